@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
-from speckle3d.kernels.increments import LOST
 from xsens.fusion import inclination as constants
 from xsens.fusion.inclination import fresh_filter
 from xsens.fusion.samples import Samples
-from xsens.fusion.settings import FusionSettings
+from xsens.fusion.settings import LOST, FusionSettings
 
 _CHUNK = 64
 """Increments summed with one bias, about two seconds; its later change is corrected to first order."""

@@ -178,8 +178,12 @@ class HeadingBank:
 
     def follow(self, steps: FilterSteps) -> Headings:
         """Take in the filter's next steps, the last bin of which may be shorter."""
-        rows = filtered_bins(steps, self._settings)
         bias_rad_s = steps.bias_rad_s[lasts_of_bins(steps, self._settings)]
+        return self.follow_bins(filtered_bins(steps, self._settings), bias_rad_s)
+
+    def follow_bins(self, bins: FloatArray, bias_rad_s: FloatArray) -> Headings:
+        """Take in bins; `bias_rad_s`, shape (n, 3), is the filter's bias at the end of each."""
+        rows = bins.copy()
         before = bias_rad_s[:1] if self._bias is None else self._bias[None]
         rows[:, at.BIAS_CHANGE : at.BIAS_CHANGE + 3] = np.diff(bias_rad_s, axis=0, prepend=before)
         self._bias = bias_rad_s[-1].copy()

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
 from speckle3d.kernels import heading_arrays as at
+from xsens.fusion.bins import averaged_bins, filtered_bins, steps_per_bin
 from xsens.fusion.heading import (
     FIRST_STRAY,
     MEMORY_S,
@@ -14,9 +15,7 @@ from xsens.fusion.heading import (
     FieldModel,
     HeadingBank,
     _backward,
-    bins_of,
     smooth_headings,
-    steps_per_bin,
     weights_of,
 )
 from xsens.fusion.inclination import forward, fresh_filter
@@ -77,14 +76,16 @@ def filtered(samples, kept=None, pause_s=0.0, corrected=True):
     """Steps of the inclination's filter, and bins of them."""
     kept = fresh_filter(SETTINGS) if kept is None else kept
     steps = forward(samples, SETTINGS, kept, pause_s, heading_apart=True)
-    args = (steps.start, steps.bias, steps.bias_sd_rad_s, steps.sd_rad, SETTINGS)
-    return steps, bins_of(steps, *args, corrected=corrected)
+    if corrected:
+        return steps, filtered_bins(steps, SETTINGS)
+    args = (steps.start, steps.bias_rad_s, steps.bias_sd_rad_s, steps.sd_rad, SETTINGS)
+    return steps, averaged_bins(steps, *args)
 
 
 def at_ends(steps, bins):
     """The bias at the end of each bin."""
     ends = np.arange(1, len(bins) + 1) * steps_per_bin(SETTINGS)
-    return steps.bias[np.minimum(ends, len(steps.bias)) - 1]
+    return steps.bias_rad_s[np.minimum(ends, len(steps.bias_rad_s)) - 1]
 
 
 def norm_of(bins):
@@ -150,10 +151,10 @@ def test_the_bank_follows_as_the_plain_filters_do_through_a_pause_and_correction
                 one.resume()
         steps, bins = filtered(part, level, pause_s)
         norm = norm or norm_of(bins)
-        biases = steps.bias[
-            np.minimum(np.arange(1, len(bins) + 1) * steps_per_bin(SETTINGS), len(steps.bias)) - 1
+        biases = steps.bias_rad_s[
+            np.minimum(np.arange(1, len(bins) + 1) * steps_per_bin(SETTINGS), len(steps.bias_rad_s)) - 1
         ]
-        found = bank.follow(bins, biases)
+        found = bank.follow_bins(bins, biases)
         each = twin.bins_from(bins, norm, np.diff(biases, axis=0, prepend=biases[:1]))
         rows = [one.run(each) for one in plain]
         weights = []
@@ -246,7 +247,9 @@ def test_iron_on_the_sensor_from_the_start_is_found_by_turning_it():
     states, _, _, found = bank.kept(bins)
     np.testing.assert_allclose(states[-1, 0, 6:9] * norm_of(bins), iron, atol=0.3)
     ends = np.minimum(np.arange(1, len(bins) + 1) * steps_per_bin(SETTINGS), len(steps.last)) - 1
-    turns = Rotation.from_euler("z", found[:, :1, at.FOUND_TURN]) * Rotation.from_matrix(steps.matrix[ends])
+    turns = Rotation.from_euler("z", found[:, :1, at.FOUND_TURN]) * Rotation.from_matrix(
+        steps.corrected[ends]
+    )
     assert heading_deg(turns, truth[steps.last[ends] - 1])[-20:].max() < 1.0
     estimate = smoothed(samples, SETTINGS)
     assert heading_deg(Rotation.from_quat(estimate.xyzw), truth).max() < 1.0
@@ -303,7 +306,7 @@ def test_heading_is_as_certain_as_the_number_of_independent_readings_allows(stra
 
 
 def follow(bins, model, settings):
-    found = HeadingBank(settings, (model,)).follow(bins, np.zeros((len(bins), 3)))
+    found = HeadingBank(settings, (model,)).follow_bins(bins, np.zeros((len(bins), 3)))
     return found.turn_rad, found.sd_rad
 
 
@@ -336,7 +339,7 @@ def test_the_fields_unit_does_not_matter():
 
 def both(bins):
     """Turns and deviations while readings arrive, and smoothed."""
-    following = HeadingBank(SETTINGS).follow(bins, np.zeros((len(bins), 3)))
+    following = HeadingBank(SETTINGS).follow_bins(bins, np.zeros((len(bins), 3)))
     whole = smooth_headings(bins, SETTINGS)
     return np.hstack([following.turn_rad, whole.turn_rad]), np.hstack([following.sd_rad, whole.sd_rad])
 
@@ -353,7 +356,8 @@ def test_a_model_that_begins_late_has_no_say_before():
     early, late = FieldModel(0.02), FieldModel(0.01, after_s=8.0, handicap=-1e6)
     biases = np.zeros((len(bins), 3))
     alone, other, mixed = (
-        HeadingBank(SETTINGS, models).follow(bins, biases) for models in ((early,), (late,), (early, late))
+        HeadingBank(SETTINGS, models).follow_bins(bins, biases)
+        for models in ((early,), (late,), (early, late))
     )
     begins = np.flatnonzero(other.sd_rad < np.pi)[0]
     assert begins > 20
