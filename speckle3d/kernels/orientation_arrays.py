@@ -46,8 +46,8 @@ flags; the integral of the specific force; variance of the turn over lost sample
 
 STEP = 79
 
-SAMPLE_TURN, SAMPLE_S, SAMPLE = 0, 4, 5
-"""Of a sample within its step: start of the increment from the sample, xyzw, and its time since the start."""
+SAMPLE_S, SAMPLE = 4, 5
+"""Of a sample within its step: start of the increment from it, xyzw, then its time since the start."""
 
 # -- buffer: rows of SIZE numbers
 

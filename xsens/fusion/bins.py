@@ -28,8 +28,16 @@ def lasts_of_bins(steps: FilterSteps, settings: FusionSettings) -> IntArray:
     return np.minimum(np.arange(per_bin, n + per_bin, per_bin), n) - 1
 
 
-def filtered_bins(steps: FilterSteps, settings: FusionSettings) -> FloatArray:
-    """Average the filter's own orientation, with the corrections that it made of its tilt."""
+def filtered_bins(steps: FilterSteps, settings: FusionSettings) -> tuple[FloatArray, FloatArray]:
+    """Average the steps of each bin as the filter left them.
+
+    Returns
+    -------
+    bins : ndarray, shape (bins, BIN)
+        As of `averaged_bins`, with the filter's corrections of its tilt.
+    bias_rad_s : ndarray, shape (bins, 3)
+        At the end of each bin.
+    """
     level, bias, bias_sd, sd = steps.start, steps.bias_rad_s, steps.bias_sd_rad_s, steps.sd_rad
     rows = averaged_bins(steps, level, bias, bias_sd, sd, settings)
     lasts = lasts_of_bins(steps, settings)
@@ -40,7 +48,7 @@ def filtered_bins(steps: FilterSteps, settings: FusionSettings) -> FloatArray:
         there = firsts + i <= lasts
         turns[there] = corrections[firsts[there] + i] @ turns[there]
     rows[:, at.CORRECTION : at.CORRECTION + 9] = turns.reshape(-1, 9)
-    return rows
+    return rows, bias[lasts]
 
 
 def averaged_bins(

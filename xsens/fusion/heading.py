@@ -31,8 +31,6 @@ import numpy as np
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.kernels import heading_arrays as at
 from speckle3d.kernels.heading import find_headings, turn_to_north
-from xsens.fusion.bins import filtered_bins, lasts_of_bins
-from xsens.fusion.inclination import FilterSteps
 from xsens.fusion.settings import FusionSettings
 
 
@@ -158,7 +156,7 @@ class HeadingBank:
         models: tuple[FieldModel, ...] = MODELS,
         first_stray: float = FIRST_STRAY,
     ) -> None:
-        self.models, self._settings = models, settings
+        self.models = models
         self._table = np.array([[m.stray, m.stray_s, m.iron, m.iron_put_on, m.after_s] for m in models])
         self._handicap = np.array([m.handicap for m in models])
         online = [m.handicap if m.online_handicap is None else m.online_handicap for m in models]
@@ -176,13 +174,8 @@ class HeadingBank:
         self._flags[:, at.BEGUN] = 0.0
         self._bias = None
 
-    def follow(self, steps: FilterSteps) -> Headings:
-        """Take in the filter's next steps, the last bin of which may be shorter."""
-        bias_rad_s = steps.bias_rad_s[lasts_of_bins(steps, self._settings)]
-        return self.follow_bins(filtered_bins(steps, self._settings), bias_rad_s)
-
-    def follow_bins(self, bins: FloatArray, bias_rad_s: FloatArray) -> Headings:
-        """Take in bins; `bias_rad_s`, shape (n, 3), is the filter's bias at the end of each."""
+    def follow(self, bins: FloatArray, bias_rad_s: FloatArray) -> Headings:
+        """Take in bins; `bias_rad_s`, shape (n, 3), is the bias with which each one's steps ended."""
         rows = bins.copy()
         before = bias_rad_s[:1] if self._bias is None else self._bias[None]
         rows[:, at.BIAS_CHANGE : at.BIAS_CHANGE + 3] = np.diff(bias_rad_s, axis=0, prepend=before)

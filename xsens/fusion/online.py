@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.kernels.orientation import GOES_ON
-from xsens.fusion.bins import steps_per_bin
+from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, real_field, require_metres
@@ -192,7 +192,7 @@ class OnlineFilter:
         steps = joined(self._steps)
         self._steps = []
         if self._settings.use_magnetometer:
-            found = self._bank.follow(steps)
+            found = self._bank.follow(*filtered_bins(steps, self._settings))
             self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
             self._disturbed = bool(found.disturbed[0])
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from xsens.fusion.bins import averaged_bins, lasts_of_bins, steps_per_bin
+from xsens.fusion.bins import averaged_bins, filtered_bins, lasts_of_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank, Headings, smooth_headings
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Estimate, Samples
@@ -30,7 +30,7 @@ class StretchFilter:
         disturbed = np.zeros(len(starts), dtype=bool)
         if magnetic:
             self._bank.resume()
-            found = self._bank.follow(steps)
+            found = self._bank.follow(*filtered_bins(steps, settings))
             # A step turns by the heading of the last whole bin; those of the first bin by its own.
             known = np.maximum(_bin_of(steps, settings) - 1, 0)
             starts = _turned(found.turn_rad[known], starts)

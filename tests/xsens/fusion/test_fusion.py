@@ -158,7 +158,7 @@ def test_a_gyroscope_in_degrees_is_refused_or_told():
     rate = np.outer(0.5 * np.cos(time_s), [1.0, 0.0, 0.0])
     force = truth.inv().apply([0.0, 0.0, 9.80665])
     assert not any("contradict" in note for note in orient(ImuLog(time_s, force, rate)).notes)
-    # 28 degrees per second are no reading that no sensor gives, but gravity follows a 57th of it.
+    # Taken for rad/s, 28 degrees per second are within a sensor's range, but gravity turns by a 57th of it.
     told = [note for note in orient(ImuLog(time_s, force, np.rad2deg(rate))).notes if "contradict" in note]
     assert len(told) == 1
     assert "shows 2 %" in told[0]

@@ -77,9 +77,9 @@ def filtered(samples, kept=None, pause_s=0.0, corrected=True):
     kept = fresh_filter(SETTINGS) if kept is None else kept
     steps = forward(samples, SETTINGS, kept, pause_s, heading_apart=True)
     if corrected:
-        return steps, filtered_bins(steps, SETTINGS)
-    args = (steps.start, steps.bias_rad_s, steps.bias_sd_rad_s, steps.sd_rad, SETTINGS)
-    return steps, averaged_bins(steps, *args)
+        return steps, filtered_bins(steps, SETTINGS)[0]
+    sds = (steps.bias_sd_rad_s, steps.sd_rad)
+    return steps, averaged_bins(steps, steps.start, steps.bias_rad_s, *sds, SETTINGS)
 
 
 def at_ends(steps, bins):
@@ -151,10 +151,8 @@ def test_the_bank_follows_as_the_plain_filters_do_through_a_pause_and_correction
                 one.resume()
         steps, bins = filtered(part, level, pause_s)
         norm = norm or norm_of(bins)
-        biases = steps.bias_rad_s[
-            np.minimum(np.arange(1, len(bins) + 1) * steps_per_bin(SETTINGS), len(steps.bias_rad_s)) - 1
-        ]
-        found = bank.follow_bins(bins, biases)
+        biases = at_ends(steps, bins)
+        found = bank.follow(bins, biases)
         each = twin.bins_from(bins, norm, np.diff(biases, axis=0, prepend=biases[:1]))
         rows = [one.run(each) for one in plain]
         weights = []
@@ -226,16 +224,6 @@ def test_a_recordings_heading_is_the_mean_over_the_models_by_their_evidence():
     # Models below one in a hundred are left out.
     assert (np.abs(found.turn_rad - turn) < 0.1 * sd).all()
     np.testing.assert_allclose(found.sd_rad, sd, rtol=0.02)
-
-
-def test_a_bins_correction_is_that_of_its_steps_one_after_another():
-    steps, bins = filtered(eventful(seconds=8.0))
-    per_bin = steps_per_bin(SETTINGS)
-    for k, row in enumerate(bins):
-        turn = np.eye(3)
-        for i in range(per_bin * k, min(per_bin * (k + 1), len(steps.last))):
-            turn = steps.matrix[i] @ np.linalg.inv(steps.predicted[i]) @ turn
-        np.testing.assert_allclose(row[at.CORRECTION : at.CORRECTION + 9], turn.ravel(), atol=1e-12)
 
 
 # -- known answers
@@ -316,7 +304,7 @@ def test_heading_is_as_certain_as_the_number_of_independent_readings_allows(stra
 
 
 def follow(bins, model, settings):
-    found = HeadingBank(settings, (model,)).follow_bins(bins, np.zeros((len(bins), 3)))
+    found = HeadingBank(settings, (model,)).follow(bins, np.zeros((len(bins), 3)))
     return found.turn_rad, found.sd_rad
 
 
@@ -349,7 +337,7 @@ def test_the_fields_unit_does_not_matter():
 
 def both(bins):
     """Turns and deviations while readings arrive, and smoothed."""
-    following = HeadingBank(SETTINGS).follow_bins(bins, np.zeros((len(bins), 3)))
+    following = HeadingBank(SETTINGS).follow(bins, np.zeros((len(bins), 3)))
     whole = smooth_headings(bins, SETTINGS)
     return np.hstack([following.turn_rad, whole.turn_rad]), np.hstack([following.sd_rad, whole.sd_rad])
 
@@ -366,8 +354,7 @@ def test_a_model_that_begins_late_has_no_say_before():
     early, late = FieldModel(0.02), FieldModel(0.01, after_s=8.0, handicap=-1e6)
     biases = np.zeros((len(bins), 3))
     alone, other, mixed = (
-        HeadingBank(SETTINGS, models).follow_bins(bins, biases)
-        for models in ((early,), (late,), (early, late))
+        HeadingBank(SETTINGS, models).follow(bins, biases) for models in ((early,), (late,), (early, late))
     )
     begins = np.flatnonzero(other.sd_rad < np.pi)[0]
     assert begins > 20
