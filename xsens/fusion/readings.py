@@ -163,11 +163,11 @@ def _require_radians(rate_rad_s: FloatArray, source: str) -> None:
 
 def _readable(rate_rad_s: FloatArray) -> tuple[BoolArray, int]:
     """Where a gyroscope, shape (m, 3), was read; and how many readings, a few, no gyroscope can give."""
-    there = np.isfinite(rate_rad_s).all(axis=1)
+    there = np.asarray(np.isfinite(rate_rad_s).all(axis=1))
     wild = there & (np.abs(rate_rad_s).max(axis=1) > FASTEST_RAD_S)
     if wild.sum() > _FEW * there.sum():
         return there, 0  # another unit, not errors
-    return there & ~wild, int(wild.sum())
+    return np.asarray(there & ~wild), int(wild.sum())
 
 
 def _near(time_s: FloatArray, there: BoolArray) -> BoolArray:

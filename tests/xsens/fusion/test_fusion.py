@@ -207,13 +207,13 @@ def test_a_sensor_upside_down_starts_like_any_other():
     assert worst_deg(truth, orient(shaky, method="filter")) < 2.0
 
 
-@pytest.mark.parametrize(("peak_m_s2", "bound_deg"), [(500.0, 4.0), (1e9, 1.0)])
-def test_a_knock_does_not_tilt_it(peak_m_s2, bound_deg):
-    # One reading of 500 m/s^2 is a velocity of 5 m/s that the hand never had: a tilt of tens of degrees.
+@pytest.mark.parametrize("peak_m_s2", [500.0, 1e9])
+def test_a_knock_does_not_tilt_it(peak_m_s2):
+    # One reading of 500 m/s^2 is a velocity of 5 m/s that no hand had: believed, it tilts by 3 degrees.
     truth, log = swung()
     force = log.accelerometer_m_s2.copy()
     force[1000] += [peak_m_s2, 0.0, 0.0]
-    assert worst_deg(truth, orient(replace(log, accelerometer_m_s2=force))) < bound_deg
+    assert worst_deg(truth, orient(replace(log, accelerometer_m_s2=force))) < 1.0
 
 
 def test_an_accelerometer_that_pauses_is_not_made_up():
