@@ -171,7 +171,7 @@ def find_recording(path: Path) -> Recording:
         return replace(_only(path, members), cut=cut)
     prefix, kind = named
     beside = [each for each in _folder_members(path.parent) if _parsed(Path(each.name).name) == named]
-    kinds = (kind,) if kind != "imu" else KINDS
+    kinds = (kind,) if kind != "imu" else (*KINDS, kind)
     others = [
         each
         for each in _folder_members(path.parent)

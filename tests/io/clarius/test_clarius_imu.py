@@ -9,6 +9,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import rotations_from_quaternions
 from speckle3d.io.clarius import imu
 from speckle3d.io.clarius.package import Member
+from speckle3d.io.clarius.reader import sensor_of
 
 TIMES_S = examples.bursts_s(100.0, 102.0)
 
@@ -148,7 +149,7 @@ def test_samples_that_make_no_sense_are_named(tmp_path, change, message):
 )
 def test_real_recordings(realdata, name, count, gaps, norm, off_deg, dip_deg):
     path = realdata / "clarius" / f"{name}_imu.yml"
-    samples = imu.read_samples(Member(path, path.name, 0, path.stat().st_size))
+    samples, _ = sensor_of(path)
     assert len(samples) == count
     fits = imu.fits_of(samples)
     chosen = imu.meaning_of(fits)
