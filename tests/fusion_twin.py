@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
+from speckle3d.kernels.orientation import SHOCK_M_S2
 from xsens.fusion import inclination as constants
 from xsens.fusion.inclination import fresh_filter
 from xsens.fusion.samples import Samples
@@ -160,7 +161,7 @@ class LevelFilter:
             fresh[BIAS, BIAS] = self.p[BIAS, BIAS] + walk * np.eye(3)
         self.p, self.starting, self.still_s = fresh, True, 0.0
         self.level, self.speed = upright(increment.push), np.zeros(3)
-        self.start_push, self.start_turn, self.start_s = np.zeros(3), Rotation.identity(), 0.0
+        self.start_push, self.start_turn, self.start_s = np.zeros(3), self.level, 0.0
         self.mean_rate, self.mean_force = increment.rate, increment.push / increment.duration_s
 
     def _advance(self, increment: Increment) -> Step:
@@ -225,6 +226,8 @@ class LevelFilter:
         each = [turning, s.bias_walk_rad_s_sqrt_s**2, s.force_noise_m_s_sqrt_s**2]
         noise = np.diag(np.repeat(each, 3)) * duration
         noise[ANGLE, ANGLE] += increment.bridged * np.eye(3)
+        beyond = np.linalg.norm(increment.push) - SHOCK_M_S2 * duration
+        noise[SPEED, SPEED] += max(beyond, 0.0) ** 2 * np.eye(3)
         return transition, noise
 
     def _begin(self, increment: Increment) -> None:
