@@ -50,7 +50,7 @@ class Bin:
 
 
 def bins_from(rows: FloatArray, norm: float, bias_change: FloatArray | None = None) -> list[Bin]:
-    """Bins of rows as `bins_of` makes them, their fields as fractions of `norm`."""
+    """Bins of rows as `averaged_bins` makes them, their fields as fractions of `norm`."""
     changes = np.zeros((len(rows), 3)) if bias_change is None else bias_change
     return [
         Bin(

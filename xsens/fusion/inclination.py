@@ -172,6 +172,7 @@ def forward(
     pause_s: float = 0.0,
     covariances: bool = False,
     heading_apart: bool = False,
+    whole: bool = False,
 ) -> FilterSteps:
     """Run the filter over a stretch.
 
@@ -189,12 +190,12 @@ def forward(
     heading_apart : bool
         Leave the heading to the gyroscope, whose bias is known at each time: corrections of it are made
         elsewhere.
+    whole : bool
+        Take all samples for one increment, however many they are.
     """
     per_block = max(1, round(settings.block_s / float(np.mean(samples.step_s))))
-    whole = len(samples) // per_block
-    last = per_block * np.arange(1, whole + 1)
-    if whole * per_block < len(samples):
-        last = np.append(last, len(samples))
+    last = np.arange(per_block, len(samples), per_block)
+    last = np.append([] if whole else last, len(samples))
     n = len(last)
     wide = (n if covariances else 0, places.SIZE, places.SIZE)
     shapes = ((n, places.STEP), (len(samples), places.SAMPLE), wide, wide)

@@ -15,7 +15,7 @@ from speckle3d.kernels.orientation import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
-from xsens.fusion.readings import FASTEST_RAD_S, real_field, require_metres
+from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, real_field, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 
@@ -153,11 +153,11 @@ class OnlineFilter:
             return
         step_s += self._skipped_s
         self._skipped_s = 0.0
-        if step_s > BRIDGED_S and self._last is not None:
+        if step_s > PAUSE_S and self._last is not None:
             self._advance()
             self._pause_s = step_s
         # The turn in a pause is not known, nor is the first sample's own step.
-        step_s = step_s if step_s <= BRIDGED_S else self._settings.block_s
+        step_s = step_s if step_s <= PAUSE_S else self._settings.block_s
         self._pending.append((step_s, rate, self._force, field))
         self._pending_s += step_s
         # Half a sample too short is as near to the block's length as half a sample too long.
@@ -174,9 +174,12 @@ class OnlineFilter:
         if self._last is None or self._pause_s:
             self._find_north()
             self._bank.resume()
+            self._heading_sd_rad = math.pi  # until the first bin after it
             pause_s = self._pause_s
         magnetic = self._settings.use_magnetometer
-        self._last = forward(samples, self._settings, self._level, pause_s, heading_apart=magnetic)
+        self._last = forward(
+            samples, self._settings, self._level, pause_s, heading_apart=magnetic, whole=True
+        )
         self._pause_s = 0.0
         self._steps.append(self._last)
         if len(self._steps) == steps_per_bin(self._settings):

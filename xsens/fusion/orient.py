@@ -12,7 +12,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.methods import DEFAULT_METHOD, Method, method_of
-from xsens.fusion.readings import UNKNOWN_HEADING_RAD, usable_samples
+from xsens.fusion.readings import PAUSE_S, UNKNOWN_HEADING_RAD, usable_samples
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 from xsens.logs.samples import ImuLog
@@ -111,7 +111,7 @@ def orient(
     if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():
         notes.append("no magnetometer: the heading is relative to the start")
         settings = replace(settings, use_magnetometer=False)
-    breaks = np.flatnonzero(samples.step_s > BRIDGED_S)
+    breaks = np.flatnonzero(samples.step_s > PAUSE_S)
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, method, notes)

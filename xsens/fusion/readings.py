@@ -15,6 +15,9 @@ from xsens.logs.samples import ImuLog
 FORCE_M_S2 = (4.0, 25.0)
 """Limits of the median of the accelerometer's norm if it is in m/s^2."""
 
+PAUSE_S = 1.25 * BRIDGED_S
+"""A longer step is a pause. Steps of a clock of 10 Hz vary by rounding, and by jitter."""
+
 FASTEST_RAD_S = 60.0
 """The widest range of the sensors' gyroscopes ends at 35 rad/s about an axis, and a hand's ordinary movement
 in deg/s exceeds 60."""
@@ -94,7 +97,7 @@ def _bridging(readings: FloatArray, step_s: FloatArray) -> FloatArray:
     A reading tells the last usual step alone; before that it is taken for the mean of the two.
     """
     usual = float(np.median(step_s))
-    late = np.flatnonzero((step_s > LOST * usual) & (step_s <= BRIDGED_S))
+    late = np.flatnonzero((step_s > LOST * usual) & (step_s <= PAUSE_S))
     if not late.size:
         return readings
     told = (usual / step_s[late])[:, None]
@@ -118,7 +121,7 @@ def _lacking(log: ImuLog) -> str:
 def _require_seconds(steps_s: FloatArray, source: str) -> None:
     """Raise `InvalidInputError` if samples are too far apart to integrate a gyroscope."""
     median = float(np.median(steps_s))
-    if median > BRIDGED_S * (1.0 + 1e-6):
+    if median > 1.05 * BRIDGED_S:  # a clock of 10 Hz, and jitter
         raise InvalidInputError(
             f"{source}: expected samples at most {BRIDGED_S:g} s apart, got a median of {median:.4g} s: "
             "times in milliseconds?"
