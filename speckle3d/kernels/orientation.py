@@ -75,6 +75,9 @@ from speckle3d.kernels.orientation_arrays import (
 from speckle3d.kernels.orientation_kalman import predict_covariance, update
 from speckle3d.kernels.rotations import product_into, turn_into
 
+SHOCK_M_S2 = 60.0
+"""Mean force of an increment beyond which it is not believed: a board shaken by hand in BROAD reads 51."""
+
 GOES_ON = -1.0
 """Pause before a stretch that is none: the stretch goes on from the last one."""
 
@@ -197,9 +200,9 @@ def _set_up(
     s[REST_KNOWN] = s[STILL] = s[START_S] = 0.0
     for i in range(3):
         s[REST_FORCE + i] = s[START_FORCE + i] = s[SPEED + i] = 0.0
-        for j in range(3):
-            s[START_TURN + 3 * i + j] = 1.0 if i == j else 0.0
     _upright(step[FORCE : FORCE + 3], s[LEVEL : LEVEL + 9])
+    for i in range(9):  # in level axes: those of a sensor upside down would turn with every reading
+        s[START_TURN + i] = s[LEVEL + i]
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -237,6 +240,14 @@ def _rate(s: FloatArray, step: FloatArray) -> float:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _shock(limits: FloatArray, step: FloatArray) -> float:
+    """Variance of the velocity by a force that no hand gives: a knock, whose reading may be cut off."""
+    x, y, z = step[FORCE], step[FORCE + 1], step[FORCE + 2]
+    beyond = math.sqrt(x * x + y * y + z * z) - SHOCK_M_S2 * step[DURATION]
+    return beyond * beyond if beyond > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray, work: FloatArray) -> None:
     """Predict over one increment."""
     _rest(s, p, limits, step)
@@ -252,7 +263,8 @@ def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray,
             f[0, 3 + j], f[1, 3 + j], f[2, 3 + j] = -x, -y, -z
             f[6, 3 + j], f[7, 3 + j], f[8, 3 + j] = vz * y - vy * z, vx * z - vz * x, vy * x - vx * y
     f[6, 1], f[7, 0] = limits[GRAVITY] * duration, -limits[GRAVITY] * duration
-    predict_covariance(p, _rate(s, step), step[BRIDGED], resting, limits, duration, work)
+    shock = _shock(limits, step)
+    predict_covariance(p, _rate(s, step), step[BRIDGED], shock, resting, limits, duration, work)
     for i in range(3):
         x, y, z = step[FORCE], step[FORCE + 1], step[FORCE + 2]
         s[SPEED + i] += level[3 * i] * x + level[3 * i + 1] * y + level[3 * i + 2] * z

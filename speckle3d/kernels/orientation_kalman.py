@@ -32,12 +32,16 @@ def predict_covariance(
     p: FloatArray,
     rate: float,
     bridged: float,
+    shock: float,
     resting: bool,
     limits: FloatArray,
     duration: float,
     work: FloatArray,
 ) -> None:
-    """Predict the covariance `p` over one increment by the transition in `work`; fill the noise there."""
+    """Predict the covariance `p` over one increment by the transition in `work`; fill the noise there.
+
+    `bridged` and `shock` are variances of angle, rad^2, and velocity, m^2/s^2, that the readings add.
+    """
     f, wide = work[TRANSITION : TRANSITION + SIZE], work[WIDE : WIDE + SIZE]
     q, size = work[NOISES : NOISES + SIZE], p.shape[0]  # not unrolled
     turning = limits[GYRO_NOISE] * limits[GYRO_NOISE] + (limits[GYRO_SCALE_NOISE] * rate) ** 2
@@ -47,7 +51,7 @@ def predict_covariance(
     for i in range(3):
         q[i, i] = turning * duration + bridged
         q[i + 3, i + 3] = walk
-        q[i + 6, i + 6] = limits[FORCE_NOISE] * limits[FORCE_NOISE] * duration
+        q[i + 6, i + 6] = limits[FORCE_NOISE] * limits[FORCE_NOISE] * duration + shock
     for i in range(size):
         for j in range(size):
             wide[i, j] = f[i, i] * p[i, j]

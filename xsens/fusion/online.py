@@ -15,7 +15,7 @@ from speckle3d.kernels.orientation import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
-from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, real_field, require_metres
+from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, real_field, real_force, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, FusionSettings
 
@@ -76,7 +76,7 @@ class OnlineFilter:
         self._last: FilterSteps | None = None
         self._turn_rad, self._heading_sd_rad, self._disturbed = 0.0, math.pi, False
         self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
-        self._pending_s = self._skipped_s = self._pause_s = 0.0
+        self._pending_s = self._skipped_s = self._pause_s = self._forceless_s = 0.0
         self._force = np.full(3, np.nan)
         self._first: list[FloatArray] = []
         self._judged_s = 0.0
@@ -96,7 +96,8 @@ class OnlineFilter:
             Time from the sample before to each sample; more than 0.1 s is a pause, after which up and north
             are found again.
         gyroscope_rad_s, accelerometer_m_s2 : array_like, shape (3,) or (m, 3)
-            A sample without gyroscope (NaN) is left out, one without accelerometer takes the last reading.
+            A sample without gyroscope (NaN) is left out, one without accelerometer takes the last reading of
+            0.1 s.
         magnetometer_au : array_like, shape (3,) or (m, 3), optional
             Rows may be NaN; rows of zeros count as missing too.
 
@@ -146,9 +147,10 @@ class OnlineFilter:
                 self._first = []
 
     def _take(self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
-        if np.isfinite(force).all():
-            self._force = force
-        if not (np.isfinite(rate).all() and np.isfinite(self._force).all()):
+        self._forceless_s += step_s
+        if real_force(force[None])[0]:
+            self._force, self._forceless_s = force, 0.0
+        if not (np.isfinite(rate).all() and self._forceless_s <= PAUSE_S and np.isfinite(self._force).all()):
             self._skipped_s += step_s
             return
         step_s += self._skipped_s

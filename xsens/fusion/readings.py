@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, LOST
@@ -35,6 +35,13 @@ _FOLLOWED = 0.3
 """Smallest fraction of the gyroscope's turn that gravity must show: it shows 1 if the unit is rad/s, 1/57 if
 it is deg/s, 0 if the two do not belong together."""
 
+_FEW = 0.01
+"""Share of readings that may be errors of transmission."""
+
+_FORCE_ENDS_M_S2 = 2000.0
+_FIELD_ENDS_AU = (1e-12, 1e12)
+"""Readings beyond them are none: accelerometers end at 200 g, fields in any unit are between."""
+
 _NEAR_REST_M_S2 = 1.0
 _FEWEST = 20
 
@@ -61,10 +68,12 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     source = log.source or "log"
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
         raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {_lacking(log)}")
-    used = np.flatnonzero(np.isfinite(log.gyroscope_rad_s).all(axis=1))
+    readable, wild = _readable(log.gyroscope_rad_s)
+    readable &= _near(log.time_s, real_force(log.accelerometer_m_s2))
+    used = np.flatnonzero(readable)
     part = slice(None) if used.size == len(log) else used
     rate, force = (_plain(values[part]) for values in (log.gyroscope_rad_s, log.accelerometer_m_s2))
-    there = np.isfinite(force).all(axis=1)
+    there = real_force(force)
     if used.size < 2 or there.sum() < 2:
         raise InsufficientDataError(
             f"{source}: expected two samples of gyroscope and accelerometer or more, got {int(there.sum())}"
@@ -74,8 +83,10 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     _require_seconds(steps, source)
     require_metres(force if there.all() else force[there], source)
     _require_radians(rate, source)
-    if used.size < len(log):
-        notes.append(f"{len(log) - used.size} samples without gyroscope left out")
+    if used.size + wild < len(log):
+        notes.append(f"{len(log) - used.size - wild} samples without gyroscope or accelerometer left out")
+    if wild:
+        notes.append(f"{wild} samples whose gyroscope reads over {FASTEST_RAD_S:g} rad/s left out")
     if not there.all():
         notes.append(f"{int((~there).sum())} accelerometer readings missing: interpolated")
         force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
@@ -147,10 +158,36 @@ def _require_radians(rate_rad_s: FloatArray, source: str) -> None:
         )
 
 
+def _readable(rate_rad_s: FloatArray) -> tuple[BoolArray, int]:
+    """Where a gyroscope, shape (m, 3), was read; and how many readings, a few, no gyroscope can give."""
+    there = np.asarray(np.isfinite(rate_rad_s).all(axis=1))
+    wild = there & (np.abs(rate_rad_s).max(axis=1) > FASTEST_RAD_S)
+    if wild.sum() > _FEW * there.sum():
+        return there, 0  # another unit, not errors
+    return np.asarray(there & ~wild), int(wild.sum())
+
+
+def _near(time_s: FloatArray, there: BoolArray) -> BoolArray:
+    """Where a reading is there, or one before and one after it at most a bridged pause apart."""
+    known = time_s[there]
+    if not known.size:
+        return np.ones(len(there), dtype=bool)
+    after = np.clip(np.searchsorted(known, time_s), 0, known.size - 1)
+    before = np.maximum(np.searchsorted(known, time_s, side="right") - 1, 0)
+    return np.asarray(np.maximum(known[after], time_s) - np.minimum(known[before], time_s) <= PAUSE_S)
+
+
+def real_force(force_m_s2: FloatArray) -> BoolArray:
+    """Where an accelerometer, shape (m, 3), was read."""
+    return np.asarray((np.abs(force_m_s2) < _FORCE_ENDS_M_S2).all(axis=1))
+
+
 def real_field(field_au: FloatArray) -> tuple[FloatArray, int]:
-    """The field, shape (m, 3), NaN where zero or not finite, and how many readings were exactly zero."""
+    """The field, shape (m, 3), NaN where zero or beyond any unit, and how many readings were exactly zero."""
     zero = (field_au == 0.0).all(axis=1)
-    none = zero | ~np.isfinite(field_au).all(axis=1)
+    low, high = _FIELD_ENDS_AU
+    size = np.abs(field_au).max(axis=1, initial=0.0)
+    none = ~((size > low) & (size < high))
     return np.where(none[:, None], np.nan, field_au) if none.any() else field_au, int(zero.sum())
 
 

@@ -1,5 +1,7 @@
 """Orientation from gyroscope, accelerometer and magnetometer: exact cases, disturbances, bad readings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -180,3 +182,56 @@ def test_columns_that_were_not_understood_are_named_where_they_are_missed():
     text = "time_s,gyr_x,gyr_y,gyr_z,accelerometer_x_g\n0,0,0,0,1\n0.01,0,0,0,1\n"
     with pytest.raises(InsufficientDataError, match=r"accelerometer_x_g.*accelerometer_x_m_s2"):
         orient(parse_text(text))
+
+
+def swung(seconds=20.0):
+    """A sensor upside down, still for two seconds, then swung; exact readings, and its truth."""
+    time_s = np.arange(1, round(100.0 * seconds) + 1) / 100.0
+    swing = np.clip(time_s - 2.0, 0.0, None)
+    angles = np.column_stack([np.sin(swing), np.pi + 0.8 * np.sin(1.7 * swing), 0.5 * np.sin(1.3 * swing)])
+    truth = Rotation.from_euler("ZYX", angles)
+    rate = (Rotation.concatenate([truth[:1], truth[:-1]]).inv() * truth).as_rotvec() * 100.0
+    force, field = truth.inv().apply([0.0, 0.0, 9.80665]), truth.inv().apply([0.4, 0.0, -0.9])
+    return truth, ImuLog(time_s, force, rate, field)
+
+
+def worst_deg(truth, found):
+    return float(np.rad2deg((found.rotations.world_from_sensor * truth.inv()).magnitude().max()))
+
+
+def test_a_sensor_upside_down_starts_like_any_other():
+    truth, log = swung(4.0)
+    noise = np.random.default_rng(0).normal(scale=0.05, size=(len(log), 3))
+    shaky = replace(log, accelerometer_m_s2=log.accelerometer_m_s2 + noise)
+    # By the mean of 31 ms alone up is 0.2 degrees wrong, and north, the field dipping by 66, twice that.
+    assert worst_deg(truth, orient(shaky, method="filter")) < 2.0
+
+
+@pytest.mark.parametrize("peak_m_s2", [500.0, 1e9])
+def test_a_knock_does_not_tilt_it(peak_m_s2):
+    # One reading of 500 m/s^2 is a velocity of 5 m/s that no hand had: believed, it tilts by 3 degrees.
+    truth, log = swung()
+    force = log.accelerometer_m_s2.copy()
+    force[1000] += [peak_m_s2, 0.0, 0.0]
+    assert worst_deg(truth, orient(replace(log, accelerometer_m_s2=force))) < 1.0
+
+
+def test_an_accelerometer_that_pauses_is_not_made_up():
+    truth, log = swung()
+    force = log.accelerometer_m_s2.copy()
+    force[800:1200] = np.nan
+    found = orient(replace(log, accelerometer_m_s2=force))
+    there = np.isin(log.time_s, found.rotations.time_s)
+    assert there.sum() == len(log) - 400
+    assert worst_deg(truth[there], found) < 10.0
+
+
+@pytest.mark.parametrize("what", ["gyroscope_rad_s", "magnetometer_au"])
+@pytest.mark.parametrize("value", [1e30, 1e-30])
+def test_a_reading_beyond_all_units_is_none(what, value):
+    truth, log = swung(8.0)
+    readings = getattr(log, what).copy()
+    readings[[0, 500]] = value
+    found = orient(replace(log, **{what: readings}))
+    there = np.isin(log.time_s, found.rotations.time_s)
+    assert worst_deg(truth[there], found) < 2.0

@@ -226,6 +226,16 @@ def test_a_recordings_heading_is_the_mean_over_the_models_by_their_evidence():
     np.testing.assert_allclose(found.sd_rad, sd, rtol=0.02)
 
 
+def test_a_bins_correction_is_that_of_its_steps_one_after_another():
+    steps, bins = filtered(eventful(seconds=8.0))
+    per_bin = steps_per_bin(SETTINGS)
+    for k, row in enumerate(bins):
+        turn = np.eye(3)
+        for i in range(per_bin * k, min(per_bin * (k + 1), len(steps.last))):
+            turn = steps.corrected[i] @ np.linalg.inv(steps.predicted[i]) @ turn
+        np.testing.assert_allclose(row[at.CORRECTION : at.CORRECTION + 9], turn.ravel(), atol=1e-12)
+
+
 # -- known answers
 
 
