@@ -62,9 +62,9 @@ class Increment:
         return self.turns[-1]
 
 
-def summed(samples: Samples, first: int, end: int, assumed: FloatArray) -> Increment:
+def summed(samples: Samples, first: int, end: int, assumed: FloatArray, before: FloatArray) -> Increment:
     """Sum samples with that bias; the specific force is read halfway through each sample's turn."""
-    changes = np.diff(samples.rate_rad_s, axis=0, prepend=samples.rate_rad_s[:1])
+    changes = np.diff(samples.rate_rad_s, axis=0, prepend=before)
     lost = samples.step_s > LOST * np.median(samples.step_s)
     bridged = ((changes * samples.step_s[:, None]) ** 2).sum(axis=1)[first:end] @ lost[first:end]
     samples = samples[first:end]
@@ -143,12 +143,14 @@ class LevelFilter:
     def run(self, samples: Samples, last: FloatArray, pause_s: float | None) -> list[Step]:
         """Run over a stretch whose increments end before the samples `last`; no pause: it goes on."""
         steps = []
+        before = samples.rate_rad_s[:1] if pause_s is not None else self.last_rate
+        self.last_rate = samples.rate_rad_s[-1:]
         edges = list(pairwise([0, *last]))
         for n, (first, end) in enumerate(edges):
             left_over = n == len(edges) - 1 and end - first != last[0]
             if n % _CHUNK == 0 or left_over:
                 assumed = self.bias
-            increment = summed(samples, first, end, assumed)
+            increment = summed(samples, first, end, assumed, before)
             if n == 0 and pause_s is not None:
                 self._set_up(increment, pause_s)
             steps.append(self._advance(increment))

@@ -38,6 +38,7 @@ def sum_samples(
     first: int,
     last: int,
     longest_s: float,
+    before: FloatArray,
     step: FloatArray,
     within: FloatArray,
 ) -> None:
@@ -52,6 +53,8 @@ def sum_samples(
     longest_s : float
         Longest step without a loss: over a longer one the rate may change as much as it did from the sample
         before to the one after.
+    before : ndarray, shape (3,)
+        Rate of the sample before, NaN if there is none; becomes that of the last.
     step : ndarray, shape (STEP,)
         Filled up to the turn, and the integral of the specific force.
     within : ndarray, shape (m, SAMPLE)
@@ -65,9 +68,10 @@ def sum_samples(
         step[RATE + i] = step[FIELD + i] = step[FORCE + i] = 0.0
     for k in range(first, last):
         dt = step_s[k]
-        if dt > longest_s and k > 0:
-            for i in range(3):
-                step[BRIDGED] += (dt * (rate[k, i] - rate[k - 1, i])) ** 2
+        for i in range(3):
+            if dt > longest_s and math.isfinite(before[i]):
+                step[BRIDGED] += (dt * (rate[k, i] - before[i])) ** 2
+            before[i] = rate[k, i]
         x, y = (rate[k, 0] - step[ASSUMED]) * dt, (rate[k, 1] - step[ASSUMED + 1]) * dt
         z = (rate[k, 2] - step[ASSUMED + 2]) * dt
         q = multiplied(q, quaternion_of(x, y, z))

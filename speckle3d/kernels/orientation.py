@@ -32,6 +32,7 @@ from speckle3d.kernels.orientation_arrays import (
     FORCE,
     GRAVITY,
     HEADING_APART,
+    LAST_RATE,
     LEVEL,
     LONGEST_S,
     MATRIX,
@@ -133,8 +134,11 @@ def run_filter(
         for i in range(3):
             step[ASSUMED + i] = s[BIAS + i] if n % chunk == 0 or n == whole else steps[n - 1, ASSUMED + i]
         first = 0 if n == 0 else last[n - 1]
+        before = s[LAST_RATE : LAST_RATE + 3]
+        if n == 0 and pause_s != GOES_ON:
+            before[:] = math.nan
         longest_s = limits[LONGEST_S]
-        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], longest_s, step, within)
+        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], longest_s, before, step, within)
         if n == 0 and pause_s != GOES_ON:
             _set_up(s, p, fresh, limits, step, pause_s)
         for i in range(9):

@@ -25,10 +25,10 @@ REST_KNOWN, REST_RATE, REST_FORCE, STILL = 9, 10, 13, 16
 START_S, START_FORCE = 17, 18
 """Flags, velocity, bias; rest detector; the start's mean."""
 
-LEVEL, START_TURN = 21, 30
-"""World from sensor; a start's first axes from the present ones."""
+LEVEL, START_TURN, LAST_RATE = 21, 30, 39
+"""World from sensor; a start's first axes from the present ones; the gyroscope's last reading."""
 
-STATE = 39
+STATE = 42
 
 # -- a step: one increment, and the filter before and after it
 

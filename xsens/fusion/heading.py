@@ -180,6 +180,7 @@ class HeadingBank:
         before = bias_rad_s[:1] if self._bias is None else self._bias[None]
         rows[:, at.BIAS_CHANGE : at.BIAS_CHANGE + 3] = np.diff(bias_rad_s, axis=0, prepend=before)
         self._bias = bias_rad_s[-1].copy()
+        self._know_norm(rows, 1)
         found = self._run(rows)
         turns, variances = found[..., at.FOUND_TURN], found[..., at.FOUND_VARIANCE]
         weights = np.array(
@@ -204,7 +205,7 @@ class HeadingBank:
         for late in np.flatnonzero(~early):
             k = min(first[late], len(bins)) - 1
             total[late] += running[k, early].max()
-        return np.asarray(total - self._handicap)
+        return np.asarray(np.where(begun.any(axis=0), total, -np.inf) - self._handicap)
 
     def kept(self, bins: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """States, covariances, those before the reading, and what was found, of every bin."""
@@ -213,11 +214,15 @@ class HeadingBank:
         states, after, before = np.zeros(wide[:3]), np.zeros(wide), np.zeros(wide)
         return states, after, before, self._run(bins, states, after, before)
 
+    def _know_norm(self, bins: FloatArray, most: int) -> None:
+        """Take the field's norm from the first readings, unless it is known: wild ones do not count."""
+        readings = bins[bins[:, at.SEEN] > 0.0, at.READING : at.READING + 3][:most]
+        if len(readings) and not math.isfinite(self._norm):
+            self._norm = float(np.median(np.linalg.norm(readings, axis=1)))
+
     def _run(self, bins: FloatArray, *kept: FloatArray) -> FloatArray:
         rows = bins.copy()
-        if not math.isfinite(self._norm) and (rows[:, at.SEEN] > 0.0).any():
-            first = rows[int(np.argmax(rows[:, at.SEEN])), at.READING : at.READING + 3]
-            self._norm = float(np.linalg.norm(first))
+        self._know_norm(rows, len(rows))
         if self._norm > 0.0:
             rows[:, at.READING : at.READING + 3] /= self._norm
             rows[:, at.LATE : at.LATE + 3] /= self._norm

@@ -172,7 +172,7 @@ def forward(
     pause_s: float = 0.0,
     covariances: bool = False,
     heading_apart: bool = False,
-    whole: bool = False,
+    usual_s: float | None = None,
 ) -> FilterSteps:
     """Run the filter over a stretch.
 
@@ -190,12 +190,12 @@ def forward(
     heading_apart : bool
         Leave the heading to the gyroscope, whose bias is known at each time: corrections of it are made
         elsewhere.
-    whole : bool
-        Take all samples for one increment, however many they are.
+    usual_s : float, optional
+        Usual step between samples, if these are the samples of one increment alone; by default their median.
     """
     per_block = max(1, round(settings.block_s / float(np.mean(samples.step_s))))
     last = np.arange(per_block, len(samples), per_block)
-    last = np.append([] if whole else last, len(samples))
+    last = np.append([] if usual_s is not None else last, len(samples))
     n = len(last)
     wide = (n if covariances else 0, places.SIZE, places.SIZE)
     shapes = ((n, places.STEP), (len(samples), places.SAMPLE), wide, wide)
@@ -211,7 +211,7 @@ def forward(
         kept.state,
         kept.covariance,
         kept.fresh,
-        _limits(settings, heading_apart, float(np.median(samples.step_s))),
+        _limits(settings, heading_apart, usual_s or float(np.median(samples.step_s))),
         steps.rows,
         steps.within,
         steps.covariance,

@@ -17,10 +17,13 @@ from xsens.fusion.heading import HeadingBank
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, real_field, real_force, require_metres
 from xsens.fusion.samples import Samples
-from xsens.fusion.settings import BRIDGED_S, FusionSettings
+from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
 
 _JUDGED_S = 0.99
 """The accelerometer's unit is judged by the median of the first second, less rounding of the steps."""
+
+_FOLLOWS = 0.05
+"""How fast the usual step between samples follows theirs, as a fraction of a sample."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,7 @@ class OnlineFilter:
         self._turn_rad, self._heading_sd_rad, self._disturbed = 0.0, math.pi, False
         self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
         self._pending_s = self._skipped_s = self._pause_s = self._forceless_s = 0.0
+        self._usual_s = math.nan
         self._force = np.full(3, np.nan)
         self._first: list[FloatArray] = []
         self._judged_s = 0.0
@@ -179,8 +183,12 @@ class OnlineFilter:
             self._heading_sd_rad = math.pi  # until the first bin after it
             pause_s = self._pause_s
         magnetic = self._settings.use_magnetometer
+        if self._last is None:
+            self._usual_s = float(np.median(samples.step_s))
+        for step_s in samples.step_s.tolist():
+            self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)
         self._last = forward(
-            samples, self._settings, self._level, pause_s, heading_apart=magnetic, whole=True
+            samples, self._settings, self._level, pause_s, heading_apart=magnetic, usual_s=self._usual_s
         )
         self._pause_s = 0.0
         self._steps.append(self._last)

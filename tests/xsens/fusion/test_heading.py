@@ -88,9 +88,9 @@ def at_ends(steps, bins):
     return steps.bias_rad_s[np.minimum(ends, len(steps.bias_rad_s)) - 1]
 
 
-def norm_of(bins):
-    first = np.flatnonzero(bins[:, at.SEEN] > 0.0)[0]
-    return np.linalg.norm(bins[first, at.READING : at.READING + 3])
+def norm_of(bins, most=None):
+    seen = bins[bins[:, at.SEEN] > 0.0][:most]
+    return np.median(np.linalg.norm(seen[:, at.READING : at.READING + 3], axis=1))
 
 
 def filled(steps, name, missing):
@@ -150,7 +150,7 @@ def test_the_bank_follows_as_the_plain_filters_do_through_a_pause_and_correction
             for one in plain:
                 one.resume()
         steps, bins = filtered(part, level, pause_s)
-        norm = norm or norm_of(bins)
+        norm = norm or norm_of(bins, 1)
         biases = at_ends(steps, bins)
         found = bank.follow(bins, biases)
         each = twin.bins_from(bins, norm, np.diff(biases, axis=0, prepend=biases[:1]))
