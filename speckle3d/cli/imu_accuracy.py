@@ -10,17 +10,13 @@ import typer
 from speckle3d.cli.common import Json, emit, emit_rows, note
 from speckle3d.cli.imu import (
     DEFAULT_SOURCE,
-    Log,
     Magnetometer,
     MethodOption,
-    RateHz,
-    WorldOption,
     imu,
     orientation_of,
-    read,
     require_finite_offset,
-    tell,
 )
+from speckle3d.cli.imu_logs import Log, RateHz, WorldOption, read, tell
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:

@@ -97,11 +97,11 @@ class OnlineFilter:
         Parameters
         ----------
         step_s : float or array_like, shape (m,)
-            Time from the sample before to each sample; more than 0.1 s is a pause, after which up and north
+            Time from the sample before to each sample; more than 0.125 s is a pause, after which up and north
             are found again.
         gyroscope_rad_s, accelerometer_m_s2 : array_like, shape (3,) or (m, 3)
             A sample without gyroscope (NaN) is left out, one without accelerometer takes the last reading of
-            0.1 s.
+            0.125 s.
         magnetometer_au : array_like, shape (3,) or (m, 3), optional
             Rows may be NaN; rows of zeros count as missing too.
 

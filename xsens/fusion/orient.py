@@ -14,8 +14,11 @@ from speckle3d.core.streams import TimedRotations
 from xsens.fusion.methods import DEFAULT_METHOD, Method, method_of
 from xsens.fusion.readings import PAUSE_S, UNKNOWN_HEADING_RAD, usable_samples
 from xsens.fusion.samples import Estimate, Samples
-from xsens.fusion.settings import BRIDGED_S, FusionSettings
+from xsens.fusion.settings import FusionSettings
 from xsens.logs.samples import ImuLog
+
+_FORESEEN = 3
+"""Standard deviations of the gyroscope's bias that are foreseen."""
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -82,7 +85,7 @@ def orient(
 
     Notes
     -----
-    How the sensor turned in a pause of more than 0.1 s is not known: up and north are found again after it.
+    How the sensor turned in a pause of more than 0.125 s is not known: up and north are found again after it.
     The filter keeps the bias, the field of iron on the sensor and the magnetometer's lag; on-line VQF the
     bias and the field's reference; off-line VQF the bias. In a shorter hole the readings are taken for the
     mean of those around it.
@@ -113,9 +116,15 @@ def orient(
         settings = replace(settings, use_magnetometer=False)
     breaks = np.flatnonzero(samples.step_s > PAUSE_S)
     if breaks.size:
-        notes.append(f"{breaks.size} pauses over {BRIDGED_S:g} s: orientation found anew after each")
+        notes.append(f"{breaks.size} pauses over {PAUSE_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, method, notes)
     joined = _joined(results)
+    bias = float(np.abs(joined.bias_rad_s).max())
+    if bias > _FORESEEN * settings.bias_sd_rad_s:
+        notes.append(
+            f"a gyroscope bias of {np.rad2deg(bias):.1f} deg/s, over {_FORESEEN} standard deviations: "
+            "claimed errors do not foresee it"
+        )
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
