@@ -51,7 +51,8 @@ class FieldModel:
     after_s : float
         How long the sensor must have moved before the field is used: the first place may be beside iron.
     handicap : float
-        Logarithm of the evidence that the others must lack before this one is taken.
+        Logarithm of the evidence that the others must lack before this one is taken; of iron put on, in
+        recordings that move for no longer than `PROVED_S`.
     online_handicap : float, optional
         The same while samples arrive, when evidence is short.
     """
@@ -86,6 +87,9 @@ MODELS = (
 """Rooms from a quiet one to a workshop; those that are walked through; a start beside iron; iron put on the
 sensor; and iron on it from the start. The later ones must be proved: a sensor that is turned while it is
 carried through an uneven field shows nearly the same as one with iron on it."""
+
+PROVED_S = 150.0
+"""Longer movement proves iron by as much more: an uneven field that looks like it does so all the time."""
 
 BIAS_S = 10.0
 """How long what is left of the gyroscope's bias persists."""
@@ -161,6 +165,8 @@ class HeadingBank:
         self._handicap = np.array([m.handicap for m in models])
         online = [m.handicap if m.online_handicap is None else m.online_handicap for m in models]
         self._online_handicap = np.array(online)
+        self._iron_put_on = np.array([m.iron_put_on > 0.0 for m in models])
+        self._moved_s = 0.0
         self._shared = _shared(settings, first_stray)
         count = len(models)
         self._means, self._flags = np.zeros((count, at.STATES)), np.zeros((count, at.FLAGS))
@@ -185,7 +191,7 @@ class HeadingBank:
         turns, variances = found[..., at.FOUND_TURN], found[..., at.FOUND_VARIANCE]
         weights = np.array(
             [
-                self._weighed(row[at.SPAN], evidence)
+                self._weighed(row[at.SPAN], row[at.RESTS] > 0.0, evidence)
                 for row, evidence in zip(rows, found[..., at.EVIDENCE], strict=True)
             ]
         )
@@ -205,7 +211,9 @@ class HeadingBank:
         for late in np.flatnonzero(~early):
             k = min(first[late], len(bins)) - 1
             total[late] += running[k, early].max()
-        return np.asarray(np.where(begun.any(axis=0), total, -np.inf) - self._handicap)
+        moved_s = float(bins[bins[:, at.RESTS] == 0.0, at.SPAN].sum())
+        handicap = self._handicap * self._longer(moved_s)
+        return np.asarray(np.where(begun.any(axis=0), total, -np.inf) - handicap)
 
     def kept(self, bins: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """States, covariances, those before the reading, and what was found, of every bin."""
@@ -233,24 +241,28 @@ class HeadingBank:
         find_headings(rows, table, shared, self._means, self._covariances, self._flags, found, *into)
         return found
 
-    def _weighed(self, span_s: float, evidence: FloatArray) -> FloatArray:
+    def _longer(self, moved_s: float) -> FloatArray:
+        """Factors of the models' handicaps after so long a movement."""
+        return np.where(self._iron_put_on, max(1.0, moved_s / PROVED_S), 1.0)
+
+    def _weighed(self, span_s: float, resting: bool, evidence: FloatArray) -> FloatArray:
         """Weights of the models after one more bin."""
+        self._moved_s += 0.0 if resting else span_s
         seen, known = np.isfinite(evidence), np.isfinite(self._scores)
         late = seen & ~known
         if late.any():
             self._scores[late] = self._scores[known].max() if known.any() else 0.0
         self._scores[seen] = math.exp(-span_s / MEMORY_S) * self._scores[seen] + evidence[seen]
-        return weights_of(self._scores - self._online_handicap)
+        handicap = self._online_handicap * self._longer(min(self._moved_s, MEMORY_S))
+        return weights_of(self._scores - handicap)
 
 
 def weights_of(evidence: FloatArray) -> FloatArray:
     """Weights of models by the logarithms of their evidence, NaN where a model has none."""
     if not np.isfinite(evidence).any():
         return np.full(len(evidence), 1.0 / len(evidence))
-    return np.asarray(
-        np.nan_to_num(np.exp(evidence - np.nanmax(evidence)))
-        / np.nansum(np.exp(evidence - np.nanmax(evidence)))
-    )
+    likely = np.nan_to_num(np.exp(evidence - np.nanmax(evidence)))
+    return np.asarray(likely / likely.sum())
 
 
 def _mixed(
