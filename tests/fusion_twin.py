@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
-from speckle3d.kernels.orientation import SHOCK_M_S2
+from speckle3d.kernels.orientation.inclination import SHOCK_M_S2
 from xsens.fusion import inclination as constants
 from xsens.fusion.inclination import fresh_filter
 from xsens.fusion.samples import Samples

@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 from scipy.stats import multivariate_t
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels import heading_arrays as at
+from speckle3d.kernels.orientation import heading_arrays as at
 from xsens.fusion import heading as constants
 from xsens.fusion.heading import FieldModel
 from xsens.fusion.settings import FusionSettings

@@ -79,7 +79,7 @@ def test_the_version_stands_in_one_place(project):
 
 def compiled_kernels(project):
     """Every use of `njit` in the kernels: where, its keywords, and whether it is a decorator."""
-    for path in sorted((project / "speckle3d" / "kernels").glob("*.py")):
+    for path in sorted((project / "speckle3d" / "kernels").rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         above = {id(use) for each in ast.walk(tree) for use in getattr(each, "decorator_list", ())}
         called = {id(each.func) for each in ast.walk(tree) if isinstance(each, ast.Call)}

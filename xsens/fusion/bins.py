@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.kernels import heading_arrays as at
+from speckle3d.kernels.orientation import heading_arrays as at
 from xsens.fusion.settings import FusionSettings
 
 if TYPE_CHECKING:

@@ -29,8 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.kernels import heading_arrays as at
-from speckle3d.kernels.heading import find_headings, turn_to_north
+from speckle3d.kernels.orientation import heading_arrays as at
+from speckle3d.kernels.orientation.heading import find_headings, turn_to_north
 from xsens.fusion.settings import FusionSettings
 
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.kernels import orientation_arrays as places
-from speckle3d.kernels.increments import orient_samples
-from speckle3d.kernels.orientation import run_filter
-from speckle3d.kernels.orientation_smoothing import smooth_steps
+from speckle3d.kernels.orientation import inclination_arrays as places
+from speckle3d.kernels.orientation.inclination import run_filter
+from speckle3d.kernels.orientation.increments import orient_samples
+from speckle3d.kernels.orientation.smoothing import smooth_steps
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import LOST, FusionSettings
 
@@ -80,7 +80,7 @@ class FilterSteps:
     last : ndarray of int, shape (n,)
         Sample after each increment's last.
     rows : ndarray, shape (n, STEP)
-        Laid out in `orientation_arrays`; the properties are views.
+        Laid out in `inclination_arrays`; the properties are views.
     within : ndarray, shape (m, SAMPLE)
     covariance, transition : ndarray, shape (n, 9, 9), or (0, 9, 9) if they are not wanted
     """

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.kernels.orientation import GOES_ON
+from speckle3d.kernels.orientation.inclination import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
-from speckle3d.kernels import heading_arrays as at
+from speckle3d.kernels.orientation import heading_arrays as at
 from xsens.fusion.bins import averaged_bins, filtered_bins, steps_per_bin
 from xsens.fusion.heading import (
     FIRST_STRAY,

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from speckle3d.kernels.orientation import GOES_ON
+from speckle3d.kernels.orientation.inclination import GOES_ON
 from xsens.fusion.inclination import forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import FusionSettings

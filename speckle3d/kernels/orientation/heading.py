@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.heading_arrays import (
+from speckle3d.kernels.orientation.heading_arrays import (
     AFTER_S,
     BEGUN,
     BIAS_CHANGE,
@@ -54,7 +54,7 @@ from speckle3d.kernels.heading_arrays import (
     TRUST,
     WHITE,
 )
-from speckle3d.kernels.rotations import sparse_product_into
+from speckle3d.kernels.orientation.rotations import sparse_product_into
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

@@ -15,7 +15,7 @@ import math
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.kernels.orientation_arrays import (
+from speckle3d.kernels.orientation.inclination_arrays import (
     ASSUMED,
     BRIDGED,
     DURATION,
@@ -26,7 +26,13 @@ from speckle3d.kernels.orientation_arrays import (
     SAMPLE_S,
     TURN,
 )
-from speckle3d.kernels.rotations import matrix_into, multiplied, quaternion_from, quaternion_of, vector_of
+from speckle3d.kernels.orientation.rotations import (
+    matrix_into,
+    multiplied,
+    quaternion_from,
+    quaternion_of,
+    vector_of,
+)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

@@ -3,7 +3,7 @@
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.orientation_arrays import (
+from speckle3d.kernels.orientation.inclination_arrays import (
     BIAS,
     BIAS_WALK,
     CROSS,
@@ -24,7 +24,13 @@ from speckle3d.kernels.orientation_arrays import (
     VECTOR,
     WIDE,
 )
-from speckle3d.kernels.rotations import apply_into, product_into, solve_into, sparse_product_into, turn_into
+from speckle3d.kernels.orientation.rotations import (
+    apply_into,
+    product_into,
+    solve_into,
+    sparse_product_into,
+    turn_into,
+)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

@@ -1,4 +1,4 @@
-"""Smoothing an orientation backward: a loop over steps, laid out in `orientation_arrays`.
+"""Smoothing an orientation backward: a loop over steps, laid out in `inclination_arrays`.
 
 References
 ----------
@@ -11,8 +11,7 @@ import math
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.increments import rate_beyond
-from speckle3d.kernels.orientation_arrays import (
+from speckle3d.kernels.orientation.inclination_arrays import (
     DURATION,
     MATRIX,
     NOISE,
@@ -24,7 +23,8 @@ from speckle3d.kernels.orientation_arrays import (
     STEP_SPEED,
     TURN,
 )
-from speckle3d.kernels.rotations import (
+from speckle3d.kernels.orientation.increments import rate_beyond
+from speckle3d.kernels.orientation.rotations import (
     apply_into,
     back_product_into,
     product_into,

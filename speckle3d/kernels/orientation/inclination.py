@@ -3,8 +3,7 @@
 The accelerometer is integrated to velocity, which stays near zero in a hand: over many swings that shows the
 direction of gravity in spite of movement, where the accelerometer itself shows it only at rest. The attitude
 error is the invariant one (velocity turns with it), so that errors of heading and velocity stay separate. The
-magnetometer has no part in it: it cannot tilt the orientation; `speckle3d.kernels.heading` turns that to
-north.
+magnetometer has no part in it: it cannot tilt the orientation; `heading` beside this turns that to north.
 
 References
 ----------
@@ -19,8 +18,7 @@ import math
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.kernels.increments import rate_beyond, sum_samples
-from speckle3d.kernels.orientation_arrays import (
+from speckle3d.kernels.orientation.inclination_arrays import (
     ASSUMED,
     BIAS,
     BIAS_WALK,
@@ -73,8 +71,9 @@ from speckle3d.kernels.orientation_arrays import (
     TURN,
     TURNS,
 )
-from speckle3d.kernels.orientation_kalman import predict_covariance, update
-from speckle3d.kernels.rotations import product_into, turn_into
+from speckle3d.kernels.orientation.increments import rate_beyond, sum_samples
+from speckle3d.kernels.orientation.kalman import predict_covariance, update
+from speckle3d.kernels.orientation.rotations import product_into, turn_into
 
 SHOCK_M_S2 = 60.0
 """Mean force of an increment beyond which it is not believed: a board shaken by hand in BROAD reads 51."""

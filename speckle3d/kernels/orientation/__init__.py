@@ -1,0 +1,1 @@
+"""Kernels of the orientation sensor: inclination by a Kalman filter, its smoothing, and the heading."""
