@@ -47,7 +47,8 @@ class FieldModel:
     iron : float
         Deviation of the field of iron on the sensor at the start, as a fraction.
     iron_put_on : float
-        That of iron put on the sensor later; zero if none ever is.
+        That of iron put on the sensor later, added in each bin while it is put on (`HOLD_S`); zero if none
+        ever is.
     after_s : float
         How long the sensor must have moved before the field is used: the first place may be beside iron.
     handicap : float

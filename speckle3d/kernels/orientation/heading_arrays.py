@@ -7,7 +7,7 @@ READING, POSE, LATE, TILT, CORRECTION = 8, 11, 20, 23, 24
 BIN = 33
 """s; flags of rest and of a reading; variance of the level axes' slip about up, rad^2; variance of the
 gyroscope's bias, rad^2/s^2, and its change, rad/s (three); the mean field in the level axes, over its norm
-at the start (three); mean level axes from the sensor's (nine); derivative of the reading by the
+(three); mean level axes from the sensor's (nine); derivative of the reading by the
 magnetometer's lag, 1/s (three); variance of the level axes' tilt, rad^2; turn by which corrections of it
 turned them (nine)."""
 
@@ -32,7 +32,7 @@ OF_ROOM, GYRO_BIAS, IRON, OF_PLACE, OF_STRAY, OF_LAG = 0, 3, 6, 9, 12, 15
 STATES = 16
 """The room's field (level axes); what is left of the gyroscope's bias (sensor axes); the field of iron
 (sensor axes); what the place adds to the room's, and the stray (level axes); the magnetometer's lag, s. All
-fields are fractions of the first reading's norm."""
+fields are fractions of the field's norm: at the start, or in a recording its median."""
 
 BEGUN, RAN, RESTED, HOLDING, MOVED = 0, 1, 2, 3, 4
 FLAGS = 5
