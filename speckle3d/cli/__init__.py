@@ -35,6 +35,7 @@ from speckle3d.cli import (  # noqa: F401
     scenes,
     surfaces,
     trajectory,
+    view,
     volumes,
 )
 from speckle3d.cli.common import app, note

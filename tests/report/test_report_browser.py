@@ -1,25 +1,11 @@
 """The report as a person meets it: opened, clicked through and printed in a browser without a window."""
 
-import importlib.util
-import shutil
 import subprocess
 
 import pytest
+from browsers import ARGUMENTS, CHROMIUM, chromium, needs_browser
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-ARGUMENTS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
-SOFTWARE_WEBGL = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(
-        importlib.util.find_spec("playwright") is None, reason="needs playwright (extra browser-test)"
-    ),
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium on the path (Debian's package chromium)"),
-]
+pytestmark = needs_browser
 
 VISIBLE = "element => element.getClientRects().length > 0"
 
@@ -31,12 +17,8 @@ def report(report_study):
 
 @pytest.fixture(scope="module")
 def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS, *SOFTWARE_WEBGL])
-        yield chromium
-        chromium.close()
+    with chromium() as started:
+        yield started
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,37 @@
+"""Looking at a file in the browser."""
+
+from __future__ import annotations
+
+import webbrowser
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from speckle3d.cli.common import app, note
+from speckle3d.core.errors import InvalidInputError
+
+
+@app.command()
+def view(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A recording, a reconstruction, or a log of a sensor.")
+    ],
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: any free one.")] = 0,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the browser, or only print the address.")
+    ] = True,
+) -> None:
+    """Look at a file in the browser, on this machine alone; ends ten minutes after the last viewer left."""
+    if find_spec("panel") is None:
+        raise InvalidInputError("view: expected Panel to be installed: pip install 'speckle3d[app]'")
+    from speckle3d.app.opened import pages_of
+    from speckle3d.app.server import AppServer
+
+    pages_of(file)
+    server = AppServer(lambda: pages_of(file), file.name, port)
+    note(server.address)
+    if browser:
+        webbrowser.open(server.address)
+    server.run()

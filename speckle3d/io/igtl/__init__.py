@@ -1,0 +1,1 @@
+"""OpenIGTLink: messages, and the two ends of a connection."""

@@ -1,0 +1,72 @@
+"""Debian's Chromium without a window, for tests of pages; they skip where it or Playwright is not at hand."""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+import pytest
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+ARGUMENTS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+SOFTWARE_WEBGL = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
+
+needs_browser = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        importlib.util.find_spec("playwright") is None, reason="needs playwright (extra browser-test)"
+    ),
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium on the path (Debian's package chromium)"),
+]
+
+
+@contextmanager
+def chromium():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS, *SOFTWARE_WEBGL])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def viewing(*arguments):
+    """The address that `speckle3d view ...` serves; the server has its port and everything to itself."""
+    command = [sys.executable, "-m", "speckle3d.cli", "view", "--no-browser", *map(str, arguments)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        said = []
+        for line in server.stderr:
+            said.append(line)
+            if line.startswith("http"):
+                break
+        else:
+            raise AssertionError("".join(said))
+        drain = threading.Thread(target=lambda: said.extend(server.stderr), daemon=True)
+        drain.start()
+        try:
+            yield said[-1].strip()
+        finally:
+            server.terminate()
+            server.wait(20)
+            drain.join(5)
+        assert not [line for line in said if "Traceback" in line], "".join(said)
+
+
+def opened(browser, address, width=1366, height=768):
+    """A page with what it complained of and asked for in `complaints` and `requests`."""
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(60_000)
+    page.complaints, page.requests = [], []
+    page.on("console", lambda m: page.complaints.append(m.text) if m.type == "error" else None)
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    page.on(
+        "request", lambda r: page.requests.append(r.url) if not r.url.startswith(("data:", "blob:")) else None
+    )
+    page.goto(address)
+    return page
