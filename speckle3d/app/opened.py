@@ -18,6 +18,8 @@ from speckle3d.io.readers import find_reader, first_bytes
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 
 if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
     from speckle3d.core.reconstruction import Reconstruction
     from speckle3d.core.sweep import Sweep
     from xsens.logs.samples import ImuLog
@@ -79,7 +81,7 @@ def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
     except InvalidInputError:
         with suppress(InvalidInputError, InsufficientDataError):
             if (log := held_log(path)) is not None:
-                return [_sensor(log, Folder(path))]
+                return [_sensor(log)]
         raise
     return _recorded(sweep, path)
 
@@ -90,10 +92,9 @@ def _recorded(sweep: Sweep, path: Path, reconstruction: Reconstruction | None = 
 
     if not len(sweep):
         raise InvalidInputError(f"{path}: expected frames to look at, got none")
-    folder = Folder(path)
-    pages: list[Page] = [SweepPage(sweep, folder, reconstruction)]
+    pages: list[Page] = [SweepPage(sweep, Folder(path), reconstruction)]
     if sweep.orientation is not None:
-        pages.append(_sensor(log_of(sweep.orientation, path.name), folder))
+        pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))
     return pages
 
 
@@ -116,10 +117,10 @@ def _logged(path: Path) -> list[Page]:
         raise InvalidInputError(
             f"{path}: expected a recording, a log, or a results folder with {RECONSTRUCTION}, got another"
         )
-    return [_sensor(read_log(path), Folder(path))]
+    return [_sensor(read_log(path))]
 
 
-def _sensor(log: ImuLog, folder: Folder) -> Page:
+def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:
     from speckle3d.app.sensor.page import SensorPage
 
-    return SensorPage(log, folder)
+    return SensorPage(log, mounting)

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from xsens.fusion.field import ROUGH
 from xsens.live.device import DeviceInfo
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream
@@ -79,11 +80,11 @@ class LiveState:
 
     @property
     def disturbed(self) -> bool | None:
-        """Whether the filter hardly believes the magnetic field; None until it knows, or without one."""
+        """Whether the filter does not trust the magnetic field; None until it knows, or without one."""
         fused = self.fused
         if fused is None or not fused.started or not np.isfinite(fused.field_stray):
             return None
-        return fused.disturbed
+        return fused.disturbed or fused.field_stray > ROUGH
 
     def line(self) -> str:
         """The state in one line of text."""

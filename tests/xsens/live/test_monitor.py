@@ -95,15 +95,15 @@ class TestMonitor:
         np.testing.assert_allclose(found, [30.0, 0.0, 0.0], atol=1e-4)
 
     def test_iron_disturbs_the_field_and_clears(self, monitor):
-        monitor.arrived(sent(range(100)))
+        monitor.arrived(sent(range(400)))
         assert monitor.state().disturbed is False
-        monitor.arrived(sent(range(100, 125), iron=0.3))
+        monitor.arrived(sent(range(400, 475), iron=0.3))
         near = monitor.state()
         # (0.74, 0, -0.9): norm and angle below the horizontal.
         assert near.field == pytest.approx(np.hypot(0.74, 0.9), rel=1e-5)
         assert near.dip_rad == pytest.approx(np.arctan2(0.9, 0.74), abs=1e-5)
         assert near.disturbed is True
-        monitor.arrived(sent(range(125, 150)))
+        monitor.arrived(sent(range(475, 625)))
         assert monitor.state().disturbed is False
 
     def test_hours_without_a_question_take_no_more_memory(self, monitor):
@@ -153,7 +153,12 @@ class TestLine:
 
     @pytest.mark.parametrize(
         ("disturbed", "stray", "verdict"),
-        [(False, 0.01, " clear"), (True, 0.01, " DISTURBED"), (False, float("nan"), "")],
+        [
+            (False, 0.01, " clear"),
+            (True, 0.01, " DISTURBED"),
+            (False, 0.04, " DISTURBED"),
+            (False, float("nan"), ""),
+        ],
     )
     def test_says_whether_the_filter_believes_the_field(self, disturbed, stray, verdict):
         no = np.zeros(3)
@@ -169,4 +174,5 @@ def test_readings_that_the_filter_refuses_do_not_end_the_display():
     )
     attitude = _Attitude(0.01)
     attitude.follow(ImuLog(time_s, up, turning), 0)
-    assert attitude.follow(ImuLog(time_s, up, still), 0).magnitude() < 1e-6
+    found = attitude.follow(ImuLog(time_s, up, still), 0)
+    assert found.world_from_sensor.magnitude() < 1e-6
