@@ -15,6 +15,7 @@ from calibration.plane import PIXEL_ERROR
 from calibration.solver import OUTLIER_SIGMA
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.io.text import numbers
 
 Corners = tuple[tuple[float, float], ...]
 
@@ -127,6 +128,23 @@ def region_of(text: str | None) -> Corners | None:
 def region_text(corners: Corners) -> str:
     """The polygon as `region_of` reads it."""
     return " ".join(f"{_number(column)},{_number(row)}" for column, row in corners)
+
+
+def offset_of(text: str | None) -> float | Literal["estimate"] | None:
+    """Parse a clock offset: seconds, or ``estimate``.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is neither.
+    """
+    if text is None or text == "estimate":
+        return text
+    try:
+        (seconds,) = numbers(text, 1, "--time-offset")
+    except InvalidInputError:
+        raise InvalidInputError(f"--time-offset: expected seconds or `estimate`, got {text!r}") from None
+    return seconds
 
 
 def frames_of(text: str | None) -> tuple[int, ...]:

@@ -171,24 +171,13 @@ def calibrate_wires(
 
 
 def _parsed(region: str | None, time_offset: str | None, leave_out: str | None) -> dict[str, Any]:
-    from speckle3d.calibrating.settings import frames_of, region_of
+    from speckle3d.calibrating.settings import frames_of, offset_of, region_of
 
-    estimated = time_offset is None or time_offset == "estimate"
     return {
         "region": region_of(region),
-        "time_offset": time_offset if estimated else _seconds(str(time_offset)),
+        "time_offset": offset_of(time_offset),
         "leave_out": frames_of(leave_out),
     }
-
-
-def _seconds(text: str) -> float:
-    from speckle3d.io.text import numbers
-
-    try:
-        (seconds,) = numbers(text, 1, "--time-offset")
-    except InvalidInputError:
-        raise InvalidInputError(f"--time-offset: expected seconds or `estimate`, got {text!r}") from None
-    return seconds
 
 
 def _calibrate(
