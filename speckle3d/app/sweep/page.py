@@ -8,6 +8,7 @@ from bokeh.plotting import figure
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
+from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
 from speckle3d.study.images import GreyImages
 
@@ -24,7 +25,7 @@ class SweepPage:
 
     title = "Sweep"
 
-    def __init__(self, sweep: Sweep, folder: Folder) -> None:
+    def __init__(self, sweep: Sweep, folder: Folder, reconstruction: Reconstruction | None = None) -> None:
         self._sweep, self._folder = sweep, folder
         self._images = GreyImages(sweep, 60.0, clipped=False)
 
