@@ -308,7 +308,7 @@ def _levels(cuts: Mapping[str, DrawnCut], unit: str) -> tuple[float, float]:
 
 
 def contrast_of(image: Float32Array, levels: tuple[float, float]) -> tuple[float, float]:
-    """Levels of a reference's image that are dark and bright in an overlay; `levels` where it shows nothing."""
+    """Levels that are dark and bright in an overlay on this image; `levels` if it shows nothing."""
     finite = image[np.isfinite(image)]
     if not finite.size:
         return levels
