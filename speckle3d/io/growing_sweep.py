@@ -164,7 +164,7 @@ class GrowingSweep:
         self._time_s, self._count = time_s, i + 1
 
     def append_pose(self, time_s: float, matrix: npt.ArrayLike, valid: bool = True) -> None:
-        """Write a tracker's reading: world_from_sensor, shape (4, 4), mm, of which only valid ones are looked at.
+        """Write a tracker's reading: world_from_sensor, shape (4, 4), mm; of an invalid one any.
 
         Raises
         ------
@@ -243,7 +243,7 @@ class GrowingSweep:
             self._write_readings()
 
     def _require_room(self, size: int) -> None:
-        """Raise before the disk is full; HDF5 takes the interpreter down when it cannot write what it holds."""
+        """Raise before the disk is full: HDF5 takes the interpreter down if it cannot write what it holds."""
         place = os.statvfs(self.path.parent) if hasattr(os, "statvfs") else None
         if place is not None and place.f_bavail * place.f_frsize < size + _SPARE_BYTES:
             raise NoSpaceError(f"{self.path}: cannot be written: no space left on device")
@@ -272,7 +272,7 @@ class _Column:
 
 
 class _Stream:
-    """A sensor's readings: they wait for the next frame, or a moment, and are then written, their times last."""
+    """A sensor's readings; they wait for the next frame or a moment, then are written, times last."""
 
     def __init__(
         self, file: h5py.File, name: str, shapes: dict[str, tuple[int, ...]], with_valid: bool = False
@@ -294,7 +294,8 @@ class _Stream:
         read = np.asarray(value, dtype=np.float64)
         if read.shape != self._shape or not np.isfinite(read).all():
             raise InvalidInputError(
-                f"{self._where}: expected finite numbers of shape {self._shape} at {time_s} s, got {read.tolist()}"
+                f"{self._where}: expected finite numbers of shape {self._shape} at {time_s} s, "
+                f"got {read.tolist()}"
             )
         if not (np.isfinite(time_s) and time_s > self._time_s):
             raise InvalidInputError(f"{self._where}: expected a time after {self._time_s} s, got {time_s}")

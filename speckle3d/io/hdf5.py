@@ -184,7 +184,7 @@ def open_hdf5(path: PathLike) -> h5py.File:
 def _has_writer(path: PathLike) -> bool:
     """Whether a file is being written in HDF5's single-writer mode, or its writer was killed [1]_.
 
-    It is then to be opened as a reader beside a writer; others opened so would not be checked for their length.
+    It is then to be opened as by a reader beside a writer, which does not look at a file's length.
 
     References
     ----------

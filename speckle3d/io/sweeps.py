@@ -45,8 +45,8 @@ from speckle3d.io.hdf5 import (
     read_vector_attribute,
     require_dataset,
 )
-from speckle3d.io.lazy import HDF5Slices, Slices
 from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.lazy import HDF5Slices, Slices
 from speckle3d.io.readers import Reader
 
 FORMAT = "speckle3d.sweep"
@@ -54,7 +54,7 @@ VERSION, IQ_VERSION = 1, 2
 """Of files without and with I/Q, so that older readers still read what they can make sense of."""
 
 GROWING = "unfinished"
-"""Data set of files written frame by frame as they were recorded: 0 once their recording has ended as it should."""
+"""Data set of files that grow as they are recorded: 0 once the recording has been closed."""
 
 KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth", GROWING})
 """Members of the root that these versions of the format give a meaning to."""
@@ -279,8 +279,11 @@ def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
 def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
     if not has_member(group, "valid"):
         return np.ones(samples, dtype=bool)
-    read = read_rows if is_growing(group.file) else read_checked
-    valid: BoolArray = read(group, "valid", (samples,)).astype(np.bool_)
+    valid: BoolArray
+    if is_growing(group.file):
+        valid = read_rows(group, "valid", (samples,)).astype(np.bool_)
+    else:
+        valid = read_checked(group, "valid", (samples,), np.bool_)
     if samples and not valid.any() and not has_member(group.file, GROWING):
         raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
     return valid

@@ -176,7 +176,7 @@ class Outbox:
 
 
 class Link:
-    """A connected socket: what it brings goes into `inbox`, what is in `outbox` is sent, until one end closes.
+    """A connected socket: what it brings goes into `inbox`, what is in `outbox` is sent.
 
     Parameters
     ----------

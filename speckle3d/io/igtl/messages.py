@@ -1,7 +1,7 @@
 """Messages of OpenIGTLink [1]_, of which pyigtl packs and unpacks the contents; here they are checked.
 
-Positions are in mm. The world is the one of the sender's TRANSFORMs (PLUS: the frame after ``To`` in a name as
-``ImageToReference``; Slicer: RAS). An image whose message says LPS is turned into RAS, as Slicer does.
+Positions are in mm. The world is the one of the sender's TRANSFORMs (PLUS: the frame after ``To`` in a name
+as ``ImageToReference``; Slicer: RAS). An image whose message says LPS is turned into RAS, as Slicer does.
 
 References
 ----------
@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
@@ -403,7 +404,12 @@ def _status(header: Header, body: bytes) -> StatusReceived:
     return StatusReceived(header.device, header.time_s, code, _text(body[first + _STATUS.size : last]))
 
 
-_MAKERS = {"IMAGE": _image, "TRANSFORM": _transform, "STRING": _string, "STATUS": _status}
+_MAKERS: dict[str, Callable[[Header, bytes], Received]] = {
+    "IMAGE": _image,
+    "TRANSFORM": _transform,
+    "STRING": _string,
+    "STATUS": _status,
+}
 
 
 def _require_finite(matrix: FloatArray, header: Header) -> None:
