@@ -26,7 +26,7 @@ from speckle3d.core.threads import on_one_thread
 from speckle3d.live.placing import OPEN, place_latest
 from speckle3d.live.revising import LATEST, Growing, Reviser, Revision
 from speckle3d.live.window import FramePlanes, Known
-from speckle3d.matching.blocks import FrameByFrame, FrameMaker
+from speckle3d.matching.blocks import FrameByFrame, FrameMaker, ImageSink
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
@@ -84,6 +84,13 @@ class LiveTracker:
     config : Config, optional
     background : bool
         Revise in a thread of its own, as fast as it can; false: now and then, with the frame that has come.
+    images : callable, optional
+        Called with every frame's intensity image.
+
+    Attributes
+    ----------
+    image_grid : ImageGrid
+        Of the intensity images.
 
     Raises
     ------
@@ -97,10 +104,13 @@ class LiveTracker:
         curves: DecorrelationCurves,
         config: Config | None = None,
         background: bool = True,
+        images: ImageSink | None = None,
     ) -> None:
+        self._images = images
         self._config = config or Config()
         matcher = matcher_for(example, curves, self._config)
         self._patches = len(matcher.patches)
+        self.image_grid = matcher.grid
         self._maker = FrameMaker(example.signal, matcher, self._config.quality)
         self._matched = FrameByFrame(matcher, self._config.trajectory)
         self._reviser = Reviser(matcher, curves, self._config)
@@ -160,6 +170,8 @@ class LiveTracker:
         """
         number = len(self._tables)
         made = self._maker.make(number, frame)
+        if self._images:
+            self._images(number, made.intensity)
         pairs = self._matched.advance(number, made.ready)
         table = CorrelationTable.of(((i, number, pairs[i]) for i in sorted(pairs)), self._patches)
         with self._lock:
