@@ -30,6 +30,7 @@ from speckle3d.cli import (  # noqa: F401
     imu,
     imu_accuracy,
     measure,
+    play,
     reconstruction,
     reslices,
     scenes,
