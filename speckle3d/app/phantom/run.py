@@ -6,10 +6,12 @@ import asyncio
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import panel as pn
+from bokeh.document import Document
 from panel.viewable import Viewable
 
 from calibration.chain import Seen
@@ -104,14 +106,19 @@ class RunPane:
             self._verdict.object = _told(str(error), "#D55E00")
             return
         self.button.disabled, self._bar.visible, self._counted = True, True, (0, 0)
-        try:
-            work = asyncio.create_task(asyncio.to_thread(self._solve, settings))
-            while not (await asyncio.wait({work}, timeout=_POLL_S))[0]:
-                done, total = self._counted
-                self._bar.value = int(100 * done / total) if total else 0
-            self._show(work.result())
-        finally:
-            self.button.disabled, self._bar.visible = False, False
+        document = pn.state.curdoc
+        work = asyncio.create_task(asyncio.to_thread(self._solve, settings))
+        while not (await asyncio.wait({work}, timeout=_POLL_S))[0]:
+            later(document, self._progress)
+        later(document, partial(self._ended, work))
+
+    def _progress(self) -> None:
+        done, total = self._counted
+        self._bar.value = int(100 * done / total) if total else 0
+
+    def _ended(self, work: asyncio.Task[Solved]) -> None:
+        self.button.disabled, self._bar.visible = False, False
+        self._show(work.result())
 
     def _solve(self, settings: ScanSettings) -> Solved:
         seen = None
@@ -142,7 +149,7 @@ class RunPane:
         if found is None or found.outcome is None:
             return
         try:
-            written = self._written(found.outcome, found.settings, self._name.value)
+            written = self._written(found.outcome, found.settings, self._name.value or "")
         except Speckle3DError as error:
             self._saved.object = _told(str(error), "#D55E00")
             return
@@ -158,6 +165,14 @@ class RunPane:
             self._folder.place(out.with_suffix(suffix).name)
         settings = self._before_saving(settings)
         return write_outcome(outcome, settings, self._images, out, remarks(outcome)).files
+
+
+def later(document: Document | None, change: Callable[[], None]) -> None:
+    """Change what a viewer sees when it is the viewer's turn: after a wait, it no longer is."""
+    if document is None:
+        change()
+    else:
+        document.add_next_tick_callback(change)
 
 
 def _told(words: str, colour: str) -> str:
