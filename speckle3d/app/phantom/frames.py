@@ -44,7 +44,7 @@ class FrameChoice:
         )
         self._toggle_one = pn.widgets.Toggle(width=170)
         self._text = pn.widgets.TextInput(
-            placeholder="frames left out, as 3,17-20", value=frames_text(left_out), width=200
+            placeholder="left out, as 3,17-20", value=frames_text(left_out), width=200
         )
         self._complaint = pn.pane.HTML("", margin=(8, 4))
         self.slider.param.watch(lambda event: self._look(), "value")

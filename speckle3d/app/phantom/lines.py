@@ -9,7 +9,6 @@ References
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from speckle3d.app.phantom.options import Options
 from speckle3d.app.phantom.picture import DROPPED, FOUND, USED, Picture
 from speckle3d.app.phantom.region import Region
 from speckle3d.app.phantom.run import RunPane, Solved, labelled
+from speckle3d.app.phantom.work import Progress
 from speckle3d.calibrating.phantoms import found
 from speckle3d.calibrating.settings import (
     OrientationSettings,
@@ -121,9 +121,13 @@ class _Tuner:
         left = pn.Column(
             self._frames.slider, pn.pane.Bokeh(self._picture.plot), self._told, self._frames.below()
         )
+        hint = pn.pane.HTML(
+            "Region: double click in the image, click its corners, double click to end.", margin=(2, 8)
+        )
         right = pn.Column(
             labelled("Line detection (orange mark: default)", detection),
             pn.Row(reset, self._region.controls()),
+            hint,
             self._options.view(),
             self._run.view(),
         )
@@ -193,7 +197,7 @@ class _Tuner:
     def _tell(self, words: str, colour: str) -> None:
         self._told.object = f"<span class='line-told' style='color:{colour}'>{html.escape(words)}</span>"
 
-    def _found(self, settings: ScanSettings, progress: Callable[[int, int], None]) -> Seen:
+    def _found(self, settings: ScanSettings, progress: Progress) -> Seen:
         return found(self._recording, settings, None, progress)
 
     def _solved(self, run: Solved) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from bokeh.events import DoubleTap, Tap
@@ -71,6 +71,11 @@ class FrameStrip:
     def leave_out(self, frames: tuple[int, ...]) -> None:
         """Say which frames are left out by hand."""
         self._left_out = frames
+        self._draw()
+
+    def picked(self, frames: Iterable[int]) -> None:
+        """Say which frames have points; what became of them before is forgotten."""
+        self._used, self._dropped = dict.fromkeys(frames, "has points"), {}
         self._draw()
 
     def tell(self, seen: Seen | None, outcome: Outcome | None) -> None:
