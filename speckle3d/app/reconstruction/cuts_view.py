@@ -73,23 +73,24 @@ class CutsView:
             self._movers[name] = Handle(self.plots[name], FREE, False, self._mover(name))
             self._turners[name] = Handle(self.plots[name], FREE, True, self._turner(name))
         self._placing = False
+        self._dragged: Handle | None = None
 
     def layout(self) -> Viewable:
         """The plots in two rows; those of a second mode are hidden while there is none."""
         def cell(name: Name) -> Viewable:
             return pn.Row(pn.pane.Bokeh(self.plots[name].plot), pn.pane.Bokeh(self._others[name].plot))
 
-        return pn.Column(*(pn.Row(cell(a), cell(b)) for a, b in (NAMES[:2], NAMES[2:])))
+        return pn.Column(*(pn.Row(cell(a), cell(b)) for a, b in (("along", "frame"), ("depth", "free"))))
 
-    def show_state(self, shown: Shown, dragged_in: Name | None = None) -> None:
+    def draw(self) -> None:
         """Draw lines and handles where they are now; cuts follow by `show_cut`."""
-        self.shown = shown
         self._placing = True
         for (_, what), span in self._spans.items():
-            span.location = shown.lateral_mm if what == "lateral_mm" else shown.depth_mm
+            span.location = self.shown.lateral_mm if what == "lateral_mm" else self.shown.depth_mm
         self._placing = False
         for name in NAMES:
-            self._draw_lines(name, name == dragged_in)
+            self._draw_lines(name)
+        self._dragged = None
 
     def show_cut(self, name: Name, picture: CutPicture, is_fine: bool) -> None:
         """Show a cut of the modes."""
@@ -110,7 +111,7 @@ class CutsView:
             self._others[name].show(grey(drawn.image, levels), drawn.cut.extent_mm)
             self._others[name].name_axes(label_of(other), picture.axes)
         self._fit(name, main.cut)
-        self._draw_lines(name, False)
+        self._draw_lines(name)
         self._draw_points(name)
 
     def show_none(self, name: Name, why: str) -> None:
@@ -148,7 +149,7 @@ class CutsView:
         x, y = np.hypot(grid.width_mm, length) / 2, np.hypot(tall, length) / 2
         return Box(-x, x, y, -y)
 
-    def _draw_lines(self, name: Name, is_dragged: bool) -> None:
+    def _draw_lines(self, name: Name) -> None:
         cut = self._cuts.get((name, self.shown.mode))
         if not isinstance(cut, ReslicePlane):
             return
@@ -162,8 +163,7 @@ class CutsView:
             ends = None if found is None else self.plots[name].box.line(*found)
             if ends is not None:
                 lines.append((ends, FREE))
-            if not is_dragged:
-                self._place_handles(name, ends)
+            self._place_handles(name, ends)
         self.plots[name].show_lines(lines)
 
     def _place_handles(self, name: Name, ends: FloatArray | None) -> None:
@@ -178,19 +178,18 @@ class CutsView:
         # Where it was along the line, if that is still in sight.
         wished = (mover.at if mover.box.visible else ends.mean(axis=0)) - ends[0]
         at = ends[0] + along * np.clip(wished @ along, 0.2 * size, 0.8 * size)
-        arm = turner.at - mover.at
         box = self.plots[name].box
         reach = _ARM * min(abs(box.right - box.left), abs(box.bottom - box.top))
-        way = -1.0 if turner.box.visible and arm @ along < 0 else 1.0
-        mover.place(at)
-        turner.place(at + way * along * reach)
+        # What the mouse holds stays where the mouse is.
+        if self._dragged is not mover and self._dragged is not turner:
+            mover.place(at)
+        if self._dragged is not turner:
+            turner.place(mover.at + along * reach)
 
     def _mover(self, name: Name) -> Callable[[FloatArray, FloatArray], None]:
         def moved(old: FloatArray, new: FloatArray) -> None:
-            cut = self._plane(name)
-            turner = self._turners[name]
-            turner.place(turner.at + new - old)
-            self._changed(plane=self._axes.moved(self.shown.plane, cut, old, new), dragged_in=name)
+            self._dragged = self._movers[name]
+            self._changed(plane=self._axes.moved(self.shown.plane, self._plane(name), old, new))
 
         return moved
 
@@ -199,8 +198,8 @@ class CutsView:
             pivot = self._movers[name].at
             (x, y), (u, v) = old - pivot, new - pivot
             angle = float(np.arctan2(x * v - y * u, x * u + y * v))
-            plane = self._axes.turned(self.shown.plane, self._plane(name), pivot, angle)
-            self._changed(plane=plane, dragged_in=name)
+            self._dragged = self._turners[name]
+            self._changed(plane=self._axes.turned(self.shown.plane, self._plane(name), pivot, angle))
 
         return turned
 

@@ -23,7 +23,8 @@ from speckle3d.study.figures import label_of
 from speckle3d.study.reslices.cuts import CutPicture
 
 _SIDE_PX = 290
-_ALONE = "(none)"
+_ALONE = "nothing"
+_SOON_MS = 15
 
 
 class Viewer:
@@ -47,36 +48,49 @@ class Viewer:
             material.modes[0], None, False, frames // 2, round(grid.width_mm / 2, 2), round(middle, 2),
             FreePlane(0.0, 45.0, 0.0),
         )  # fmt: skip
-        self._setting = False
+        self._setting = self._is_drawing_due = False
         self._add_widgets(grid.width_mm, (grid.first_sample_depth_mm, grid.depth_mm), frames)
         self._cuts = CutsView(material, self.change, self._pick)
+        self._cuts.shown = self.shown
         self._cutter = Cutter(material, self._told)
 
     def view(self) -> Viewable:
         """Lay everything out and begin."""
-        self.change(is_new=True)
+        self._begin()
+        self._draw()
+        self._cutter.ask(self.shown)
         side = pn.Column(
             self._mode, self._other, self._style, self._frame, self._lateral, self._depth,
             pn.pane.Markdown("**Free plane**"), self._shift, self._turn, self._tilt, self._status, width=_SIDE_PX,
         )  # fmt: skip
         return pn.Row(side, self._cuts.layout())
 
-    def change(self, dragged_in: Name | None = None, is_new: bool = False, **changes: Any) -> None:
-        """Show something else."""
+    def change(self, **changes: Any) -> None:
+        """Show something else; what is drawn follows soon, so that many changes are drawn once."""
         before, self.shown = self.shown, replace(self.shown, **changes)
-        if self.shown == before and not is_new:
+        self._cuts.shown = self.shown
+        if self.shown == before:
             return
-        self._set_widgets()
-        beside = self.shown.other is not None and not self.shown.is_difference
-        if is_new or beside != (before.other is not None and not before.is_difference):
-            self._cuts.lay_out_for(beside)
-        self._cuts.show_state(self.shown, dragged_in)
-        if is_new or self.shown.modes != before.modes:
-            for mode in self.shown.modes:
-                self._material.ask_for_voxels(mode, self._tell_progress)
-        if self.shown.is_difference != before.is_difference:
-            self._cutter.forget()
+        if self.shown.modes != before.modes or self.shown.is_difference != before.is_difference:
+            self._begin()
         self._cutter.ask(self.shown)
+        if not self._is_drawing_due:
+            self._is_drawing_due = True
+            self._later(self._draw, _SOON_MS)
+
+    def _begin(self) -> None:
+        """Make room for the modes, and have their voxels made."""
+        beside = self.shown.other is not None and not self.shown.is_difference
+        self._cuts.lay_out_for(beside)
+        for mode in self.shown.modes:
+            self._material.ask_for_voxels(mode, self._tell_progress)
+        self._cutter.forget()
+
+    def _draw(self) -> None:
+        self._is_drawing_due = False
+        with pn.io.hold(self._document):
+            self._set_widgets()
+            self._cuts.draw()
 
     def _add_widgets(self, width_mm: float, depths_mm: tuple[float, float], frames: int) -> None:
         modes = {label_of(mode): mode for mode in self._material.modes}
@@ -132,10 +146,11 @@ class Viewer:
         def show() -> None:
             if key != self.shown.key(name):
                 return
-            if isinstance(found, str):
-                self._cuts.show_none(name, found)
-            else:
-                self._cuts.show_cut(name, found, is_fine)
+            with pn.io.hold(self._document):
+                if isinstance(found, str):
+                    self._cuts.show_none(name, found)
+                else:
+                    self._cuts.show_cut(name, found, is_fine)
 
         self._later(show)
 
@@ -143,8 +158,11 @@ class Viewer:
         words = "" if share == 1.0 else f"making voxels of {label_of(mode)}: {100 * share:.0f} %"
         self._later(lambda: setattr(self._status, "object", words))
 
-    def _later(self, act: Callable[[], None]) -> None:
+    def _later(self, act: Callable[[], None], after_ms: int = 0) -> None:
+        """Do something in the viewer's own turn; at once where there is no server, as in notebooks."""
         if self._document is None or self._document.session_context is None:
             act()
+        elif after_ms:
+            self._document.add_timeout_callback(act, after_ms)
         else:
             self._document.add_next_tick_callback(act)
