@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,9 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
 from speckle3d.io.igtl.messages import ImageReceived
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.import_settings import ImportSettings
 
-_TYPES = {"rf": ("int16", "float32"), "iq": (), "bmode": ("uint8",)}
+_TYPES = {"rf": ("int16", "float32"), "bmode": ("uint8",)}
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class ImageLayout:
         ----------
         image : ImageReceived
         settings : ImportSettings
-            What messages do not say. With a sampling rate or a centre frequency the samples are RF, else B-mode
-            grey levels, whose pixel sizes are the message's unless given.
+            What messages do not say. With a sampling rate or a centre frequency the samples are RF, else grey
+            levels of B-mode, whose pixel sizes are the message's unless given.
         name : str
             Of the sweep, for messages.
 
@@ -114,11 +114,11 @@ def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
     return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
 
 
-def _of_echoes(
-    frame: npt.NDArray[Any], settings: ImportSettings, where: str
-) -> tuple[ImageGrid, RFSettings]:
+def _of_echoes(frame: npt.NDArray[Any], settings: ImportSettings, where: str) -> tuple[ImageGrid, RFSettings]:
     if settings.demodulation_frequency_hz is not None:
-        raise InvalidInputError(f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz")
+        raise InvalidInputError(
+            f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz"
+        )
     s = settings.over(
         where,
         sampling_rate_hz=None,
@@ -131,9 +131,7 @@ def _of_echoes(
     signal = RFSettings(
         s["sampling_rate_hz"], s["speed_of_sound_m_s"], s["centre_frequency_hz"], tuple(s["bandwidth_hz"])
     )
-    grid = ImageGrid(
-        *frame.shape, s["vector_pitch_mm"], signal.sample_spacing_mm, s["first_sample_depth_mm"]
-    )
+    grid = ImageGrid(*frame.shape, s["vector_pitch_mm"], signal.sample_spacing_mm, s["first_sample_depth_mm"])
     return grid, signal
 
 
