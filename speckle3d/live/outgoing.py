@@ -13,7 +13,7 @@ POSE, VOLUME, ADVICE = "ImageToReference", "Volume_Reference", "SweepAdvice"
 """Devices: pixels of the received images to the first image's mm, as PLUS names it; the growing volume in the
 same; words."""
 _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Files of this package call the axes of a world left, posterior, superior, and so Slicer shows both alike."""
+"""Files of this package call a world's axes left, posterior, superior: Slicer shows both alike."""
 
 
 def pose_message(world_from_image: RigidTransform, image_from_pixel: FloatArray, time_s: float) -> bytes:

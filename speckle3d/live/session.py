@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeGuard
 
 import numpy.typing as npt
 
@@ -208,7 +208,7 @@ class Session:
         if show:
             show(self.progress)
 
-    def _is_wanted(self, message: Received) -> bool:
+    def _is_wanted(self, message: Received) -> TypeGuard[ImageReceived]:
         return isinstance(message, ImageReceived) and self._settings.image in (None, message.device)
 
     def _take_all(self, received: Sequence[Received], recording: Recording, layout: ImageLayout) -> None:
