@@ -31,6 +31,7 @@ from speckle3d.cli import (  # noqa: F401
     imu_accuracy,
     live,
     measure,
+    play,
     reconstruction,
     reslices,
     scenes,
