@@ -29,6 +29,7 @@ from speckle3d.cli import (  # noqa: F401
     files,
     imu,
     imu_accuracy,
+    live,
     measure,
     play,
     reconstruction,

@@ -201,6 +201,7 @@ class LiveTracker:
 
     def _keep(self, features: FrameFeatures, table: CorrelationTable) -> None:
         """Take a frame's features and pairs; it stands where the last one was."""
+        number = len(self._tables)
         self._features.append(features)
         self._tables.append(table)
         flag = int(flag_frames(self._features[-COMPARED:], self._config.quality)[-1])
@@ -208,8 +209,7 @@ class LiveTracker:
         if len(table) and table.median.max() < least:
             flag |= FrameFlag.UNMATCHED
         self._flags = np.append(self._flags, flag)
-        last = self._poses[-1:] if len(self._poses) else RigidTransform.identity(1)
-        self._poses = RigidTransform.concatenate([self._poses, last])
+        self._poses = self._poses[[*range(number), number - 1]] if number else RigidTransform.identity(1)
         none = np.zeros(0, dtype=np.int64)
         self._planes.append(FramePlanes(none, none, PairPlanes.none(self._patches)))
         self._planes[: -2 * OPEN] = []
