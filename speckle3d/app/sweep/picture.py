@@ -10,7 +10,7 @@ from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
 from speckle3d.app.sweep.pairs import PatchValues
-from speckle3d.core.arrays import ByteArray, FloatArray
+from speckle3d.core.arrays import ByteArray
 
 HEIGHT_PX, WIDEST_PX = 400, 560
 """Of the picture itself, so that a page fits on a screen of 1366 x 768."""
@@ -104,26 +104,27 @@ class Picture:
             "angle": np.full(len(state), patches.turn_rad),
             "value": values[by],
             "alpha": np.where(known, opacity, 0.0),
-            "line": np.where(state == "rejected", "#ff4d4d", "#ffffff"),
-            "hatch": np.where(state == "rejected", "diagonal_cross", " "),
+            "line": ["#ff4d4d" if each == "rejected" else "#ffffff" for each in state],
+            "hatch": ["diagonal_cross" if each == "rejected" else " " for each in state],
             "state": state,
             "distance": patches.distance_mm,
             "sigma": patches.sigma_mm,
             "correlation": patches.correlation,
         }
-        return PatchCount(*(int((state == name).sum()) for name in ("used", "rejected", "without distance")))
+        return PatchCount(*(state.count(name) for name in ("used", "rejected", "without distance")))
 
 
-def _states(patches: PatchValues) -> np.ndarray:
+def _states(patches: PatchValues) -> list[str]:
     """What became of each patch, in words."""
     if patches.used is None:
-        return np.full(len(patches.centre_mm), "correlated", dtype=object)
+        return ["correlated"] * len(patches.centre_mm)
     measured = np.isfinite(patches.distance_mm)
-    words = np.where(measured, "rejected", "without distance").astype(object)
-    words[patches.used] = "used"
-    return words
+    return [
+        "used" if used else "rejected" if known else "without distance"
+        for used, known in zip(patches.used.tolist(), measured.tolist(), strict=True)
+    ]
 
 
-def _no_patches() -> dict[str, FloatArray]:
+def _no_patches() -> dict[str, list[object]]:
     names = ("x", "y", "angle", "value", "alpha", "line", "hatch", "state", "distance", "sigma", "correlation")
-    return {name: np.empty(0) for name in names}
+    return {name: [] for name in names}
