@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from speckle3d.cli.common import app, note
+from speckle3d.cli.common import SweepFile, app, note
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -18,6 +18,10 @@ def view(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="A recording, a reconstruction, or a log of a sensor.")
     ],
+    reconstruction: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Reconstruction of the recording, to see with it.")
+    ] = None,
+    sweep: SweepFile = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: any free one.")] = 0,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the browser, or only print the address.")
@@ -29,9 +33,8 @@ def view(
     from speckle3d.app.opened import pages_of
     from speckle3d.app.server import AppServer
 
-    pages_of(file)
-    server = AppServer(lambda: pages_of(file), file.name, port)
+    server = AppServer(pages_of(file, reconstruction, sweep), file.name, port)
     note(server.address)
     if browser:
-        webbrowser.open(server.address)
+        webbrowser.open(server.address_for_once())
     server.run()
