@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -16,16 +17,17 @@ from speckle3d.io.sweep_writer import write_sweep
 WAIT_S = 60.0
 
 
-def served(port_of, *arguments):
-    """Start the command at any free port; its process and the port that it told."""
-    process = subprocess.Popen(
+@contextmanager
+def served(*arguments):
+    """Start the command at any free port; yields its process and the port that it told."""
+    with subprocess.Popen(
         command("play", *arguments, "--port", 0), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-    )
-    for line in process.stderr:
-        if "waiting for a client" in line:
-            return process, int(line.split(":")[1])
-        port_of.append(line)
-    raise AssertionError(port_of)
+    ) as process:
+        try:
+            said = process.stderr.readline()
+            yield process, int(said.split(":")[1])
+        finally:
+            process.kill()
 
 
 def received(port, enough):
@@ -47,10 +49,9 @@ def received(port, enough):
 def test_a_recorded_sweep_is_served_whole_and_at_its_own_rate(tmp_path):
     sweep = sweep_examples.rf_sweep(frames=26)
     write_sweep(tmp_path / "s.h5", sweep)
-    said = []
-    process, port = served(said, tmp_path / "s.h5")
-    found, came = received(port, 26)
-    assert process.wait(WAIT_S) == 0
+    with served(tmp_path / "s.h5") as (process, port):
+        found, came = received(port, 26)
+        assert process.wait(WAIT_S) == 0
     frames = [each for each in found if isinstance(each, ImageReceived)]
     np.testing.assert_array_equal([each.pixels.T for each in frames], sweep.frames)
     # Half a nanosecond: the clock of messages counts 2^-32 s.
@@ -76,16 +77,16 @@ def test_a_recorded_sweep_is_served_whole_and_at_its_own_rate(tmp_path):
 def test_bmode_stands_upright_and_a_loop_goes_on_in_time_until_it_is_stopped(tmp_path):
     sweep = sweep_examples.bmode_sweep(frames=4)
     write_sweep(tmp_path / "s.h5", sweep)
-    process, port = served([], tmp_path / "s.h5", "--loop", "--rate", 20, "--image", "Scan")
-    found, _ = received(port, 10)
+    with served(tmp_path / "s.h5", "--loop", "--rate", 20, "--image", "Scan") as (process, port):
+        found, _ = received(port, 10)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(WAIT_S) == 130
+        assert process.stderr.read().splitlines()[-1] == "speckle3d: stopped"
     frames = [each for each in found if isinstance(each, ImageReceived)]
     for k in range(10):
         np.testing.assert_array_equal(frames[k].pixels, sweep.frames[k % 4])
     np.testing.assert_allclose(np.diff([each.time_s for each in frames]), 0.04, atol=1e-8)
     assert {each.device for each in frames} == {"Scan"}
-    process.send_signal(signal.SIGINT)
-    assert process.wait(WAIT_S) == 130
-    assert process.stderr.read().splitlines()[-1] == "speckle3d: stopped"
 
 
 @pytest.mark.slow
