@@ -32,6 +32,8 @@ from speckle3d.live.recording import Recording
 from speckle3d.live.tracking import LivePose, LiveTracker
 from speckle3d.live.volume import GrowingVolume
 
+MOST_BEFORE = 1000
+"""Messages that are kept until the first frame comes."""
 MOST_WAITING = 2
 """Frames that wait to be matched: more would be late, not better."""
 _LOOK_S = 0.1
@@ -178,20 +180,20 @@ class Session:
             can be read.
         """
         until_s = None if duration_s is None else time.monotonic() + duration_s
-        waiting: list[Received] = []
+        # Readings from before the first frame are kept: that frame lies between two of them.
+        waiting: deque[Received] = deque(maxlen=MOST_BEFORE)
         layout = first = None
         while layout is None and not self._is_over(until_s):
-            for number, message in enumerate(received := self._source.receive(_LOOK_S)):
-                if self._is_wanted(message):
+            for message in self._source.receive(_LOOK_S):
+                waiting.append(message)
+                if layout is None and self._is_wanted(message):
                     layout, first = ImageLayout.of(message, self._settings.imported, message.device), message
-                    waiting = received[number:]
-                    break
             self._shown(show)
         if layout is None or first is None:
             return
         with (
-            Recording(self._settings.recording, layout, first.time_s, self._settings.packed) as recording,
             self._tracking(layout),
+            Recording(self._settings.recording, layout, first.time_s, self._settings.packed) as recording,
         ):
             self._take_all(waiting, recording, layout)
             while not self._is_over(until_s):
