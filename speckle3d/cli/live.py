@@ -89,6 +89,7 @@ def live(
     from speckle3d.io.igtl.server import Server
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.live.session import Session, SessionSettings
+    from speckle3d.live.warming import warm_up
     from speckle3d.study.job import require_own_results
 
     options = locals()
@@ -112,6 +113,8 @@ def live(
         check,
         compression == "gzip",
     )
+    note("loading")
+    warm_up(curves, config)
     first = None if crossing_file is None else _first_sweep(crossing_file, curves, config)
     with ExitStack() as open_:
         served = None if serve is None else open_.enter_context(Server(serve))
@@ -119,6 +122,7 @@ def live(
             note(f"poses and volume at 127.0.0.1:{served.port}")
         connection = open_.enter_context(Connection(host, port))
         outlets = [connection.send] if served is None else [connection.send, served.send]
+        note(f"listening to {server}")
         session = Session(connection, outlets, curves, settings, first)
         _run(
             session, duration_s, _Line(lambda: "" if connection.state.connected else f"waiting for {server}")

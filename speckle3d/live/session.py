@@ -34,7 +34,7 @@ from speckle3d.live.volume import GrowingVolume
 
 MOST_BEFORE = 1000
 """Messages that are kept until the first frame comes."""
-MOST_WAITING = 2
+MOST_WAITING = 8
 """Frames that wait to be matched: more would be late, not better."""
 _LOOK_S = 0.1
 VOLUME_EVERY_S = 1.0

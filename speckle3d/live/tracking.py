@@ -91,6 +91,8 @@ class LiveTracker:
     ----------
     image_grid : ImageGrid
         Of the intensity images.
+    images : callable or None
+        As given; may be set before the first frame.
 
     Raises
     ------
@@ -106,7 +108,7 @@ class LiveTracker:
         background: bool = True,
         images: ImageSink | None = None,
     ) -> None:
-        self._images = images
+        self.images = images
         self._config = config or Config()
         matcher = matcher_for(example, curves, self._config)
         self._patches = len(matcher.patches)
@@ -170,8 +172,8 @@ class LiveTracker:
         """
         number = len(self._tables)
         made = self._maker.make(number, frame)
-        if self._images:
-            self._images(number, made.intensity)
+        if self.images:
+            self.images(number, made.intensity)
         pairs = self._matched.advance(number, made.ready)
         table = CorrelationTable.of(((i, number, pairs[i]) for i in sorted(pairs)), self._patches)
         with self._lock:
