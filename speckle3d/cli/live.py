@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from speckle3d.live.session import Progress, Session
 
 _LOG_EVERY_S = 5.0
+_SWITCH_S = 5e-4
+"""For which one thread keeps the interpreter at most; Python's 5 ms a frame would wait for many times."""
 
 
 @app.command(cls=Importing)
@@ -147,10 +149,12 @@ def _first_sweep(path: Path, curves: DecorrelationCurves, config: Config) -> Cro
 
 def _run(session: Session, duration_s: float | None, line: _Line) -> None:
     """Run until Ctrl-C, or for so long."""
-    before = signal.signal(signal.SIGINT, lambda *_: session.end())
+    before, interval_s = signal.signal(signal.SIGINT, lambda *_: session.end()), sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
     try:
         session.run(duration_s, line.show)
     finally:
+        sys.setswitchinterval(interval_s)
         signal.signal(signal.SIGINT, before)
         line.end()
 
