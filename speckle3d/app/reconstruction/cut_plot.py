@@ -61,7 +61,7 @@ class Box:
         return Box(x - half_x, x + half_x, y + half_y, y - half_y)
 
     def line(self, normal: FloatArray, offset: float) -> FloatArray | None:
-        """Ends of the part of a line ``normal @ p == offset`` in the box, shape (2, 2); None if there is none."""
+        """Ends of a line ``normal @ p == offset`` within the box, shape (2, 2); None if it misses."""
         along = np.array([-normal[1], normal[0]])
         foot = offset * normal
         low, high = -np.inf, np.inf
@@ -88,9 +88,7 @@ class CutPlot:
         Called with x and y of a click, mm by the axes.
     """
 
-    def __init__(
-        self, name: str, size_px: tuple[int, int], picked: Callable[[float, float], None]
-    ) -> None:
+    def __init__(self, name: str, size_px: tuple[int, int], picked: Callable[[float, float], None]) -> None:
         self.box = Box(0.0, 1.0, 1.0, 0.0)
         self._size = size_px
         self.plot = figure(
@@ -109,7 +107,7 @@ class CutPlot:
         self.plot.toolbar.autohide = True
         self.plot.grid.visible = False
         self.plot.background_fill_color = UNSEEN
-        self.plot.title.text_font_size = "12px"
+        self.plot.title.update(text_font_size="11px", text_font_style="normal")
         for axis in self.plot.axis:
             axis.axis_label_text_font_style = "normal"
             axis.axis_label_text_font_size = axis.major_label_text_font_size = "11px"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -48,7 +48,7 @@ class Shown:
     frame: int = 0
     lateral_mm: float = 0.0
     depth_mm: float = 0.0
-    plane: FreePlane = FreePlane()
+    plane: FreePlane = field(default_factory=FreePlane)
 
     @property
     def modes(self) -> tuple[str, ...]:
