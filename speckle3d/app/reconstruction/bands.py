@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from bokeh.models import ColumnDataSource, Span
+from bokeh.models import ColumnDataSource
+from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
 from speckle3d.app.reconstruction.cut_plot import FRAME

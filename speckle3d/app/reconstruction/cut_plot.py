@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from bokeh.events import Tap
-from bokeh.models import BoxAnnotation, ColumnDataSource, Range1d, Span
+from bokeh.models import ColumnDataSource, Range1d, Title
+from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from speckle3d.core.arrays import Float32Array, FloatArray
@@ -91,12 +92,15 @@ class CutPlot:
     def __init__(self, name: str, size_px: tuple[int, int], picked: Callable[[float, float], None]) -> None:
         self.box = Box(0.0, 1.0, 1.0, 0.0)
         self._size = size_px
+        self._across, self._down = Range1d(start=0, end=1), Range1d(start=1, end=0)
+        self._title = Title(text="making the cut", text_font_size="11px", text_font_style="normal")
         self.plot = figure(
             name=name,
             frame_width=size_px[0],
             frame_height=size_px[1],
-            x_range=Range1d(0, 1),
-            y_range=Range1d(1, 0),
+            x_range=self._across,
+            y_range=self._down,
+            title=self._title,
             tools="pan,wheel_zoom,reset",
             active_drag=None,
             active_scroll="wheel_zoom",
@@ -107,7 +111,6 @@ class CutPlot:
         self.plot.toolbar.autohide = True
         self.plot.grid.visible = False
         self.plot.background_fill_color = UNSEEN
-        self.plot.title.update(text_font_size="11px", text_font_style="normal")
         for axis in self.plot.axis:
             axis.axis_label_text_font_style = "normal"
             axis.axis_label_text_font_size = axis.major_label_text_font_size = "11px"
@@ -135,12 +138,8 @@ class CutPlot:
         """Show this part of the plane, a millimetre as long across as down."""
         self.box = box
         shown = box.scaled_to(*self._size)
-        self.plot.x_range.update(
-            start=shown.left, end=shown.right, reset_start=shown.left, reset_end=shown.right
-        )
-        self.plot.y_range.update(
-            start=shown.bottom, end=shown.top, reset_start=shown.bottom, reset_end=shown.top
-        )
+        self._across.update(start=shown.left, end=shown.right, reset_start=shown.left, reset_end=shown.right)
+        self._down.update(start=shown.bottom, end=shown.top, reset_start=shown.bottom, reset_end=shown.top)
 
     def show(self, colours: npt.NDArray[np.uint32], extent_mm: tuple[float, float, float, float]) -> None:
         """Show an image between left, right, bottom and top."""
@@ -148,9 +147,18 @@ class CutPlot:
         place = {"x": [left], "y": [top], "w": [right - left], "h": [bottom - top]}
         self.image.data = {"image": [colours], **place}
 
+    @property
+    def mm_per_px(self) -> float:
+        """Size of a pixel of the screen."""
+        return abs(self._across.end - self._across.start) / self._size[0]
+
+    def title(self, text: str) -> None:
+        """Write above the plot."""
+        self._title.text = text
+
     def name_axes(self, title: str, axes: tuple[str, str]) -> None:
         """Write where the cut is, and what its axes are."""
-        self.plot.title.text = title
+        self.title(title)
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{each} / mm" for each in axes)
 
     def show_lines(self, lines: Sequence[tuple[FloatArray, str]]) -> None:
@@ -205,8 +213,7 @@ class Handle:
         self.box.visible = at_mm is not None
         if at_mm is None:
             return
-        shown = self._plot.plot
-        half = _HANDLE_PX / 2 * abs(shown.x_range.end - shown.x_range.start) / shown.frame_width
+        half = _HANDLE_PX / 2 * self._plot.mm_per_px
         self.at = np.asarray(at_mm, dtype=float)
         self._placing = True
         self.box.update(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import panel as pn
-from bokeh.models import Span
+from bokeh.models.annotations import Span
 from panel.viewable import Viewable
 
 from speckle3d.app.reconstruction.cut_plot import (
@@ -84,7 +84,7 @@ class CutsView:
         def cell(name: Name) -> Viewable:
             return pn.Row(pn.pane.Bokeh(self.plots[name].plot), pn.pane.Bokeh(self._others[name].plot))
 
-        return pn.Column(*(pn.Row(cell(a), cell(b)) for a, b in (("along", "frame"), ("depth", "free"))))
+        return pn.Column(*(pn.Row(*map(cell, NAMES[row : row + 2])) for row in (0, 2)))
 
     def draw(self) -> None:
         """Draw lines and handles where they are now; cuts follow by `show_cut`."""
@@ -120,7 +120,7 @@ class CutsView:
 
     def show_none(self, name: Name, why: str) -> None:
         """Say why there is no cut."""
-        self.plots[name].plot.title.text = why.split(";")[0]
+        self.plots[name].title(why.split(";")[0])
         for plot in (self.plots[name], self._others[name]):
             plot.show(np.zeros((1, 1), np.uint32), (0.0, 1e-6, 1e-6, 0.0))
 

@@ -68,26 +68,28 @@ class Saving:
         axes = self._material.axes(self._shown.mode)
         place = None if name is None else self._shown.place(name, axes, self._material)
         source = Path(self._folder.opened.name)
-        out = self.name.value_input or self.name.value
+        out = _as_png(self.name.value_input or self.name.value or "")
         self.command.object = code(reslice_command(source, out, self._shown, place, self._sweep_file))
 
     def _save(self) -> None:
         try:
-            path = self._folder.save(self.name.value, self._writer())
-            self.said.object = f"saved {escape(str(path))}"
+            path = self._folder.save(_as_png(self.name.value or ""), self._writer())
+            self.said.object = f"saved {escape(path.name)}"
         except (Speckle3DError, OSError) as error:
             self.said.object = f"<span style='color:#a03000'>{escape(str(error))}</span>"
 
     def _writer(self) -> Callable[[Path], object]:
         material, shown, name = self._material, self._shown, self.what.value
         opened = material.opened(*shown.modes)
-        if not self.name.value.endswith(".png"):
-            self.name.value = f"{self.name.value}.png"
         if name is None:
             return lambda path: save_outlines(opened, path)
         place = shown.place(name, material.axes(shown.mode), material)
         picture = cut_posed(opened, place, made=material.images())
         return lambda path: save_reslices(picture, path)
+
+
+def _as_png(name: str) -> str:
+    return name if not name.strip() or name.endswith(".png") else f"{name}.png"
 
 
 def code(text: str) -> str:
