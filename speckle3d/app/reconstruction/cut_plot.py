@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from bokeh.events import Tap
-from bokeh.models import ColumnDataSource, Range1d, Title
-from bokeh.models.annotations import BoxAnnotation, Span
+from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models.annotations import BoxAnnotation, Span, Title
 from bokeh.plotting import figure
 
 from speckle3d.core.arrays import Float32Array, FloatArray
@@ -150,7 +151,8 @@ class CutPlot:
     @property
     def mm_per_px(self) -> float:
         """Size of a pixel of the screen."""
-        return abs(self._across.end - self._across.start) / self._size[0]
+        across: Any = self._across  # Bokeh has it that ranges may be of dates
+        return float(abs(across.end - across.start) / self._size[0])
 
     def title(self, text: str) -> None:
         """Write above the plot."""
@@ -173,7 +175,9 @@ class CutPlot:
         """Draw picked points, shape (k, 2), joined in their order."""
         self._points.data = {"x": points_mm[:, 0], "y": points_mm[:, 1], "number": list(numbers)}
 
-    def add_span(self, dimension: str, colour: str, moved: Callable[[float], None]) -> Span:
+    def add_span(
+        self, dimension: Literal["width", "height"], colour: str, moved: Callable[[float], None]
+    ) -> Span:
         """Add a line across the plot that can be dragged."""
         span = Span(dimension=dimension, line_color=colour, line_width=1.5, editable=True)
         span.hover_line_width = 4
@@ -198,11 +202,12 @@ class Handle:
     ) -> None:
         self.at = np.zeros(2)
         self._plot, self._moved, self._placing = plot, moved, False
+        look: dict[str, Any] = {"border_radius": _HANDLE_PX if round_ else 0}
         self.box = BoxAnnotation(
             left=0, right=1, top=0, bottom=1, editable=True, movable="both", resizable="none",
             fill_color=colour, fill_alpha=0.85, line_color="white", line_width=1.5,
             hover_fill_color="white", hover_fill_alpha=0.9,
-            border_radius=_HANDLE_PX if round_ else 0, visible=False, use_handles=False,
+            visible=False, use_handles=False, **look,
         )  # fmt: skip
         for side in ("left", "right", "top", "bottom"):
             self.box.on_change(side, lambda attr, old, new: self._dragged())
@@ -224,7 +229,7 @@ class Handle:
     def _dragged(self) -> None:
         if self._placing:
             return
-        box = self.box
+        box: Any = self.box
         new = np.array([(box.left + box.right) / 2, (box.top + box.bottom) / 2], dtype=float)
         old, self.at = self.at, new
         if not np.array_equal(old, new):

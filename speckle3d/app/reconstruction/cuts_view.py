@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import panel as pn
@@ -230,7 +231,7 @@ class CutsView:
 
             return tell
 
-        wanted: list[tuple[Name, str, str, str]] = [
+        wanted: list[tuple[Name, str, Literal["width", "height"], str]] = [
             ("along", "depth_mm", "width", DEPTH),
             ("frame", "depth_mm", "width", DEPTH),
             ("frame", "lateral_mm", "height", LATERAL),
