@@ -125,8 +125,8 @@ class CutPlot:
         self.plot.line("x", "y", color="white", line_dash=[4, 3], source=self._points)
         self.plot.scatter("x", "y", size=8, color="#ff3030", line_color="white", source=self._points)
         self.plot.text(
-            "x", "y", "number", x_offset=6, y_offset=-3, color="white", text_font_size="13px",
-            text_font_style="bold", text_outline_color="black", source=self._points,
+            "x", "y", "number", x_offset=6, y_offset=-3, color="#ffe600", text_font_size="14px",
+            text_font_style="bold", source=self._points,
         )  # fmt: skip
         self.plot.on_event(Tap, lambda event: picked(float(event.x), float(event.y)))
 

@@ -109,6 +109,8 @@ class CutsView:
             colours = laid_over(picture.cuts[other].image, main.image, levels)
         self.plots[name].show(colours, main.cut.extent_mm)
         said = f"free {picture.place}" if name == "free" else picture.place
+        if other and not self.shown.is_difference:
+            said = f"{label_of(mode)}: {said.split(', seen')[0]}"
         said = said if is_fine else f"{said} (voxels)"
         self.plots[name].name_axes(said, picture.axes)
         if other and not self.shown.is_difference:

@@ -52,8 +52,8 @@ def figure_space(
         look = {"color": PLANE_COLOURS[name], "width": 5 if name == "free" else 3}
         figure.add_trace(_line(corners, line=look, showlegend=False, hoverinfo="skip"))
     scene = {
-        "xaxis": {"title": {"text": "lateral / mm"}},
-        "yaxis": {"title": {"text": "along / mm"}},
+        "xaxis": {"title": {"text": "lateral / mm"}, "nticks": 4},
+        "yaxis": {"title": {"text": "along / mm"}, "nticks": 4},
         "zaxis": {"title": {"text": "depth / mm"}, "autorange": "reversed"},
         "aspectmode": "data",
         "camera": {"eye": {"x": 1.7, "y": -2.1, "z": 0.6}},

@@ -63,7 +63,7 @@ class Viewer:
         self._saving = Saving(material, folder, sweep_file, _SIDE_PX - 10)
         self._bands = BandsPlot(material, _BANDS_PX)
         self._space = pn.pane.Plotly(None, width=_SPACE_PX[0], height=_SPACE_PX[1], margin=0)
-        self._status = pn.pane.HTML("", width=_SIDE_PX - 10, height=20, margin=(0, 5))
+        self._status = pn.pane.HTML("", width=_SIDE_PX - 10, min_height=20, margin=(0, 5))
         self._cutter = Cutter(material, self._told)
 
     def view(self) -> Viewable:
@@ -106,6 +106,7 @@ class Viewer:
         beside = self.shown.other is not None and not self.shown.is_difference
         self._cuts.lay_out_for(beside)
         self._aside.visible = not beside
+        self._status.object = self._colours()
         for mode in self.shown.modes:
             self._material.ask_for_voxels(mode, self._tell_progress)
         self._cutter.forget()
@@ -148,8 +149,18 @@ class Viewer:
         self._later(show)
 
     def _tell_progress(self, mode: str, share: float) -> None:
-        words = "" if share == 1.0 else f"making voxels of {label_of(mode)}: {100 * share:.0f} %"
-        self._later(lambda: setattr(self._status, "object", words))
+        making = "" if share == 1.0 else f"making voxels of {label_of(mode)}: {100 * share:.0f} %"
+        self._later(lambda: setattr(self._status, "object", making or self._colours()))
+
+    def _colours(self) -> str:
+        """What the colours of a difference mean."""
+        mode, other = self.shown.mode, self.shown.other
+        if other is None or not self.shown.is_difference:
+            return ""
+        return (
+            f"<b style='color:#c000c0'>magenta</b>: {label_of(other)} alone, "
+            f"<b style='color:#008000'>green</b>: {label_of(mode)} alone, grey: both"
+        )
 
     def _once(self, act: Callable[[], None], after_ms: int) -> None:
         """Do something a while later, once however often it is asked for until then."""
