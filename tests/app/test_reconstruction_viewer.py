@@ -16,13 +16,11 @@ PLOT = """([name, x, y]) => {
   const box = view.canvas_view.el.getBoundingClientRect()
   return [box.left + view.frame.x_scale.compute(x), box.top + view.frame.y_scale.compute(y)]
 }"""
-HANDLES = """(name) => Bokeh.documents[0].get_model_by_name(name).center
-  .filter(each => each.movable && each.visible).map(each => [(each.left + each.right) / 2, (each.top + each.bottom) / 2])
-"""
-IMAGE = (
-    "(name) => Bokeh.documents[0].get_model_by_name(name).renderers[0].data_source.data.image[0].toString()"
-)
-TITLE = "(name) => Bokeh.documents[0].get_model_by_name(name).title.text"
+PLOT_OF = "Bokeh.documents[0].get_model_by_name(name)"
+HANDLES = f"""name => {PLOT_OF}.center.filter(each => each.movable && each.visible)
+  .map(each => [(each.left + each.right) / 2, (each.top + each.bottom) / 2])"""
+IMAGE = f"name => {PLOT_OF}.renderers[0].data_source.data.image[0].toString()"
+TITLE = f"name => {PLOT_OF}.title.text"
 
 
 def speckle3d(*arguments, **more):
@@ -100,7 +98,7 @@ def test_the_saved_picture_is_what_the_command_makes(page, results, other):
     name = f"seen-{bool(other)}.png"
     page.get_by_label("file").fill(name)
     page.get_by_label("file").press("Enter")
-    page.get_by_role("button", name="save").click()
+    page.get_by_role("button", name="save the picture").click()
     page.get_by_text(f"saved {name}").wait_for()
     command[command.index("-o") + 1] = "again.png"
     assert ("--difference-to" in command) == bool(other)

@@ -42,7 +42,7 @@ class Saving:
         choices: dict[str, Name | None] = {words: name for name, words in TITLES.items()} | {_OUTLINES: None}
         self.what = pn.widgets.Select(name="picture of", options=choices, value="free", width=width_px)
         self.name = pn.widgets.TextInput(name="file", value="free.png", width=width_px)
-        self.button = pn.widgets.Button(name="save", button_type="primary", width=width_px)
+        self.button = pn.widgets.Button(name="save the picture", button_type="primary", width=width_px)
         self.command = pn.pane.HTML("", width=width_px)
         self.said = pn.pane.HTML("", width=width_px)
         self.what.param.watch(self._chosen, "value")
