@@ -112,7 +112,7 @@ def _reconstructed(path: Path, sweep_file: Path | None, opened: Path) -> list[Pa
     found, sweep = open_reconstruction(path, sweep_file)
     found = replace(found, pairs=read_reconstruction(path).pairs)
     pages = _recorded(sweep, opened, found, recorded_doubts(path, found.provenance))
-    viewer = ReconstructionPage(found, sweep, Folder(path))
+    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file)
     # First what was asked for.
     return [viewer, *pages] if opened == path else [pages[0], viewer, *pages[1:]]
 

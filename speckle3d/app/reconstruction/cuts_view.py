@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import panel as pn
-from bokeh.models import Span
+from bokeh.models.annotations import Span
 from panel.viewable import Viewable
 
 from speckle3d.app.reconstruction.cut_plot import (
@@ -35,7 +36,12 @@ _ARM = 0.32
 """Of the box's smaller side: from the handle that moves the free plane to the one that turns it."""
 _NEAR_MM = 0.3
 """A picked point is drawn in cuts as near as this."""
-_TITLES = {"along": "along the sweep", "frame": "frame", "depth": "parallel to the skin", "free": "free plane"}
+TITLES: dict[Name, str] = {
+    "along": "along the sweep",
+    "frame": "across the sweep",
+    "depth": "parallel to the skin",
+    "free": "free plane",
+}
 
 ORTHOGONAL: tuple[Name, ...] = ("along", "frame", "depth")
 
@@ -61,9 +67,7 @@ class CutsView:
         self._material, self._changed, self._picked = material, changed, picked
         self.shown = Shown(material.modes[0])
         self.plots = {name: CutPlot(f"cut-{name}", _ALONE_PX, self._picker(name, 0)) for name in NAMES}
-        self._others = {
-            name: CutPlot(f"other-{name}", _BESIDE_PX, self._picker(name, 1)) for name in NAMES
-        }
+        self._others = {name: CutPlot(f"other-{name}", _BESIDE_PX, self._picker(name, 1)) for name in NAMES}
         self._cuts: dict[tuple[Name, str], AnyCut] = {}
         self._points: dict[str, FloatArray] = {}
         self._spans = self._add_spans()
@@ -77,10 +81,11 @@ class CutsView:
 
     def layout(self) -> Viewable:
         """The plots in two rows; those of a second mode are hidden while there is none."""
+
         def cell(name: Name) -> Viewable:
             return pn.Row(pn.pane.Bokeh(self.plots[name].plot), pn.pane.Bokeh(self._others[name].plot))
 
-        return pn.Column(*(pn.Row(cell(a), cell(b)) for a, b in (("along", "frame"), ("depth", "free"))))
+        return pn.Column(*(pn.Row(*map(cell, NAMES[row : row + 2])) for row in (0, 2)))
 
     def draw(self) -> None:
         """Draw lines and handles where they are now; cuts follow by `show_cut`."""
@@ -103,7 +108,9 @@ class CutsView:
         if other and self.shown.is_difference:
             colours = laid_over(picture.cuts[other].image, main.image, levels)
         self.plots[name].show(colours, main.cut.extent_mm)
-        said = f"{_TITLES[name]}: {picture.place}" if name != "frame" else picture.place
+        said = f"free {picture.place}" if name == "free" else picture.place
+        if other and not self.shown.is_difference:
+            said = f"{label_of(mode)}: {said.split(', seen')[0]}"
         said = said if is_fine else f"{said} (voxels)"
         self.plots[name].name_axes(said, picture.axes)
         if other and not self.shown.is_difference:
@@ -116,9 +123,15 @@ class CutsView:
 
     def show_none(self, name: Name, why: str) -> None:
         """Say why there is no cut."""
-        self.plots[name].plot.title.text = why.split(";")[0]
+        self.plots[name].title(why.split(";")[0])
         for plot in (self.plots[name], self._others[name]):
             plot.show(np.zeros((1, 1), np.uint32), (0.0, 1e-6, 1e-6, 0.0))
+
+    @property
+    def planes(self) -> dict[Name, ReslicePlane]:
+        """Where the cuts of the first mode are, as far as they are made."""
+        found = {name: self._cuts.get((name, self.shown.mode)) for name in NAMES}
+        return {name: cut for name, cut in found.items() if isinstance(cut, ReslicePlane)}
 
     def show_points(self, points: dict[str, FloatArray]) -> None:
         """Draw picked points, shape (k, 3) by mode, in the cuts that they lie in."""
@@ -141,7 +154,7 @@ class CutsView:
                 plot.fit(box)
 
     def _span_of_free(self) -> Box:
-        """Box about the sweep's centre that holds what any free plane shows: the scale stays as it is turned."""
+        """Box that holds what any free plane shows: the scale stays as it is turned."""
         grid = self._material.grid
         path = self._material.opened(self.shown.mode).poses[self.shown.mode]
         length = float(np.linalg.norm(np.ptp(path.apply(grid.centre_mm), axis=0)))
@@ -220,7 +233,7 @@ class CutsView:
 
             return tell
 
-        wanted: list[tuple[Name, str, str, str]] = [
+        wanted: list[tuple[Name, str, Literal["width", "height"], str]] = [
             ("along", "depth_mm", "width", DEPTH),
             ("frame", "depth_mm", "width", DEPTH),
             ("frame", "lateral_mm", "height", LATERAL),
@@ -249,4 +262,3 @@ class CutsView:
             near = np.abs(there[:, 2]) < _NEAR_MM
             xy = there[:, :2] + np.array(cut.first_mm)
             plot.show_points(np.where(near[:, None], xy, np.nan), [str(k + 1) for k in range(len(points))])
-

@@ -125,7 +125,9 @@ class FrameFindings:
         if self.flags is None:
             return f"looking at all frames: {len(self._found)} of {total}"
         flagged = int(np.count_nonzero(self.flags))
-        source = "by its reconstruction" if self._reconstruction is not None else (
-            "each by itself; a reconstruction also tells which are unlike all earlier ones"
+        source = (
+            "by its reconstruction"
+            if self._reconstruction is not None
+            else ("each by itself; a reconstruction also tells which are unlike all earlier ones")
         )
         return f"{flagged or 'none'} of {total} frames flagged ({source})"

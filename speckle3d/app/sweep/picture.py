@@ -94,7 +94,11 @@ class Picture:
     def colour(self, patches: PatchValues, by: str, most: float, opacity: float) -> PatchCount:
         """Draw patches coloured by a quantity from zero to `most`."""
         self._bar.visible = True
-        values = {"distance": patches.distance_mm, "sigma": patches.sigma_mm, "correlation": patches.correlation}
+        values = {
+            "distance": patches.distance_mm,
+            "sigma": patches.sigma_mm,
+            "correlation": patches.correlation,
+        }
         state = _states(patches)
         self._colours.high, self._bar.title = most, COLOURINGS[by]
         known = np.isfinite(values[by])
@@ -126,5 +130,17 @@ def _states(patches: PatchValues) -> list[str]:
 
 
 def _no_patches() -> dict[str, list[object]]:
-    names = ("x", "y", "angle", "value", "alpha", "line", "hatch", "state", "distance", "sigma", "correlation")
+    names = (
+        "x",
+        "y",
+        "angle",
+        "value",
+        "alpha",
+        "line",
+        "hatch",
+        "state",
+        "distance",
+        "sigma",
+        "correlation",
+    )
     return {name: [] for name in names}

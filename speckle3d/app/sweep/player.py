@@ -69,7 +69,9 @@ class Player:
             options=["none", *colourings], value="none", button_type="default", button_style="outline"
         )
         self._other = pn.widgets.Select(options={}, width=230, disabled=True)
-        self._opacity = pn.widgets.FloatSlider(name="opacity", start=0.1, end=1.0, step=0.1, value=0.5, width=150)
+        self._opacity = pn.widgets.FloatSlider(
+            name="opacity", start=0.1, end=1.0, step=0.1, value=0.5, width=150
+        )
         self._told = pn.pane.HTML("", sizing_mode="stretch_width")
         self._judged = pn.pane.HTML("", sizing_mode="stretch_width")
         self._keys = Keys(width=0, height=0, margin=0)

@@ -85,7 +85,9 @@ class TimeLine:
         source = ColumnDataSource()
         plot = self._plot(_STREAM_PX)
         for part, colour in enumerate(COLOURS):
-            plot.line("time", f"part{part}", source=source, color=colour, line_width=1.4, legend_label=str(part))
+            plot.line(
+                "time", f"part{part}", source=source, color=colour, line_width=1.4, legend_label=str(part)
+            )
         legend = plot.legend[0]
         plot.add_layout(legend, "right")
         legend.update(padding=2, spacing=0, margin=2, label_text_font_size="11px", border_line_alpha=0.0)
