@@ -43,8 +43,8 @@ _MOST_WAITING = 4096
 class GrowingSweep:
     """Write a sweep file frame by frame; what was appended is in it even if the process is killed.
 
-    A block that ends without an error leaves a file as `SweepWriter` does, and so does one with an error, but
-    that it says that its recording ended early.
+    A block that ends without an error leaves a file as `SweepWriter` does; one with an error, a file that
+    says that its recording was not closed. Without a frame there is no file.
 
     Parameters
     ----------
@@ -203,6 +203,8 @@ class GrowingSweep:
                 raise cannot_write(self.path, OSError(str(error))) from error
         finally:
             self._file.close()
+            if not self._count:  # no sweep is without frames
+                self.path.unlink(missing_ok=True)
 
     def _begin(self) -> None:
         file = self._file

@@ -36,6 +36,7 @@ from speckle3d.io.hdf5 import (
     has_member,
     hdf5_claim,
     locate,
+    open_hdf5,
     opened,
     read_attribute,
     read_checked,
@@ -43,6 +44,7 @@ from speckle3d.io.hdf5 import (
     read_text,
     read_transforms,
     read_vector_attribute,
+    reading,
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
@@ -110,6 +112,8 @@ def read_sweep(path: PathLike) -> Sweep:
         if grows:
             times = read_rows(file, "frame_time_s", ("frame",))
             n = times.size
+            if not n:
+                raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
         frames, grid, signal = _read_image(file, n)
         n = frames.shape[0]
         if times is None:
@@ -289,13 +293,20 @@ def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
     return valid
 
 
-def _notes(path: Path, _: ImportSettings) -> list[str]:
-    """Say so if a recording was not closed."""
-    with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
-        if not is_growing(file):
-            return []
+def unfinished_note(path: PathLike) -> str | None:
+    """Words for a sweep file whose recording goes on or was not closed; None for any other file."""
+    if not Path(path).is_file() or not h5py.is_hdf5(path):
+        return None
+    with reading(path), open_hdf5(path) as file:
+        if not has_format(file, FORMAT) or not is_growing(file):
+            return None
         times = read_rows(file, "frame_time_s", ("frame",))
-    return [f"the recording goes on, or was ended without being closed: {times.size} frames so far"]
+    return f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far"
+
+
+def _notes(path: Path, _: ImportSettings) -> list[str]:
+    note = unfinished_note(path)
+    return [] if note is None else [note]
 
 
 READER = Reader(

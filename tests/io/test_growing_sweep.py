@@ -17,6 +17,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError
 from speckle3d.core.parts import locks
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io import growing_sweep
+from speckle3d.io.describe import describe
 from speckle3d.io.growing_sweep import GrowingSweep
 from speckle3d.io.load import import_notes, load_sweep
 from speckle3d.io.sweep_writer import write_sweep
@@ -81,13 +82,15 @@ def test_what_was_appended_is_read_while_it_grows_and_when_it_is_closed(tmp_path
             np.testing.assert_array_equal(found.frames[i], sweep.frames[i])
             assert (found.tracker, found.orientation) == (None, None)
             assert import_notes(path) == [
-                f"the recording goes on, or was ended without being closed: {i + 1} frames so far"
+                f"{path}: the recording goes on, or was ended without being closed: {i + 1} frames so far"
             ]
+            assert ("recording", "goes on, or was ended without being closed", "") in describe(path)
             found.frames.close()
     with growing(tmp_path / "whole.h5", sweep, compression) as target:
         readings = fill(target, sweep)
     assert_begins(load_sweep(tmp_path / "whole.h5"), sweep, len(sweep), readings)
     assert import_notes(tmp_path / "whole.h5") == []
+    assert "recording" not in {row[0] for row in describe(tmp_path / "whole.h5")}
     assert_begins_a_usual_file(tmp_path, sweep)
 
 
@@ -100,6 +103,14 @@ def assert_begins_a_usual_file(folder, sweep):
     with h5py.File(folder / "copy.h5", "r") as file:
         assert "unfinished" not in file
     np.testing.assert_array_equal(load_sweep(folder / "copy.h5").frames[1], sweep.frames[1])
+
+
+def test_without_a_frame_there_is_no_sweep_and_no_file(tmp_path):
+    with growing(tmp_path / "s.h5", SWEEPS["rf"]) as target:
+        target.append_pose(0.0, np.eye(4))
+        with pytest.raises(InvalidInputError, match="got none so far"):
+            load_sweep(tmp_path / "s.h5")
+    assert not (tmp_path / "s.h5").exists()
 
 
 def test_calibration_probe_and_offset_are_kept(tmp_path):
