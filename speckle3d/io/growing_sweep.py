@@ -7,7 +7,9 @@ file before its time is, and a reading before its time: a reader takes as many o
 from __future__ import annotations
 
 import os
+import struct
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -17,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.geometry import rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
@@ -30,8 +32,11 @@ _GZIP_LEVEL = 1
 _TIMES_PER_CHUNK = 1024
 _READINGS_PER_CHUNK = 128
 """A chunk is written again with every value that is added to it."""
-_SPARE_BYTES = 16 * 2**20
-"""Room that is left on the disk: HDF5 cannot end a file that it cannot write."""
+_AHEAD_BYTES, _SPARE_BYTES = 16 * 2**20, 2**20
+"""Room on the disk that is taken before it is needed, and the least of it that is left after a frame: HDF5
+cannot end a file that it cannot write."""
+_EOF_AT = 28
+"""Of the file's length in a superblock of version 3."""
 
 _FLUSH_S = 0.2
 """Longest time for which readings wait for the next frame."""
@@ -119,12 +124,15 @@ class GrowingSweep:
         except OSError as error:
             raise cannot_write(self.path, error) from error
         try:
-            self._require_room(2 * _SPARE_BYTES)
-            self._file = h5py.File(target, "w", libver="latest")
-            self._begin()
-            self._file.swmr_mode = True
+            with ExitStack() as undo:
+                undo.callback(target.unlink, missing_ok=True)
+                self._room = undo.enter_context(_Room(target))
+                self._file = undo.enter_context(h5py.File(target, "w", libver="latest"))
+                self._room.reserve(_AHEAD_BYTES)
+                self._begin()
+                self._file.swmr_mode = True
+                undo.pop_all()
         except OSError as error:
-            target.unlink(missing_ok=True)
             raise cannot_write(self.path, error) from error
         return self
 
@@ -152,8 +160,7 @@ class GrowingSweep:
         stored = frame_for(self._name, frame, self._grid, self._dtype, where)
         if not (np.isfinite(time_s) and time_s > self._time_s):
             raise InvalidInputError(f"{where}: expected a time after {self._time_s} s, got {time_s}")
-        self._require_room(stored.nbytes)
-        self._write_readings()
+        self._write_readings(stored.nbytes)
         i, shape = self._count, stored.shape
         packed = deflated(shuffled(stored)) if self._compression else stored
         try:
@@ -203,6 +210,7 @@ class GrowingSweep:
                 raise cannot_write(self.path, OSError(str(error))) from error
         finally:
             self._file.close()
+            self._room.close()
             if not self._count:  # no sweep is without frames
                 self.path.unlink(missing_ok=True)
 
@@ -238,8 +246,10 @@ class GrowingSweep:
             self._orientation.group.attrs["sensor_from_image_wxyz"] = wxyz
         self._growing = file.create_dataset(GROWING, data=np.uint8(1))
 
-    def _write_readings(self) -> None:
+    def _write_readings(self, frame_bytes: int = 0) -> None:
+        """Write readings that wait, once there is room for them and for the next frame."""
         try:
+            self._room.reserve(self._file.id.get_filesize() + frame_bytes + _SPARE_BYTES)
             for stream in (self._tracker, self._orientation):
                 stream.write()
         except OSError as error:
@@ -247,14 +257,41 @@ class GrowingSweep:
 
     def _flush_in_time(self) -> None:
         if any(stream.is_due for stream in (self._tracker, self._orientation)):
-            self._require_room(0)
             self._write_readings()
 
-    def _require_room(self, size: int) -> None:
-        """Raise before the disk is full: HDF5 takes the interpreter down if it cannot write what it holds."""
-        place = os.statvfs(self.path.parent) if hasattr(os, "statvfs") else None
-        if place is not None and place.f_bavail * place.f_frsize < size + _SPARE_BYTES:
-            raise NoSpaceError(f"{self.path}: cannot be written: no space left on device")
+
+class _Room:
+    """Room on the disk behind what HDF5 has written, so that a full disk is an error before HDF5 meets it.
+
+    HDF5 cannot close a file whose last bytes it cannot write: what was recorded would be lost. Without
+    ``posix_fallocate``, as on Windows, nothing is reserved.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._reserved = path, 0
+        self._file = os.open(path, os.O_RDWR)
+        self.reserve(_AHEAD_BYTES)
+        self._reserved = 0  # HDF5 begins by emptying the file
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._file)
+
+    def reserve(self, stop: int) -> None:
+        """Take room up to a byte of the file, and some more; raises `OSError` if there is none."""
+        if stop > self._reserved and hasattr(os, "posix_fallocate"):
+            ahead = stop + _AHEAD_BYTES
+            os.posix_fallocate(self._file, self._reserved, ahead - self._reserved)
+            self._reserved = ahead
+
+    def close(self) -> None:
+        """Give back what was not needed of a closed file."""
+        length = struct.unpack("<Q", os.pread(self._file, 8, _EOF_AT))[0]
+        if 0 < length < os.fstat(self._file).st_size:
+            os.ftruncate(self._file, length)
+        os.close(self._file)
 
 
 class _Column:

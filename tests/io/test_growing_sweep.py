@@ -4,13 +4,13 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import sweep_examples
+from disks import FULL, limited
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError
@@ -204,23 +204,19 @@ def test_an_error_ends_the_recording_and_the_file_says_so(tmp_path):
     assert "3 frames" in import_notes(path)[0]
 
 
-def test_a_disk_that_fills_up_ends_the_recording_with_what_is_there(tmp_path, monkeypatch):
-    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
-    usual = os.statvfs(tmp_path)
-    left = [0]
-
-    class Disk:
-        f_frsize = 1
-
-        @property
-        def f_bavail(self):
-            left[0] += 1
-            return 0 if left[0] > 4 else usual.f_bavail * usual.f_frsize
-
-    monkeypatch.setattr(growing_sweep.os, "statvfs", lambda _: Disk())
-    with pytest.raises(NoSpaceError, match="no space"), growing(path, sweep) as target:
-        fill(target, replace(sweep, tracker=replace(sweep.tracker), orientation=sweep.orientation))
-    assert 1 <= len(load_sweep(path)) < len(sweep)
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="room on the disk is reserved by POSIX alone")
+@pytest.mark.parametrize("frames", [0, 3])
+def test_a_disk_that_fills_up_ends_the_recording_with_what_is_there(tmp_path, monkeypatch, frames):
+    monkeypatch.setattr(growing_sweep, "_AHEAD_BYTES", 2**14)
+    monkeypatch.setattr(growing_sweep, "_SPARE_BYTES", 2**17)
+    sweep, path = sweep_examples.rf_sweep(vectors=100, samples=1000), tmp_path / "s.h5"
+    size = frames * sweep.frames[0].nbytes + 2**18 if frames else 1000
+    with pytest.raises(NoSpaceError, match=FULL), limited(size), growing(path, sweep) as target:
+        fill(target, sweep)
+    assert path.exists() == (frames > 0)
+    if frames:
+        assert 0 < len(load_sweep(path)) < len(sweep)
+        assert path.stat().st_size < size
 
 
 def test_damage_to_a_file_that_grows_is_an_error_of_one_line(tmp_path):
