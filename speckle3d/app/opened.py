@@ -3,26 +3,131 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.page import Page
-from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.load import load_sweep
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.io.hdf5 import SIGNATURE
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.load import kind_of, load_sweep
+from speckle3d.io.readers import find_reader, first_bytes
+from speckle3d.io.reconstructions import FORMAT, read_reconstruction
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.core.doubts import Doubt
+    from speckle3d.core.reconstruction import Reconstruction
+    from speckle3d.core.sweep import Sweep
+    from xsens.logs.samples import ImuLog
+
+RECONSTRUCTION = "reconstruction.h5"
+"""File of a results folder."""
 
 
-def pages_of(path: Path) -> Sequence[Page]:
-    """Pages for what a file holds.
+def pages_of(
+    path: Path,
+    reconstruction: Path | None = None,
+    sweep: Path | None = None,
+    settings: ImportSettings | None = None,
+) -> Sequence[Page]:
+    """Pages for what a file or folder holds.
+
+    Parameters
+    ----------
+    path : path
+        A recording, a reconstruction or its results folder, or a log of the orientation sensor.
+    reconstruction : path, optional
+        Of the recording, to be seen with it.
+    sweep : path, optional
+        The sweep of a reconstruction, if it moved.
+    settings : ImportSettings, optional
+        What a recording does not say.
 
     Raises
     ------
+    FileError
+        If it cannot be read.
     InvalidInputError
         If the app has no page for it.
+    MismatchError
+        If reconstruction and recording do not belong together.
     """
-    from speckle3d.app.sweep.page import SweepPage
+    place = path / RECONSTRUCTION if (path / RECONSTRUCTION).is_file() else path
+    if find_reader(place) is not None:
+        if reconstruction is not None:
+            return _reconstructed(reconstruction, place, place)
+        return _recording(place, settings)
+    if reconstruction is not None:
+        raise InvalidInputError(f"{path}: expected a recording beside --reconstruction, got something else")
+    if first_bytes(place).startswith(SIGNATURE) and (kind := kind_of(place)) is not None:
+        if kind != FORMAT:
+            raise InvalidInputError(f"{path}: expected a recording, a reconstruction or a log, got {kind}")
+        return _reconstructed(place, sweep, place)
+    return _logged(place)
 
-    folder = Folder(path)
-    sweep = load_sweep(path)
+
+def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
+    """Pages of a recording; of a package with a sensor's samples but no frames, the sensor's alone."""
+    from speckle3d.sensor_logs import held_log
+
+    try:
+        sweep = load_sweep(path, settings)
+    except MissingSettingsError:
+        raise
+    except InvalidInputError:
+        with suppress(InvalidInputError, InsufficientDataError):
+            if (log := held_log(path)) is not None:
+                return [_sensor(log)]
+        raise
+    return _recorded(sweep, path)
+
+
+def _recorded(
+    sweep: Sweep,
+    path: Path,
+    reconstruction: Reconstruction | None = None,
+    doubts: Sequence[Doubt] | None = None,
+) -> list[Page]:
+    from speckle3d.app.sweep.page import SweepPage
+    from speckle3d.sensor_logs import log_of
+
     if not len(sweep):
         raise InvalidInputError(f"{path}: expected frames to look at, got none")
-    return [SweepPage(sweep, folder)]
+    pages: list[Page] = [SweepPage(sweep, Folder(path), reconstruction, doubts)]
+    if sweep.orientation is not None:
+        pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))
+    return pages
+
+
+def _reconstructed(path: Path, sweep_file: Path | None, opened: Path) -> list[Page]:
+    from speckle3d.app.reconstruction.page import ReconstructionPage
+    from speckle3d.study.details import recorded_doubts
+    from speckle3d.study.images import open_reconstruction
+
+    found, sweep = open_reconstruction(path, sweep_file)
+    found = replace(found, pairs=read_reconstruction(path).pairs)
+    pages = _recorded(sweep, opened, found, recorded_doubts(path, found.provenance))
+    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file)
+    # First what was asked for.
+    return [viewer, *pages] if opened == path else [pages[0], viewer, *pages[1:]]
+
+
+def _logged(path: Path) -> list[Page]:
+    from xsens.logs.read import read_log
+
+    if path.is_dir():
+        raise InvalidInputError(
+            f"{path}: expected a recording, a log, or a results folder with {RECONSTRUCTION}, got another"
+        )
+    return [_sensor(read_log(path))]
+
+
+def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:
+    from speckle3d.app.sensor.page import SensorPage
+
+    return SensorPage(log, mounting)

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-import panel as pn
-from bokeh.server.server import Server
-from panel.viewable import Viewable
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from panel.io.application import build_applications
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.netutil import bind_sockets
 
-from speckle3d.app.guard import LOOPBACK, Guard
+from speckle3d.app.guard import LOOPBACK, Careful, Gate, Guard
+from speckle3d.app.look import shell
 from speckle3d.app.page import Page
+from speckle3d.core.errors import FileError
 
 UNSEEN_S = 600.0
 """Without a viewer for so long, the server ends."""
+
 _LOOK_S = 1.0
+_MOST_HEADER_BYTES = 32 * 1024
+_MOST_BODY_BYTES = 1024
+"""Of requests, none of which has a body."""
+
+_MOST_MESSAGE_BYTES = 4 * 2**20
+"""Of what a page sends: a drawn outline of a hundred thousand corners."""
 
 
 class AppServer:
@@ -22,40 +34,63 @@ class AppServer:
 
     Parameters
     ----------
-    make : callable
-        Makes the pages, for each viewer anew.
+    pages : sequence of Page
+        Shared by all viewers; each is shown views of their own.
+    title : str
+        Name of what is looked at.
     port : int
         0 for any that is free.
     unseen_s : float
         Time without a viewer after which the server ends.
+
+    Raises
+    ------
+    FileError
+        If the port is taken.
     """
 
-    def __init__(
-        self, make: Callable[[], Sequence[Page]], title: str, port: int = 0, unseen_s: float = UNSEEN_S
-    ) -> None:
-        self._guard = Guard()
+    def __init__(self, pages: Sequence[Page], title: str, port: int = 0, unseen_s: float = UNSEEN_S) -> None:
         self._unseen_s, self._seen_s = unseen_s, time.monotonic()
-        self._server: Server = pn.io.server.get_server(
-            lambda: shell(make()),
-            port=port,
-            address=LOOPBACK,
-            websocket_origin=[f"{LOOPBACK}:{port}"],
-            title=title,
-            auth_provider=self._guard,
+        self._guard = Guard()
+        try:
+            sockets = bind_sockets(port, LOOPBACK)
+        except OSError as error:
+            raise FileError(f"port {port}: expected a free one: {error.strerror or error}") from error
+        self._port: int = sockets[0].getsockname()[1]
+        application = BokehTornado(
+            build_applications(lambda: shell(pages, title), title=f"{title} - speckle3d"),
+            # The gate looks at origins, by the name that was asked for.
+            extra_websocket_origins=["*"],
+            secret_key=self._guard.secret_key,
+            sign_sessions=True,
+            websocket_max_message_size_bytes=_MOST_MESSAGE_BYTES,
+            # What is refused is told to who asked, not to the terminal.
+            log_function=lambda _: None,
         )
-        self._guard.port = self._server.port
-        # Known once a free port was found.
-        self._server._tornado._websocket_origins = set(self._guard.hosts)
+        application.add_transform(Careful)
+        http = HTTPServer(
+            Gate(application, self._guard),
+            max_header_size=_MOST_HEADER_BYTES,
+            max_body_size=_MOST_BODY_BYTES,
+            idle_connection_timeout=60.0,
+        )
+        http.add_sockets(sockets)
+        self._server = BaseServer(IOLoop.current(), application, http)
 
     @property
     def address(self) -> str:
         """What to open in a browser, with the token."""
-        return f"http://{LOOPBACK}:{self._server.port}/?token={self._guard.token}"
+        return self._address(self._guard.token)
+
+    def address_for_once(self) -> str:
+        """Address that leads to `address` at its first use and nowhere after."""
+        return self._address(self._guard.ticket())
+
+    def _address(self, token: str) -> str:
+        return f"http://{LOOPBACK}:{self._port}/?token={token}"
 
     def run(self) -> None:
         """Serve until nobody has looked for a while, or the process is told to end."""
-        from tornado.ioloop import PeriodicCallback
-
         self._server.start()
         looking = PeriodicCallback(self._look, 1000.0 * _LOOK_S)
         looking.start()
@@ -63,7 +98,7 @@ class AppServer:
             self._server.io_loop.start()
         finally:
             looking.stop()
-            self._server.stop()
+            self._server.stop(wait=False)
 
     def _look(self) -> None:
         now = time.monotonic()
@@ -71,11 +106,3 @@ class AppServer:
             self._seen_s = now
         elif now - self._seen_s > self._unseen_s:
             self._server.io_loop.stop()
-
-
-def shell(pages: Sequence[Page]) -> Viewable:
-    """Pages as tabs; a single one without."""
-    pn.extension()
-    if len(pages) == 1:
-        return pages[0].view()
-    return pn.Tabs(*((page.title, page.view()) for page in pages), dynamic=True, sizing_mode="stretch_width")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import Json, app, emit_json, emit_rows, note
-from speckle3d.cli.imu_logs import Log, RateHz, WorldOption, log_of, read, ridden_along, tell
+from speckle3d.cli.imu_logs import Log, RateHz, WorldOption, read, tell
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 from xsens.fusion.methods import DEFAULT_METHOD, Method
@@ -122,6 +122,7 @@ def imu_orient(
     as_json: Json = False,
 ) -> None:
     """Find the sensor's orientation from its log, and put it into a sweep, on its own clock."""
+    from speckle3d.sensor_logs import log_of, ridden_along
     from xsens.logs.textlogs import write_csv
 
     if into is None and out is None:

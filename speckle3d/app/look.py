@@ -1,0 +1,76 @@
+"""How all pages look: a line with the file's name, tabs below it, one sober style."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import panel as pn
+from panel.viewable import Viewable
+
+from speckle3d.app.page import Page
+from speckle3d.core.errors import Speckle3DError
+
+STYLE = """
+:host {
+  --panel-primary-color: #20507a; --panel-on-primary-color: #ffffff; --bokeh-font-size: 13px;
+  --panel-background-color: #ffffff; --panel-border-color: #c9d1d9;
+  font-family: system-ui, "Segoe UI", "DejaVu Sans", sans-serif; font-size: 13px; color: #1c2730;
+}
+"""
+"""Of the outermost element; what lies within inherits it."""
+
+_HEADER = """
+<div style="display:flex;align-items:baseline;gap:14px;background:#1d3347;color:#fff;padding:7px 14px">
+<span style="font-weight:600;letter-spacing:.02em">speckle3d</span>
+<span style="font-family:ui-monospace,'DejaVu Sans Mono',monospace;overflow:hidden;text-overflow:ellipsis;
+white-space:nowrap" title="{name}">{name}</span></div>
+"""
+
+_BODY = "html, body { background: #fff; overflow-x: hidden; }"
+
+
+def shell(pages: Sequence[Page], title: str) -> Viewable:
+    """Pages as tabs below the name of what is looked at; a single one without tabs.
+
+    A page's view is made when its tab is first opened.
+    """
+    pn.extension(raw_css=[_BODY])
+    header = pn.pane.HTML(
+        _HEADER.format(name=escape(title, quote=True)), sizing_mode="stretch_width", margin=0
+    )
+    return pn.Column(header, inside(pages), stylesheets=[STYLE], sizing_mode="stretch_width", margin=0)
+
+
+def inside(pages: Sequence[Page]) -> Viewable:
+    """Pages as tabs, or a single one, without the line of the app."""
+    if len(pages) == 1:
+        return _viewed(pages[0])
+    views = [pn.Column(sizing_mode="stretch_width") for _ in pages]
+    tabs = pn.Tabs(
+        *((page.title, view) for page, view in zip(pages, views, strict=True)),
+        dynamic=True,
+        sizing_mode="stretch_width",
+    )
+
+    def fill(_: object = None) -> None:
+        if not views[tabs.active].objects:
+            views[tabs.active].append(_viewed(pages[tabs.active]))
+
+    tabs.param.watch(fill, "active")
+    fill()
+    return tabs
+
+
+def _viewed(page: Page) -> Viewable:
+    """A page's view, or why there is none."""
+    try:
+        return page.view()
+    except Speckle3DError as error:
+        return told(str(error))
+
+
+def told(words: str) -> Viewable:
+    """Words of an error, or in place of what there is nothing to show of."""
+    box = "border-left:4px solid #b3541e;background:#fdf3ec;padding:8px 12px;max-width:60em"
+    return pn.pane.HTML(f'<div role="status" style="{box}">{escape(words)}</div>', margin=10)
