@@ -132,6 +132,7 @@ class LiveTracker:
         self._revision, self._last_whole, self._looked_at = 0, 0, 0
         self._lock, self._grown = threading.Lock(), threading.Condition()
         self._ended = False
+        self._failure: Exception | None = None
         self.hurried = False
         self._thread: threading.Thread | None = None
         if background:
@@ -178,6 +179,8 @@ class LiveTracker:
         time_s : float
             On the image clock, later than the last frame's.
         """
+        if self._failure is not None:
+            raise self._failure
         number = len(self._tables)
         made = self._maker.make(number, frame)
         if self.images:
@@ -254,7 +257,7 @@ class LiveTracker:
                 self._last_whole = len(sweep)
             else:
                 revision = self._reviser.latest(sweep, known)
-        except InsufficientDataError:
+        except (InsufficientDataError, np.linalg.LinAlgError):
             # Frames that come later may tell.
             return
         self._take(revision)
@@ -285,11 +288,14 @@ class LiveTracker:
 
     def _keep_revising(self) -> None:
         """Revise as often as there are new frames, on this thread alone: matching needs the others."""
-        with on_one_thread():
-            while self._awaited(self._looked_at):
-                sweep = self._growing()
-                self._revised(sweep)
-                self._looked_at = len(sweep)
+        try:
+            with on_one_thread():
+                while self._awaited(self._looked_at):
+                    sweep = self._growing()
+                    self._revised(sweep)
+                    self._looked_at = len(sweep)
+        except Exception as error:  # noqa: BLE001 (raised with the next frame)
+            self._failure = error
 
     def _awaited(self, frames: int) -> bool:
         """Wait for more frames; false at the end."""

@@ -8,7 +8,9 @@ from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.igtl.messages import HEADER_BYTES, ImageReceived, TransformReceived, decode
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.igtl.header import HEADER_BYTES
+from speckle3d.io.igtl.messages import ImageReceived, TransformReceived, decode
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
@@ -41,7 +43,7 @@ class Messages:
         self.until_s = time.monotonic() + 60
 
     def receive(self, timeout_s):
-        if self.batches:
+        if self.batches and self.session.progress.waiting < 3:
             return self.batches.pop(0)
         time.sleep(0.005)
         if self.done(self.session.progress) or time.monotonic() > self.until_s:
@@ -99,6 +101,7 @@ def test_messages_that_make_no_sweep_are_counted_and_cost_nothing_else(recorded,
     assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 5
 
 
+@pytest.mark.slow
 def test_frames_that_come_too_fast_are_recorded_and_every_other_one_is_left(recorded, tmp_path):
     frames, curves = recorded
     many = [image(frames[k % 14], k / 1000) for k in range(40)]
@@ -111,6 +114,7 @@ def test_frames_that_come_too_fast_are_recorded_and_every_other_one_is_left(reco
     assert progress.waiting <= MOST_WAITING
 
 
+@pytest.mark.slow
 def test_words_and_a_volume_go_out(recorded, tmp_path, monkeypatch):
     frames, curves = recorded
     monkeypatch.setattr("speckle3d.live.session.VOLUME_EVERY_S", 0.05)
@@ -158,7 +162,7 @@ def test_a_pose_takes_pixels_to_slicers_axes(recorded):
 
 
 def test_memory_of_the_volume_is_bounded():
-    growing, rng = GrowingVolume(s3.ImageGrid(16, 32, 0.5, 0.5)), np.random.default_rng(0)
+    growing, rng = GrowingVolume(ImageGrid(16, 32, 0.5, 0.5)), np.random.default_rng(0)
     for k in range(2 * MOST_IMAGES + 5):
         growing.keep(k, rng.exponential(size=(16, 32)).astype(np.float32))
     numbers, images = growing.kept()

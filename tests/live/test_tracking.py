@@ -8,14 +8,14 @@ import pytest
 import speckle3d as s3
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep
 from speckle3d.live import revising, tracking
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.matching.blocks import Block, FrameByFrame, FrameMaker, MatchedBlock, match_block
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.pipeline import matcher_for, track
 
-FRAMES = 40
+FRAMES = 24
 
 
 def apart_mm(sweep, poses, others):
@@ -57,7 +57,7 @@ def followed(shipped):
 
 def test_each_pose_is_what_the_frames_up_to_it_give(followed):
     sweep, curves, matched, _, told = followed
-    for k in (3, 14, 23, 38):
+    for k in (3, 14, 22):
         part = tracked_part(sweep.part(0, k + 1), curves, matched)
         # 0.1 mm is asked for; 0.013 mm is the largest over the whole shipped sweep.
         assert apart_mm(sweep, told[k].world_from_image, part[k]) < 0.02
@@ -84,6 +84,7 @@ def test_frames_matched_as_they_come_are_matched_as_in_a_block(shipped):
             np.testing.assert_array_equal(pair.correlation, expected.pairs[first].correlation)
 
 
+@pytest.mark.slow
 def test_learning_from_the_latest_frames_alone_keeps_the_place(shipped, monkeypatch):
     """As in a sweep too long to be looked at as a whole each time."""
     sweep, curves, matched = matched_sweep(shipped, 64)
@@ -100,6 +101,7 @@ def test_learning_from_the_latest_frames_alone_keeps_the_place(shipped, monkeypa
     assert told[-1].revision > 10
 
 
+@pytest.mark.slow
 def test_a_thread_of_its_own_revises_and_ends(shipped):
     sweep, curves, _ = matched_sweep(shipped)
     with LiveTracker(sweep, curves) as tracker:
@@ -133,8 +135,8 @@ def test_nothing_but_noise_stays_finite(shipped):
 
 def test_curves_of_another_probe_are_refused_before_any_frame(shipped):
     _, curves, _ = matched_sweep(shipped)
-    signal = s3.RFSettings(40e6, 1540.0, 5e6, (3e6, 7e6))
-    grid = s3.ImageGrid(48, 1200, 0.3, signal.sample_spacing_mm)
+    signal = RFSettings(40e6, 1540.0, 5e6, (3e6, 7e6))
+    grid = ImageGrid(48, 1200, 0.3, signal.sample_spacing_mm)
     other = Sweep(np.zeros((1, 48, 1200), np.int16), grid, signal, np.zeros(1))
     with pytest.raises(MismatchError):
         LiveTracker(other, curves)
