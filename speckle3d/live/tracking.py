@@ -4,6 +4,9 @@ A frame is matched by the functions that match recordings, in one block however 
 placed with the coherence that is known so far. Meanwhile, in another thread, coherence is learnt anew from
 the latest frames, and everything from all frames each time the sweep has grown by half: the cost per frame
 stays bounded. Poses of a revision take the place of earlier ones.
+
+Two things of a recording's reconstruction have to wait for its end: ties between visits of the same tissue,
+and the sign of the motion, which sensors tell.
 """
 
 from __future__ import annotations
