@@ -77,7 +77,7 @@ class Recording:
         try:
             self._sweep.append(frame, time_s)
         except InvalidInputError as error:
-            self._refuse(error)
+            self.refuse(error)
             return None
         self.counts.frames += 1
         return time_s
@@ -94,10 +94,11 @@ class Recording:
             elif transform.valid:
                 self._sweep.append_orientation(time_s, rigid.rotation.as_quat(scalar_first=True)[0])
         except InvalidInputError as error:
-            self._refuse(error)
+            self.refuse(error)
             return
         self.counts.readings += 1
 
-    def _refuse(self, error: InvalidInputError) -> None:
+    def refuse(self, error: InvalidInputError) -> None:
+        """Count a message that cannot be written."""
         self.counts.refused += 1
         self.counts.last_refused = str(error)

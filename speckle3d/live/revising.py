@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import IntArray
+from speckle3d.core.arrays import BoolArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.live.window import FramePlanes, Known, Window
 from speckle3d.matching.blocks import StageTimes
 from speckle3d.matching.matcher import FrameMatcher
@@ -107,6 +108,7 @@ class Reviser:
         """
         table, config = CorrelationTable.joined(sweep.tables), self._config
         reader, times = (known or self).reader.of_frames(len(sweep)), StageTimes()
+        _require_any(sound_pairs(table, sweep.flags))
         pairs, coherence, path = measured(table, sweep.flags, reader, config, times)
         if known is None:
             factors = reader.depth_factors(table, path, sound_pairs(table, sweep.flags), config.coherence)
@@ -131,6 +133,7 @@ class Reviser:
         first = begin + STAYING
         bad = (sweep.flags & ~int(FrameFlag.UNMATCHED)) != 0
         window = Window.of(sweep.tables, first, sweep.poses, bad, known.reader, begin)
+        _require_any(window.sound)
         reader, coherence = known.reader.of_frames(window.frames.size), known.coherence
         path = window.path
         if coherence is not None:
@@ -145,6 +148,11 @@ class Reviser:
         counts = [len(each) for each in sweep.tables[first:]]
         held = _by_frame(pairs, window.fixed, counts, skipped, window.frames)
         return Revision(first, len(sweep), poses, held, Known(known.reader, there, known.slopes), False)
+
+
+def _require_any(sound: BoolArray) -> None:
+    if not sound.any():
+        raise InsufficientDataError("expected pairs of frames to be trusted, got none")
 
 
 def _by_frame(

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from speckle3d.config import Config
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.threads import on_one_thread
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
@@ -90,6 +91,8 @@ class Progress:
     length_mm : float
         Between the first and the last frame's centres, along the first's elevational axis.
     words : str
+    volumes : int
+        Sent.
     refused : int
         Messages that could not be used; `last_refused` says why.
     """
@@ -101,6 +104,7 @@ class Progress:
     delay_s: float = 0.0
     length_mm: float = 0.0
     words: str = ""
+    volumes: int = 0
     refused: int = 0
     last_refused: str = ""
 
@@ -159,7 +163,7 @@ class Session:
         self._changed = threading.Condition()
         self._over = threading.Event()
         self._failure: Exception | None = None
-        self._words = Words()
+        self._words, self._sent_s = Words(), 0.0
 
     def end(self) -> None:
         """Let `run` end with what it has."""
@@ -230,7 +234,11 @@ class Session:
 
     def _take_image(self, image: ImageReceived, recording: Recording, layout: ImageLayout) -> None:
         came_s = time.monotonic()
-        frame = layout.frame(image)
+        try:
+            frame = layout.frame(image)
+        except InvalidInputError as error:
+            recording.refuse(error)
+            return
         time_s = recording.keep_frame(frame, image.time_s)
         if time_s is None:
             return
@@ -294,6 +302,7 @@ class Session:
             pose = self.tracker.append(waiting.frame, waiting.time_s)
             self._send(pose_message(pose.world_from_image, image_from_pixel, waiting.sent_s))
             self.poses.append(pose)
+            self._sent_s = waiting.sent_s
             self.progress.matched += 1
             self.progress.delay_s = time.monotonic() - waiting.came_s
             self.progress.length_mm = float(
@@ -321,7 +330,8 @@ class Session:
             if len(poses) > max(seen, 1):
                 seen = len(poses)
                 with on_one_thread():
-                    self._send(volume_message(self._volume.compounded(poses), self.poses[-1].time_s))
+                    self._send(volume_message(self._volume.compounded(poses), self._sent_s))
+                self.progress.volumes += 1
 
     def _look_for_crossing(self) -> None:
         assert self._crossing is not None

@@ -4,6 +4,9 @@ A frame is matched by the functions that match recordings, in one block however 
 placed with the coherence that is known so far. Meanwhile, in another thread, coherence is learnt anew from
 the latest frames, and everything from all frames each time the sweep has grown by half: the cost per frame
 stays bounded. Poses of a revision take the place of earlier ones.
+
+Two things of a recording's reconstruction have to wait for its end: ties between visits of the same tissue,
+and the sign of the motion, which sensors tell.
 """
 
 from __future__ import annotations
@@ -132,6 +135,7 @@ class LiveTracker:
         self._revision, self._last_whole, self._looked_at = 0, 0, 0
         self._lock, self._grown = threading.Lock(), threading.Condition()
         self._ended = False
+        self._failure: Exception | None = None
         self.hurried = False
         self._thread: threading.Thread | None = None
         if background:
@@ -178,6 +182,8 @@ class LiveTracker:
         time_s : float
             On the image clock, later than the last frame's.
         """
+        if self._failure is not None:
+            raise self._failure
         number = len(self._tables)
         made = self._maker.make(number, frame)
         if self.images:
@@ -254,7 +260,7 @@ class LiveTracker:
                 self._last_whole = len(sweep)
             else:
                 revision = self._reviser.latest(sweep, known)
-        except InsufficientDataError:
+        except (InsufficientDataError, np.linalg.LinAlgError):
             # Frames that come later may tell.
             return
         self._take(revision)
@@ -285,11 +291,14 @@ class LiveTracker:
 
     def _keep_revising(self) -> None:
         """Revise as often as there are new frames, on this thread alone: matching needs the others."""
-        with on_one_thread():
-            while self._awaited(self._looked_at):
-                sweep = self._growing()
-                self._revised(sweep)
-                self._looked_at = len(sweep)
+        try:
+            with on_one_thread():
+                while self._awaited(self._looked_at):
+                    sweep = self._growing()
+                    self._revised(sweep)
+                    self._looked_at = len(sweep)
+        except Exception as error:  # noqa: BLE001 (raised with the next frame)
+            self._failure = error
 
     def _awaited(self, frames: int) -> bool:
         """Wait for more frames; false at the end."""
