@@ -34,7 +34,7 @@ def made():
     x, y = np.meshgrid(np.arange(32) * 0.5, np.arange(40) * 0.5, indexing="ij")
     images = [128 + 60 * np.sin(x / 2 + 0.3 * k) * np.cos(y / 3 + 0.1 * k) for k in range(FRAMES)]
     signal = BModeSettings(dynamic_range_db=60.0)
-    sweep = Sweep(np.rint(images).astype(np.uint8), z / 10, GRID, signal, name="smooth")
+    sweep = Sweep(np.rint(images).astype(np.uint8), GRID, signal, z / 10, name="smooth")
     poses = {
         mode: RigidTransform.from_translation(np.outer(scale * z, [0.0, 0.0, 1.0]))
         for mode, scale in (("image", 1.0), ("pose", 1.05))
@@ -157,6 +157,7 @@ def test_bands_hold_95_percent():
     assert triangles.max() == len(rings) - 1
 
 
+@pytest.mark.filterwarnings("ignore:Widget.name is deprecated:PendingDeprecationWarning")
 def test_without_a_server_it_is_drawn_to_a_document(made, tmp_path):
     from bokeh.document import Document
 

@@ -1,4 +1,4 @@
-"""What dragging the free plane of the reconstruction viewer takes on the server: from the mouse's message to the cut.
+"""What dragging the free plane of the reconstruction viewer takes on the server: from message to cut.
 
 Run: python tests/benchmarks/bench_free_plane.py RECONSTRUCTION.h5
 """
