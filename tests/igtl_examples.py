@@ -1,5 +1,6 @@
 """Messages of OpenIGTLink, whole and damaged; made by pyigtl, which knows nothing of our packing."""
 
+import itertools
 import struct
 
 import numpy as np
@@ -72,8 +73,8 @@ def damaged_message(rng, message):
     for _ in range(int(rng.integers(1, 4))):
         how = int(rng.integers(0, 6))
         if how == 0:
-            size = int(rng.choice([0, 1, len(body) + 1, 2**16, 2**20, 2**31, 2**40, 2**63, 2**64 - 1]))
-            struct.pack_into("> Q", header, SIZE_AT, size)
+            sizes = (0, 1, len(body) + 1, 2**16, 2**20, 2**31, 2**40, 2**63, 2**64 - 1)
+            struct.pack_into("> Q", header, SIZE_AT, sizes[int(rng.integers(0, len(sizes)))])
         elif how == 1:
             kinds = (b"IMAGE", b"TRANSFORM", b"STATUS", b"STRING", b"TDATA", b"POLYDATA", b"\xff\0A", b"")
             struct.pack_into("12s", header, 2, kinds[int(rng.integers(0, len(kinds)))])
@@ -99,7 +100,7 @@ def received(content, pieces=7, limits=None):
     """What comes of a stream that arrives in pieces, and then stalls until nothing is expected of it."""
     framing, found = Framing(limits), []
     edges = np.linspace(0, len(content), pieces + 1).astype(int)
-    for first, stop in zip(edges[:-1], edges[1:], strict=True):
+    for first, stop in itertools.pairwise(edges):
         found += framing.feed(content[first:stop])
     while framing.within_message:
         framing.skip()

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from speckle3d.live.session import Progress, Session
 
 _LOG_EVERY_S = 5.0
+_SWITCH_S = 5e-4
+"""For which one thread keeps the interpreter at most; Python's 5 ms a frame would wait for many times."""
 
 
 @app.command(cls=Importing)
@@ -89,6 +91,7 @@ def live(
     from speckle3d.io.igtl.server import Server
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.live.session import Session, SessionSettings
+    from speckle3d.live.warming import warm_up
     from speckle3d.study.job import require_own_results
 
     options = locals()
@@ -112,6 +115,8 @@ def live(
         check,
         compression == "gzip",
     )
+    note("loading")
+    warm_up(curves, config)
     first = None if crossing_file is None else _first_sweep(crossing_file, curves, config)
     with ExitStack() as open_:
         served = None if serve is None else open_.enter_context(Server(serve))
@@ -119,6 +124,7 @@ def live(
             note(f"poses and volume at 127.0.0.1:{served.port}")
         connection = open_.enter_context(Connection(host, port))
         outlets = [connection.send] if served is None else [connection.send, served.send]
+        note(f"listening to {server}")
         session = Session(connection, outlets, curves, settings, first)
         _run(
             session, duration_s, _Line(lambda: "" if connection.state.connected else f"waiting for {server}")
@@ -143,10 +149,12 @@ def _first_sweep(path: Path, curves: DecorrelationCurves, config: Config) -> Cro
 
 def _run(session: Session, duration_s: float | None, line: _Line) -> None:
     """Run until Ctrl-C, or for so long."""
-    before = signal.signal(signal.SIGINT, lambda *_: session.end())
+    before, interval_s = signal.signal(signal.SIGINT, lambda *_: session.end()), sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
     try:
         session.run(duration_s, line.show)
     finally:
+        sys.setswitchinterval(interval_s)
         signal.signal(signal.SIGINT, before)
         line.end()
 

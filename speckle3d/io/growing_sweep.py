@@ -27,8 +27,9 @@ from speckle3d.io.sweep_writer import Compression, frame_for, frames_attributes,
 from speckle3d.io.sweeps import FORMAT, GROWING, IQ_VERSION, SAMPLE_TYPES, VERSION, require_sample_type
 
 _GZIP_LEVEL = 1
-_TIMES_PER_CHUNK = 4096
-_READINGS_PER_CHUNK = 1024
+_TIMES_PER_CHUNK = 1024
+_READINGS_PER_CHUNK = 128
+"""A chunk is written again with every value that is added to it."""
 _SPARE_BYTES = 16 * 2**20
 """Room that is left on the disk: HDF5 cannot end a file that it cannot write."""
 

@@ -1,7 +1,7 @@
 """A live session: received, recorded, tracked and sent on, each in a thread of its own.
 
 What is received is recorded before anything else is done with it. Frames that come while earlier ones are
-still being matched wait, `MOST_WAITING` of them; of more the oldest are left for later: they are in the
+still being matched wait, `MOST_WAITING` of them; of more every other one is left for later: they are in the
 recording, and the reconstruction at the end has them.
 """
 
@@ -32,8 +32,10 @@ from speckle3d.live.recording import Recording
 from speckle3d.live.tracking import LivePose, LiveTracker
 from speckle3d.live.volume import GrowingVolume
 
-MOST_WAITING = 2
-"""Frames that wait to be matched: more would be late, not better."""
+MOST_BEFORE = 1000
+"""Messages that are kept until the first frame comes."""
+MOST_WAITING = 12
+"""Frames that wait to be matched, half a second of them: more would be late, not better."""
 _LOOK_S = 0.1
 VOLUME_EVERY_S = 1.0
 
@@ -178,20 +180,20 @@ class Session:
             can be read.
         """
         until_s = None if duration_s is None else time.monotonic() + duration_s
-        waiting: list[Received] = []
+        # Readings from before the first frame are kept: that frame lies between two of them.
+        waiting: deque[Received] = deque(maxlen=MOST_BEFORE)
         layout = first = None
         while layout is None and not self._is_over(until_s):
-            for number, message in enumerate(received := self._source.receive(_LOOK_S)):
-                if self._is_wanted(message):
+            for message in self._source.receive(_LOOK_S):
+                waiting.append(message)
+                if layout is None and self._is_wanted(message):
                     layout, first = ImageLayout.of(message, self._settings.imported, message.device), message
-                    waiting = received[number:]
-                    break
             self._shown(show)
         if layout is None or first is None:
             return
         with (
-            Recording(self._settings.recording, layout, first.time_s, self._settings.packed) as recording,
             self._tracking(layout),
+            Recording(self._settings.recording, layout, first.time_s, self._settings.packed) as recording,
         ):
             self._take_all(waiting, recording, layout)
             while not self._is_over(until_s):
@@ -234,9 +236,11 @@ class Session:
             return
         with self._changed:
             self._queue.append(_Waiting(frame, time_s, image.time_s, came_s))
-            while len(self._queue) > MOST_WAITING:
-                self._queue.popleft()
-                self.progress.left += 1
+            if len(self._queue) > MOST_WAITING:
+                # Every other one, so that those that are left out leave no gap that speckle does not cross.
+                thinned = list(self._queue)[::-2][::-1]
+                self.progress.left += len(self._queue) - len(thinned)
+                self._queue = deque(thinned)
             self.progress.waiting = len(self._queue)
             self._changed.notify()
 
@@ -286,6 +290,7 @@ class Session:
                     return
                 waiting = self._queue.popleft()
                 self.progress.waiting = len(self._queue)
+            self.tracker.hurried = bool(self._queue)
             pose = self.tracker.append(waiting.frame, waiting.time_s)
             self._send(pose_message(pose.world_from_image, image_from_pixel, waiting.sent_s))
             self.poses.append(pose)

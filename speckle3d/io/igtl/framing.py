@@ -73,6 +73,8 @@ class Framing:
                 except MessageError as refused:
                     if not self._searching:
                         yield refused
+                        # A body that lacks its last byte, a zero, has taken this header's first one for it.
+                        self._buffer[:0] = b"\0\0"
                     self._search()
                 continue
             try:

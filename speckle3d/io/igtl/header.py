@@ -20,6 +20,8 @@ _VERSIONS = (1, 2, 3)
 _NAME = re.compile(rb"[A-Z][A-Z0-9_]*\0*")
 _SCALAR_BYTES = {2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 4, 10: 4, 11: 8}
 _RAS, _LPS = 1, 2
+_QUERIES = ("GET_", "STT_", "STP_", "RTS_")
+"""How types of messages begin that may have no body."""
 
 
 class MessageError(InvalidInputError):
@@ -81,11 +83,16 @@ def read_header(header: bytes | bytearray | memoryview, limits: Limits) -> Heade
     MessageError
         If they are none, or the message is longer than the limits allow.
     """
+    if len(header) != HEADER_BYTES:
+        raise MessageError(f"expected a header of {HEADER_BYTES} bytes, got {len(header)}")
     version, kind, device, seconds, fraction, size, crc = HEADER.unpack(header)
     if version not in _VERSIONS or not _NAME.fullmatch(kind):
         raise MessageError(f"expected the header of a message, got version {version} and type {text(kind)!r}")
     found = Header(version, text(kind), text(device), seconds + fraction / 2**32, size, crc)
     most = limits.max_body_bytes if found.type == "IMAGE" else limits.max_other_body_bytes
+    if not size and not found.type.startswith(_QUERIES):
+        # Zeros are the right check sum of no bytes, and so say nothing.
+        raise MessageError(f"{named(found)}: expected a body, got none")
     if size > most:
         raise MessageError(f"{named(found)}: expected at most {most} bytes, got {size}")
     return found

@@ -44,7 +44,8 @@ def packed_image(
     if pixels.dtype.newbyteorder("=") not in ImageMessage.scalar_types.values():
         raise InvalidInputError(f"image: expected integers of 1 to 4 bytes or floats, got {pixels.dtype}")
     whole = pixels if with_slices else np.expand_dims(pixels, 2)
-    turned = np.ascontiguousarray(whole.transpose(2, 1, 0, *range(3, whole.ndim)))
+    native = pixels.dtype.newbyteorder("=")
+    turned = np.ascontiguousarray(whole.transpose(2, 1, 0, *range(3, whole.ndim)), native)
     return _packed(ImageMessage(turned, image_to_world, "ras"), device, time_s)
 
 
