@@ -1,13 +1,16 @@
 """The reconstruction viewer as a browser meets it, against the commands that it shows."""
 
+import io
 import shlex
-import subprocess
 import sys
+from contextlib import chdir, redirect_stdout, suppress
 
 import numpy as np
 import pytest
 from browsers import needs_browser, opened, viewing
 from matplotlib.image import imread
+
+from speckle3d import cli
 
 pytestmark = needs_browser
 
@@ -23,12 +26,14 @@ IMAGE = f"name => {PLOT_OF}.renderers[0].data_source.data.image[0].toString()"
 TITLE = f"name => {PLOT_OF}.title.text"
 
 
-def speckle3d(*arguments, **more):
-    done = subprocess.run(
-        [sys.executable, "-m", "speckle3d.cli", *map(str, arguments)], capture_output=True, text=True, **more
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+def speckle3d(*arguments):
+    """Run a command in this process, and return what it said."""
+    said = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        patch.setattr(sys, "argv", ["speckle3d", *map(str, arguments)])
+        with suppress(SystemExit):
+            cli.main()
+    return said.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +107,8 @@ def test_the_saved_picture_is_what_the_command_makes(page, results, other):
     page.get_by_text(f"saved {name}").wait_for()
     command[command.index("-o") + 1] = "again.png"
     assert ("--difference-to" in command) == bool(other)
-    speckle3d(*command[1:], cwd=results)
+    with chdir(results):
+        speckle3d(*command[1:])
     assert (results / "again.png").read_bytes() == (results / name).read_bytes()
     assert np.ptp(imread(results / name)) > 0
 
@@ -113,7 +119,8 @@ def test_points_measure_as_the_command_has_it(page, results):
         page.wait_for_timeout(700)  # two clicks at once are a double one
     page.get_by_text("angle 1 2 3").wait_for()
     command = shown_command(page, "measure")
-    said = speckle3d(*command[1:], cwd=results).splitlines()
+    with chdir(results):
+        said = speckle3d(*command[1:]).splitlines()
     assert len(said) == 5
     for line in said:
         assert page.get_by_text(line, exact=True).count() == 1

@@ -33,7 +33,7 @@ class Controls:
     """
 
     def __init__(self, material: Material, width_px: int, changed: Callable[..., None]) -> None:
-        self._changed, self._setting, self._shown = changed, False, Shown(material.modes[0])
+        self._changed, self._setting, self.shown = changed, False, Shown(material.modes[0])
         grid, poses = material.grid, material.opened(material.modes[0]).poses[material.modes[0]]
         modes = {label_of(mode): mode for mode in material.modes}
         wide: dict[str, Any] = {"width": width_px, "margin": (2, 5)}
@@ -79,7 +79,7 @@ class Controls:
     def show(self, shown: Shown) -> None:
         """Set all widgets to what is shown."""
         plane = shown.plane
-        self._shown, self._setting = shown, True
+        self.shown, self._setting = shown, True
         self.mode.value, self.other.value = shown.mode, shown.other or _ALONE
         self.style.value = shown.is_difference
         self.style.disabled = shown.other is None
@@ -94,7 +94,7 @@ class Controls:
 
     def _tell_plane(self, name: str, event: Any) -> None:
         if not self._setting:
-            self._changed(plane=replace(self._shown.plane, **{name: event.new}))
+            self._changed(plane=replace(self.shown.plane, **{name: event.new}))
 
     def _set_plane(self, plane: FreePlane, _: object) -> None:
         self._changed(plane=plane)

@@ -78,6 +78,7 @@ class CutsView:
             self._turners[name] = Handle(self.plots[name], FREE, True, self._turner(name))
         self._placing = False
         self._dragged: Handle | None = None
+        self._frame_lines: dict[Name, tuple[tuple[int, int], FloatArray]] = {}
 
     def layout(self) -> Viewable:
         """The plots in two rows; those of a second mode are hidden while there is none."""
@@ -88,13 +89,18 @@ class CutsView:
         return pn.Column(*(pn.Row(*map(cell, NAMES[row : row + 2])) for row in (0, 2)))
 
     def draw(self) -> None:
-        """Draw lines and handles where they are now; cuts follow by `show_cut`."""
+        """Draw lines where they are now; cuts follow by `show_cut`."""
         self._placing = True
         for (_, what), span in self._spans.items():
             span.location = self.shown.lateral_mm if what == "lateral_mm" else self.shown.depth_mm
         self._placing = False
         for name in NAMES:
             self._draw_lines(name)
+
+    def draw_handles(self) -> None:
+        """Put handles where the lines are, but for what the mouse holds."""
+        for name in ORTHOGONAL:
+            self._place_handles(name, self._line_of_plane(name))
         self._dragged = None
 
     def show_cut(self, name: Name, picture: CutPicture, is_fine: bool) -> None:
@@ -119,6 +125,8 @@ class CutsView:
             self._others[name].name_axes(label_of(other), picture.axes)
         self._fit(name, main.cut)
         self._draw_lines(name)
+        if is_fine:
+            self.draw_handles()
         self._draw_points(name)
 
     def show_none(self, name: Name, why: str) -> None:
@@ -163,21 +171,28 @@ class CutsView:
         return Box(-x, x, y, -y)
 
     def _draw_lines(self, name: Name) -> None:
+        lines = self._line_of_frame(name)
+        ends = self._line_of_plane(name)
+        self.plots[name].show_lines([*lines, *([] if ends is None else [(ends, FREE)])])
+
+    def _line_of_frame(self, name: Name) -> list[tuple[FloatArray, str]]:
         cut = self._cuts.get((name, self.shown.mode))
-        if not isinstance(cut, ReslicePlane):
-            return
-        lines = []
-        if name != "frame":
+        if name == "frame" or cut is None:
+            return []
+        key = (self.shown.frame, id(cut))
+        if name not in self._frame_lines or self._frame_lines[name][0] != key:
             poses = self._material.opened(self.shown.mode).poses[self.shown.mode]
-            line = frame_lines(cut, self._material.grid, poses[self.shown.frame : self.shown.frame + 1])[0]
-            lines.append((line, FRAME))
-        if name in ORTHOGONAL:
-            found = self._axes.line_in(self.shown.plane, cut)
-            ends = None if found is None else self.plots[name].box.line(*found)
-            if ends is not None:
-                lines.append((ends, FREE))
-            self._place_handles(name, ends)
-        self.plots[name].show_lines(lines)
+            one = poses[self.shown.frame : self.shown.frame + 1]
+            self._frame_lines[name] = key, frame_lines(cut, self._material.grid, one)[0]
+        return [(self._frame_lines[name][1], FRAME)]
+
+    def _line_of_plane(self, name: Name) -> FloatArray | None:
+        """Ends of the free plane's line in a cut, shape (2, 2); None where it has none."""
+        cut = self._cuts.get((name, self.shown.mode))
+        if name == "free" or not isinstance(cut, ReslicePlane):
+            return None
+        found = self._axes.line_in(self.shown.plane, cut)
+        return None if found is None else self.plots[name].box.line(*found)
 
     def _place_handles(self, name: Name, ends: FloatArray | None) -> None:
         mover, turner = self._movers[name], self._turners[name]
@@ -190,7 +205,7 @@ class CutsView:
         along = along / max(size, 1e-9)
         # Where it was along the line, if that is still in sight.
         wished = (mover.at if mover.box.visible else ends.mean(axis=0)) - ends[0]
-        at = ends[0] + along * np.clip(wished @ along, 0.2 * size, 0.8 * size)
+        at = ends[0] + along * np.clip(wished @ along, 0.0, size)
         box = self.plots[name].box
         reach = _ARM * min(abs(box.right - box.left), abs(box.bottom - box.top))
         # What the mouse holds stays where the mouse is.

@@ -28,7 +28,8 @@ from speckle3d.study.reslices.cuts import CutPicture
 
 _SIDE_PX, _SPACE_PX = 270, (350, 350)
 _BANDS_PX = (350, 225)
-_SOON_MS, _REST_MS = 15, 400
+_SOON_MS, _LATER_MS, _REST_MS = 15, 150, 400
+"""After which lines and handles, numbers, and what is seen in space follow a change."""
 _MEASURE_TAB = 1
 
 
@@ -54,6 +55,9 @@ class Viewer:
             FreePlane(0.0, 45.0, 0.0),
         )  # fmt: skip
         self._due: set[Callable[[], None]] = set()
+        self._is_gone = False
+        if self._document is not None:
+            self._document.on_session_destroyed(self._leave)
         self._controls = Controls(material, _SIDE_PX - 10, self.change)
         self._cuts = CutsView(material, self.change, self._pick)
         self._cuts.shown = self.shown
@@ -84,6 +88,7 @@ class Viewer:
         )
         self._begin()
         self._draw()
+        self._draw_numbers()
         self._draw_space()
         self._cutter.ask(self.shown)
         side = pn.Column(self._tabs, self._status, width=_SIDE_PX, margin=(0, 5))
@@ -94,12 +99,16 @@ class Viewer:
         before, self.shown = self.shown, replace(self.shown, **changes)
         if self.shown.other == self.shown.mode:
             self.shown = replace(self.shown, other=None)
-        self._cuts.shown = self.shown
+        self._cuts.shown = self._controls.shown = self.shown
         if self.shown != before:
             if self.shown.modes != before.modes or self.shown.is_difference != before.is_difference:
                 self._begin()
             self._cutter.ask(self.shown)
         self._once(self._draw, _SOON_MS)
+
+    def _leave(self, _: object) -> None:
+        """Have nothing done for someone who left."""
+        self._is_gone = True
 
     def _begin(self) -> None:
         """Make room for the modes, and have their voxels made."""
@@ -113,11 +122,16 @@ class Viewer:
 
     def _draw(self) -> None:
         with pn.io.hold(self._document):
-            self._controls.show(self.shown)
             self._cuts.draw()
+        self._once(self._draw_numbers, _LATER_MS)
+        self._once(self._draw_space, _REST_MS)
+
+    def _draw_numbers(self) -> None:
+        with pn.io.hold(self._document):
+            self._cuts.draw_handles()
+            self._controls.show(self.shown)
             self._bands.cursor.location = self.shown.frame
             self._saving.show(self.shown)
-        self._once(self._draw_space, _REST_MS)
 
     def _draw_space(self) -> None:
         planes = self._cuts.planes
@@ -176,6 +190,8 @@ class Viewer:
 
     def _later(self, act: Callable[[], None], after_ms: int = 0) -> None:
         """Do something in the viewer's own turn; at once where there is no server, as in notebooks."""
+        if self._is_gone:
+            return
         if self._document is None or self._document.session_context is None:
             act()
         elif after_ms:
