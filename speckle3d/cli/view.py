@@ -16,12 +16,21 @@ from speckle3d.core.errors import InvalidInputError
 @app.command()
 def view(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A recording, a reconstruction, or a log of a sensor.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A recording, a reconstruction or its results folder, a log of an orientation sensor, or "
+            "the serial port of one, as /dev/ttyUSB0 or COM3.",
+        ),
     ],
     reconstruction: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Reconstruction of the recording, to see with it.")
     ] = None,
     sweep: SweepFile = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT", help="Of a sensor on a port: new file for its bytes; else none is kept."),
+    ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: any free one.")] = 0,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the browser, or only print the address.")
@@ -30,11 +39,12 @@ def view(
     """Look at a file in the browser, on this machine alone; ends ten minutes after the last viewer left."""
     if find_spec("panel") is None:
         raise InvalidInputError("view: expected Panel to be installed: pip install 'speckle3d[app]'")
-    from speckle3d.app.opened import pages_of
+    from speckle3d.app.opened import opened
     from speckle3d.app.server import AppServer
 
-    server = AppServer(pages_of(file, reconstruction, sweep), file.name, port)
-    note(server.address)
-    if browser:
-        webbrowser.open(server.address_for_once())
-    server.run()
+    with opened(file, record, reconstruction=reconstruction, sweep=sweep) as pages:
+        server = AppServer(pages, file.name, port)
+        note(server.address)
+        if browser:
+            webbrowser.open(server.address_for_once())
+        server.run()

@@ -13,8 +13,8 @@ import panel as pn
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.reconstruction.cutter import Cutter
 from speckle3d.app.reconstruction.cuts_view import CutsView
+from speckle3d.app.reconstruction.cutter import Cutter
 from speckle3d.app.reconstruction.free_plane import FreePlane
 from speckle3d.app.reconstruction.material import Material
 from speckle3d.app.reconstruction.shown import Name, Shown
