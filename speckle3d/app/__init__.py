@@ -45,5 +45,6 @@ def view(path: PathLike, reconstruction: PathLike | None = None, sweep: PathLike
     from speckle3d.app.look import in_notebook
     from speckle3d.app.opened import pages_of
 
-    beside = [None if each is None else Path(each) for each in (reconstruction, sweep)]
-    return in_notebook(pages_of(Path(path), *beside))
+    beside = {"reconstruction": reconstruction, "sweep": sweep}
+    given = {name: Path(each) for name, each in beside.items() if each is not None}
+    return in_notebook(pages_of(Path(path), given.get("reconstruction"), given.get("sweep")))

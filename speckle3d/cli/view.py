@@ -48,3 +48,4 @@ def view(
         if browser:
             webbrowser.open(server.address_for_once())
         server.run()
+    note(f"{file}: no viewer for ten minutes: ended")
