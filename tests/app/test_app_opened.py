@@ -70,13 +70,14 @@ def test_a_port_without_a_sensor_is_an_error_and_leaves_nothing(tmp_path):
 
 def test_a_notebook_shows_the_same_pages(log):
     from bokeh.document import Document
+    from bokeh.plotting import figure
 
     document = Document()
     shown = speckle3d.app.view(log)
     document.add_root(shown.get_root(document))
     document.to_json()  # as it is sent to the notebook
     assert len(document.roots) == 1
-    plots = [each for each in document.models if type(each).__name__ == "Figure"]
+    plots = list(document.select({"type": figure}))
     assert {each.yaxis.axis_label for each in plots} >= {"dip, \N{DEGREE SIGN}", "heading, \N{DEGREE SIGN}"}
     drawn = [each.data["y"] for each in document.models if "y" in getattr(each, "data", {})]
     assert all(np.isfinite(each).any() for each in drawn)
