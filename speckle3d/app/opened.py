@@ -21,6 +21,7 @@ from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+    from speckle3d.core.doubts import Doubt
     from speckle3d.core.reconstruction import Reconstruction
     from speckle3d.core.sweep import Sweep
     from xsens.logs.samples import ImuLog
@@ -117,13 +118,18 @@ def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
     return _recorded(sweep, path)
 
 
-def _recorded(sweep: Sweep, path: Path, reconstruction: Reconstruction | None = None) -> list[Page]:
+def _recorded(
+    sweep: Sweep,
+    path: Path,
+    reconstruction: Reconstruction | None = None,
+    doubts: Sequence[Doubt] | None = None,
+) -> list[Page]:
     from speckle3d.app.sweep.page import SweepPage
     from speckle3d.sensor_logs import log_of
 
     if not len(sweep):
         raise InvalidInputError(f"{path}: expected frames to look at, got none")
-    pages: list[Page] = [SweepPage(sweep, Folder(path), reconstruction)]
+    pages: list[Page] = [SweepPage(sweep, Folder(path), reconstruction, doubts)]
     if sweep.orientation is not None:
         pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))
     return pages
@@ -131,11 +137,12 @@ def _recorded(sweep: Sweep, path: Path, reconstruction: Reconstruction | None = 
 
 def _reconstructed(path: Path, sweep_file: Path | None, opened: Path) -> list[Page]:
     from speckle3d.app.reconstruction.page import ReconstructionPage
+    from speckle3d.study.details import recorded_doubts
     from speckle3d.study.images import open_reconstruction
 
     found, sweep = open_reconstruction(path, sweep_file)
     found = replace(found, pairs=read_reconstruction(path).pairs)
-    pages = _recorded(sweep, opened, found)
+    pages = _recorded(sweep, opened, found, recorded_doubts(path, found.provenance))
     viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file)
     # First what was asked for.
     return [viewer, *pages] if opened == path else [pages[0], viewer, *pages[1:]]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -16,7 +16,9 @@ from calibration.solver import OUTLIER_SIGMA
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.text import numbers
+from speckle3d.io.toml import validated
 
+Model = TypeVar("Model", bound="ScanSettings")
 Corners = tuple[tuple[float, float], ...]
 
 _MOST_FRAMES = 2**31
@@ -106,6 +108,17 @@ class WireSettings(ScanSettings):
     )
 
 
+def with_values(settings: Model, values: Mapping[str, Any]) -> Model:
+    """The same settings with other values.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first that is wrong.
+    """
+    return validated(settings.model_dump() | dict(values), settings.method, type(settings))
+
+
 def region_of(text: str | None) -> Corners | None:
     """Parse the polygon "column,row column,row ...".
 
@@ -138,8 +151,10 @@ def offset_of(text: str | None) -> float | Literal["estimate"] | None:
     InvalidInputError
         If it is neither.
     """
-    if text is None or text == "estimate":
-        return text
+    if text is None:
+        return None
+    if text == "estimate":
+        return "estimate"
     try:
         (seconds,) = numbers(text, 1, "--time-offset")
     except InvalidInputError:

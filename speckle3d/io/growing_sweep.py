@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError
+from speckle3d.core.geometry import rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
 from speckle3d.io.deflate import deflated, shuffled
@@ -26,8 +27,9 @@ from speckle3d.io.sweep_writer import Compression, frame_for, frames_attributes,
 from speckle3d.io.sweeps import FORMAT, GROWING, IQ_VERSION, SAMPLE_TYPES, VERSION, require_sample_type
 
 _GZIP_LEVEL = 1
-_TIMES_PER_CHUNK = 4096
-_READINGS_PER_CHUNK = 1024
+_TIMES_PER_CHUNK = 1024
+_READINGS_PER_CHUNK = 128
+"""A chunk is written again with every value that is added to it."""
 _SPARE_BYTES = 16 * 2**20
 """Room that is left on the disk: HDF5 cannot end a file that it cannot write."""
 
@@ -164,13 +166,15 @@ class GrowingSweep:
         self._time_s, self._count = time_s, i + 1
 
     def append_pose(self, time_s: float, matrix: npt.ArrayLike, valid: bool = True) -> None:
-        """Write a tracker's reading: world_from_sensor, shape (4, 4), mm; of an invalid one any.
+        """Write a tracker's reading: world_from_sensor, shape (4, 4), mm; of an invalid one any numbers.
 
         Raises
         ------
         InvalidInputError
-            If it is not finite, or its time is not after the one before.
+            If a valid one is not rigid, or its time is not after the one before: it is then not in the file.
         """
+        if valid:
+            transforms_from_matrices(np.asarray(matrix)[None], f"{self.path}: /tracker at {time_s} s")
         self._tracker.add(time_s, matrix, valid)
         self._flush_in_time()
 
@@ -180,8 +184,10 @@ class GrowingSweep:
         Raises
         ------
         InvalidInputError
-            If it is not finite, or its time is not after the one before.
+            If it is no unit quaternion, or its time is not after the one before: it is then not in the file.
         """
+        where = f"{self.path}: /orientation at {time_s} s"
+        rotations_from_quaternions(np.asarray(quaternion_wxyz)[None], where)
         self._orientation.add(time_s, quaternion_wxyz)
         self._flush_in_time()
 

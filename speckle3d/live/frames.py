@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,9 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
 from speckle3d.io.igtl.messages import ImageReceived
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.import_settings import ImportSettings
 
-_TYPES = {"rf": ("int16", "float32"), "iq": (), "bmode": ("uint8",)}
+_TYPES = {"rf": ("int16", "float32"), "bmode": ("uint8",)}
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class ImageLayout:
         ----------
         image : ImageReceived
         settings : ImportSettings
-            What messages do not say. With a sampling rate or a centre frequency the samples are RF, else B-mode
-            grey levels, whose pixel sizes are the message's unless given.
+            What messages do not say. With a sampling rate or a centre frequency the samples are RF, else grey
+            levels of B-mode, whose pixel sizes are the message's unless given.
         name : str
             Of the sweep, for messages.
 
@@ -61,10 +61,11 @@ class ImageLayout:
         if pixels.dtype.name not in known:
             kind = "RF" if of_rf else "B-mode (without --sampling-rate-hz)"
             raise InvalidInputError(f"{where}: expected {' or '.join(known)} for {kind}, got {pixels.dtype}")
-        if of_rf:
-            grid, signal = _of_echoes(pixels.T, settings, where)
-        else:
-            grid, signal = _of_grey(pixels, image.spacing_mm, settings, where)
+        grid, signal = (
+            _of_echoes(pixels.T.shape, settings, where)
+            if of_rf
+            else _of_grey(pixels.shape, image.spacing_mm, settings, where)
+        )
         black = np.zeros((1, grid.vectors, grid.samples), pixels.dtype)
         example = Sweep(black, grid, signal, np.zeros(1), name=name, probe=settings.probe or "")
         return cls(image.device, example, of_rf)
@@ -115,10 +116,12 @@ def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
 
 
 def _of_echoes(
-    frame: npt.NDArray[Any], settings: ImportSettings, where: str
-) -> tuple[ImageGrid, RFSettings]:
+    shape: tuple[int, ...], settings: ImportSettings, where: str
+) -> tuple[ImageGrid, RFSettings | BModeSettings]:
     if settings.demodulation_frequency_hz is not None:
-        raise InvalidInputError(f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz")
+        raise InvalidInputError(
+            f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz"
+        )
     s = settings.over(
         where,
         sampling_rate_hz=None,
@@ -132,14 +135,14 @@ def _of_echoes(
         s["sampling_rate_hz"], s["speed_of_sound_m_s"], s["centre_frequency_hz"], tuple(s["bandwidth_hz"])
     )
     grid = ImageGrid(
-        *frame.shape, s["vector_pitch_mm"], signal.sample_spacing_mm, s["first_sample_depth_mm"]
+        shape[0], shape[1], s["vector_pitch_mm"], signal.sample_spacing_mm, s["first_sample_depth_mm"]
     )
     return grid, signal
 
 
 def _of_grey(
-    frame: npt.NDArray[Any], spacing_mm: FloatArray, settings: ImportSettings, where: str
-) -> tuple[ImageGrid, BModeSettings]:
+    shape: tuple[int, ...], spacing_mm: FloatArray, settings: ImportSettings, where: str
+) -> tuple[ImageGrid, RFSettings | BModeSettings]:
     said = spacing_mm if np.all(spacing_mm[:2] > 0) and not np.all(spacing_mm[:2] == 1.0) else [None, None]
     s = settings.over(
         where,
@@ -149,6 +152,10 @@ def _of_grey(
         first_sample_depth_mm=0.0,
     )
     grid = ImageGrid(
-        *frame.shape, float(s["column_pitch_mm"]), float(s["row_spacing_mm"]), s["first_sample_depth_mm"]
+        shape[0],
+        shape[1],
+        float(s["column_pitch_mm"]),
+        float(s["row_spacing_mm"]),
+        s["first_sample_depth_mm"],
     )
     return grid, BModeSettings(s["dynamic_range_db"])

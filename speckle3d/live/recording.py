@@ -7,12 +7,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import require_rigid
+from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.io.growing_sweep import GrowingSweep
 from speckle3d.io.igtl.messages import TransformReceived
 from speckle3d.live.frames import ImageLayout
@@ -87,11 +85,14 @@ class Recording:
     def keep_reading(self, transform: TransformReceived, with_position: bool) -> None:
         """Write a sensor's reading: of a tracker, or with the rotation alone of an orientation sensor."""
         time_s = transform.time_s - self._first_s
+        where = f"TRANSFORM {transform.device}"
         try:
+            # Rigid to single precision as it comes.
+            rigid = transforms_from_matrices(transform.matrix[None], where)
             if with_position:
-                self._sweep.append_pose(time_s, transform.matrix, transform.valid)
+                self._sweep.append_pose(time_s, rigid.as_matrix()[0], transform.valid)
             elif transform.valid:
-                self._sweep.append_orientation(time_s, _quaternion_wxyz(transform))
+                self._sweep.append_orientation(time_s, rigid.rotation.as_quat(scalar_first=True)[0])
         except InvalidInputError as error:
             self._refuse(error)
             return
@@ -100,8 +101,3 @@ class Recording:
     def _refuse(self, error: InvalidInputError) -> None:
         self.counts.refused += 1
         self.counts.last_refused = str(error)
-
-
-def _quaternion_wxyz(transform: TransformReceived) -> npt.NDArray[np.float64]:
-    turn = require_rigid(transform.matrix, f"TRANSFORM {transform.device}")
-    return Rotation.from_matrix(turn[:3, :3]).as_quat(scalar_first=True)

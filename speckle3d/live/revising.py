@@ -78,6 +78,11 @@ class Reviser:
     matcher : FrameMatcher
     curves : DecorrelationCurves
     config : Config
+
+    Attributes
+    ----------
+    reader : PairReader
+        With the curves as given.
     """
 
     def __init__(self, matcher: FrameMatcher, curves: DecorrelationCurves, config: Config) -> None:
@@ -86,8 +91,14 @@ class Reviser:
             curves, matcher.patches, matcher.centre_mm, 1, config.planes, config.trajectory
         )
 
-    def whole(self, sweep: Growing) -> Revision:
+    def whole(self, sweep: Growing, known: Known | None = None) -> Revision:
         """Estimate everything from all frames, as `track` does of a recording, but for returns.
+
+        Parameters
+        ----------
+        known : Known, optional
+            With whose curves images are read; without it, those given are straightened by what is seen, which
+            may take half a second.
 
         Raises
         ------
@@ -95,13 +106,14 @@ class Reviser:
             If the images do not determine a plane yet.
         """
         table, config = CorrelationTable.joined(sweep.tables), self._config
-        reader, times = self.reader.of_frames(len(sweep)), StageTimes()
+        reader, times = (known or self).reader.of_frames(len(sweep)), StageTimes()
         pairs, coherence, path = measured(table, sweep.flags, reader, config, times)
-        factors = reader.depth_factors(table, path, sound_pairs(table, sweep.flags), config.coherence)
-        curves, _ = straightened_by(factors, self._curves, coherence, self._patches, config)
-        if curves is not self._curves:
-            reader = reader.with_curves(curves)
-            pairs, coherence, path = measured(table, sweep.flags, reader, config, times, path)
+        if known is None:
+            factors = reader.depth_factors(table, path, sound_pairs(table, sweep.flags), config.coherence)
+            curves, _ = straightened_by(factors, self._curves, coherence, self._patches, config)
+            if curves is not self._curves:
+                reader = reader.with_curves(curves)
+                pairs, coherence, path = measured(table, sweep.flags, reader, config, times, path)
         slopes = reader.slopes(pairs, coherence)
         poses = reader.solve(reader.edges(table, pairs, slopes.applied(pairs.planes))).poses
         held = _by_frame(pairs, 0, [len(each) for each in sweep.tables])

@@ -30,14 +30,17 @@ from speckle3d.matching.blocks import FrameByFrame, FrameMaker, ImageSink
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
+from speckle3d.motion.uncertainty import SlopeEvidence
 from speckle3d.pipeline import matcher_for
 
-ANEW = 8
+ANEW = 4
 """Frames up to which everything is estimated anew with each."""
 GROWTH = 1.5
 """Factor of a sweep's length after which everything is estimated anew."""
 EVERY = 8
 """Frames after which coherence is learnt anew, if nothing is done in the background."""
+LONGEST_HURRY_S = 1.0
+"""For which nothing is revised, however many frames wait."""
 COMPARED = 400
 """Earlier frames against whose levels a frame's are judged."""
 
@@ -91,6 +94,10 @@ class LiveTracker:
     ----------
     image_grid : ImageGrid
         Of the intensity images.
+    images : callable or None
+        As given; may be set before the first frame.
+    hurried : bool
+        Set while frames wait to be matched: what is revised in the background waits, but not for ever.
 
     Raises
     ------
@@ -106,7 +113,7 @@ class LiveTracker:
         background: bool = True,
         images: ImageSink | None = None,
     ) -> None:
-        self._images = images
+        self.images = images
         self._config = config or Config()
         matcher = matcher_for(example, curves, self._config)
         self._patches = len(matcher.patches)
@@ -120,9 +127,12 @@ class LiveTracker:
         self._flags = np.zeros(0, dtype=np.int64)
         self._poses = RigidTransform.identity(0)
         self._known: Known | None = None
+        self._given = Known(self._reviser.reader, None, SlopeEvidence(np.ones(2), np.zeros(2)))
+        self._last_straightened = 0
         self._revision, self._last_whole, self._looked_at = 0, 0, 0
         self._lock, self._grown = threading.Lock(), threading.Condition()
         self._ended = False
+        self.hurried = False
         self._thread: threading.Thread | None = None
         if background:
             self._thread = threading.Thread(target=self._keep_revising, name="revising", daemon=True)
@@ -170,8 +180,8 @@ class LiveTracker:
         """
         number = len(self._tables)
         made = self._maker.make(number, frame)
-        if self._images:
-            self._images(number, made.intensity)
+        if self.images:
+            self.images(number, made.intensity)
         pairs = self._matched.advance(number, made.ready)
         table = CorrelationTable.of(((i, number, pairs[i]) for i in sorted(pairs)), self._patches)
         with self._lock:
@@ -201,6 +211,7 @@ class LiveTracker:
 
     def _keep(self, features: FrameFeatures, table: CorrelationTable) -> None:
         """Take a frame's features and pairs; it stands where the last one was."""
+        number = len(self._tables)
         self._features.append(features)
         self._tables.append(table)
         flag = int(flag_frames(self._features[-COMPARED:], self._config.quality)[-1])
@@ -208,8 +219,7 @@ class LiveTracker:
         if len(table) and table.median.max() < least:
             flag |= FrameFlag.UNMATCHED
         self._flags = np.append(self._flags, flag)
-        last = self._poses[-1:] if len(self._poses) else RigidTransform.identity(1)
-        self._poses = RigidTransform.concatenate([self._poses, last])
+        self._poses = self._poses[[*range(number), number - 1]] if number else RigidTransform.identity(1)
         none = np.zeros(0, dtype=np.int64)
         self._planes.append(FramePlanes(none, none, PairPlanes.none(self._patches)))
         self._planes[: -2 * OPEN] = []
@@ -240,7 +250,7 @@ class LiveTracker:
         known = self._known
         try:
             if known is None or len(sweep) <= LATEST or len(sweep) >= GROWTH * self._last_whole:
-                revision = self._reviser.whole(sweep)
+                revision = self._reviser.whole(sweep, self._curves_for(len(sweep)))
                 self._last_whole = len(sweep)
             else:
                 revision = self._reviser.latest(sweep, known)
@@ -248,6 +258,15 @@ class LiveTracker:
             # Frames that come later may tell.
             return
         self._take(revision)
+
+    def _curves_for(self, frames: int) -> Known | None:
+        """With whose curves to read: None if it is time to straighten them by what is seen now."""
+        if self._known is None or frames <= ANEW:
+            return self._given
+        if frames >= GROWTH * self._last_straightened:
+            self._last_straightened = frames
+            return None
+        return self._known
 
     def _take(self, revision: Revision) -> None:
         """Put a revision's poses in place of earlier ones; later frames go along with its last."""
@@ -276,4 +295,5 @@ class LiveTracker:
         """Wait for more frames; false at the end."""
         with self._grown:
             self._grown.wait_for(lambda: self._ended or len(self) > max(frames, ANEW))
+            self._grown.wait_for(lambda: self._ended or not self.hurried, LONGEST_HURRY_S)
             return not self._ended

@@ -9,7 +9,6 @@ References
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,21 +22,21 @@ from calibration.chain import Seen
 from calibration.detection.lines import EchoLine, LineFinder, LineSettings, NoLineError
 from calibration.job import Recording
 from speckle3d.app.folder import Folder
+from speckle3d.app.phantom.frames import FrameChoice
 from speckle3d.app.phantom.marked import slider, widget
 from speckle3d.app.phantom.options import Options
 from speckle3d.app.phantom.picture import DROPPED, FOUND, USED, Picture
 from speckle3d.app.phantom.region import Region
 from speckle3d.app.phantom.run import RunPane, Solved, labelled
-from speckle3d.app.phantom.strip import FrameStrip
+from speckle3d.app.phantom.work import Progress
 from speckle3d.calibrating.phantoms import found
 from speckle3d.calibrating.settings import (
     OrientationSettings,
     PlaneSettings,
     ScanSettings,
-    frames_of,
-    frames_text,
+    with_values,
 )
-from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.errors import InvalidInputError
 
 _WIDTH, _HEIGHT = 590, 400
 _STEEPEST = 300.0
@@ -88,25 +87,17 @@ class _Tuner:
         settings: PlaneSettings | OrientationSettings,
     ) -> None:
         self._recording, self._given = recording, settings
-        count = recording.images.shape[0]
-        self._left_out = set(settings.leave_out)
         self._finder: tuple[object, LineFinder] | None = None
         self._picture = Picture(recording, _WIDTH, _HEIGHT)
         self._region = Region(self._picture.plot, settings.region, self._changed)
-        self._strip = FrameStrip(count, self._picture.plot.frame_width, self._go, self._toggle)
-        self._frame = pn.widgets.IntSlider(
-            name="frame", start=0, end=max(count - 1, 1), width=_WIDTH, disabled=count < 2
-        )
+        count = recording.images.shape[0]
+        self._frames = FrameChoice(count, _WIDTH, settings.leave_out, self._show, self._changed)
         self._sliders = _sliders(settings)
         self._automatic = pn.widgets.Checkbox(
             name="T: by brightness (default)", value=settings.threshold is None, margin=(6, 8)
         )
         self._place = widget(LineSettings, "place")
         self._place.value = settings.place
-        self._leave = pn.widgets.Toggle(name="", width=170)
-        self._left_text = pn.widgets.TextInput(
-            name="", placeholder="frames left out, as 3,17-20", value=frames_text(self._left_out), width=200
-        )
         self._told = pn.pane.HTML("", width=_WIDTH)
         self._options = Options(settings, self._changed)
         self._line = ColumnDataSource({"column": [], "row": []})
@@ -128,15 +119,15 @@ class _Tuner:
             pn.Row(s["consensus"], self._place),
         )
         left = pn.Column(
-            self._frame,
-            pn.pane.Bokeh(self._picture.plot),
-            self._told,
-            pn.pane.Bokeh(self._strip.plot),
-            pn.Row(self._leave, self._left_text),
+            self._frames.slider, pn.pane.Bokeh(self._picture.plot), self._told, self._frames.below()
+        )
+        hint = pn.pane.HTML(
+            "Region: double click in the image, click its corners, double click to end.", margin=(2, 8)
         )
         right = pn.Column(
             labelled("Line detection (orange mark: default)", detection),
             pn.Row(reset, self._region.controls()),
+            hint,
             self._options.view(),
             self._run.view(),
         )
@@ -147,22 +138,16 @@ class _Tuner:
         values: dict[str, Any] = {name: round(each.value, 6) for name, each in self._sliders.items()}
         if self._automatic.value:
             values["threshold"] = None
-        return self._given.model_copy(
-            update=values
-            | self._options.values()
-            | {
-                "place": self._place.value,
-                "region": self._region.corners,
-                "leave_out": tuple(sorted(self._left_out)),
-            }
-        )
+        values |= self._options.values() | {
+            "place": self._place.value,
+            "region": self._region.corners,
+            "leave_out": self._frames.left_out,
+        }
+        return with_values(self._given, values)
 
     def _watch(self) -> None:
         for each in (*self._sliders.values(), self._automatic, self._place):
             each.param.watch(self._changed, "value")
-        self._frame.param.watch(lambda event: self._show(), "value")
-        self._leave.param.watch(self._left, "value")
-        self._left_text.param.watch(self._left_by_text, "value")
 
     def _reset(self, event: object) -> None:
         fields = LineSettings.model_fields
@@ -177,13 +162,7 @@ class _Tuner:
         self._show()
 
     def _show(self) -> None:
-        frame = int(self._frame.value)
-        image = self._picture.show(frame)
-        self._strip.point_at(frame)
-        left_out = frame in self._left_out
-        self._leave.param.update(
-            name=f"Frame {frame} is left out" if left_out else f"Leave out frame {frame}", value=left_out
-        )
+        image = self._picture.show(self._frames.frame)
         try:
             line = self._line_finder().line(image)
         except (NoLineError, InvalidInputError) as error:
@@ -218,39 +197,11 @@ class _Tuner:
     def _tell(self, words: str, colour: str) -> None:
         self._told.object = f"<span class='line-told' style='color:{colour}'>{html.escape(words)}</span>"
 
-    def _go(self, frame: int) -> None:
-        self._frame.value = frame
-
-    def _toggle(self, frame: int) -> None:
-        self._take_out(self._left_out ^ {frame})
-
-    def _left(self, event: object) -> None:
-        frame = int(self._frame.value)
-        if self._leave.value != (frame in self._left_out):
-            self._toggle(frame)
-
-    def _left_by_text(self, event: object) -> None:
-        try:
-            frames = set(frames_of(self._left_text.value))
-            if frames and max(frames) >= self._recording.images.shape[0]:
-                raise InvalidInputError(f"expected frames of the recording, got {max(frames)}")
-        except Speckle3DError as error:
-            self._tell(str(error), DROPPED)
-            return
-        if frames != self._left_out:
-            self._take_out(frames)
-
-    def _take_out(self, frames: set[int]) -> None:
-        self._left_out = frames
-        self._left_text.value = frames_text(frames)
-        self._strip.leave_out(tuple(frames))
-        self._changed()
-
-    def _found(self, settings: ScanSettings, progress: Callable[[int, int], None]) -> Seen:
+    def _found(self, settings: ScanSettings, progress: Progress) -> Seen:
         return found(self._recording, settings, None, progress)
 
     def _solved(self, run: Solved) -> None:
-        self._strip.tell(run.seen, run.outcome)
+        self._frames.strip.tell(run.seen, run.outcome)
 
 
 def _sliders(settings: PlaneSettings | OrientationSettings) -> dict[str, Any]:

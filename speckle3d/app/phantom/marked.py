@@ -41,8 +41,8 @@ def slider(model: type[BaseModel], name: str, label: str, span: tuple[float, flo
 def mark_at(share: float) -> str:
     """Style of a slider with a mark at so many per cent of its length."""
     return (
-        f".noUi-base::before {{ content: ''; position: absolute; left: calc({share:.2f}% - 1px); top: -5px; "
-        f"height: 18px; width: 3px; background: {DEFAULT_MARK}; pointer-events: none; }}"
+        f".noUi-base::before {{ content: ''; position: absolute; left: calc({share:.2f}% - 1px); top: 13px; "
+        f"height: 8px; width: 3px; background: {DEFAULT_MARK}; pointer-events: none; }}"
     )
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from speckle3d.app.folder import Folder
 from speckle3d.app.page import Page
 from speckle3d.app.phantom.lines import LinesPage
+from speckle3d.app.phantom.points import PointsPage
 from speckle3d.calibrating.phantoms import opened, require_frames
-from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, ScanSettings
+from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, ScanSettings, WireSettings
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -31,5 +32,7 @@ def phantom_pages(images: Path, settings: ScanSettings) -> Sequence[Page]:
         raise InvalidInputError(f"{images}: expected frames to look at, got none")
     require_frames(settings.leave_out, recording.images.shape[0])
     folder = Folder(images)
+    if isinstance(settings, WireSettings):
+        return [PointsPage(recording, images, folder, settings)]
     assert isinstance(settings, PlaneSettings | OrientationSettings)
     return [LinesPage(recording, images, folder, settings)]

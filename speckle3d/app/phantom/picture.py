@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool, Range1d
+from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool, Image, LinearColorMapper, Range1d
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 
@@ -46,8 +46,8 @@ class Picture:
         self.plot = figure(
             frame_width=round(columns * column_mm * scale),
             frame_height=round(rows * row_mm * scale),
-            x_range=Range1d(-0.5, columns - 0.5, bounds=(-0.5 - columns, 2 * columns)),
-            y_range=Range1d(rows - 0.5, -0.5, bounds=(-0.5 - rows, 2 * rows)),
+            x_range=Range1d(start=-0.5, end=columns - 0.5, bounds=(-0.5 - columns, 2 * columns)),
+            y_range=Range1d(start=rows - 0.5, end=-0.5, bounds=(-0.5 - rows, 2 * rows)),
             x_axis_label=f"column ({column_mm:.3g} mm apart)",
             y_axis_label=f"row ({row_mm:.3g} mm apart)",
             tools="pan,wheel_zoom,reset",
@@ -58,10 +58,9 @@ class Picture:
         self.plot.grid.visible = False
         self.plot.add_tools(CrosshairTool(line_alpha=0.3, line_color="white"))
         self._source = ColumnDataSource({"image": [np.zeros((rows, columns), np.uint8)]})
-        drawn = self.plot.image(
-            "image", x=-0.5, y=-0.5, dw=columns, dh=rows, source=self._source, palette=Greys256[::1]
-        )
-        drawn.glyph.color_mapper.update(low=0, high=255)
+        greys = LinearColorMapper(palette=list(Greys256), low=0, high=255)
+        glyph = Image(image="image", x=-0.5, y=-0.5, dw=columns, dh=rows, color_mapper=greys)
+        drawn = self.plot.add_glyph(self._source, glyph)
         self.plot.add_tools(
             HoverTool(renderers=[drawn], tooltips=[("column, row", "$x{0.0}, $y{0.0}")], attachment="below")
         )

@@ -77,7 +77,7 @@ class Region:
 
     def _typed(self, event: object) -> None:
         try:
-            corners = region_of(self._text.value.strip() or None)
+            corners = region_of((self._text.value or "").strip() or None)
         except InvalidInputError:
             self._text.value = "" if self.corners is None else region_text(self.corners)
             return

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +13,42 @@ import panel as pn
 from panel.viewable import Viewable
 
 from calibration.chain import Seen
+from calibration.identifiability import judge
 from calibration.job import Outcome, Recording
 from calibration.report import text_report
 from speckle3d.app.folder import Folder
+from speckle3d.app.phantom.picture import DROPPED, USED
+from speckle3d.app.phantom.work import Progress, Work
 from speckle3d.calibrating.phantoms import remarks, solved, write_outcome
 from speckle3d.calibrating.settings import ScanSettings
 from speckle3d.calibrating.written import BESIDE
 from speckle3d.core.errors import Speckle3DError
 
-_POLL_S = 0.1
-_FIGURE = "calibration"
+_LACKING = "#9a6700"
+"""Dark amber: a result that more motion would improve."""
+_TABLE = "margin:0;font-size:12px;line-height:1.35"
 
-Finder = Callable[[ScanSettings, Callable[[int, int], None]], Seen]
+Finder = Callable[[ScanSettings, Progress], Seen]
 
 
 @dataclass(frozen=True)
 class Solved:
-    """A calibration with the settings that made it; without an outcome, why it was refused."""
+    """A calibration with the settings that made it.
+
+    Attributes
+    ----------
+    seen : Seen, optional
+        What was found in the images, as far as it came.
+    lacking : bool
+        Whether the verdict names motions that are missing.
+    refusal : str
+        Without an outcome, why.
+    """
 
     settings: ScanSettings
     seen: Seen | None = None
     outcome: Outcome | None = None
+    lacking: bool = False
     refusal: str = ""
 
 
@@ -51,7 +66,8 @@ class RunPane:
     done : callable
         Called with what came of a run.
     before_saving : callable, optional
-        Brings the settings of a run into what a command can be given, as by saving points picked by hand.
+        Brings the settings of a run, whose calibration goes to a path, into what a command can be given,
+        as by saving points picked by hand.
     """
 
     def __init__(
@@ -62,18 +78,17 @@ class RunPane:
         settings: Callable[[], ScanSettings],
         find: Finder,
         done: Callable[[Solved], None],
-        before_saving: Callable[[ScanSettings], ScanSettings] = lambda settings: settings,
+        before_saving: Callable[[ScanSettings, Path], ScanSettings] = lambda settings, out: settings,
     ) -> None:
         self._recording, self._images, self._folder = recording, images, folder
         self._settings, self._find, self._done = settings, find, done
         self._before_saving = before_saving
         self._solved: Solved | None = None
-        self._counted = (0, 0)
         self.button = pn.widgets.Button(name="Run calibration", button_type="primary", width=150)
-        self._bar = pn.indicators.Progress(value=0, max=100, width=300, visible=False, margin=(14, 8))
+        self._work = Work(self.button)
         self._verdict = pn.pane.HTML(_told("Not calibrated yet.", "#555555"), width=600)
         self._table = pn.pane.HTML("", width=600, max_height=300, styles={"overflow-y": "auto"})
-        self._name = pn.widgets.TextInput(name="", value=f"{images.stem}-calibration.h5", width=300)
+        self._name = pn.widgets.TextInput(name="", value=f"{images.stem}-calibration.h5", width=460)
         self._save = pn.widgets.Button(name="Save result", width=110, disabled=True)
         self._saved = pn.pane.HTML("", width=600)
         self.button.on_click(self._run)
@@ -82,7 +97,7 @@ class RunPane:
     def view(self) -> Viewable:
         """The button, the verdict, the table, and saving."""
         return pn.Column(
-            pn.Row(self.button, self._bar),
+            pn.Row(self.button, self._work.bar),
             self._verdict,
             self._table,
             pn.Row(self._save, self._name),
@@ -95,45 +110,35 @@ class RunPane:
             return
         self._save.disabled = True
         words = "Settings changed since this result: run again."
-        self._verdict.object = _told(words, "#D55E00") + self._verdict.object
+        self._verdict.object = _told(words, DROPPED) + self._verdict.object
 
     async def _run(self, event: object) -> None:
         try:
             settings = self._settings()
         except Speckle3DError as error:
-            self._verdict.object = _told(str(error), "#D55E00")
+            self._verdict.object = _told(str(error), DROPPED)
             return
-        self.button.disabled, self._bar.visible, self._counted = True, True, (0, 0)
-        try:
-            work = asyncio.create_task(asyncio.to_thread(self._solve, settings))
-            while not (await asyncio.wait({work}, timeout=_POLL_S))[0]:
-                done, total = self._counted
-                self._bar.value = int(100 * done / total) if total else 0
-            self._show(work.result())
-        finally:
-            self.button.disabled, self._bar.visible = False, False
+        await self._work.run(partial(self._solve, settings), self._show)
 
-    def _solve(self, settings: ScanSettings) -> Solved:
+    def _solve(self, settings: ScanSettings, progress: Progress) -> Solved:
         seen = None
         try:
-            seen = self._find(settings, self._count)
-            return Solved(settings, seen, solved(self._recording, seen, settings))
+            seen = self._find(settings, progress)
+            outcome = solved(self._recording, seen, settings)
+            return Solved(settings, seen, outcome, bool(judge(outcome.solution).missing))
         except Speckle3DError as error:
             return Solved(settings, seen, refusal=str(error))
-
-    def _count(self, done: int, total: int) -> None:
-        self._counted = done, total
 
     def _show(self, found: Solved) -> None:
         self._solved, self._saved.object = found, ""
         if found.outcome is None:
-            self._verdict.object = _told(f"No calibration: {found.refusal}", "#D55E00")
+            self._verdict.object = _told(f"No calibration: {found.refusal}", DROPPED)
             self._table.object = ""
         else:
             calibration = found.outcome.calibration
-            self._verdict.object = _told(calibration.verdict, "#0072B2")
+            self._verdict.object = _told(calibration.verdict, _LACKING if found.lacking else USED)
             table = text_report(calibration, found.outcome.beam, remarks(found.outcome))
-            self._table.object = f"<pre class='calibration' style='margin:0'>{html.escape(table)}</pre>"
+            self._table.object = f"<pre class='calibration' style='{_TABLE}'>{html.escape(table)}</pre>"
         self._save.disabled = found.outcome is None
         self._done(found)
 
@@ -142,12 +147,12 @@ class RunPane:
         if found is None or found.outcome is None:
             return
         try:
-            written = self._written(found.outcome, found.settings, self._name.value)
+            written = self._written(found.outcome, found.settings, self._name.value or "")
         except Speckle3DError as error:
-            self._saved.object = _told(str(error), "#D55E00")
+            self._saved.object = _told(str(error), DROPPED)
             return
         names = ", ".join(path.name for path in written)
-        self._saved.object = _told(f"Saved {names} in {self._folder.path}", "#0072B2")
+        self._saved.object = _told(f"Saved {names} in {self._folder.path}", USED)
 
     def _written(self, outcome: Outcome, settings: ScanSettings, name: str) -> tuple[Path, ...]:
         out = self._folder.place(name)
@@ -156,7 +161,7 @@ class RunPane:
             out = out.with_name(f"{name}.h5")
         for suffix in BESIDE:
             self._folder.place(out.with_suffix(suffix).name)
-        settings = self._before_saving(settings)
+        settings = self._before_saving(settings, out)
         return write_outcome(outcome, settings, self._images, out, remarks(outcome)).files
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from bokeh.events import DoubleTap, Tap
-from bokeh.models import ColumnDataSource, HoverTool, Range1d, Span
+from bokeh.models import BasicTicker, ColumnDataSource, HoverTool, Range1d
 from bokeh.plotting import figure
 
 from calibration.chain import ChainSolution, Seen
@@ -42,21 +42,21 @@ class FrameStrip:
         self.plot = figure(
             frame_width=width,
             frame_height=70,
-            x_range=Range1d(-0.5, count - 0.5),
-            y_range=Range1d(0.0, 1.0),
+            x_range=Range1d(start=-0.5, end=count - 0.5),
+            y_range=Range1d(start=0.0, end=1.0),
             x_axis_label="frame: click to see it, double click to leave it out or take it in",
             y_axis_label="residual",
             tools="",
             toolbar_location=None,
         )
         self.plot.grid.visible = False
-        self.plot.yaxis.ticker.desired_num_ticks = 3
+        self.plot.yaxis.ticker = BasicTicker(desired_num_ticks=3)
         bars = self.plot.vbar(
             "frame", width=0.9, bottom=0, top=1e6, color="colour", alpha=0.55, source=self._frames
         )
         self.plot.scatter("frame", "residual", size=4, color="black", source=self._residuals)
-        self._cursor = Span(location=0, dimension="height", line_color="black", line_width=2)
-        self.plot.add_layout(self._cursor)
+        self._cursor = ColumnDataSource({"frame": [0]})
+        self.plot.vspan("frame", source=self._cursor, color="black", line_width=2)
         self.plot.add_tools(HoverTool(renderers=[bars], tooltips=[("frame", "@frame"), ("", "@told")]))
         self.plot.on_event(Tap, lambda event: chosen(self._at(event.x)))
         self.plot.on_event(DoubleTap, lambda event: toggled(self._at(event.x)))
@@ -66,11 +66,16 @@ class FrameStrip:
 
     def point_at(self, frame: int) -> None:
         """Mark the frame that is looked at."""
-        self._cursor.location = frame
+        self._cursor.data = {"frame": [frame]}
 
     def leave_out(self, frames: tuple[int, ...]) -> None:
         """Say which frames are left out by hand."""
         self._left_out = frames
+        self._draw()
+
+    def picked(self, frames: Iterable[int]) -> None:
+        """Say which frames have points; what became of them before is forgotten."""
+        self._used, self._dropped = dict.fromkeys(frames, "has points"), {}
         self._draw()
 
     def tell(self, seen: Seen | None, outcome: Outcome | None) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from bokeh.events import Tap
-from bokeh.models import BoxAnnotation, ColumnDataSource, Range1d, Span
+from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models.annotations import BoxAnnotation, Span, Title
 from bokeh.plotting import figure
 
 from speckle3d.core.arrays import Float32Array, FloatArray
@@ -61,7 +63,7 @@ class Box:
         return Box(x - half_x, x + half_x, y + half_y, y - half_y)
 
     def line(self, normal: FloatArray, offset: float) -> FloatArray | None:
-        """Ends of the part of a line ``normal @ p == offset`` in the box, shape (2, 2); None if there is none."""
+        """Ends of a line ``normal @ p == offset`` within the box, shape (2, 2); None if it misses."""
         along = np.array([-normal[1], normal[0]])
         foot = offset * normal
         low, high = -np.inf, np.inf
@@ -88,17 +90,18 @@ class CutPlot:
         Called with x and y of a click, mm by the axes.
     """
 
-    def __init__(
-        self, name: str, size_px: tuple[int, int], picked: Callable[[float, float], None]
-    ) -> None:
+    def __init__(self, name: str, size_px: tuple[int, int], picked: Callable[[float, float], None]) -> None:
         self.box = Box(0.0, 1.0, 1.0, 0.0)
         self._size = size_px
+        self._across, self._down = Range1d(start=0, end=1), Range1d(start=1, end=0)
+        self._title = Title(text="making the cut", text_font_size="11px", text_font_style="normal")
         self.plot = figure(
             name=name,
             frame_width=size_px[0],
             frame_height=size_px[1],
-            x_range=Range1d(0, 1),
-            y_range=Range1d(1, 0),
+            x_range=self._across,
+            y_range=self._down,
+            title=self._title,
             tools="pan,wheel_zoom,reset",
             active_drag=None,
             active_scroll="wheel_zoom",
@@ -109,7 +112,6 @@ class CutPlot:
         self.plot.toolbar.autohide = True
         self.plot.grid.visible = False
         self.plot.background_fill_color = UNSEEN
-        self.plot.title.text_font_size = "12px"
         for axis in self.plot.axis:
             axis.axis_label_text_font_style = "normal"
             axis.axis_label_text_font_size = axis.major_label_text_font_size = "11px"
@@ -123,8 +125,8 @@ class CutPlot:
         self.plot.line("x", "y", color="white", line_dash=[4, 3], source=self._points)
         self.plot.scatter("x", "y", size=8, color="#ff3030", line_color="white", source=self._points)
         self.plot.text(
-            "x", "y", "number", x_offset=6, y_offset=-3, color="white", text_font_size="13px",
-            text_font_style="bold", text_outline_color="black", source=self._points,
+            "x", "y", "number", x_offset=6, y_offset=-3, color="#ffe600", text_font_size="14px",
+            text_font_style="bold", source=self._points,
         )  # fmt: skip
         self.plot.on_event(Tap, lambda event: picked(float(event.x), float(event.y)))
 
@@ -137,12 +139,8 @@ class CutPlot:
         """Show this part of the plane, a millimetre as long across as down."""
         self.box = box
         shown = box.scaled_to(*self._size)
-        self.plot.x_range.update(
-            start=shown.left, end=shown.right, reset_start=shown.left, reset_end=shown.right
-        )
-        self.plot.y_range.update(
-            start=shown.bottom, end=shown.top, reset_start=shown.bottom, reset_end=shown.top
-        )
+        self._across.update(start=shown.left, end=shown.right, reset_start=shown.left, reset_end=shown.right)
+        self._down.update(start=shown.bottom, end=shown.top, reset_start=shown.bottom, reset_end=shown.top)
 
     def show(self, colours: npt.NDArray[np.uint32], extent_mm: tuple[float, float, float, float]) -> None:
         """Show an image between left, right, bottom and top."""
@@ -150,9 +148,19 @@ class CutPlot:
         place = {"x": [left], "y": [top], "w": [right - left], "h": [bottom - top]}
         self.image.data = {"image": [colours], **place}
 
+    @property
+    def mm_per_px(self) -> float:
+        """Size of a pixel of the screen."""
+        across: Any = self._across  # Bokeh has it that ranges may be of dates
+        return float(abs(across.end - across.start) / self._size[0])
+
+    def title(self, text: str) -> None:
+        """Write above the plot."""
+        self._title.text = text
+
     def name_axes(self, title: str, axes: tuple[str, str]) -> None:
         """Write where the cut is, and what its axes are."""
-        self.plot.title.text = title
+        self.title(title)
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{each} / mm" for each in axes)
 
     def show_lines(self, lines: Sequence[tuple[FloatArray, str]]) -> None:
@@ -167,7 +175,9 @@ class CutPlot:
         """Draw picked points, shape (k, 2), joined in their order."""
         self._points.data = {"x": points_mm[:, 0], "y": points_mm[:, 1], "number": list(numbers)}
 
-    def add_span(self, dimension: str, colour: str, moved: Callable[[float], None]) -> Span:
+    def add_span(
+        self, dimension: Literal["width", "height"], colour: str, moved: Callable[[float], None]
+    ) -> Span:
         """Add a line across the plot that can be dragged."""
         span = Span(dimension=dimension, line_color=colour, line_width=1.5, editable=True)
         span.hover_line_width = 4
@@ -192,11 +202,12 @@ class Handle:
     ) -> None:
         self.at = np.zeros(2)
         self._plot, self._moved, self._placing = plot, moved, False
+        look: dict[str, Any] = {"border_radius": _HANDLE_PX if round_ else 0}
         self.box = BoxAnnotation(
             left=0, right=1, top=0, bottom=1, editable=True, movable="both", resizable="none",
             fill_color=colour, fill_alpha=0.85, line_color="white", line_width=1.5,
             hover_fill_color="white", hover_fill_alpha=0.9,
-            border_radius=_HANDLE_PX if round_ else 0, visible=False, use_handles=False,
+            visible=False, use_handles=False, **look,
         )  # fmt: skip
         for side in ("left", "right", "top", "bottom"):
             self.box.on_change(side, lambda attr, old, new: self._dragged())
@@ -207,8 +218,7 @@ class Handle:
         self.box.visible = at_mm is not None
         if at_mm is None:
             return
-        shown = self._plot.plot
-        half = _HANDLE_PX / 2 * abs(shown.x_range.end - shown.x_range.start) / shown.frame_width
+        half = _HANDLE_PX / 2 * self._plot.mm_per_px
         self.at = np.asarray(at_mm, dtype=float)
         self._placing = True
         self.box.update(
@@ -219,7 +229,7 @@ class Handle:
     def _dragged(self) -> None:
         if self._placing:
             return
-        box = self.box
+        box: Any = self.box
         new = np.array([(box.left + box.right) / 2, (box.top + box.bottom) / 2], dtype=float)
         old, self.at = self.at, new
         if not np.array_equal(old, new):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 import panel as pn
-from bokeh.models import Span
+from bokeh.models.annotations import Span
 from panel.viewable import Viewable
 
 from speckle3d.app.reconstruction.cut_plot import (
@@ -35,7 +36,12 @@ _ARM = 0.32
 """Of the box's smaller side: from the handle that moves the free plane to the one that turns it."""
 _NEAR_MM = 0.3
 """A picked point is drawn in cuts as near as this."""
-_TITLES = {"along": "along the sweep", "frame": "frame", "depth": "parallel to the skin", "free": "free plane"}
+TITLES: dict[Name, str] = {
+    "along": "along the sweep",
+    "frame": "across the sweep",
+    "depth": "parallel to the skin",
+    "free": "free plane",
+}
 
 ORTHOGONAL: tuple[Name, ...] = ("along", "frame", "depth")
 
@@ -61,9 +67,7 @@ class CutsView:
         self._material, self._changed, self._picked = material, changed, picked
         self.shown = Shown(material.modes[0])
         self.plots = {name: CutPlot(f"cut-{name}", _ALONE_PX, self._picker(name, 0)) for name in NAMES}
-        self._others = {
-            name: CutPlot(f"other-{name}", _BESIDE_PX, self._picker(name, 1)) for name in NAMES
-        }
+        self._others = {name: CutPlot(f"other-{name}", _BESIDE_PX, self._picker(name, 1)) for name in NAMES}
         self._cuts: dict[tuple[Name, str], AnyCut] = {}
         self._points: dict[str, FloatArray] = {}
         self._spans = self._add_spans()
@@ -73,23 +77,25 @@ class CutsView:
             self._movers[name] = Handle(self.plots[name], FREE, False, self._mover(name))
             self._turners[name] = Handle(self.plots[name], FREE, True, self._turner(name))
         self._placing = False
+        self._dragged: Handle | None = None
 
     def layout(self) -> Viewable:
         """The plots in two rows; those of a second mode are hidden while there is none."""
+
         def cell(name: Name) -> Viewable:
             return pn.Row(pn.pane.Bokeh(self.plots[name].plot), pn.pane.Bokeh(self._others[name].plot))
 
-        return pn.Column(*(pn.Row(cell(a), cell(b)) for a, b in (NAMES[:2], NAMES[2:])))
+        return pn.Column(*(pn.Row(*map(cell, NAMES[row : row + 2])) for row in (0, 2)))
 
-    def show_state(self, shown: Shown, dragged_in: Name | None = None) -> None:
+    def draw(self) -> None:
         """Draw lines and handles where they are now; cuts follow by `show_cut`."""
-        self.shown = shown
         self._placing = True
         for (_, what), span in self._spans.items():
-            span.location = shown.lateral_mm if what == "lateral_mm" else shown.depth_mm
+            span.location = self.shown.lateral_mm if what == "lateral_mm" else self.shown.depth_mm
         self._placing = False
         for name in NAMES:
-            self._draw_lines(name, name == dragged_in)
+            self._draw_lines(name)
+        self._dragged = None
 
     def show_cut(self, name: Name, picture: CutPicture, is_fine: bool) -> None:
         """Show a cut of the modes."""
@@ -102,7 +108,9 @@ class CutsView:
         if other and self.shown.is_difference:
             colours = laid_over(picture.cuts[other].image, main.image, levels)
         self.plots[name].show(colours, main.cut.extent_mm)
-        said = f"{_TITLES[name]}: {picture.place}" if name != "frame" else picture.place
+        said = f"free {picture.place}" if name == "free" else picture.place
+        if other and not self.shown.is_difference:
+            said = f"{label_of(mode)}: {said.split(', seen')[0]}"
         said = said if is_fine else f"{said} (voxels)"
         self.plots[name].name_axes(said, picture.axes)
         if other and not self.shown.is_difference:
@@ -110,14 +118,20 @@ class CutsView:
             self._others[name].show(grey(drawn.image, levels), drawn.cut.extent_mm)
             self._others[name].name_axes(label_of(other), picture.axes)
         self._fit(name, main.cut)
-        self._draw_lines(name, False)
+        self._draw_lines(name)
         self._draw_points(name)
 
     def show_none(self, name: Name, why: str) -> None:
         """Say why there is no cut."""
-        self.plots[name].plot.title.text = why.split(";")[0]
+        self.plots[name].title(why.split(";")[0])
         for plot in (self.plots[name], self._others[name]):
             plot.show(np.zeros((1, 1), np.uint32), (0.0, 1e-6, 1e-6, 0.0))
+
+    @property
+    def planes(self) -> dict[Name, ReslicePlane]:
+        """Where the cuts of the first mode are, as far as they are made."""
+        found = {name: self._cuts.get((name, self.shown.mode)) for name in NAMES}
+        return {name: cut for name, cut in found.items() if isinstance(cut, ReslicePlane)}
 
     def show_points(self, points: dict[str, FloatArray]) -> None:
         """Draw picked points, shape (k, 3) by mode, in the cuts that they lie in."""
@@ -140,7 +154,7 @@ class CutsView:
                 plot.fit(box)
 
     def _span_of_free(self) -> Box:
-        """Box about the sweep's centre that holds what any free plane shows: the scale stays as it is turned."""
+        """Box that holds what any free plane shows: the scale stays as it is turned."""
         grid = self._material.grid
         path = self._material.opened(self.shown.mode).poses[self.shown.mode]
         length = float(np.linalg.norm(np.ptp(path.apply(grid.centre_mm), axis=0)))
@@ -148,7 +162,7 @@ class CutsView:
         x, y = np.hypot(grid.width_mm, length) / 2, np.hypot(tall, length) / 2
         return Box(-x, x, y, -y)
 
-    def _draw_lines(self, name: Name, is_dragged: bool) -> None:
+    def _draw_lines(self, name: Name) -> None:
         cut = self._cuts.get((name, self.shown.mode))
         if not isinstance(cut, ReslicePlane):
             return
@@ -162,8 +176,7 @@ class CutsView:
             ends = None if found is None else self.plots[name].box.line(*found)
             if ends is not None:
                 lines.append((ends, FREE))
-            if not is_dragged:
-                self._place_handles(name, ends)
+            self._place_handles(name, ends)
         self.plots[name].show_lines(lines)
 
     def _place_handles(self, name: Name, ends: FloatArray | None) -> None:
@@ -178,19 +191,18 @@ class CutsView:
         # Where it was along the line, if that is still in sight.
         wished = (mover.at if mover.box.visible else ends.mean(axis=0)) - ends[0]
         at = ends[0] + along * np.clip(wished @ along, 0.2 * size, 0.8 * size)
-        arm = turner.at - mover.at
         box = self.plots[name].box
         reach = _ARM * min(abs(box.right - box.left), abs(box.bottom - box.top))
-        way = -1.0 if turner.box.visible and arm @ along < 0 else 1.0
-        mover.place(at)
-        turner.place(at + way * along * reach)
+        # What the mouse holds stays where the mouse is.
+        if self._dragged is not mover and self._dragged is not turner:
+            mover.place(at)
+        if self._dragged is not turner:
+            turner.place(mover.at + along * reach)
 
     def _mover(self, name: Name) -> Callable[[FloatArray, FloatArray], None]:
         def moved(old: FloatArray, new: FloatArray) -> None:
-            cut = self._plane(name)
-            turner = self._turners[name]
-            turner.place(turner.at + new - old)
-            self._changed(plane=self._axes.moved(self.shown.plane, cut, old, new), dragged_in=name)
+            self._dragged = self._movers[name]
+            self._changed(plane=self._axes.moved(self.shown.plane, self._plane(name), old, new))
 
         return moved
 
@@ -199,8 +211,8 @@ class CutsView:
             pivot = self._movers[name].at
             (x, y), (u, v) = old - pivot, new - pivot
             angle = float(np.arctan2(x * v - y * u, x * u + y * v))
-            plane = self._axes.turned(self.shown.plane, self._plane(name), pivot, angle)
-            self._changed(plane=plane, dragged_in=name)
+            self._dragged = self._turners[name]
+            self._changed(plane=self._axes.turned(self.shown.plane, self._plane(name), pivot, angle))
 
         return turned
 
@@ -221,7 +233,7 @@ class CutsView:
 
             return tell
 
-        wanted: list[tuple[Name, str, str, str]] = [
+        wanted: list[tuple[Name, str, Literal["width", "height"], str]] = [
             ("along", "depth_mm", "width", DEPTH),
             ("frame", "depth_mm", "width", DEPTH),
             ("frame", "lateral_mm", "height", LATERAL),
@@ -250,4 +262,3 @@ class CutsView:
             near = np.abs(there[:, 2]) < _NEAR_MM
             xy = there[:, :2] + np.array(cut.first_mm)
             plot.show_points(np.where(near[:, None], xy, np.nan), [str(k + 1) for k in range(len(points))])
-

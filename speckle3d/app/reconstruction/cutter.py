@@ -1,4 +1,4 @@
-"""Cuts for one viewer, made in the background: at once from voxels, and from the frames when all is at rest."""
+"""Cuts for one viewer, made in the background: at once from voxels, and from the frames when at rest."""
 
 from __future__ import annotations
 

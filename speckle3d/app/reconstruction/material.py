@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from speckle3d.app.reconstruction.free_plane import SweepAxes
 from speckle3d.app.reconstruction.newest import Newest
-from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.imaging.images import Images
@@ -20,6 +21,7 @@ from speckle3d.imaging.voxels.grid import spacing_within
 from speckle3d.imaging.voxels.volume import CompoundedVolume, compound
 from speckle3d.scoring.references import find_reference
 from speckle3d.scoring.trajectories import poses_of
+from speckle3d.study.pose_errors import errors_of
 from speckle3d.study.posed import USUAL_RANGE_DB, PosedSweep
 from speckle3d.study.reslices.cuts import OpenedModes, at_modes
 
@@ -118,6 +120,7 @@ class Material:
         self._voxels: dict[str, CompoundedVolume | str] = {}
         self._opened: dict[tuple[str, str | None], OpenedModes] = {}
         self._axes: dict[str, SweepAxes] = {}
+        self._errors: dict[str, FloatArray | None] = {}
         self._asked: dict[str, list[Callable[[str, float], None]]] = {}
         self._maker = Newest(self._make_voxels)
 
@@ -132,6 +135,18 @@ class Material:
         if mode not in self._axes:
             self._axes[mode] = SweepAxes.of(self.grid, self.opened(mode).poses[mode])
         return self._axes[mode]
+
+    def errors(self, mode: str) -> FloatArray | None:
+        """Covariance of every frame's pose that a mode claims, shape (n, 6, 6); None where nothing is known.
+
+        Of (x, y, z, tilt, yaw, roll) about the image's centre along the mode's first frame, mm and rad.
+        """
+        if mode not in self._errors:
+            try:
+                self._errors[mode] = errors_of(self.reconstruction, mode).covariance()
+            except (InvalidInputError, InsufficientDataError):
+                self._errors[mode] = None
+        return self._errors[mode]
 
     def images(self, look: Callable[[], None] = lambda: None) -> tuple[Images, ImageGrid]:
         """Images to cut, log-compressed, and their grid; `look` is called before each is read."""

@@ -34,10 +34,19 @@ class ReconstructionPage:
         self, reconstruction: Reconstruction, sweep: Sweep, folder: Folder, sweep_file: Path | None = None
     ) -> None:
         self._material = Material(reconstruction, sweep)
-        self._folder, self._sweep_file = folder, sweep_file
+        self._folder, self._sweep_file = folder, _named(sweep_file, reconstruction, folder)
 
     def view(self) -> Viewable:
         """Trajectories, cuts and what is measured in them."""
         from speckle3d.app.reconstruction.viewer import Viewer
 
         return Viewer(self._material, self._folder, self._sweep_file).view()
+
+
+def _named(sweep_file: Path | None, reconstruction: Reconstruction, folder: Folder) -> Path | None:
+    """The sweep's path, if a command in the folder would not find it by what the reconstruction says."""
+    stored = Path(reconstruction.provenance.input_path)
+    if sweep_file is None and (folder.path / stored).exists():
+        return None
+    found = sweep_file or stored
+    return found.resolve() if found.exists() else None

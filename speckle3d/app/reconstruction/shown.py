@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -48,7 +48,7 @@ class Shown:
     frame: int = 0
     lateral_mm: float = 0.0
     depth_mm: float = 0.0
-    plane: FreePlane = FreePlane()
+    plane: FreePlane = field(default_factory=FreePlane)
 
     @property
     def modes(self) -> tuple[str, ...]:
@@ -57,14 +57,14 @@ class Shown:
 
     def place(self, name: Name, axes: SweepAxes, material: Material) -> Place:
         """Where a cut is."""
-        pixels = {"pixel_mm": material.pixel_mm, "reach_mm": material.reach_mm}
+        pixel_mm, reach_mm = material.pixel_mm, material.reach_mm
         if name == "along":
-            return Place(lateral_mm=self.lateral_mm, **pixels)
+            return Place(lateral_mm=self.lateral_mm, pixel_mm=pixel_mm, reach_mm=reach_mm)
         if name == "frame":
-            return Place(frame=self.frame, **pixels)
+            return Place(frame=self.frame, pixel_mm=pixel_mm, reach_mm=reach_mm)
         if name == "depth":
-            return Place(depth_mm=self.depth_mm, **pixels)
-        return axes.place(self.plane, **pixels)
+            return Place(depth_mm=self.depth_mm, pixel_mm=pixel_mm, reach_mm=reach_mm)
+        return axes.place(self.plane, pixel_mm, reach_mm)
 
     def key(self, name: Name) -> tuple[object, ...]:
         """What a cut depends on: the same key, the same cut."""

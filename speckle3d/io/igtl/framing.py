@@ -7,18 +7,17 @@ from collections.abc import Iterator
 
 from fastcrc.crc64 import ecma_182
 
-from speckle3d.io.igtl.messages import (
+from speckle3d.io.igtl.header import (
     HEADER_BYTES,
     Header,
     Limits,
     MessageError,
-    Received,
     damaged,
-    decoded,
     image_start_bytes,
     read_header,
     require_image_size,
 )
+from speckle3d.io.igtl.messages import Received, decoded
 
 _START = re.compile(rb"\0[\1-\3](?=[A-Z])")
 """How a header begins: its version and the first letter of its type."""
@@ -74,6 +73,8 @@ class Framing:
                 except MessageError as refused:
                     if not self._searching:
                         yield refused
+                        # A body that lacks its last byte, a zero, has taken this header's first one for it.
+                        self._buffer[:0] = b"\0\0"
                     self._search()
                 continue
             try:

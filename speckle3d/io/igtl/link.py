@@ -136,7 +136,7 @@ class Outbox:
         self._most = limits.max_sending_bytes
         self._changed = threading.Condition()
         self._held: deque[bytes] = deque()
-        self._bytes = 0
+        self._bytes = self._in_hand = 0
         self.dropped = 0
 
     def put(self, message: bytes) -> None:
@@ -154,10 +154,12 @@ class Outbox:
             self._changed.notify()
 
     def next(self, timeout_s: float) -> bytes | None:
-        """Take the oldest message; None if none comes in time."""
+        """Take the oldest message, the one before being sent; None if none comes in time."""
         with self._changed:
+            self._in_hand = 0
             if not self._changed.wait_for(lambda: bool(self._held), timeout_s):
                 return None
+            self._in_hand = 1
             message = self._held.popleft()
             self._bytes -= len(message)
             return message
@@ -171,8 +173,8 @@ class Outbox:
 
     @property
     def waiting(self) -> int:
-        """Messages not yet sent."""
-        return len(self._held)
+        """Messages not yet handed to the system as a whole."""
+        return len(self._held) + self._in_hand
 
 
 class Link:

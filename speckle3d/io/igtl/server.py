@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from dataclasses import replace
 from functools import partial
 from typing import Self
@@ -89,10 +90,14 @@ class Server:
         for outbox in outboxes:
             outbox.put(message)
 
-    def unsent(self) -> int:
-        """Messages that some client has not yet been sent, of the slowest one."""
-        with self._changed:
-            return max((outbox.waiting for outbox in self._clients.values()), default=0)
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until all clients were sent everything; whether they were in time."""
+        end_s = time.monotonic() + timeout_s
+        while any(outbox.waiting for outbox in list(self._clients.values())):
+            if time.monotonic() > end_s:
+                return False
+            time.sleep(_LOOK_S / 10)
+        return True
 
     @property
     def clients(self) -> int:

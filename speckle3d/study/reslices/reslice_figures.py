@@ -23,10 +23,21 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
-from speckle3d.study.figures import UNSEEN, colour_of, label_of, name_figure, new_figure, show_grey, wrapped
+from speckle3d.imaging.cuts.outlines import frame_outlines
+from speckle3d.matching.intensity import IntensityExtractor
+from speckle3d.study.figures import (
+    UNSEEN,
+    colour_of,
+    label_of,
+    name_figure,
+    new_figure,
+    save_figure,
+    show_grey,
+    wrapped,
+)
 from speckle3d.study.reslices.cut_geometry import save_cuts
 from speckle3d.study.reslices.cut_panels import add_axes_in, laid_out, name_axes
-from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, OpenedModes
 
 _BRIGHTEST_PERCENTILE = 99.9
 """A single specular echo must not darken the tissue."""
@@ -130,6 +141,19 @@ def figure_outlines(outlines_mm: Mapping[str, FloatArray], title: str = "") -> F
     figure.legend(frameon=False, fontsize="small", loc="lower right")
     name_figure(figure, f"{title}: frames, all from the first one's place")
     return figure
+
+
+def save_outlines(opened: OpenedModes, path: Path) -> Path:
+    """Draw the outlines of a sweep's frames at several modes, all from the first one's place; write a PNG.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    grid = IntensityExtractor.for_sweep(opened.posed.sweep).grid
+    outlines = {mode: frame_outlines(grid, poses[0].inv() * poses) for mode, poses in opened.poses.items()}
+    return save_figure(figure_outlines(outlines, opened.posed.sweep.name), path)
 
 
 def overlay(image: Float32Array, reference: Float32Array, contrast: tuple[float, float]) -> FloatArray:
