@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.page import Page
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 RECONSTRUCTION = "reconstruction.h5"
 """File of a results folder."""
+
+_WINDOWS_PORT = re.compile(r"COM\d+", re.IGNORECASE)
 
 
 def pages_of(
@@ -69,6 +72,34 @@ def pages_of(
             raise InvalidInputError(f"{path}: expected a recording, a reconstruction or a log, got {kind}")
         return _reconstructed(place, sweep, place)
     return _logged(place)
+
+
+def is_port(path: Path) -> bool:
+    """Whether a path is that of a serial port: a device, or a name as COM3."""
+    return path.is_char_device() or _WINDOWS_PORT.fullmatch(str(path)) is not None
+
+
+@contextmanager
+def opened(path: Path, record: Path | None = None, **of_file: Any) -> Iterator[Sequence[Page]]:
+    """Pages of a file, as `pages_of` has them, or of a sensor on a serial port, which runs during the block.
+
+    Raises
+    ------
+    FileError
+        Also if no sensor answers on the port, or what it sends cannot be recorded.
+    InvalidInputError
+        Also if a file is to be recorded.
+    """
+    if is_port(path):
+        from speckle3d.app.sensor.live import LiveSensorPage
+        from speckle3d.app.sensor.watch import SensorWatch
+
+        with SensorWatch(str(path), record) as watch:
+            yield [LiveSensorPage(watch)]
+        return
+    if record is not None:
+        raise InvalidInputError(f"{path}: expected a serial port beside --record, got something else")
+    yield pages_of(path, **of_file)
 
 
 def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:

@@ -31,6 +31,9 @@ ROUGH = 0.03
 """A field that strays by more, as a fraction of its norm, is rough: where it dips by 65 degrees it turns a
 reading's north by four. The fusion grows used to such a field, and takes it for what it is worth."""
 
+POOR = 0.06
+"""Twice as much: nine degrees, which is no north."""
+
 
 class Trust(StrEnum):
     """How far a magnetometer's heading can be trusted."""
@@ -73,7 +76,7 @@ class FieldFound:
         """How far the heading can be trusted."""
         if not math.isfinite(self.stray):
             return Trust.UNKNOWN
-        if self.heading_sd_rad > LOST_RAD or self.disbelieved > _MOST:
+        if self.heading_sd_rad > LOST_RAD or self.disbelieved > _MOST or self.stray > POOR:
             return Trust.NO
         return Trust.CARE if self._doubts() else Trust.YES
 
@@ -102,7 +105,7 @@ class FieldFound:
         if self.iron > 0.5:
             doubts.append("part of it turns with the sensor, as by iron on the probe, and is taken off")
         if self.stray > ROUGH:
-            doubts.append("such a field is rough: iron or currents are near")
+            doubts.append("such a field is rough: iron or motors are near")
         if self.disbelieved > _SOME:
             doubts.append("something magnetic comes near at times")
         if self.heading_sd_rad > HELD_RAD:

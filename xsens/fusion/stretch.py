@@ -98,5 +98,6 @@ def _each_sample(
 ) -> Estimate:
     """Give every sample what was found for its step."""
     each = np.repeat(np.arange(len(steps.last)), np.diff(steps.last, prepend=0))
-    disturbed, stray, iron = (values[each] for values in field)
-    return Estimate(xyzw, sd_rad[each], bias_rad_s[each], disturbed, steps.resting[each], stray, iron)
+    disturbed, stray, iron = field
+    found = (xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], steps.resting[each])
+    return Estimate(*found, stray[each], iron[each])

@@ -28,6 +28,7 @@ class ReconstructionPage:
     """
 
     title = "Reconstruction"
+    extensions = ("plotly",)
 
     def __init__(
         self, reconstruction: Reconstruction, sweep: Sweep, folder: Folder, sweep_file: Path | None = None

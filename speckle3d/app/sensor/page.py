@@ -87,11 +87,14 @@ class SensorPage:
             on_s = float(when.value or 0.0) + _PLAY_MS / 1000.0
             when.value = 0.0 if on_s > duration_s else on_s
 
+        def go(at_s: float) -> None:
+            when.value = float(np.clip(at_s, 0.0, duration_s))
+
         clock = pn.state.add_periodic_callback(step, period=_PLAY_MS, start=False)
         play.param.watch(lambda event: clock.start() if event.new else clock.stop(), "value")
         when.param.watch(show, "value")
         side.param.watch(lambda event: picture.look_from(float(event.new)), "value")
-        plots.on_tap(lambda at_s: when.param.update(value=float(np.clip(at_s, 0.0, duration_s))))
+        plots.on_tap(go)
         show()
         left = pn.Column(
             pn.pane.Bokeh(picture.plot), side, pn.Row(when, play, margin=0), words, width=_LEFT_PX, margin=0
@@ -111,8 +114,9 @@ class SensorPage:
 
 _KEY = (
     '<span style="color:#6b7780"><span style="background:#e8a33d55">&emsp;</span> the field is hardly '
-    'believed &emsp;<span style="color:#b3261e">|</span> samples are missing &emsp;<span style="background:#20507a40">'
-    "&emsp;</span> 95 % band &emsp; click: go there; drag, wheel: move and zoom in time</span>"
+    'believed &emsp;<span style="color:#b3261e">|</span> samples are missing &emsp;'
+    '<span style="background:#20507a40">&emsp;</span> 95 % band &emsp; '
+    "click: go there; drag, wheel: move and zoom in time</span>"
 )
 
 
@@ -201,6 +205,7 @@ def _facts(readings: Readings, mounting: Rotation | None) -> list[tuple[str, str
 
 
 def table(rows: list[tuple[str, str]]) -> str:
+    """HTML of rows of name and value."""
     style = "color:#6b7780;padding:1px 12px 1px 0;white-space:nowrap;vertical-align:top"
     cell = f'<tr><td style="{style}">{{}}</td><td>{{}}</td></tr>'
     return f"<table>{''.join(cell.format(escape(name), escape(value)) for name, value in rows)}</table>"

@@ -123,8 +123,8 @@ class Readings:
             return []
         used = np.searchsorted(self.log.time_s, stream[0] + self.start_s - 1e-9)
         held = field[used]
-        there = np.isfinite(held).all(axis=1)
-        if not there.any():
+        there = np.flatnonzero(np.isfinite(held).all(axis=1))
+        if not there.size:
             return []
         dip = np.full(len(held), np.nan)
         dip[there] = np.degrees(dip_rad(stream[1][there].apply(held[there])))
