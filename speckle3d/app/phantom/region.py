@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import panel as pn
@@ -10,6 +11,7 @@ from bokeh.models import ColumnDataSource, PolyDrawTool, PolyEditTool
 from panel.viewable import Viewable
 
 from speckle3d.app.phantom.picture import REGION
+from speckle3d.app.phantom.work import in_turn
 from speckle3d.calibrating.settings import Corners, region_of, region_text
 from speckle3d.core.errors import InvalidInputError
 
@@ -53,8 +55,8 @@ class Region:
         )
         self._clear = pn.widgets.Button(name="No region", width=90)
         self._source.on_change("data", self._drawn)
-        self._text.param.watch(self._typed, "value")
-        self._clear.on_click(lambda event: self._set(None))
+        self._text.param.watch(in_turn(self._typed), "value")
+        self._clear.on_click(in_turn(partial(self._set, None)))
 
     def controls(self) -> Viewable:
         """The region as text, and a button to be without."""
@@ -75,7 +77,7 @@ class Region:
         if len(corners) >= 3:
             self._take(tuple(corners))
 
-    def _typed(self, event: object) -> None:
+    def _typed(self) -> None:
         try:
             corners = region_of((self._text.value or "").strip() or None)
         except InvalidInputError:
