@@ -12,16 +12,15 @@ _WHERE = """name => {
     const figure = Bokeh.documents[0].get_model_by_name(name)
     const view = Bokeh.index.find_one(figure), at = view.el.getBoundingClientRect(), box = view.frame.bbox
     return {x: at.x + box.left, y: at.y + box.top, width: box.width, height: box.height,
-            columns: [figure.x_range.start, figure.x_range.end], rows: [figure.y_range.start, figure.y_range.end]}
+            columns: [figure.x_range.start, figure.x_range.end],
+            rows: [figure.y_range.start, figure.y_range.end]}
 }"""
 
 
 def place(page, column, row, name="picture"):
     """Where on the screen a figure shows a place."""
     at = page.evaluate(_WHERE, name)
-    (left, right), (top, bottom) = at["columns"], at["rows"]
-    if name == "strip":
-        top, bottom = bottom, top
+    (left, right), (bottom, top) = at["columns"], at["rows"]
     share = (column - left) / (right - left), (row - top) / (bottom - top)
     return at["x"] + share[0] * at["width"], at["y"] + share[1] * at["height"]
 

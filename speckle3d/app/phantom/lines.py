@@ -122,7 +122,8 @@ class _Tuner:
             self._frames.slider, pn.pane.Bokeh(self._picture.plot), self._told, self._frames.below()
         )
         hint = pn.pane.HTML(
-            "Region: double click in the image, click its corners, double click to end.", margin=(2, 8)
+            "Region: drag a box in the image; or a polygon: hold the button, click corners, hold it.",
+            margin=(2, 8),
         )
         right = pn.Column(
             labelled("Line detection (orange mark: default)", detection),

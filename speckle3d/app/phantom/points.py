@@ -160,7 +160,7 @@ class _Picker:
             description="Points",
         )
         plot.add_tools(self._tool)
-        plot.toolbar.active_tap = self._tool
+        plot.toolbar.active_tap = plot.toolbar.active_drag = self._tool
 
     def _watch(self) -> None:
         self._points.on_change("data", self._edited)

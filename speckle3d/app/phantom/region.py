@@ -7,7 +7,8 @@ from functools import partial
 from typing import Any
 
 import panel as pn
-from bokeh.models import ColumnDataSource, PolyDrawTool, PolyEditTool
+from bokeh.events import SelectionGeometry
+from bokeh.models import BoxSelectTool, ColumnDataSource, PolyDrawTool, PolyEditTool
 from panel.viewable import Viewable
 
 from speckle3d.app.phantom.picture import REGION
@@ -34,7 +35,7 @@ class Region:
     def __init__(self, plot: Any, given: Corners | None, changed: Callable[[], None]) -> None:
         self.corners = given
         self._changed = changed
-        self._source = ColumnDataSource(_data(given))
+        self._source = ColumnDataSource(_data(given), name="region")
         patches = plot.patches(
             "xs", "ys", source=self._source, fill_alpha=0.06, color=REGION, line_width=2, line_dash="dashed"
         )
@@ -46,7 +47,10 @@ class Region:
             drawing,
             PolyEditTool(renderers=[patches], vertex_renderer=vertices, description="Edit the region"),
         )
-        plot.toolbar.active_tap = drawing
+        box = BoxSelectTool(renderers=[], description="Drag a box as the region")
+        plot.add_tools(box)
+        plot.toolbar.active_tap, plot.toolbar.active_drag = drawing, box
+        plot.on_event(SelectionGeometry, self._boxed)
         self._text = pn.widgets.TextInput(
             name="",
             value="" if given is None else region_text(given),
@@ -76,6 +80,15 @@ class Region:
         # While it is being drawn, it is no polygon yet.
         if len(corners) >= 3:
             self._take(tuple(corners))
+
+    def _boxed(self, event: SelectionGeometry) -> None:
+        held = event.geometry
+        if not event.final or held["type"] != "rect":
+            return
+        left, right, top, bottom = (round(float(held[end]), _DIGITS) for end in ("x0", "x1", "y0", "y1"))
+        left, right, top, bottom = min(left, right), max(left, right), min(top, bottom), max(top, bottom)
+        if left < right and top < bottom:
+            self._set(((left, top), (right, top), (right, bottom), (left, bottom)))
 
     def _typed(self) -> None:
         try:
