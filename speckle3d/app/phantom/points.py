@@ -99,7 +99,7 @@ class _Picker:
             recording.images.shape[0], _WIDTH, settings.leave_out, self._show, self._changed
         )
         self._options = Options(settings, self._changed)
-        self._points = ColumnDataSource(_NO_POINTS)
+        self._points = ColumnDataSource(_NO_POINTS, name="points")
         self._near = ColumnDataSource({"column": [], "row": []})
         self._draw_tools()
         self._wire = pn.widgets.Select(name="wire of the next point", options=[*wired.names], width=170)
@@ -222,12 +222,12 @@ class _Picker:
         missing = self._picks.missing(self._frames.frame)
         if missing and self._wire.value not in missing:
             self._proposed = self._wire.value = missing[0]
-        self._tool.empty_value = self._wire.value or ""
+        self._tool.default_overrides = {"wire": self._wire.value or ""}
 
     def _named(self) -> None:
         """The wire of the next point, or of the one that is selected."""
         name = self._wire.value or ""
-        self._tool.empty_value = name
+        self._tool.default_overrides = {"wire": name}
         if name == self._proposed:
             return
         self._proposed = ""

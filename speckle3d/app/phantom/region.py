@@ -41,13 +41,17 @@ class Region:
         )
         vertices = plot.scatter([], [], size=9, color=REGION)
         drawing = PolyDrawTool(
-            renderers=[patches], num_objects=1, vertex_renderer=vertices, description="Draw the region"
+            renderers=[patches],
+            num_objects=1,
+            drag=False,
+            vertex_renderer=vertices,
+            description="Draw the region",
         )
         plot.add_tools(
             drawing,
             PolyEditTool(renderers=[patches], vertex_renderer=vertices, description="Edit the region"),
         )
-        box = BoxSelectTool(renderers=[], description="Drag a box as the region")
+        box = BoxSelectTool(renderers=[vertices], description="Drag a box as the region")
         plot.add_tools(box)
         plot.toolbar.active_tap, plot.toolbar.active_drag = drawing, box
         plot.on_event(SelectionGeometry, self._boxed)
