@@ -8,6 +8,7 @@ import panel as pn
 from panel.viewable import Viewable
 
 from speckle3d.app.phantom.strip import FrameStrip
+from speckle3d.app.phantom.work import in_turn
 from speckle3d.calibrating.phantoms import require_frames
 from speckle3d.calibrating.settings import frames_of, frames_text
 from speckle3d.core.errors import Speckle3DError
@@ -47,9 +48,9 @@ class FrameChoice:
             placeholder="left out, as 3,17-20", value=frames_text(left_out), width=200
         )
         self._complaint = pn.pane.HTML("", margin=(8, 4))
-        self.slider.param.watch(lambda event: self._look(), "value")
-        self._toggle_one.param.watch(self._clicked, "value")
-        self._text.param.watch(self._typed, "value")
+        self.slider.param.watch(in_turn(self._look), "value")
+        self._toggle_one.param.watch(in_turn(self._clicked), "value")
+        self._text.param.watch(in_turn(self._typed), "value")
         self._name_toggle()
 
     @property
@@ -82,7 +83,7 @@ class FrameChoice:
         name = f"Frame {self.frame} is left out" if out else f"Leave out frame {self.frame}"
         self._toggle_one.param.update(name=name, value=out)
 
-    def _clicked(self, event: object) -> None:
+    def _clicked(self) -> None:
         # The value follows the frame, too.
         if self._toggle_one.value != (self.frame in self._left_out):
             self._toggle(self.frame)
@@ -90,7 +91,7 @@ class FrameChoice:
     def _toggle(self, frame: int) -> None:
         self._take_out(self._left_out ^ {frame})
 
-    def _typed(self, event: object) -> None:
+    def _typed(self) -> None:
         try:
             frames = frames_of(self._text.value)
             require_frames(frames, self._count)

@@ -28,7 +28,7 @@ from speckle3d.app.phantom.options import Options
 from speckle3d.app.phantom.picture import DROPPED, FOUND, USED, Picture
 from speckle3d.app.phantom.region import Region
 from speckle3d.app.phantom.run import RunPane, Solved, labelled
-from speckle3d.app.phantom.work import Progress
+from speckle3d.app.phantom.work import Progress, in_turn
 from speckle3d.calibrating.phantoms import found
 from speckle3d.calibrating.settings import (
     OrientationSettings,
@@ -100,7 +100,7 @@ class _Tuner:
         self._place.value = settings.place
         self._told = pn.pane.HTML("", width=_WIDTH)
         self._options = Options(settings, self._changed)
-        self._line = ColumnDataSource({"column": [], "row": []})
+        self._line = ColumnDataSource({"column": [], "row": []}, name="line")
         self._inliers = ColumnDataSource({"column": [], "row": []})
         plot = self._picture.plot
         plot.line("column", "row", source=self._line, color=FOUND, line_width=2)
@@ -111,7 +111,7 @@ class _Tuner:
 
     def layout(self) -> Viewable:
         reset = pn.widgets.Button(name="Defaults", width=90)
-        reset.on_click(self._reset)
+        reset.on_click(in_turn(self._reset))
         s = self._sliders
         detection = pn.Column(
             pn.Row(s["columns"], s["smoothing_mm"]),
@@ -122,7 +122,8 @@ class _Tuner:
             self._frames.slider, pn.pane.Bokeh(self._picture.plot), self._told, self._frames.below()
         )
         hint = pn.pane.HTML(
-            "Region: double click in the image, click its corners, double click to end.", margin=(2, 8)
+            "Region: drag a box in the image; or a polygon: hold the button, click corners, hold it.",
+            margin=(2, 8),
         )
         right = pn.Column(
             labelled("Line detection (orange mark: default)", detection),
@@ -147,16 +148,16 @@ class _Tuner:
 
     def _watch(self) -> None:
         for each in (*self._sliders.values(), self._automatic, self._place):
-            each.param.watch(self._changed, "value")
+            each.param.watch(in_turn(self._changed), "value")
 
-    def _reset(self, event: object) -> None:
+    def _reset(self) -> None:
         fields = LineSettings.model_fields
         for name, each in self._sliders.items():
             if fields[name].default is not None:
                 each.value = fields[name].default
         self._automatic.value, self._place.value = True, fields["place"].default
 
-    def _changed(self, event: object = None) -> None:
+    def _changed(self) -> None:
         self._sliders["threshold"].disabled = self._automatic.value
         self._run.outdate()
         self._show()

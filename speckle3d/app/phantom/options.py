@@ -9,6 +9,7 @@ import panel as pn
 from panel.viewable import Viewable
 
 from speckle3d.app.phantom.marked import widget
+from speckle3d.app.phantom.work import in_turn
 from speckle3d.calibrating.settings import ScanSettings, offset_of
 
 _SHOWN = {
@@ -26,10 +27,10 @@ class Options:
     given : ScanSettings
         To begin with.
     changed : callable
-        Called with the event when a value changes.
+        Called when a value changes.
     """
 
-    def __init__(self, given: ScanSettings, changed: Callable[[object], None]) -> None:
+    def __init__(self, given: ScanSettings, changed: Callable[[], None]) -> None:
         model = type(given)
         self._widgets: dict[str, Any] = {
             name: widget(model, name) for name in (*_SHOWN[given.method], "outlier_sigma")
@@ -42,7 +43,7 @@ class Options:
             width=285,
         )
         for each in (*self._widgets.values(), self._offset):
-            each.param.watch(changed, "value")
+            each.param.watch(in_turn(changed), "value")
 
     def values(self) -> dict[str, Any]:
         """The settings as they stand.

@@ -53,6 +53,7 @@ class Picture:
             tools="pan,wheel_zoom,reset",
             toolbar_location="right",
             background_fill_color="#202020",
+            name="picture",
         )
         self.plot.toolbar.logo = None
         self.plot.grid.visible = False

@@ -23,7 +23,7 @@ from speckle3d.app.phantom.picks import Picks
 from speckle3d.app.phantom.picture import DROPPED, FOUND, USED, Picture
 from speckle3d.app.phantom.region import Region
 from speckle3d.app.phantom.run import RunPane, Solved, labelled
-from speckle3d.app.phantom.work import Progress, Work
+from speckle3d.app.phantom.work import Progress, Work, in_turn
 from speckle3d.calibrating.phantoms import Wired, found, picked
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
 from speckle3d.core.arrays import FloatArray
@@ -90,6 +90,7 @@ class _Picker:
         self._given, self._picks = settings, picks
         self._run_with, self._drawing = PickedPoints(np.zeros(0, int), np.zeros((0, 2))), False
         self._candidates: Seen | None = None
+        self._proposed = ""
         self._picture = Picture(recording, _WIDTH, _HEIGHT)
         clip = wired.clip_px
         self._clip = None if clip is None else tuple((float(column), float(row)) for column, row in clip)
@@ -98,7 +99,7 @@ class _Picker:
             recording.images.shape[0], _WIDTH, settings.leave_out, self._show, self._changed
         )
         self._options = Options(settings, self._changed)
-        self._points = ColumnDataSource(_NO_POINTS)
+        self._points = ColumnDataSource(_NO_POINTS, name="points")
         self._near = ColumnDataSource({"column": [], "row": []})
         self._draw_tools()
         self._wire = pn.widgets.Select(name="wire of the next point", options=[*wired.names], width=170)
@@ -159,16 +160,16 @@ class _Picker:
             description="Points",
         )
         plot.add_tools(self._tool)
-        plot.toolbar.active_tap = self._tool
+        plot.toolbar.active_tap = plot.toolbar.active_drag = self._tool
 
     def _watch(self) -> None:
         self._points.on_change("data", self._edited)
-        self._wire.param.watch(self._named, "value")
-        self._find.on_click(self._find_all)
-        self._clear.on_click(lambda event: self._put([]))
-        self._save.on_click(self._save_points)
+        self._wire.param.watch(in_turn(self._named), "value")
+        self._find.on_click(in_turn(self._find_all))
+        self._clear.on_click(in_turn(partial(self._put, [])))
+        self._save.on_click(in_turn(self._save_points))
 
-    def _changed(self, event: object = None) -> None:
+    def _changed(self) -> None:
         self._run.outdate()
         self._show()
 
@@ -220,13 +221,16 @@ class _Picker:
     def _next_wire(self) -> None:
         missing = self._picks.missing(self._frames.frame)
         if missing and self._wire.value not in missing:
-            self._wire.value = missing[0]
-        self._tool.empty_value = self._wire.value or ""
+            self._proposed = self._wire.value = missing[0]
+        self._tool.default_overrides = {"wire": self._wire.value or ""}
 
-    def _named(self, event: object) -> None:
+    def _named(self) -> None:
         """The wire of the next point, or of the one that is selected."""
         name = self._wire.value or ""
-        self._tool.empty_value = name
+        self._tool.default_overrides = {"wire": name}
+        if name == self._proposed:
+            return
+        self._proposed = ""
         chosen = list(self._points.selected.indices)
         points = self._picks.of(self._frames.frame)
         if len(chosen) == 1 and chosen[0] < len(points):
@@ -244,14 +248,14 @@ class _Picker:
     def _tell(self, words: str, colour: str) -> None:
         self._told.object = f"<span class='points-told' style='color:{colour}'>{html.escape(words)}</span>"
 
-    async def _find_all(self, event: object) -> None:
+    def _find_all(self) -> None:
         try:
             settings = self.settings()
         except Speckle3DError as error:
             self._tell(str(error), DROPPED)
             return
         self._tell("finding points in all frames ...", USED)
-        await self._work.run(partial(self._search, settings), lambda found: self._searched(*found))
+        self._work.start(partial(self._search, settings), lambda found: self._searched(*found))
 
     def _search(self, settings: ScanSettings, progress: Progress) -> tuple[Seen | None, Seen | None, str]:
         """Candidates, those of them that are chosen, and why there are none."""
@@ -271,7 +275,7 @@ class _Picker:
         self._picks.take_seen(chosen)
         self._changed()
 
-    def _save_points(self, event: object) -> None:
+    def _save_points(self) -> None:
         try:
             path = self._write(self._name.value or "", self._picks.points())
         except Speckle3DError as error:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import panel as pn
-from bokeh.models import ColumnDataSource, PolyDrawTool, PolyEditTool
+from bokeh.events import SelectionGeometry
+from bokeh.models import BoxSelectTool, ColumnDataSource, PolyDrawTool, PolyEditTool
 from panel.viewable import Viewable
 
 from speckle3d.app.phantom.picture import REGION
+from speckle3d.app.phantom.work import in_turn
 from speckle3d.calibrating.settings import Corners, region_of, region_text
 from speckle3d.core.errors import InvalidInputError
 
@@ -32,19 +35,26 @@ class Region:
     def __init__(self, plot: Any, given: Corners | None, changed: Callable[[], None]) -> None:
         self.corners = given
         self._changed = changed
-        self._source = ColumnDataSource(_data(given))
+        self._source = ColumnDataSource(_data(given), name="region")
         patches = plot.patches(
             "xs", "ys", source=self._source, fill_alpha=0.06, color=REGION, line_width=2, line_dash="dashed"
         )
         vertices = plot.scatter([], [], size=9, color=REGION)
         drawing = PolyDrawTool(
-            renderers=[patches], num_objects=1, vertex_renderer=vertices, description="Draw the region"
+            renderers=[patches],
+            num_objects=1,
+            drag=False,
+            vertex_renderer=vertices,
+            description="Draw the region",
         )
         plot.add_tools(
             drawing,
             PolyEditTool(renderers=[patches], vertex_renderer=vertices, description="Edit the region"),
         )
-        plot.toolbar.active_tap = drawing
+        box = BoxSelectTool(renderers=[vertices], description="Drag a box as the region")
+        plot.add_tools(box)
+        plot.toolbar.active_tap, plot.toolbar.active_drag = drawing, box
+        plot.on_event(SelectionGeometry, self._boxed)
         self._text = pn.widgets.TextInput(
             name="",
             value="" if given is None else region_text(given),
@@ -53,8 +63,8 @@ class Region:
         )
         self._clear = pn.widgets.Button(name="No region", width=90)
         self._source.on_change("data", self._drawn)
-        self._text.param.watch(self._typed, "value")
-        self._clear.on_click(lambda event: self._set(None))
+        self._text.param.watch(in_turn(self._typed), "value")
+        self._clear.on_click(in_turn(partial(self._set, None)))
 
     def controls(self) -> Viewable:
         """The region as text, and a button to be without."""
@@ -75,7 +85,16 @@ class Region:
         if len(corners) >= 3:
             self._take(tuple(corners))
 
-    def _typed(self, event: object) -> None:
+    def _boxed(self, event: SelectionGeometry) -> None:
+        held = event.geometry
+        if not event.final or held["type"] != "rect":
+            return
+        left, right, top, bottom = (round(float(held[end]), _DIGITS) for end in ("x0", "x1", "y0", "y1"))
+        left, right, top, bottom = min(left, right), max(left, right), min(top, bottom), max(top, bottom)
+        if left < right and top < bottom:
+            self._set(((left, top), (right, top), (right, bottom), (left, bottom)))
+
+    def _typed(self) -> None:
         try:
             corners = region_of((self._text.value or "").strip() or None)
         except InvalidInputError:

@@ -18,7 +18,7 @@ from calibration.job import Outcome, Recording
 from calibration.report import text_report
 from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.picture import DROPPED, USED
-from speckle3d.app.phantom.work import Progress, Work
+from speckle3d.app.phantom.work import Progress, Work, in_turn
 from speckle3d.calibrating.phantoms import remarks, solved, write_outcome
 from speckle3d.calibrating.settings import ScanSettings
 from speckle3d.calibrating.written import BESIDE
@@ -91,8 +91,8 @@ class RunPane:
         self._name = pn.widgets.TextInput(name="", value=f"{images.stem}-calibration.h5", width=460)
         self._save = pn.widgets.Button(name="Save result", width=110, disabled=True)
         self._saved = pn.pane.HTML("", width=600)
-        self.button.on_click(self._run)
-        self._save.on_click(self._write)
+        self.button.on_click(in_turn(self._run))
+        self._save.on_click(in_turn(self._write))
 
     def view(self) -> Viewable:
         """The button, the verdict, the table, and saving."""
@@ -112,13 +112,13 @@ class RunPane:
         words = "Settings changed since this result: run again."
         self._verdict.object = _told(words, DROPPED) + self._verdict.object
 
-    async def _run(self, event: object) -> None:
+    def _run(self) -> None:
         try:
             settings = self._settings()
         except Speckle3DError as error:
             self._verdict.object = _told(str(error), DROPPED)
             return
-        await self._work.run(partial(self._solve, settings), self._show)
+        self._work.start(partial(self._solve, settings), self._show)
 
     def _solve(self, settings: ScanSettings, progress: Progress) -> Solved:
         seen = None
@@ -142,7 +142,7 @@ class RunPane:
         self._save.disabled = found.outcome is None
         self._done(found)
 
-    def _write(self, event: object) -> None:
+    def _write(self) -> None:
         found = self._solved
         if found is None or found.outcome is None:
             return

@@ -48,6 +48,7 @@ class FrameStrip:
             y_axis_label="residual",
             tools="",
             toolbar_location=None,
+            name="strip",
         )
         self.plot.grid.visible = False
         self.plot.yaxis.ticker = BasicTicker(desired_num_ticks=3)

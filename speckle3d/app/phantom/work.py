@@ -30,11 +30,18 @@ class Work:
         self.bar = pn.indicators.Progress(value=0, max=100, width=250, visible=False, margin=(14, 8))
         self._counted = (0, 0)
 
-    async def run(self, work: Callable[[Progress], Result], ended: Callable[[Result], Any]) -> None:
+    def start(self, work: Callable[[Progress], Result], ended: Callable[[Result], Any]) -> None:
         """Do the work, which is given where to count frames done and frames in all; then show its result."""
-        document = pn.state.curdoc
         self._counted, self.bar.value = (0, 0), 0
         self.button.disabled, self.bar.visible = True, True
+        pn.state.execute(partial(self._run, pn.state.curdoc, work, ended))
+
+    async def _run(
+        self,
+        document: Document | None,
+        work: Callable[[Progress], Result],
+        ended: Callable[[Result], Any],
+    ) -> None:
         task = asyncio.create_task(asyncio.to_thread(work, self._count))
         while not (await asyncio.wait({task}, timeout=_POLL_S))[0]:
             _later(document, self._show)
@@ -52,9 +59,14 @@ class Work:
         ended(task.result())
 
 
-def _later(document: Document | None, change: Callable[[], None]) -> None:
-    """Change what a viewer sees when it is the viewer's turn: after a wait, it no longer is."""
-    if document is None:
+def in_turn(change: Callable[[], Any]) -> Callable[[object], None]:
+    """Wrap what a widget's event changes: a figure may be changed in its viewer's turn alone."""
+    return lambda event: _later(pn.state.curdoc, change)
+
+
+def _later(document: Document | None, change: Callable[[], Any]) -> None:
+    # In a notebook there are no turns.
+    if document is None or document.session_context is None:
         change()
     else:
         document.add_next_tick_callback(change)

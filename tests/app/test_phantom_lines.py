@@ -1,0 +1,153 @@
+"""The tuner of line detection as somebody uses it: what the sliders, the mouse and the button do."""
+
+import pytest
+from browsers import needs_browser, opened, viewing
+from phantom_pages import by_command, place, require_same, run_and_save, told
+from phantom_recordings import MEMBRANE_MM, PIXEL_MM, floor_recording
+
+from speckle3d.io.calibrations import read_calibration
+
+pytestmark = needs_browser
+
+LINE = r"(\d+) of (\d+) columns agree; row ([\d.]+)"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = tmp_path_factory.mktemp("floor") / "floor.h5"
+    return path, floor_recording(path, membrane=(0,))
+
+
+@pytest.fixture(scope="module")
+def page(browser, recording):
+    with viewing(recording[0], "--calibrate", "plane") as address:
+        page = opened(browser, address)
+        page.locator(".line-told").wait_for()
+        page.set_default_timeout(8000)
+        yield page
+        assert page.complaints == []
+
+
+def handle(page, number):
+    """Of the sliders, in the order of the page: frame, n, sigma, T, d, p."""
+    return page.locator(".noUi-handle").nth(number)
+
+
+def test_the_slider_moves_the_line(page, recording):
+    rows = recording[1]
+    first = float(told(page, "line-told", LINE)[3])
+    # The membrane's echo lies above the floor's and is as bright.
+    assert first == pytest.approx(rows[0] - MEMBRANE_MM / PIXEL_MM[1], abs=0.3)
+    handle(page, 0).press("ArrowRight")
+    page.get_by_text("Leave out frame 1").wait_for()
+    assert float(told(page, "line-told", LINE)[3]) == pytest.approx(rows[1], abs=0.3)
+    handle(page, 0).press("ArrowLeft")
+    page.get_by_text("Leave out frame 0").wait_for()
+    told(page, "line-told", f"row {first:.2f}")
+    for _ in range(2):
+        handle(page, 1).press("ArrowLeft")
+        page.wait_for_timeout(200)
+    told(page, "line-told", "of 58 columns agree")
+    for _ in range(2):
+        handle(page, 1).press("ArrowRight")
+        page.wait_for_timeout(200)
+    told(page, "line-told", "of 60 columns agree")
+
+
+def test_a_region_drawn_with_the_mouse_changes_the_line(page, recording):
+    row = recording[1][0]
+    below = row - MEMBRANE_MM / PIXEL_MM[1] / 2
+    slope = _slope(page)
+    corners = [(20, below - slope * 124), (270, below + slope * 126), (270, 285), (20, 285)]
+    hold(page, corners[0])
+    for corner in corners[1:-1]:
+        page.mouse.click(*place(page, *corner))
+        page.wait_for_timeout(400)  # or it were a double click
+    hold(page, corners[-1])
+    assert float(told(page, "line-told", f"row {int(row)}")[0].split()[1]) == int(row)
+    assert page.get_by_placeholder("region:", exact=False).input_value().count(",") == 4
+    page.get_by_role("button", name="No region").click()
+    above = row - MEMBRANE_MM / PIXEL_MM[1]
+    told(page, "line-told", f"row {int(above)}")
+    # A box that holds the membrane's half alone.
+    start, end = place(page, 20, 20), place(page, 120, 285)
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(*end, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(500)
+    page.screenshot(path="/tmp/phantom6.png")
+    corners = page.get_by_placeholder("region:", exact=False).input_value().split()
+    places = [tuple(map(float, corner.split(","))) for corner in corners]
+    assert places == [pytest.approx(at, abs=1.0) for at in ((20, 20), (120, 20), (120, 285), (20, 285))]
+    told(page, "line-told", f"row {int(above)}")
+    page.get_by_role("button", name="No region").click()
+
+
+def hold(page, corner):
+    """Press the mouse's button for as long as begins or ends a polygon."""
+    page.mouse.move(*place(page, *corner))
+    page.mouse.down()
+    page.wait_for_timeout(600)
+    page.mouse.up()
+    page.wait_for_timeout(200)
+
+
+def _slope(page):
+    """Of the line that is drawn, rows a column."""
+    ends = page.evaluate(
+        "() => { const d = Bokeh.documents[0].get_model_by_name('line').data;"
+        " return [[...d.column], [...d.row]] }"
+    )
+    (u, w), (v, x) = ends
+    return (x - v) / (w - u)
+
+
+def test_the_calibration_is_the_commands_to_the_last_digit(page, recording, tmp_path):
+    region = page.get_by_placeholder("region:", exact=False)
+    region.fill("12.5,20 280,20 280,289 12.5,289")
+    region.press("Enter")
+    for _ in range(2):
+        handle(page, 1).press("ArrowLeft")
+    handle(page, 2).press("ArrowRight")
+    told(page, "line-told", "of 58 columns agree")
+    # A double click on the strip leaves a frame out; the first shows the membrane, not the floor.
+    page.mouse.dblclick(*place(page, 0, 0.5, "strip"))
+    page.get_by_text("Frame 0 is left out").wait_for()
+    page.mouse.click(*place(page, 7, 0.5, "strip"))
+    page.get_by_text("Leave out frame 7").click()
+    page.get_by_text("Frame 7 is left out").wait_for()
+    table = run_and_save(page, "tuned.h5")
+    assert "left out by hand" in table
+    saved = recording[0].with_name("tuned.h5")
+    line = saved.with_suffix(".txt").read_text().split("made by: ")[1]
+    for option in ("--columns 58", "--smoothing-mm 0.75", "--leave-out 0,7", "--region '12.5,20 280,20"):
+        assert option in line
+    out = tmp_path / "again.h5"
+    assert by_command(saved, out) == table.strip()
+    require_same(saved, out)
+    found = read_calibration(saved)
+    assert not {0, 7} & {*found.frames.used}
+    assert found.pixel_mm == pytest.approx(PIXEL_MM, rel=0.01)
+
+
+def test_a_result_of_other_settings_cannot_be_saved_and_a_taken_name_is_refused(page, recording):
+    page.get_by_role("button", name="Save result").click()
+    page.get_by_text("expected a new name").wait_for()
+    handle(page, 4).press("ArrowRight")
+    page.get_by_text("Settings changed since this result").wait_for()
+    assert page.get_by_role("button", name="Save result").is_disabled()
+    assert sorted(path.name for path in recording[0].parent.iterdir()) == [
+        "floor.h5", "tuned.h5", "tuned.png", "tuned.txt"
+    ]  # fmt: skip
+
+
+def test_motion_that_is_missing_is_named(page):
+    field = page.get_by_placeholder("left out, as", exact=False)
+    field.fill("0-33")
+    field.press("Enter")
+    page.get_by_role("button", name="Run calibration").click()
+    page.get_by_text("No calibration:").wait_for()
+    field.fill("0-99")
+    field.press("Enter")
+    page.get_by_text("expected frames from 0 to 39, got 99").wait_for()

@@ -1,0 +1,77 @@
+"""Points of N-wires found, moved, deleted and added with the mouse, saved, and calibrated with."""
+
+import numpy as np
+import pytest
+from browsers import needs_browser, opened, viewing
+from phantom_pages import by_command, place, require_same, run_and_save, told
+from phantom_recordings import wire_recording
+
+from speckle3d.io.points import read_points
+
+pytestmark = needs_browser
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wires")
+    return folder / "wires.h5", wire_recording(folder / "wires.h5", folder / "wires.xml")
+
+
+@pytest.fixture(scope="module")
+def page(browser, recording):
+    path = recording[0]
+    with viewing(path, "--calibrate", "wires", "--phantom", path.with_suffix(".xml")) as address:
+        page = opened(browser, address)
+        page.locator(".points-told").wait_for()
+        page.get_by_role("button", name="Find points in all frames").click()
+        told(page, "points-told", r"in \d+ frames")
+        page.set_default_timeout(8000)
+        yield page
+        assert page.complaints == []
+
+
+def saved(page, path, name):
+    field = page.locator("input[type=text]").nth(2)
+    field.fill(name)
+    field.press("Enter")
+    page.get_by_role("button", name="Save points").click()
+    page.get_by_text(name).last.wait_for()
+    return read_points(path.with_name(name), tuple("abcdefghi"))
+
+
+def test_points_are_found_moved_deleted_and_added_by_mouse(page, recording):
+    path, scene = recording
+    told(page, "points-told", "frame 0: 9 points")
+    found = saved(page, path, "found.csv")
+    away = found.pixels - scene.pixels[found.frame, found.wire]
+    assert np.abs(away).max() < 2.0
+    first = found.pixels[0]
+    page.mouse.move(*place(page, *first))
+    page.mouse.down()
+    page.mouse.move(*place(page, first[0] + 30, first[1] - 12), steps=5)
+    page.mouse.up()
+    page.wait_for_timeout(400)
+    page.mouse.click(*place(page, *found.pixels[1]))
+    page.wait_for_timeout(400)
+    page.keyboard.press("Backspace")
+    told(page, "points-told", "frame 0: 8 points; none on b")
+    changed = saved(page, path, "changed.csv")
+    assert changed.pixels[0] == pytest.approx(first + np.array([30, -12]), abs=1.5)
+    assert 1 not in changed.wire[changed.frame == 0]
+    # The wire that is missing is the next one.
+    page.mouse.click(*place(page, *first))
+    told(page, "points-told", "frame 0: 9 points")
+    again = saved(page, path, "again.csv")
+    assert again.pixels[(again.frame == 0) & (again.wire == 1)][0] == pytest.approx(first, abs=1.5)
+
+
+def test_the_calibration_is_the_commands_with_the_points_that_were_saved(page, recording, tmp_path):
+    path = recording[0]
+    page.get_by_text("Leave out frame 0").click()
+    page.get_by_text("Frame 0 is left out").wait_for()
+    table = run_and_save(page, "wires-cal.h5")
+    assert "left out by hand" in table
+    result, out = path.with_name("wires-cal.h5"), tmp_path / "again.h5"
+    assert "--points" in result.with_suffix(".txt").read_text()
+    assert by_command(result, out) == table.strip()
+    require_same(result, out)

@@ -1,0 +1,94 @@
+"""Settings as options of the command: what is written is read as the same."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from speckle3d import cli
+from speckle3d.calibrating.settings import (
+    OrientationSettings,
+    PlaneSettings,
+    WireSettings,
+    command_line,
+    frames_of,
+    frames_text,
+    offset_of,
+    region_of,
+    region_text,
+    with_values,
+)
+from speckle3d.cli import calibrate_phantoms
+from speckle3d.core.errors import InvalidInputError
+
+number = st.floats(-1e4, 1e4, allow_nan=False)
+
+
+@given(st.sets(st.integers(0, 10**9)))
+@settings(deadline=None)
+def test_frames_are_read_as_they_are_written(frames):
+    assert frames_of(frames_text(frames)) == tuple(sorted(frames))
+
+
+@given(st.lists(st.tuples(number, number), min_size=3, max_size=8))
+@settings(deadline=None)
+def test_a_region_is_read_as_it_is_written(corners):
+    assert region_of(region_text(tuple(corners))) == tuple(corners)
+
+
+def test_frames_are_numbers_and_ranges():
+    assert frames_of("17-20, 3,18") == (3, 17, 18, 19, 20)
+    assert frames_text((3, 17, 18, 19, 20, 22)) == "3,17-20,22"
+    assert frames_of(None) == frames_of("") == ()
+
+
+@pytest.mark.parametrize("text", ["3;4", "-3", "5-3", "1.5", "0-9999999", "9999999999", "a", "3-4-5", "٣"])
+def test_what_names_no_frames_is_refused(text):
+    with pytest.raises(InvalidInputError, match="--leave-out"):
+        frames_of(text)
+
+
+def test_a_clock_offset_is_seconds_or_to_be_estimated():
+    assert offset_of(None) is None
+    assert offset_of("estimate") == "estimate"
+    assert offset_of("-0.025") == -0.025
+    with pytest.raises(InvalidInputError, match="--time-offset"):
+        offset_of("nan")
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        PlaneSettings(),
+        PlaneSettings(
+            poses=Path("its poses.mha"), transform="ProbeToTracker", pixel_mm=(0.1, 1 / 3), time_offset=-0.01,
+            outlier_sigma=3.5, region=((0.5, 1.0), (20.0, 1e-3), (7.25, 80.0)), leave_out=(0, 3, 4, 5),
+            columns=41, smoothing_mm=0.1 + 0.2, threshold=12.5, tolerance_mm=0.4, consensus=0.65, place="front",
+            fixed_pixels=True, pixel_error=float("inf"), stages="one", reflector="bar", beam_mm=(1.5, 2.0),
+        ),
+        OrientationSettings(level=True, viewed_from="below", sensor="tracker", time_offset="estimate"),
+        WireSettings(phantom="three", points=Path("a b.csv"), registration="held", fixed_pixels=True),
+    ],
+)  # fmt: skip
+def test_the_command_that_is_told_takes_the_same_settings(monkeypatch, given):
+    taken = []
+    monkeypatch.setattr(
+        calibrate_phantoms,
+        "_calibrate",
+        lambda images, found, out, *rest, **more: taken.append((images, found, out)),
+    )
+    line = command_line(given, Path("the images.mha"), Path("out.h5"))
+    monkeypatch.setattr(sys, "argv", shlex.split(line))
+    with pytest.raises(SystemExit) as leave:
+        cli.main()
+    assert leave.value.code == 0
+    assert taken == [(Path("the images.mha"), given, Path("out.h5"))]
+
+
+def test_a_value_out_of_range_is_refused_by_name():
+    assert with_values(PlaneSettings(), {"columns": 30}).columns == 30
+    with pytest.raises(InvalidInputError, match=r"plane.*consensus"):
+        with_values(PlaneSettings(), {"consensus": 1.5})
