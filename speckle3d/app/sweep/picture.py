@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, CustomJS, HoverTool, LinearColorMapper, Range1d
+from bokeh.models import ColumnDataSource, CustomJS, HoverTool, LinearColorMapper, Range1d
+from bokeh.models.annotations import ColorBar
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
 from speckle3d.app.sweep.pairs import PatchValues
 from speckle3d.core.arrays import ByteArray
 
-HEIGHT_PX, WIDEST_PX = 400, 560
+HEIGHT_PX, WIDEST_PX = 350, 560
 """Of the picture itself, so that a page fits on a screen of 1366 x 768."""
 
 COLOURINGS = {"distance": "distance (mm)", "sigma": "sigma of distance (mm)", "correlation": "correlation"}
@@ -57,7 +58,7 @@ class Picture:
         self._colours = LinearColorMapper(palette=Viridis256, low=0.0, high=1.0, nan_color="rgba(0,0,0,0)")
         self.plot = figure(
             frame_width=max(round(width * scale), 90), frame_height=round(height * scale),
-            x_range=Range1d(left, left + width), y_range=Range1d(top + height, top),
+            x_range=Range1d(start=left, end=left + width), y_range=Range1d(start=top + height, end=top),
             x_axis_label="lateral (mm)", y_axis_label="depth (mm)",
             tools="pan,wheel_zoom,box_zoom,reset,save", active_scroll="wheel_zoom", match_aspect=True,
             background_fill_color="#000000", margin=0,
@@ -66,7 +67,7 @@ class Picture:
         self.plot.grid.visible = False
         self.plot.image(
             "image", x=left, y=top, dw=width, dh=height, source=self.image,
-            color_mapper=LinearColorMapper(palette=_GREYS, low=0, high=255),
+            color_mapper=LinearColorMapper(palette=_GREYS, low=0, high=255),  # type: ignore[call-arg]
         )  # fmt: skip
         drawn = self.plot.rect(
             "x", "y", width=patch_mm[0], height=patch_mm[1], angle="angle", source=self._patches,
@@ -94,7 +95,11 @@ class Picture:
     def colour(self, patches: PatchValues, by: str, most: float, opacity: float) -> PatchCount:
         """Draw patches coloured by a quantity from zero to `most`."""
         self._bar.visible = True
-        values = {"distance": patches.distance_mm, "sigma": patches.sigma_mm, "correlation": patches.correlation}
+        values = {
+            "distance": patches.distance_mm,
+            "sigma": patches.sigma_mm,
+            "correlation": patches.correlation,
+        }
         state = _states(patches)
         self._colours.high, self._bar.title = most, COLOURINGS[by]
         known = np.isfinite(values[by])
@@ -126,5 +131,17 @@ def _states(patches: PatchValues) -> list[str]:
 
 
 def _no_patches() -> dict[str, list[object]]:
-    names = ("x", "y", "angle", "value", "alpha", "line", "hatch", "state", "distance", "sigma", "correlation")
+    names = (
+        "x",
+        "y",
+        "angle",
+        "value",
+        "alpha",
+        "line",
+        "hatch",
+        "state",
+        "distance",
+        "sigma",
+        "correlation",
+    )
     return {name: [] for name in names}

@@ -22,6 +22,10 @@ from speckle3d.core.sweep import Sweep
 
 LEAP = 10
 """Frames by which Shift and an arrow move."""
+_KEYS = (
+    '<span style="color:#57636f">&larr; &rarr; frame, with Shift ten; Home, End; Space plays; '
+    "clicks below jump</span>"
+)
 _TICK_MS = 15
 _PATIENCE_S = 1.0
 """A browser that has not drawn for so long is sent the next image all the same."""
@@ -69,10 +73,12 @@ class Player:
             options=["none", *colourings], value="none", button_type="default", button_style="outline"
         )
         self._other = pn.widgets.Select(options={}, width=230, disabled=True)
-        self._opacity = pn.widgets.FloatSlider(name="opacity", start=0.1, end=1.0, step=0.1, value=0.5, width=150)
+        self._opacity = pn.widgets.IntSlider(
+            name="opacity (%)", start=10, end=100, step=10, value=50, width=150
+        )
         self._told = pn.pane.HTML("", sizing_mode="stretch_width")
         self._judged = pn.pane.HTML("", sizing_mode="stretch_width")
-        self._keys = Keys(width=0, height=0, margin=0)
+        self._keys = Keys(width=0, height=0, margin=0)  # type: ignore[no-untyped-call]
 
     def view(self) -> Viewable:
         """Return what is shown."""
@@ -108,15 +114,16 @@ class Player:
             sizing_mode="stretch_width",
         )
         picture = pn.Column(
-            pn.pane.Bokeh(self._picture.plot, margin=0), pn.Row(self._play, self._slider, self._keys)
+            pn.pane.Bokeh(self._picture.plot, margin=0),
+            pn.Row(self._play, self._slider, self._keys, margin=0),
+            pn.pane.HTML(_KEYS, margin=(0, 10), width=430),
         )
-        line = [pn.pane.Bokeh(self._line.flags(), sizing_mode="stretch_width", margin=0)]
         below = self._line.streams(self._streams) or [
             pn.pane.HTML("No sensor was recorded with this sweep.", margin=(5, 10))
         ]
         return pn.Column(
             pn.Row(picture, chosen, sizing_mode="stretch_width"),
-            *line,
+            pn.pane.Bokeh(self._line.marks, sizing_mode="stretch_width", margin=0),
             pn.Row(*below, sizing_mode="stretch_width"),
             sizing_mode="stretch_width",
             margin=0,
@@ -126,8 +133,12 @@ class Player:
         """What is doubted of the recording, with buttons that lead to the frames of each."""
         doubts = self._findings.doubts
         kept = self._findings.are_of_reconstruction
-        heading = "What the checks found" if kept else "What the sensors' readings say against themselves"
-        rows = [pn.pane.HTML(f"<b>{heading}</b>", margin=(0, 10))]
+        heading = (
+            "What the checks found (purple below)"
+            if kept
+            else "What the sensors' readings say against themselves"
+        )
+        rows: list[Viewable] = [pn.pane.HTML(f"<b>{heading}</b>", margin=(0, 10))]
         if not doubts:
             rows.append(pn.pane.HTML("Nothing in doubt.", margin=(0, 10)))
         for doubt in doubts:
@@ -140,7 +151,7 @@ class Player:
         return pn.Column(*rows, sizing_mode="stretch_width")
 
     def _leading_to(self, frame: int, name: str) -> Viewable:
-        button = pn.widgets.Button(name=name, button_type="light", margin=(0, 2))
+        button = pn.widgets.Button(name=name, button_style="outline", height=24, margin=(0, 3))
         button.on_click(partial(lambda frame, _: self.go(frame), frame))
         return button
 
@@ -199,7 +210,7 @@ class Player:
 
     def _draw(self) -> None:
         frame = self.frame
-        image = self._images.image(frame, int(self._range.value))
+        image = self._images.image(frame, int(self._range.value or USUAL_DB))
         with pn.io.hold():
             self._count += 1
             self._shown, self._sent_s = frame, time.monotonic()
@@ -221,8 +232,8 @@ class Player:
         self._other.param.update(options={_named(each, frame): each for each in others}, value=other)
         self._filling = False
         values = self._pairs.values(frame, other, by == "correlation")
-        most = dict(zip(COLOURINGS, (*self._pairs.most_mm, 1.0), strict=True))[by]
-        count = self._picture.colour(values, by, most, float(self._opacity.value))
+        most = dict(zip(COLOURINGS, (*self._pairs.most_mm(abs(other - frame)), 1.0), strict=True))[by]
+        count = self._picture.colour(values, by, most, float(self._opacity.value or 0) / 100)
         return Compared(other, values, count)
 
     def _words(self, frame: int, compared: Compared | None) -> str:
@@ -234,7 +245,7 @@ class Player:
         if self._findings.flags is not None and not reasons:
             lines.append("no flag: the frame is sound")
         if self._colouring.value != "none":
-            lines += [_pair_words(frame, compared, self._pairs.are_reconstructed)]
+            lines += [_pair_words(compared, self._pairs)]
         return "<br>".join(lines)
 
     def _told_of_findings(self) -> None:
@@ -251,22 +262,33 @@ class Compared:
     count: PatchCount
 
 
-def _pair_words(frame: int, compared: Compared | None, reconstructed: bool) -> str:
+def _pair_words(compared: Compared | None, pairs: SweepPairs) -> str:
     if compared is None:
-        return "No pair with another frame: too little speckle in common, or flagged."
+        why = (
+            "too little speckle in common, or a flag"
+            if pairs.are_reconstructed
+            else "there is no other frame"
+        )
+        return f"No pair of this frame with another: {why}."
     values, count = compared.values, compared.count
-    words = []
+    words = [f"<b>With frame {compared.other}</b>"]
     if values.moved_mm is not None:
         moved, sigma = values.moved_mm
-        words.append(f"{moved:.3f} &plusmn; {sigma:.3f} mm from frame {compared.other} at the image's centre")
-    if reconstructed:
-        words.append(
-            f"{count.used} patches used, {count.rejected} rejected (crossed out), "
-            f"{count.without} without a distance"
-        )
+        words.append(f"the image's centre is {moved:.3f} &plusmn; {sigma:.3f} mm away, elevational")
     if np.isfinite(values.correlation).any():
         words.append(f"median correlation {np.nanmedian(values.correlation):.3f}, computed anew")
-    return "; ".join(words) + "."
+    lines = ["; ".join(words) + "."]
+    if values.used is None and pairs.are_reconstructed:
+        lines.append("The reconstruction did not use this pair.")
+    elif values.used is not None:
+        why = "the sensed orientation contradicts them" if pairs.by_orientation else "left out of the plane"
+        kept = "in the consistent subset" if pairs.by_orientation else "in the plane"
+        lines.append(
+            f"{count.used} patches {kept} (white frames), "
+            f'<span style="color:#c22">{count.rejected} rejected: {why} (red, crossed out)</span>, '
+            f"{count.without} without a distance (empty)."
+        )
+    return "<br>".join(lines)
 
 
 def _named(other: int, frame: int) -> str:
