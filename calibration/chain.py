@@ -11,7 +11,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, Protocol
@@ -153,6 +153,13 @@ class Seen:
     def __getitem__(self, chosen: BoolArray | IntArray) -> Seen:
         wire = None if self.wire is None else self.wire[chosen]
         return Seen(self.frame[chosen], self.pixels[chosen], wire, self.dropped)
+
+    def without(self, frames: Collection[int], reason: str) -> Seen:
+        """Leave out frames, for the same reason each, whether anything was found in them or not."""
+        if not frames:
+            return self
+        kept = self[~np.isin(self.frame, list(frames))]
+        return replace(kept, dropped={**self.dropped, **dict.fromkeys(frames, reason)})
 
     @property
     def are_lines(self) -> bool:

@@ -156,13 +156,14 @@ def find_nwires(
     phantom: WirePhantom,
     region_px: npt.ArrayLike | None = None,
     progress: Progress | None = None,
+    leave_out: Sequence[int] = (),
 ) -> Seen:
-    """Find the dots of an N-wire phantom and the wires they show.
+    """Find the dots of an N-wire phantom and the wires they show, but for frames that are left out.
 
     Where every frame has a sensor reading, a calibration from the frames that show all wires then finds
     those of the other frames.
     """
-    dots = dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress)
+    dots = dots_in_frames(recording.images, recording.pixel_mm, None, region_px, progress).without(leave_out)
     times, offset_s = recording.frame_time_s, recording.time_offset_s
     everywhere = covered(recording.readings, times, offset_s).all()
     if isinstance(recording.readings, TimedPoses) and everywhere:

@@ -7,7 +7,7 @@ above half of its peak.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -78,6 +78,12 @@ class Dots:
     pixels: FloatArray
     score: FloatArray
     dropped: dict[int, str] = field(default_factory=dict)
+
+    def without(self, frames: Collection[int]) -> Dots:
+        """Leave out frames."""
+        kept = ~np.isin(self.frame, list(frames))
+        dropped = {frame: why for frame, why in self.dropped.items() if frame not in frames}
+        return Dots(self.frame[kept], self.pixels[kept], self.score[kept], dropped)
 
 
 def dots_in_image(

@@ -146,6 +146,55 @@ def detect_line(
     return _detect(image, pixel, s, columns)
 
 
+@dataclass(frozen=True)
+class LineFinder:
+    """Finds the line of a plane's echo in frames of one recording, each by itself.
+
+    Attributes
+    ----------
+    pixel_mm : ndarray, shape (2,)
+        Distance between columns and between rows.
+    columns : Columns
+        Sampled in every frame.
+    """
+
+    pixel_mm: FloatArray
+    settings: LineSettings
+    columns: Columns
+
+    @classmethod
+    def of_frames(
+        cls,
+        frames: Frames,
+        pixel_mm: npt.ArrayLike,
+        settings: LineSettings | None = None,
+        region_px: npt.ArrayLike | None = None,
+    ) -> LineFinder:
+        """Choose the columns from all frames; see `detect_lines`."""
+        s = settings or LineSettings()
+        if len(frames.shape) != 3 or np.issubdtype(frames.dtype, np.complexfloating):
+            raise InvalidInputError(
+                f"frames: expected real values of shape (n, column, row), got {frames.dtype} of "
+                f"{frames.shape}"
+            )
+        pixel = checked_pixel(pixel_mm)
+        columns = lay_columns(frames.shape[1:], s.columns, region_px)
+        if region_px is None and frames.shape[0] > 0:
+            dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
+            columns = without_standing(dense, frames, s.smoothing_mm / pixel[1]).thinned(s.columns)
+        return cls(pixel, s, columns)
+
+    def line(self, image: npt.NDArray[Any]) -> EchoLine:
+        """Find the line in one frame, shape (column, row).
+
+        Raises
+        ------
+        NoLineError
+            If too few columns agree on a line.
+        """
+        return _detect(image, self.pixel_mm, self.settings, self.columns)
+
+
 def detect_lines(
     frames: Frames,
     pixel_mm: npt.ArrayLike,
@@ -171,22 +220,13 @@ def detect_lines(
     InvalidInputError
         If an argument is not what it must be.
     """
-    s = settings or LineSettings()
-    if len(frames.shape) != 3 or np.issubdtype(frames.dtype, np.complexfloating):
-        raise InvalidInputError(
-            f"frames: expected real values of shape (n, column, row), got {frames.dtype} of {frames.shape}"
-        )
-    pixel = checked_pixel(pixel_mm)
-    columns = lay_columns(frames.shape[1:], s.columns, region_px)
-    if region_px is None and frames.shape[0] > 0:
-        dense = lay_columns(frames.shape[1:], DENSELY * s.columns, None)
-        columns = without_standing(dense, frames, s.smoothing_mm / pixel[1]).thinned(s.columns)
+    finder = LineFinder.of_frames(frames, pixel_mm, settings, region_px)
     found: dict[int, FloatArray] = {}
     dropped: dict[int, str] = {}
     count = frames.shape[0]
     for index in range(count):
         try:
-            found[index] = _detect(frames[index], pixel, s, columns).points_px
+            found[index] = finder.line(frames[index]).points_px
         except NoLineError as error:
             dropped[index] = str(error)
         if progress:

@@ -18,6 +18,8 @@ from speckle3d.io.readers import find_reader, first_bytes
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 
 if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
     from speckle3d.core.doubts import Doubt
     from speckle3d.core.reconstruction import Reconstruction
     from speckle3d.core.sweep import Sweep
@@ -80,7 +82,7 @@ def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
     except InvalidInputError:
         with suppress(InvalidInputError, InsufficientDataError):
             if (log := held_log(path)) is not None:
-                return [_sensor(log, Folder(path))]
+                return [_sensor(log)]
         raise
     return _recorded(sweep, path)
 
@@ -96,10 +98,9 @@ def _recorded(
 
     if not len(sweep):
         raise InvalidInputError(f"{path}: expected frames to look at, got none")
-    folder = Folder(path)
-    pages: list[Page] = [SweepPage(sweep, folder, reconstruction, doubts)]
+    pages: list[Page] = [SweepPage(sweep, Folder(path), reconstruction, doubts)]
     if sweep.orientation is not None:
-        pages.append(_sensor(log_of(sweep.orientation, path.name), folder))
+        pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))
     return pages
 
 
@@ -123,10 +124,10 @@ def _logged(path: Path) -> list[Page]:
         raise InvalidInputError(
             f"{path}: expected a recording, a log, or a results folder with {RECONSTRUCTION}, got another"
         )
-    return [_sensor(read_log(path), Folder(path))]
+    return [_sensor(read_log(path))]
 
 
-def _sensor(log: ImuLog, folder: Folder) -> Page:
+def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:
     from speckle3d.app.sensor.page import SensorPage
 
-    return SensorPage(log, folder)
+    return SensorPage(log, mounting)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from speckle3d.cli.calibrate_phantoms import find_lines
 from speckle3d.cli.calibrations import require_free
 from speckle3d.cli.common import (
     Images,
@@ -57,7 +56,9 @@ def calibrate_clock(
     """
     from calibration.clock.images import delay_from_images
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
-    from speckle3d.cli.recordings import open_recording, open_tracked, require_unsized
+    from calibration.detection.lines import detect_lines
+    from speckle3d.calibrating.recordings import open_recording, open_tracked, require_unsized
+    from speckle3d.calibrating.settings import region_of
     from speckle3d.io.calibrations import write_calibration
     from speckle3d.study.results import json_text
 
@@ -80,7 +81,9 @@ def calibrate_clock(
         told = f"images of the two ways correlate by {found.followed:.2f}"
     else:
         recording = open_recording(images, poses, pixel_mm, sensor, transform)
-        seen = find_lines(recording, region, images)
+        corners = region_of(region)
+        with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
+            seen = detect_lines(recording.images, recording.pixel_mm, None, corners, progress)
         frames, times = len(seen), recording.frame_time_s
         if frames < FEWEST_FRAMES:
             raise InsufficientDataError(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from speckle3d.cli.calibrations import require_free, write_with_report
+from speckle3d.cli.calibrations import report_written, require_free
 from speckle3d.cli.common import (
     CalibrationOut,
     Json,
@@ -85,7 +85,8 @@ def calibrate_images(
     from calibration.clock.images import delay_from_images
     from calibration.images.report import calibration_from_images, figure_of, notes_of
     from calibration.images.solver import ImageSettings
-    from speckle3d.cli.recordings import open_tracked, require_unsized
+    from speckle3d.calibrating.recordings import open_tracked, require_unsized
+    from speckle3d.calibrating.written import write_with_report
     from speckle3d.io.calibrations import read_calibration
 
     if time_offset_s is not None and not abs(time_offset_s) < MOST_OFFSET_S:
@@ -126,14 +127,10 @@ def calibrate_images(
         found = _solve(sweeps, found.sensor_from_image, settings)
     # Checked again at the answer, because the overlap of the sweeps depends on the mounting.
     enough = _angulation(sweeps, found.sensor_from_image)
-    write_with_report(
-        calibration_from_images(found, enough, sweeps),
-        (first, second),
-        out,
-        lambda _: figure_of(found, enough, sweeps),
-        notes_of(found, enough) + told,
-        as_json=as_json,
-    )
+    notes = notes_of(found, enough) + told
+    made = calibration_from_images(found, enough, sweeps)
+    written = write_with_report(made, (first, second), out, lambda _: figure_of(found, enough, sweeps), notes)
+    report_written(written, notes, as_json=as_json)
 
 
 def _one_each(poses: list[Path] | None) -> list[Path | None]:

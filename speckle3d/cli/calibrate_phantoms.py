@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.calibrations import require_free, write_with_report
+from speckle3d.cli.calibrations import report_written, require_free
 from speckle3d.cli.common import (
     CalibrationOut,
     Images,
@@ -29,10 +27,7 @@ from speckle3d.cli.common import (
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
-    from calibration.chain import ImagePoints, Seen
-    from calibration.detection.lines import LineSettings
-    from calibration.job import JobSettings, Outcome, Recording
-    from speckle3d.core.arrays import FloatArray
+    from speckle3d.calibrating.settings import ScanSettings
 
 TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sensor's clock, or `estimate`.")]
 FixedPixels = Annotated[
@@ -52,6 +47,9 @@ Threshold = Annotated[float | None, typer.Option(help="Lines: slope that makes a
 ToleranceMm = Annotated[float | None, typer.Option(help="Lines: how near an edge must be to agree (d).")]
 Consensus = Annotated[float | None, typer.Option(help="Lines: part of the possible columns that agree (p).")]
 Place = Annotated[str | None, typer.Option(help="Lines: where on an echo: front, slope or peak.")]
+LeaveOut = Annotated[
+    str | None, typer.Option(metavar="FRAMES", help="Frames to leave out, from 0, as 3,17-20.")
+]
 Validation = Annotated[
     Path | None, typer.Option(help="Another recording of the phantom, on which the calibration is checked.")
 ]
@@ -86,24 +84,14 @@ def calibrate_plane(
     tolerance_mm: ToleranceMm = None,
     consensus: Consensus = None,
     place: Place = None,
+    leave_out: LeaveOut = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
-    from calibration.detection.lines import LineSettings
-    from calibration.job import plane_job
+    from speckle3d.calibrating.settings import PlaneSettings
 
-    require_free(out, images, poses, validation)
-    lines = from_options(LineSettings, locals())
-    widths = () if reflector == "bar" else tuple(beam_mm or (1.0, 2.0, 3.0))
-
-    def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
-        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma, transform)
-        return recording, find_lines(recording, region, path, lines), job
-
-    solve = partial(
-        plane_job, fit_pixels=not fixed_pixels, stages=stages, beam_mm=widths, pixel_error=pixel_error
-    )
-    _calibrate(scan, solve, images, poses, validation, out, as_json)
+    given = {**locals(), **_parsed(region, time_offset, leave_out)}
+    _calibrate(images, from_options(PlaneSettings, given), out, validation, as_json=as_json)
 
 
 @calibrate.command("orientation")
@@ -120,7 +108,8 @@ def calibrate_orientation(
         Literal["above", "below"], typer.Option(help="Whether the beam points down on average, or up.")
     ] = "above",
     sensor: Annotated[
-        str, typer.Option(help="orientation, or tracker: use only what a tracker says of orientation.")
+        Literal["orientation", "tracker"],
+        typer.Option(help="orientation, or tracker: use only what a tracker says of orientation."),
     ] = "orientation",
     region: Region = None,
     time_offset: TimeOffset = None,
@@ -132,21 +121,14 @@ def calibrate_orientation(
     tolerance_mm: ToleranceMm = None,
     consensus: Consensus = None,
     place: Place = None,
+    leave_out: LeaveOut = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
-    from calibration.detection.lines import LineSettings
-    from calibration.job import orientation_job
+    from speckle3d.calibrating.settings import OrientationSettings
 
-    require_free(out, images, poses, validation)
-    lines = from_options(LineSettings, locals())
-
-    def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
-        recording, job = _prepared(path, readings, pixel_mm, sensor, time_offset, outlier_sigma, transform)
-        return recording, find_lines(recording, region, path, lines), job
-
-    solve = partial(orientation_job, level=level, viewed_from=viewed_from)
-    _calibrate(scan, solve, images, poses, validation, out, as_json)
+    given = {**locals(), **_parsed(region, time_offset, leave_out)}
+    _calibrate(images, from_options(OrientationSettings, given), out, validation, as_json=as_json)
 
 
 @calibrate.command("wires")
@@ -175,189 +157,56 @@ def calibrate_wires(
     validation_points: Annotated[
         Path | None, typer.Option(help="CSV of points picked by hand in that other recording.")
     ] = None,
+    leave_out: LeaveOut = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
-    from calibration.job import wires_job
-    from speckle3d.core.wires import three_wires
-    from speckle3d.io.plus_config import WireConfig, read_wire_phantom
+    from speckle3d.calibrating.settings import WireSettings
 
     if validation is None and validation_points is not None:
         raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
-    require_free(out, images, points, poses, validation, validation_points, Path(phantom))
-    config: WireConfig | None = None
-    if phantom not in ("cross", "three"):
-        config = read_wire_phantom(phantom)
-        if pixel_mm is None and config.pixel_mm is not None:
-            pixel_mm = (config.pixel_mm, config.pixel_mm)
-    geometry = config.phantom if config else three_wires() if phantom == "three" else None
+    given = {**locals(), **_parsed(region, time_offset, leave_out)}
+    others = (points, validation_points, Path(phantom))
+    _calibrate(images, from_options(WireSettings, given), out, validation, validation_points, others, as_json)
 
-    def scan(path: Path, readings: Path | None) -> tuple[Recording, Seen, JobSettings]:
-        recording, job = _prepared(path, readings, pixel_mm, "tracker", time_offset, outlier_sigma, transform)
-        picked = validation_points if path is validation else points
-        return recording, _seen_wires(recording, phantom, config, picked, region, path), job
 
-    fit_pixels = not fixed_pixels
-    solve = partial(wires_job, phantom=geometry, fit_pixels=fit_pixels, registration=registration)
-    names = () if config is None else config.phantom.names
-    _calibrate(scan, solve, images, poses, validation, out, as_json, names)
+def _parsed(region: str | None, time_offset: str | None, leave_out: str | None) -> dict[str, Any]:
+    from speckle3d.calibrating.settings import frames_of, offset_of, region_of
+
+    return {
+        "region": region_of(region),
+        "time_offset": offset_of(time_offset),
+        "leave_out": frames_of(leave_out),
+    }
 
 
 def _calibrate(
-    scan: Callable[[Path, Path | None], tuple[Recording, Seen, JobSettings]],
-    solve: Callable[[Recording, Seen, JobSettings], Outcome],
     images: Path,
-    poses: Path | None,
-    validation: Path | None,
+    settings: ScanSettings,
     out: Path,
-    as_json: bool,
-    wire_names: tuple[str, ...] = (),
+    validation: Path | None,
+    validation_points: Path | None = None,
+    others: Sequence[Path | None] = (),
+    as_json: bool = False,
 ) -> None:
     """Calibrate, check on the other recording, and write the calibration, its report and the dots."""
-    from calibration.report import figure_report
-    from speckle3d.io.points import PickedPoints, write_points
+    from speckle3d.calibrating.phantoms import found, opened, remarks, solved, validated, write_outcome
 
-    recording, seen, job = scan(images, poses)
+    require_free(out, images, settings.poses, validation, *others)
+    recording = opened(images, settings, settings.poses)
+    with progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
+        seen = found(recording, settings, getattr(settings, "points", None), progress)
     with naming(str(images)):
-        outcome = solve(recording, seen, job)
-    notes = [] if outcome.choice is None else [str(outcome.choice)]
-    notes += _nwire_notes(outcome, outcome.solution.points)
-    if (found := outcome.offset) is not None:
-        notes.insert(0, f"clock offset {found.seconds:+.4f} +- {found.standard_error_s:.4f} s, estimated")
+        outcome = solved(recording, seen, settings)
+    notes, more = remarks(outcome), []
     if validation is not None:
-        other, other_seen, _ = scan(validation, None)
-        notes += _validated(outcome, other, other_seen, validation)
-
-    def write_dots(path: Path) -> None:
-        found = outcome.seen
-        write_points(path, PickedPoints(found.frame, found.pixels, found.wire), wire_names)
-
-    write_with_report(
-        outcome.calibration,
-        [images],
-        out,
-        lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
-        notes,
-        outcome.beam,
-        as_json,
-        None if seen.are_lines else write_dots,
-    )
-
-
-def _prepared(
-    images: Path,
-    poses: Path | None,
-    pixel_mm: tuple[float, float] | None,
-    sensor: str,
-    time_offset: str | None,
-    outlier_sigma: float,
-    transform: str | None,
-) -> tuple[Recording, JobSettings]:
-    from calibration.job import JobSettings
-    from speckle3d.cli.recordings import open_recording
-
-    recording = open_recording(images, poses, pixel_mm, sensor, transform)
-    if time_offset is None:
-        return recording, JobSettings(outlier_sigma=outlier_sigma)
-    if time_offset == "estimate":
-        return recording, JobSettings(outlier_sigma=outlier_sigma, estimate_offset=True)
-    return replace(recording, time_offset_s=_seconds(time_offset)), JobSettings(
-        outlier_sigma=outlier_sigma, offset_given=True
-    )
-
-
-def _seconds(text: str) -> float:
-    from speckle3d.io.text import numbers
-
-    try:
-        (seconds,) = numbers(text, 1, "--time-offset")
-    except InvalidInputError:
-        raise InvalidInputError(f"--time-offset: expected seconds or `estimate`, got {text!r}") from None
-    return seconds
-
-
-def _region(text: str | None) -> FloatArray | None:
-    """Parse the polygon "column,row column,row ..."; shape (k, 2)."""
-    import numpy as np
-
-    if text is None:
-        return None
-    try:
-        corners = np.array([[float(x) for x in corner.split(",")] for corner in text.split()])
-    except ValueError:
-        corners = np.empty(0)
-    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-        raise InvalidInputError(f'--region: expected at least three "column,row", got {text!r}')
-    return corners
-
-
-def find_lines(
-    recording: Recording, region: str | None, images: Path, settings: LineSettings | None = None
-) -> Seen:
-    """Find the plane's line in every image, showing progress."""
-    from calibration.detection.lines import detect_lines
-
-    corners = _region(region)
-    with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
-        return detect_lines(recording.images, recording.pixel_mm, settings, corners, progress)
-
-
-def _seen_wires(
-    recording: Recording, phantom: str, config: Any, points: Path | None, region: str | None, images: Path
-) -> Seen:
-    from calibration.chain import Seen
-    from calibration.job import find_crossings, find_nwires
-    from speckle3d.io.points import read_points
-
-    names = ("x", "y", "z") if phantom == "three" else () if config is None else config.phantom.names
-    if points is not None:
-        picked = read_points(points, names)
-        with naming(str(points)):
-            picked.require_inside(recording.images.shape)
-        return Seen(picked.frame, picked.pixels, picked.wire)
-    if phantom == "three":
-        raise InvalidInputError(
-            "--phantom three: expected --points (of --validation: --validation-points), a CSV that says on "
-            "which wire each dot lies, got none"
-        )
-    corners = _region(region)
-    with progress_bar(f"finding dots in {images.name}") as progress, naming(str(images)):
-        if config is None:
-            return find_crossings(recording, corners, progress)
-        clip = config.clip_px if corners is None else corners
-        return find_nwires(recording, config.phantom, clip, progress)
-
-
-def _validated(outcome: Outcome, other: Recording, seen: Seen, path: Path) -> list[str]:
-    from calibration.job import choose_crossings, paired
-    from calibration.repeatability import validate
-    from calibration.wires import CrossWire
-    from speckle3d.core.calibration import readable
-
-    found = outcome.calibration.time_offset_s
-    offset_s = other.time_offset_s if found is None else found
-    with naming(str(path)):
-        if isinstance(outcome.solution.phantom, CrossWire):
-            seen = choose_crossings(other, seen, [offset_s])
-        points, _ = paired(other, seen, offset_s)
-        residuals = validate(outcome.solution, points)
-    frames = len(set(points.frame.tolist()))
-    rms, unit = readable(float((residuals**2).mean() ** 0.5), outcome.calibration.rms_unit)
-    notes = [f"on {path.name}, not used: RMS residual {rms} {unit}, {frames} frames, none left out"]
-    return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, points)]
-
-
-def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
-    """Report PLUS's 3-D error, if the phantom has N-shapes."""
-    from calibration.nwires import nwire_errors_mm, pixel_matrix, trimmed_mean_mm
-    from calibration.wires import Wires
-
-    chain, phantom = outcome.solution.chain, outcome.solution.phantom
-    if not isinstance(phantom, Wires) or not phantom.geometry.n_shapes:
-        return []
-    place = chain.target_from_world.inv()
-    mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place))
-    return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]
+        with progress_bar(f"looking into {validation.name}") as progress:
+            notes += validated(outcome, validation, settings, validation_points, progress)
+        more += ["--validation", str(validation)]
+    if validation_points is not None:
+        more += ["--validation-points", str(validation_points)]
+    written = write_outcome(outcome, settings, images, out, notes, more)
+    report_written(written, notes, outcome.beam, as_json)
 
 
 @calibrate.command("repeatability")

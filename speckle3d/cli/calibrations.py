@@ -1,9 +1,8 @@
-"""Calibration files: written with their report beside them, and put on a sweep's sensors."""
+"""Calibration files: where they may be written, what was found, and putting them on a sweep's sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,14 +11,10 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from calibration.beam import BeamBias
+    from speckle3d.calibrating.written import Written
     from speckle3d.core.calibration import Calibration
     from speckle3d.core.sweep import Sweep
-
-_BESIDE = (".txt", ".png", ".csv")
-"""What lies beside a calibration file: its table, its pictures, and the dots it was made from."""
 
 NOTED_SIZE = 0.01
 """Relative difference of pixel sizes that is reported: 0.4 mm over an image of 40 mm."""
@@ -40,66 +35,30 @@ def require_free(out: Path, *inputs: Path | None) -> None:
     InvalidInputError
         If it is taken.
     """
-    if out.suffix in _BESIDE:
+    from speckle3d.calibrating.written import BESIDE
+
+    if out.suffix in BESIDE:
         raise InvalidInputError(
-            f"{out}: expected a calibration file, not {', '.join(_BESIDE)}, which are written beside it"
+            f"{out}: expected a calibration file, not {', '.join(BESIDE)}, which are written beside it"
         )
     require_own_place(out, "calibration", *inputs)
-    beside = {out.with_suffix(suffix).resolve() for suffix in _BESIDE}
+    beside = {out.with_suffix(suffix).resolve() for suffix in BESIDE}
     for path in inputs:
         if path is not None and path.resolve() in beside:
             raise InvalidInputError(f"{path}: would be overwritten by the results: give -o another name")
 
 
-def write_with_report(
-    calibration: Calibration,
-    inputs: Sequence[Path],
-    out: Path,
-    figure: Callable[[Calibration], Figure],
-    notes: Sequence[str],
-    beam: Sequence[BeamBias] = (),
-    as_json: bool = False,
-    dots: Callable[[Path], None] | None = None,
+def report_written(
+    written: Written, notes: Sequence[str], beam: Sequence[BeamBias] = (), as_json: bool = False
 ) -> None:
-    """Write a calibration, its table and its pictures, together, and print the table.
+    """Print the table of a calibration that was written, and where it is."""
+    from calibration.report import json_report
 
-    Parameters
-    ----------
-    inputs : sequence of Path
-        Recordings it was made from, named in the file with their hashes.
-    figure : callable
-        Draws the pictures of the calibration as it was written.
-    notes : sequence of str
-        What else the table says.
-    dots : callable, optional
-        Writes the dots that the calibration was made from into a CSV.
-    """
-    from importlib.metadata import version
-
-    from calibration.report import json_report, text_report
-    from speckle3d.core.calibration import Source
-    from speckle3d.io.calibrations import write_calibration
-    from speckle3d.io.fileset import FileSet
-    from speckle3d.io.hdf5 import atomic_path
-    from speckle3d.io.load import recording_sha256
-    from speckle3d.study.figures import save_figure
-
-    names, hashes = (" ".join(map(of, inputs)) for of in (str, recording_sha256))
-    named = replace(calibration, source=Source(names, hashes, version("speckle3d")))
-    table = text_report(named, beam, notes)
-    text, pictures, points = (out.with_suffix(suffix) for suffix in _BESIDE)
-    written = FileSet(out.name, (text.name, pictures.name, *([points.name] if dots else [])))
-    with written.replaced(out.parent) as part:
-        write_calibration(part / out.name, named)
-        with atomic_path(part / text.name) as path:
-            path.write_text(table, encoding="utf-8")
-        save_figure(figure(named), part / pictures.name)
-        if dots:
-            dots(part / points.name)
     if as_json:
-        emit_json(json_report(named, beam) | {"notes": list(notes)})
+        emit_json(json_report(written.calibration, beam) | {"notes": list(notes)})
     else:
-        emit(table)
+        emit(written.table)
+    out, text, pictures = written.files[:3]
     note(f"calibration in {out}, report in {text} and {pictures}")
 
 

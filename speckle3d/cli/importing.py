@@ -47,7 +47,7 @@ def given_settings(source: Path, options: Mapping[str, Any]) -> ImportSettings:
     InvalidInputError
         If an option is for another kind of recording, or the recording says the same itself.
     """
-    from speckle3d.cli.recordings import require_sequence, require_unsaid
+    from speckle3d.calibrating.recordings import require_sequence, require_unsaid
     from speckle3d.io.import_settings import ImportSettings
 
     for name in ("transform", "reference_transform", "plus_config"):

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import webbrowser
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.common import SweepFile, app, note
+from speckle3d.cli.common import PixelMm, Poses, SweepFile, Transform, app, from_options, note
 from speckle3d.core.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from speckle3d.app.page import Page
 
 
 @app.command()
@@ -22,6 +26,25 @@ def view(
         Path | None, typer.Option(metavar="FILE", help="Reconstruction of the recording, to see with it.")
     ] = None,
     sweep: SweepFile = None,
+    calibrate: Annotated[
+        Literal["plane", "orientation", "wires"] | None,
+        typer.Option(
+            help="FILE shows a phantom: tune what is found in it and calibrate, as the command would."
+        ),
+    ] = None,
+    phantom: Annotated[
+        str, typer.Option(help="Wires: cross, three, or a PLUS configuration of N-wires.")
+    ] = "cross",
+    points: Annotated[
+        Path | None, typer.Option(help="Wires: CSV of points picked by hand, to go on from.")
+    ] = None,
+    poses: Poses = None,
+    transform: Transform = None,
+    pixel_mm: PixelMm = None,
+    sensor: Annotated[
+        Literal["orientation", "tracker"], typer.Option(help="Orientation: which sensor's.")
+    ] = "orientation",
+    level: Annotated[bool, typer.Option("--level", help="Orientation: the plane is level.")] = False,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: any free one.")] = 0,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the browser, or only print the address.")
@@ -33,8 +56,36 @@ def view(
     from speckle3d.app.opened import pages_of
     from speckle3d.app.server import AppServer
 
-    server = AppServer(pages_of(file, reconstruction, sweep), file.name, port)
+    if calibrate is None:
+        _require_no_phantom(locals())
+        pages = pages_of(file, reconstruction, sweep)
+    else:
+        pages = _phantom(file, calibrate, locals())
+    server = AppServer(pages, file.name, port)
     note(server.address)
     if browser:
         webbrowser.open(server.address_for_once())
     server.run()
+
+
+_OF_PHANTOMS = ("phantom", "points", "poses", "transform", "pixel_mm", "sensor", "level")
+
+
+def _require_no_phantom(options: Mapping[str, Any]) -> None:
+    """Refuse options of phantoms without `--calibrate`, which they go with."""
+    plain = {"phantom": "cross", "sensor": "orientation", "level": False}
+    given = [name for name in _OF_PHANTOMS if options[name] != plain.get(name)]
+    if given:
+        option = given[0].replace("_", "-")
+        raise InvalidInputError(
+            f"--{option}: expected --calibrate plane, orientation or wires with it, got none"
+        )
+
+
+def _phantom(file: Path, method: str, options: Mapping[str, Any]) -> Sequence[Page]:
+    from speckle3d.app.phantom.pages import phantom_pages
+    from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, WireSettings
+
+    models = {each.method: each for each in (PlaneSettings, OrientationSettings, WireSettings)}
+    given = {name: options[name] for name in _OF_PHANTOMS if name in models[method].model_fields}
+    return phantom_pages(file, from_options(models[method], given))

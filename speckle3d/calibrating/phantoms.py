@@ -1,0 +1,255 @@
+"""Calibration with a plane or wires, from recordings to what is written: the same for command and app."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from calibration.chain import ImagePoints, Seen
+from calibration.detection.lines import detect_lines
+from calibration.job import (
+    JobSettings,
+    Outcome,
+    Recording,
+    choose_crossings,
+    find_crossings,
+    find_nwires,
+    orientation_job,
+    paired,
+    plane_job,
+    wires_job,
+)
+from calibration.nwires import nwire_errors_mm, pixel_matrix, trimmed_mean_mm
+from calibration.repeatability import validate
+from calibration.report import figure_report
+from calibration.wires import CrossWire, Wires
+from speckle3d.calibrating.recordings import open_recording
+from speckle3d.calibrating.settings import (
+    OrientationSettings,
+    PlaneSettings,
+    ScanSettings,
+    WireSettings,
+    command_line,
+)
+from speckle3d.calibrating.written import Written, write_with_report
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.calibration import readable
+from speckle3d.core.errors import InvalidInputError, MismatchError, naming
+from speckle3d.core.wires import WirePhantom, three_wires
+from speckle3d.io.plus_config import read_wire_phantom
+from speckle3d.io.points import PickedPoints, read_points, write_points
+
+Progress = Callable[[int, int], None]
+
+BY_HAND = "left out by hand"
+"""Why frames are dropped that the settings leave out."""
+
+_BEAM_MM = (1.0, 2.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Wired:
+    """What is known of a phantom of wires before it is seen.
+
+    Attributes
+    ----------
+    phantom : WirePhantom, optional
+        None of wires that cross, whose geometry is not needed.
+    pixel_mm : tuple of float, optional
+        Column pitch and row spacing, roughly.
+    clip_px : ndarray, shape (4, 2), optional
+        The part of an image in which dots are looked for.
+    found : bool
+        Whether its dots can be found in the images; else they must be picked by hand.
+    """
+
+    phantom: WirePhantom | None = None
+    pixel_mm: tuple[float, float] | None = None
+    clip_px: FloatArray | None = None
+    found: bool = True
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the wires, in their order."""
+        return () if self.phantom is None else self.phantom.names
+
+    @classmethod
+    def of(cls, phantom: str) -> Wired:
+        """Look up a phantom: ``cross``, ``three``, or a configuration of PLUS.
+
+        Raises
+        ------
+        FileError, InvalidInputError
+            If it is none of these.
+        """
+        if phantom == "cross":
+            return cls()
+        if phantom == "three":
+            return cls(three_wires(), found=False)
+        config = read_wire_phantom(phantom)
+        size = None if config.pixel_mm is None else (config.pixel_mm, config.pixel_mm)
+        return cls(config.phantom, size, config.clip_px)
+
+
+def opened(images: Path, settings: ScanSettings, poses: Path | None) -> Recording:
+    """Open a recording of a phantom; for errors see `open_recording`."""
+    sensor = settings.sensor if isinstance(settings, OrientationSettings) else "tracker"
+    pixel_mm = settings.pixel_mm
+    if pixel_mm is None and isinstance(settings, WireSettings):
+        pixel_mm = Wired.of(settings.phantom).pixel_mm
+    return open_recording(images, poses, pixel_mm, sensor, settings.transform)
+
+
+def found(
+    recording: Recording, settings: ScanSettings, points: Path | None = None, progress: Progress | None = None
+) -> Seen:
+    """Find the phantom in every image, or read the points picked by hand; without the frames left out.
+
+    Raises
+    ------
+    FileError, InvalidInputError
+        If the region, the points or the frames left out do not fit the recording.
+    """
+    require_frames(settings.leave_out, recording.images.shape[0])
+    if isinstance(settings, WireSettings):
+        seen = _seen_wires(recording, settings, points, progress)
+    else:
+        assert isinstance(settings, PlaneSettings | OrientationSettings)
+        seen = detect_lines(
+            recording.images, recording.pixel_mm, settings.lines, settings.region_px, progress
+        )
+    return seen.without(settings.leave_out, BY_HAND)
+
+
+def require_frames(frames: Sequence[int], count: int) -> None:
+    """Raise `MismatchError` unless the frames left out are among the recording's."""
+    if frames and max(frames) >= count:
+        raise MismatchError(f"--leave-out: expected frames from 0 to {count - 1}, got {max(frames)}")
+
+
+def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -> Seen:
+    """Take points picked by hand, without the frames left out.
+
+    Raises
+    ------
+    MismatchError
+        If a point lies in no image of the recording.
+    """
+    points.require_inside(recording.images.shape)
+    return Seen(points.frame, points.pixels, points.wire).without(settings.leave_out, BY_HAND)
+
+
+def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
+    """Calibrate with what was found; for errors see `calibration.job`."""
+    recording, job = _timed(recording, settings)
+    if isinstance(settings, PlaneSettings):
+        widths = () if settings.reflector == "bar" else settings.beam_mm or _BEAM_MM
+        fit_pixels = not settings.fixed_pixels
+        return plane_job(recording, seen, job, fit_pixels, settings.stages, widths, settings.pixel_error)
+    if isinstance(settings, OrientationSettings):
+        return orientation_job(recording, seen, job, settings.level, settings.viewed_from)
+    assert isinstance(settings, WireSettings)
+    phantom = Wired.of(settings.phantom).phantom
+    return wires_job(recording, seen, job, phantom, not settings.fixed_pixels, settings.registration)
+
+
+def remarks(outcome: Outcome) -> list[str]:
+    """What the report says beside the numbers: the clock's offset, the choice of registration, 3-D errors."""
+    notes = [] if outcome.choice is None else [str(outcome.choice)]
+    notes += _nwire_notes(outcome, outcome.solution.points)
+    if (offset := outcome.offset) is not None:
+        notes.insert(0, f"clock offset {offset.seconds:+.4f} +- {offset.standard_error_s:.4f} s, estimated")
+    return notes
+
+
+def validated(
+    outcome: Outcome, path: Path, settings: ScanSettings, points: Path | None, progress: Progress | None
+) -> list[str]:
+    """Check a calibration on another recording of the phantom, of which no frame is left out."""
+    settings = settings.model_copy(update={"leave_out": ()})
+    other = _timed(opened(path, settings, None), settings)[0]
+    with naming(str(path)):
+        seen = found(other, settings, points, progress)
+        seconds = outcome.calibration.time_offset_s
+        offset_s = other.time_offset_s if seconds is None else seconds
+        if isinstance(outcome.solution.phantom, CrossWire):
+            seen = choose_crossings(other, seen, [offset_s])
+        shown, _ = paired(other, seen, offset_s)
+        residuals = validate(outcome.solution, shown)
+    frames = len(set(shown.frame.tolist()))
+    rms, unit = readable(float((residuals**2).mean() ** 0.5), outcome.calibration.rms_unit)
+    notes = [f"on {path.name}, not used: RMS residual {rms} {unit}, {frames} frames, none left out"]
+    return notes + [f"on {path.name}: {text}" for text in _nwire_notes(outcome, shown)]
+
+
+def write_outcome(
+    outcome: Outcome,
+    settings: ScanSettings,
+    images: Path,
+    out: Path,
+    notes: Sequence[str],
+    more: Sequence[str] = (),
+) -> Written:
+    """Write a calibration with its report, the settings that made it, and the dots it was made from.
+
+    Parameters
+    ----------
+    more : sequence of str
+        Options of the command that are no settings of the calibration itself.
+    """
+    dots = outcome.seen
+    names = Wired.of(settings.phantom).names if isinstance(settings, WireSettings) else ()
+
+    def write_dots(path: Path) -> None:
+        write_points(path, PickedPoints(dots.frame, dots.pixels, dots.wire), names)
+
+    return write_with_report(
+        outcome.calibration,
+        [images],
+        out,
+        lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
+        [*notes, f"made by: {command_line(settings, images, out, more)}"],
+        outcome.beam,
+        None if dots.are_lines else write_dots,
+        settings.model_dump_json(exclude_defaults=True),
+    )
+
+
+def _timed(recording: Recording, settings: ScanSettings) -> tuple[Recording, JobSettings]:
+    given, outlier_sigma = settings.time_offset, settings.outlier_sigma
+    if given is None:
+        return recording, JobSettings(outlier_sigma=outlier_sigma)
+    if given == "estimate":
+        return recording, JobSettings(outlier_sigma=outlier_sigma, estimate_offset=True)
+    job = JobSettings(outlier_sigma=outlier_sigma, offset_given=True)
+    return replace(recording, time_offset_s=given), job
+
+
+def _seen_wires(
+    recording: Recording, settings: WireSettings, points: Path | None, progress: Progress | None
+) -> Seen:
+    wired = Wired.of(settings.phantom)
+    if points is not None:
+        read = read_points(points, wired.names)
+        with naming(str(points)):
+            return picked(recording, read, settings)
+    if not wired.found:
+        raise InvalidInputError(
+            f"--phantom {settings.phantom}: expected --points (of --validation: --validation-points), a CSV "
+            "that says on which wire each dot lies, got none"
+        )
+    if wired.phantom is None:
+        return find_crossings(recording, settings.region_px, progress)
+    clip = wired.clip_px if settings.region is None else settings.region_px
+    return find_nwires(recording, wired.phantom, clip, progress, settings.leave_out)
+
+
+def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
+    """Report PLUS's 3-D error, if the phantom has N-shapes."""
+    chain, phantom = outcome.solution.chain, outcome.solution.phantom
+    if not isinstance(phantom, Wires) or not phantom.geometry.n_shapes:
+        return []
+    place = chain.target_from_world.inv()
+    mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place))
+    return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]
