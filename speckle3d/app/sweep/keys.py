@@ -8,7 +8,7 @@ import param
 from panel.reactive import ReactiveHTML
 
 
-class Keys(ReactiveHTML):
+class Keys(ReactiveHTML):  # type: ignore[misc]
     """Tells keys that were pressed while the page is seen and no text is being written.
 
     Attributes

@@ -122,7 +122,10 @@ class SweepPairs:
             x, y, roll = table.inplane[0]
             centre = RigidTransform.from_translation(self._matcher.centre_mm)
             turned = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, roll]))
-            first_from_second = RigidTransform.from_translation([x, y, 0.0]) * centre * turned * centre.inv()
+            # Of frames that have nothing in common any motion is found.
+            if table.median[0] >= self._config.trajectory.least_correlation:
+                shifted = RigidTransform.from_translation([x, y, 0.0])
+                first_from_second = shifted * centre * turned * centre.inv()
         if row is not None and self._pairs is not None:
             first_from_second = RigidTransform.from_matrix(self._pairs.first_from_second[row])
         centre_mm, turn = self._placed(first_from_second, moved=frame == second)
@@ -171,4 +174,4 @@ def _high(values: npt.NDArray[np.floating]) -> float:
 
 def nearest_lag(frame: int, others: Sequence[int], lag: int) -> int | None:
     """Of some frames, the one whose distance in frames from `frame` is nearest to `lag`; None without any."""
-    return min(others, key=lambda other: (abs(other - frame - lag), -other), default=None)
+    return min(others, key=lambda other: (abs(other - frame - lag), abs(other - frame), other), default=None)

@@ -46,7 +46,8 @@ class Picture:
         left, top, width, height = extent_mm
         scale = min(HEIGHT_PX / height, WIDEST_PX / width)
         self._patch_mm = patch_mm
-        self.image = ColumnDataSource({"image": [np.zeros((2, 2), dtype=np.uint8)], "count": [0]})
+        nothing = np.zeros((2, 2), dtype=np.uint8)
+        self.image = ColumnDataSource({"image": [nothing], "count": [0]}, name="sweep image")
         self.drawn = ColumnDataSource({"count": [0]})
         """Which image the browser has drawn last."""
         # What is sent faster than it is drawn would pile up.
@@ -67,7 +68,7 @@ class Picture:
         self.plot.grid.visible = False
         self.plot.image(
             "image", x=left, y=top, dw=width, dh=height, source=self.image,
-            color_mapper=LinearColorMapper(palette=_GREYS, low=0, high=255),  # type: ignore[call-arg]
+            color_mapper=LinearColorMapper(palette=_GREYS, low=0, high=255),
         )  # fmt: skip
         drawn = self.plot.rect(
             "x", "y", width=patch_mm[0], height=patch_mm[1], angle="angle", source=self._patches,

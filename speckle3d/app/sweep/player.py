@@ -9,6 +9,7 @@ from html import escape
 
 import numpy as np
 import panel as pn
+import param
 from panel.viewable import Viewable
 
 from speckle3d.app.sweep.findings import FrameFindings
@@ -22,10 +23,7 @@ from speckle3d.core.sweep import Sweep
 
 LEAP = 10
 """Frames by which Shift and an arrow move."""
-_KEYS = (
-    '<span style="color:#57636f">&larr; &rarr; frame, with Shift ten; Home, End; Space plays; '
-    "clicks below jump</span>"
-)
+_KEYS = '<span style="color:#57636f">&larr; &rarr; (Shift: ten), Home, End, Space; click below to jump</span>'
 _TICK_MS = 15
 _PATIENCE_S = 1.0
 """A browser that has not drawn for so long is sent the next image all the same."""
@@ -78,11 +76,11 @@ class Player:
         )
         self._told = pn.pane.HTML("", sizing_mode="stretch_width")
         self._judged = pn.pane.HTML("", sizing_mode="stretch_width")
-        self._keys = Keys(width=0, height=0, margin=0)  # type: ignore[no-untyped-call]
+        self._keys = Keys(width=0, height=0, margin=0)
 
     def view(self) -> Viewable:
         """Return what is shown."""
-        self._slider.param.watch(lambda event: self.go(event.new), "value")
+        self._slider.param.watch(self._slid, "value")
         self._play.param.watch(self._started, "value")
         self._keys.param.watch(lambda event: self._pressed(event.new), "pressed")
         self._range.param.watch(self._again, "value")
@@ -97,8 +95,9 @@ class Player:
         return page
 
     def go(self, frame: int) -> None:
-        """Show a frame, as soon as the browser has drawn the one before."""
+        """Show a frame, as soon as the browser has drawn the one before; what plays goes on from there."""
         self.frame = int(np.clip(frame, 0, len(self._sweep) - 1))
+        self._began = (time.monotonic(), float(self._sweep.frame_time_s[self.frame]))
         self._draw_wanted()
 
     def _laid_out(self) -> Viewable:
@@ -155,6 +154,10 @@ class Player:
         button.on_click(partial(lambda frame, _: self.go(frame), frame))
         return button
 
+    def _slid(self, event: param.parameterized.Event) -> None:
+        if event.new != self._shown:
+            self.go(event.new)
+
     def _pressed(self, key: str) -> None:
         name = key.rpartition(" ")[0]
         held, _, name = name.rpartition("+")
@@ -170,25 +173,23 @@ class Player:
 
     def _started(self, _: object) -> None:
         self._play.name = "❚❚ pause" if self._play.value else "▶ play"
-        if self._play.value and self.frame == len(self._sweep) - 1:
-            self.go(0)
-        self._began = (time.monotonic(), float(self._sweep.frame_time_s[self.frame]))
+        if self._play.value:
+            self.go(0 if self.frame == len(self._sweep) - 1 else self.frame)
 
     def _tick(self) -> None:
         """Go on playing at the recording's own rate, or look at more frames."""
         if self._play.value:
             at, from_s = self._began
             now = from_s + time.monotonic() - at
-            frame = int(np.searchsorted(self._sweep.frame_time_s, now, side="right")) - 1
-            if frame != self.frame:
-                self.go(frame)
-            if frame >= len(self._sweep) - 1:
+            self.frame = int(np.searchsorted(self._sweep.frame_time_s, now, side="right")) - 1
+            if self.frame == len(self._sweep) - 1:
                 self._play.value = False
         elif self._findings.flags is None:
             until = time.monotonic() + _JUDGING_S
             while self._findings.flags is None and time.monotonic() < until:
                 self._findings.judge_next()
             self._told_of_findings()
+        self._draw_wanted()
 
     def _draw_wanted(self) -> None:
         """Draw the frame that is wanted if the browser has drawn the last one."""
@@ -243,7 +244,7 @@ class Player:
         reasons = self._findings.reasons(frame)
         lines += [f'<span style="color:{FLAGGED}">&#9873; {escape(reason)}</span>' for reason in reasons]
         if self._findings.flags is not None and not reasons:
-            lines.append("no flag: the frame is sound")
+            lines.append("no flag")
         if self._colouring.value != "none":
             lines += [_pair_words(compared, self._pairs)]
         return "<br>".join(lines)
@@ -264,12 +265,7 @@ class Compared:
 
 def _pair_words(compared: Compared | None, pairs: SweepPairs) -> str:
     if compared is None:
-        why = (
-            "too little speckle in common, or a flag"
-            if pairs.are_reconstructed
-            else "there is no other frame"
-        )
-        return f"No pair of this frame with another: {why}."
+        return "There is no other frame."
     values, count = compared.values, compared.count
     words = [f"<b>With frame {compared.other}</b>"]
     if values.moved_mm is not None:
