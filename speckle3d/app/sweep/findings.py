@@ -48,13 +48,13 @@ class FrameFindings:
         doubts: Sequence[Doubt] | None,
     ) -> None:
         self._sweep, self._settings = sweep, config
-        self._reconstruction = reconstruction
         self._found: list[FrameFeatures] = []
         self._of_frame: dict[int, FrameFeatures] = {}
         self._inspector: FrameInspector | None = None
         self._extractor: IntensityExtractor | None = None
         trust = None if reconstruction is None else reconstruction.trust
         self.flags: IntArray | None = None if trust is None else trust.flags
+        self._are_kept = trust is not None
         self.doubts = doubts_of_readings(sweep) if doubts is None else tuple(doubts)
         self.are_of_reconstruction = doubts is not None
 
@@ -123,11 +123,9 @@ class FrameFindings:
         """Where flags are from and how many there are, in a line."""
         total = len(self._sweep)
         if self.flags is None:
-            return f"looking at all frames: {len(self._found)} of {total}"
+            return f"Looking for frames that cannot be used: {len(self._found)} of {total}"
         flagged = int(np.count_nonzero(self.flags))
-        source = (
-            "by its reconstruction"
-            if self._reconstruction is not None
-            else ("each by itself; a reconstruction also tells which are unlike all earlier ones")
-        )
-        return f"{flagged or 'none'} of {total} frames flagged ({source})"
+        alone = "each frame looked at by itself; a reconstruction also flags those unlike all earlier ones"
+        source = "as its reconstruction was made" if self._are_kept else alone
+        below = ", orange below" if flagged else ""
+        return f"{flagged or 'None'} of {total} frames flagged{below} ({source})."

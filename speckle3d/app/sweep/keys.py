@@ -41,7 +41,8 @@ class Keys(ReactiveHTML):  # type: ignore[misc]
           };
           // A button is pressed when Space comes up again.
           state.kept = (event) => {
-            if (event.key === " " && anchor.isConnected && !writes(event.composedPath()[0])) event.preventDefault();
+            const free = anchor.isConnected && !writes(event.composedPath()[0]);
+            if (event.key === " " && free) event.preventDefault();
           };
           window.addEventListener("keydown", state.heard, true);
           window.addEventListener("keyup", state.kept, true);

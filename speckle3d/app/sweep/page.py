@@ -17,6 +17,7 @@ from speckle3d.config import Config, config_from_toml
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
+from speckle3d.correction.trust import believed
 
 
 class SweepPage:
@@ -51,7 +52,7 @@ class SweepPage:
         return Player(
             self._sweep,
             self._images,
-            SweepPairs(self._sweep, config, None if made is None else made.pairs),
+            SweepPairs(self._sweep, config, None if made is None else made.pairs, self._by_orientation),
             FrameFindings(self._sweep, config, made, self._doubts),
             streams_of(self._sweep),
         ).view()
@@ -60,6 +61,18 @@ class SweepPage:
     def _config(self) -> Config:
         made = self._reconstruction
         return config_from_toml(made.config_toml) if made is not None and made.config_toml else Config()
+
+    @property
+    def _by_orientation(self) -> bool:
+        """Whether the reconstruction had a sensed orientation to choose patches by."""
+        if self._reconstruction is None:
+            return False
+        sensor = believed(self._sweep, self._doubts or ()).orientation_source
+        # A calibration that was given then is not in the sweep.
+        mounted = bool(self._reconstruction.provenance.calibrations)
+        if sensor is None or not (mounted or sensor.sensor_from_image is not None):
+            return False
+        return self._config.sensors.consistent_subset and bool(sensor.covers(self._sweep.frame_time_s).all())
 
     @cached_property
     def _images(self) -> ScreenImages:

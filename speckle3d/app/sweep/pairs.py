@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.config import Config
@@ -57,10 +58,16 @@ class SweepPairs:
         With which patches are laid and correlated.
     pairs : FramePairs, optional
         Of the sweep's reconstruction. Correlations are not kept in it: they are computed anew.
+    by_orientation : bool
+        Whether the patches used are those that agree with a sensed orientation, or all of the plane.
     """
 
-    def __init__(self, sweep: Sweep, config: Config, pairs: FramePairs | None) -> None:
+    def __init__(
+        self, sweep: Sweep, config: Config, pairs: FramePairs | None = None, by_orientation: bool = False
+    ) -> None:
         self._sweep, self._config, self._pairs = sweep, config, pairs
+        self.by_orientation = by_orientation
+        self._most: dict[int, tuple[float, float]] = {}
 
     @property
     def are_reconstructed(self) -> bool:
@@ -74,16 +81,16 @@ class SweepPairs:
         width, height = (patches.size * patches.spacing_mm).tolist()
         return width, height
 
-    @cached_property
-    def most_mm(self) -> tuple[float, float]:
-        """Distance and standard deviation that all but a hundredth of the patches stay below."""
-        if self._pairs is None:
-            return 1.0, 1.0
-        distance, sigma = (
-            float(np.nanpercentile(values, 99)) if np.isfinite(values).any() else 1.0
-            for values in (self._pairs.distance_mm, self._pairs.sigma_mm)
-        )
-        return distance, sigma
+    def most_mm(self, lag: int) -> tuple[float, float]:
+        """Distance and standard deviation that all but a hundredth of the patches stay below.
+
+        Of the pairs that are `lag` frames apart, so that colours mean the same from frame to frame.
+        """
+        if lag not in self._most and self._pairs is not None:
+            alike = (self._pairs.second - self._pairs.first) == lag
+            some = alike if alike.any() else slice(None)
+            self._most[lag] = (_high(self._pairs.distance_mm[some]), _high(self._pairs.sigma_mm[some]))
+        return self._most.get(lag, (1.0, 1.0))
 
     def others(self, frame: int) -> list[int]:
         """Frames that this one is compared with, in order."""
@@ -92,7 +99,9 @@ class SweepPairs:
             return [other for other in near if other != frame]
         before = self._pairs.first[self._pairs.second == frame]
         after = self._pairs.second[self._pairs.first == frame]
-        return np.unique(np.concatenate([before, after])).tolist()
+        # What frames that no pair joins have in common with the next shows why.
+        beside = [other for other in (frame - 1, frame + 1) if 0 <= other < len(self._sweep)]
+        return sorted({*before.tolist(), *after.tolist(), *beside})
 
     def values(self, frame: int, other: int, with_correlation: bool) -> PatchValues:
         """Patches of a frame by its pair with another.
@@ -113,7 +122,10 @@ class SweepPairs:
             x, y, roll = table.inplane[0]
             centre = RigidTransform.from_translation(self._matcher.centre_mm)
             turned = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, roll]))
-            first_from_second = RigidTransform.from_translation([x, y, 0.0]) * centre * turned * centre.inv()
+            # Of frames that have nothing in common any motion is found.
+            if table.median[0] >= self._config.trajectory.least_correlation:
+                shifted = RigidTransform.from_translation([x, y, 0.0])
+                first_from_second = shifted * centre * turned * centre.inv()
         if row is not None and self._pairs is not None:
             first_from_second = RigidTransform.from_matrix(self._pairs.first_from_second[row])
         centre_mm, turn = self._placed(first_from_second, moved=frame == second)
@@ -155,6 +167,11 @@ class SweepPairs:
         return matcher
 
 
+def _high(values: npt.NDArray[np.floating]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.percentile(known, 99)) if known.size else 1.0
+
+
 def nearest_lag(frame: int, others: Sequence[int], lag: int) -> int | None:
     """Of some frames, the one whose distance in frames from `frame` is nearest to `lag`; None without any."""
-    return min(others, key=lambda other: (abs(other - frame - lag), -other), default=None)
+    return min(others, key=lambda other: (abs(other - frame - lag), abs(other - frame), other), default=None)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from bokeh.models import ColorBar, ColumnDataSource, CustomJS, HoverTool, LinearColorMapper, Range1d
+from bokeh.models import ColumnDataSource, CustomJS, HoverTool, LinearColorMapper, Range1d
+from bokeh.models.annotations import ColorBar
 from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
 from speckle3d.app.sweep.pairs import PatchValues
 from speckle3d.core.arrays import ByteArray
 
-HEIGHT_PX, WIDEST_PX = 400, 560
+HEIGHT_PX, WIDEST_PX = 350, 560
 """Of the picture itself, so that a page fits on a screen of 1366 x 768."""
 
 COLOURINGS = {"distance": "distance (mm)", "sigma": "sigma of distance (mm)", "correlation": "correlation"}
@@ -45,7 +46,8 @@ class Picture:
         left, top, width, height = extent_mm
         scale = min(HEIGHT_PX / height, WIDEST_PX / width)
         self._patch_mm = patch_mm
-        self.image = ColumnDataSource({"image": [np.zeros((2, 2), dtype=np.uint8)], "count": [0]})
+        nothing = np.zeros((2, 2), dtype=np.uint8)
+        self.image = ColumnDataSource({"image": [nothing], "count": [0]}, name="sweep image")
         self.drawn = ColumnDataSource({"count": [0]})
         """Which image the browser has drawn last."""
         # What is sent faster than it is drawn would pile up.
@@ -57,7 +59,7 @@ class Picture:
         self._colours = LinearColorMapper(palette=Viridis256, low=0.0, high=1.0, nan_color="rgba(0,0,0,0)")
         self.plot = figure(
             frame_width=max(round(width * scale), 90), frame_height=round(height * scale),
-            x_range=Range1d(left, left + width), y_range=Range1d(top + height, top),
+            x_range=Range1d(start=left, end=left + width), y_range=Range1d(start=top + height, end=top),
             x_axis_label="lateral (mm)", y_axis_label="depth (mm)",
             tools="pan,wheel_zoom,box_zoom,reset,save", active_scroll="wheel_zoom", match_aspect=True,
             background_fill_color="#000000", margin=0,

@@ -9,6 +9,7 @@ from html import escape
 
 import numpy as np
 import panel as pn
+import param
 from panel.viewable import Viewable
 
 from speckle3d.app.sweep.findings import FrameFindings
@@ -22,6 +23,7 @@ from speckle3d.core.sweep import Sweep
 
 LEAP = 10
 """Frames by which Shift and an arrow move."""
+_KEYS = '<span style="color:#57636f">&larr; &rarr; (Shift: ten), Home, End, Space; click below to jump</span>'
 _TICK_MS = 15
 _PATIENCE_S = 1.0
 """A browser that has not drawn for so long is sent the next image all the same."""
@@ -69,8 +71,8 @@ class Player:
             options=["none", *colourings], value="none", button_type="default", button_style="outline"
         )
         self._other = pn.widgets.Select(options={}, width=230, disabled=True)
-        self._opacity = pn.widgets.FloatSlider(
-            name="opacity", start=0.1, end=1.0, step=0.1, value=0.5, width=150
+        self._opacity = pn.widgets.IntSlider(
+            name="opacity (%)", start=10, end=100, step=10, value=50, width=150
         )
         self._told = pn.pane.HTML("", sizing_mode="stretch_width")
         self._judged = pn.pane.HTML("", sizing_mode="stretch_width")
@@ -78,7 +80,7 @@ class Player:
 
     def view(self) -> Viewable:
         """Return what is shown."""
-        self._slider.param.watch(lambda event: self.go(event.new), "value")
+        self._slider.param.watch(self._slid, "value")
         self._play.param.watch(self._started, "value")
         self._keys.param.watch(lambda event: self._pressed(event.new), "pressed")
         self._range.param.watch(self._again, "value")
@@ -93,8 +95,9 @@ class Player:
         return page
 
     def go(self, frame: int) -> None:
-        """Show a frame, as soon as the browser has drawn the one before."""
+        """Show a frame, as soon as the browser has drawn the one before; what plays goes on from there."""
         self.frame = int(np.clip(frame, 0, len(self._sweep) - 1))
+        self._began = (time.monotonic(), float(self._sweep.frame_time_s[self.frame]))
         self._draw_wanted()
 
     def _laid_out(self) -> Viewable:
@@ -110,15 +113,16 @@ class Player:
             sizing_mode="stretch_width",
         )
         picture = pn.Column(
-            pn.pane.Bokeh(self._picture.plot, margin=0), pn.Row(self._play, self._slider, self._keys)
+            pn.pane.Bokeh(self._picture.plot, margin=0),
+            pn.Row(self._play, self._slider, self._keys, margin=0),
+            pn.pane.HTML(_KEYS, margin=(0, 10), width=430),
         )
-        line = [pn.pane.Bokeh(self._line.flags(), sizing_mode="stretch_width", margin=0)]
         below = self._line.streams(self._streams) or [
             pn.pane.HTML("No sensor was recorded with this sweep.", margin=(5, 10))
         ]
         return pn.Column(
             pn.Row(picture, chosen, sizing_mode="stretch_width"),
-            *line,
+            pn.pane.Bokeh(self._line.marks, sizing_mode="stretch_width", margin=0),
             pn.Row(*below, sizing_mode="stretch_width"),
             sizing_mode="stretch_width",
             margin=0,
@@ -128,8 +132,12 @@ class Player:
         """What is doubted of the recording, with buttons that lead to the frames of each."""
         doubts = self._findings.doubts
         kept = self._findings.are_of_reconstruction
-        heading = "What the checks found" if kept else "What the sensors' readings say against themselves"
-        rows = [pn.pane.HTML(f"<b>{heading}</b>", margin=(0, 10))]
+        heading = (
+            "What the checks found (purple below)"
+            if kept
+            else "What the sensors' readings say against themselves"
+        )
+        rows: list[Viewable] = [pn.pane.HTML(f"<b>{heading}</b>", margin=(0, 10))]
         if not doubts:
             rows.append(pn.pane.HTML("Nothing in doubt.", margin=(0, 10)))
         for doubt in doubts:
@@ -142,9 +150,13 @@ class Player:
         return pn.Column(*rows, sizing_mode="stretch_width")
 
     def _leading_to(self, frame: int, name: str) -> Viewable:
-        button = pn.widgets.Button(name=name, button_type="light", margin=(0, 2))
+        button = pn.widgets.Button(name=name, button_style="outline", height=24, margin=(0, 3))
         button.on_click(partial(lambda frame, _: self.go(frame), frame))
         return button
+
+    def _slid(self, event: param.parameterized.Event) -> None:
+        if event.new != self._shown:
+            self.go(event.new)
 
     def _pressed(self, key: str) -> None:
         name = key.rpartition(" ")[0]
@@ -161,25 +173,23 @@ class Player:
 
     def _started(self, _: object) -> None:
         self._play.name = "❚❚ pause" if self._play.value else "▶ play"
-        if self._play.value and self.frame == len(self._sweep) - 1:
-            self.go(0)
-        self._began = (time.monotonic(), float(self._sweep.frame_time_s[self.frame]))
+        if self._play.value:
+            self.go(0 if self.frame == len(self._sweep) - 1 else self.frame)
 
     def _tick(self) -> None:
         """Go on playing at the recording's own rate, or look at more frames."""
         if self._play.value:
             at, from_s = self._began
             now = from_s + time.monotonic() - at
-            frame = int(np.searchsorted(self._sweep.frame_time_s, now, side="right")) - 1
-            if frame != self.frame:
-                self.go(frame)
-            if frame >= len(self._sweep) - 1:
+            self.frame = int(np.searchsorted(self._sweep.frame_time_s, now, side="right")) - 1
+            if self.frame == len(self._sweep) - 1:
                 self._play.value = False
         elif self._findings.flags is None:
             until = time.monotonic() + _JUDGING_S
             while self._findings.flags is None and time.monotonic() < until:
                 self._findings.judge_next()
             self._told_of_findings()
+        self._draw_wanted()
 
     def _draw_wanted(self) -> None:
         """Draw the frame that is wanted if the browser has drawn the last one."""
@@ -201,7 +211,7 @@ class Player:
 
     def _draw(self) -> None:
         frame = self.frame
-        image = self._images.image(frame, int(self._range.value))
+        image = self._images.image(frame, int(self._range.value or USUAL_DB))
         with pn.io.hold():
             self._count += 1
             self._shown, self._sent_s = frame, time.monotonic()
@@ -223,8 +233,8 @@ class Player:
         self._other.param.update(options={_named(each, frame): each for each in others}, value=other)
         self._filling = False
         values = self._pairs.values(frame, other, by == "correlation")
-        most = dict(zip(COLOURINGS, (*self._pairs.most_mm, 1.0), strict=True))[by]
-        count = self._picture.colour(values, by, most, float(self._opacity.value))
+        most = dict(zip(COLOURINGS, (*self._pairs.most_mm(abs(other - frame)), 1.0), strict=True))[by]
+        count = self._picture.colour(values, by, most, float(self._opacity.value or 0) / 100)
         return Compared(other, values, count)
 
     def _words(self, frame: int, compared: Compared | None) -> str:
@@ -234,9 +244,9 @@ class Player:
         reasons = self._findings.reasons(frame)
         lines += [f'<span style="color:{FLAGGED}">&#9873; {escape(reason)}</span>' for reason in reasons]
         if self._findings.flags is not None and not reasons:
-            lines.append("no flag: the frame is sound")
+            lines.append("no flag")
         if self._colouring.value != "none":
-            lines += [_pair_words(frame, compared, self._pairs.are_reconstructed)]
+            lines += [_pair_words(compared, self._pairs)]
         return "<br>".join(lines)
 
     def _told_of_findings(self) -> None:
@@ -253,22 +263,28 @@ class Compared:
     count: PatchCount
 
 
-def _pair_words(frame: int, compared: Compared | None, reconstructed: bool) -> str:
+def _pair_words(compared: Compared | None, pairs: SweepPairs) -> str:
     if compared is None:
-        return "No pair with another frame: too little speckle in common, or flagged."
+        return "There is no other frame."
     values, count = compared.values, compared.count
-    words = []
+    words = [f"<b>With frame {compared.other}</b>"]
     if values.moved_mm is not None:
         moved, sigma = values.moved_mm
-        words.append(f"{moved:.3f} &plusmn; {sigma:.3f} mm from frame {compared.other} at the image's centre")
-    if reconstructed:
-        words.append(
-            f"{count.used} patches used, {count.rejected} rejected (crossed out), "
-            f"{count.without} without a distance"
-        )
+        words.append(f"the image's centre is {moved:.3f} &plusmn; {sigma:.3f} mm away, elevational")
     if np.isfinite(values.correlation).any():
         words.append(f"median correlation {np.nanmedian(values.correlation):.3f}, computed anew")
-    return "; ".join(words) + "."
+    lines = ["; ".join(words) + "."]
+    if values.used is None and pairs.are_reconstructed:
+        lines.append("The reconstruction did not use this pair.")
+    elif values.used is not None:
+        why = "the sensed orientation contradicts them" if pairs.by_orientation else "left out of the plane"
+        kept = "in the consistent subset" if pairs.by_orientation else "in the plane"
+        lines.append(
+            f"{count.used} patches {kept} (white frames), "
+            f'<span style="color:#c22">{count.rejected} rejected: {why} (red, crossed out)</span>, '
+            f"{count.without} without a distance (empty)."
+        )
+    return "<br>".join(lines)
 
 
 def _named(other: int, frame: int) -> str:

@@ -48,7 +48,7 @@ class ScreenImages:
         return self._made(USUAL_DB).grid
 
     def extent_mm(self) -> tuple[float, float, float, float]:
-        """Left, top, width and height of the picture, whose pixels reach half a sample beyond their middles."""
+        """Left, top, width and height of the picture, out to the edges of its pixels."""
         grid = self.grid()
         pool = self._pool(grid)
         rows = grid.samples // pool * pool
@@ -80,7 +80,7 @@ class ScreenImages:
 def _pooled(grey: npt.NDArray[np.number], pool: int) -> ByteArray:
     """Means of `pool` samples each, shape (vector, row)."""
     if pool == 1:
-        return np.clip(grey, 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(grey, 0, 255), dtype=np.uint8)
     rows = grey.shape[1] // pool
     parts: Float32Array = grey[:, : rows * pool].astype(np.float32).reshape(grey.shape[0], rows, pool)
     # NumPy's mean takes more than twice as long over so short an axis.

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import panel as pn
-from bokeh.events import Tap
-from bokeh.models import ColumnDataSource, FactorRange, Range1d, Span
+from bokeh.events import Event, Tap
+from bokeh.models import ColumnDataSource, FactorRange, HoverTool, Range1d
+from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 from panel.viewable import Viewable
 
@@ -20,7 +22,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
 CURSOR = "#cc0000"
 FLAGGED, DOUBTED = "#d55e00", "#7b3fa0"
-_ROW_PX, _STREAM_PX, _LEFT_PX = 17, 130, 92
+_ROW_PX, _STREAM_PX, _LEFT_PX = 15, 135, 108
 
 
 class TimeLine:
@@ -40,11 +42,21 @@ class TimeLine:
         self._half_s = pause / 2
         margin = max(0.01 * float(np.ptp(time_s)), pause)
         self._range = Range1d(
-            float(time_s[0]) - margin, float(time_s[-1]) + margin, bounds=None, min_interval=4 * pause
+            start=float(time_s[0]) - margin, end=float(time_s[-1]) + margin, min_interval=4 * pause
         )
         self.cursor = Span(location=float(time_s[0]), dimension="height", line_color=CURSOR, line_width=1.5)
         self._marks = ColumnDataSource(_no_marks())
-        self._rows = FactorRange(factors=["flags", "doubts"])
+        self._rows = FactorRange(factors=["no frame"])
+        self.marks = self._plot(_ROW_PX, y_range=self._rows)
+        """Plot of what `mark` marks; not seen while that is nothing."""
+        marks = self.marks.quad(
+            left="left", right="right", bottom="bottom", top="top", color="colour", source=self._marks
+        )
+        self.marks.add_tools(
+            HoverTool(renderers=[marks], tooltips="<div style='max-width:30em'>@words</div>")
+        )
+        self.marks.xaxis.visible = False
+        self.marks.ygrid.visible = False
 
     def move(self, frame: int) -> None:
         """Put the cursor at a frame."""
@@ -65,17 +77,8 @@ class TimeLine:
                 rows += [] if doubt.about in rows else [doubt.about]
                 self._add(marks, first, last, doubt.about, DOUBTED, doubt.consequence)
         self._rows.factors = rows[::-1] or ["no frame"]
+        self.marks.height, self.marks.visible = _ROW_PX * max(len(rows), 1) + 6, bool(rows)
         self._marks.data = marks
-
-    def flags(self) -> figure:
-        """Plot of what `mark` marks."""
-        plot = self._plot(4 * _ROW_PX + 14, y_range=self._rows)
-        plot.quad(
-            left="left", right="right", bottom="bottom", top="top", color="colour", source=self._marks,
-            line_alpha=0.9,
-        )  # fmt: skip
-        plot.xaxis.visible = False
-        return plot
 
     def streams(self, sensors: dict[str, list[Stream]]) -> list[Viewable]:
         """A plot for each sensor, with a choice of what is shown of it."""
@@ -88,7 +91,7 @@ class TimeLine:
             plot.line(
                 "time", f"part{part}", source=source, color=colour, line_width=1.4, legend_label=str(part)
             )
-        legend = plot.legend[0]
+        legend: Any = plot.legend[0]
         plot.add_layout(legend, "right")
         legend.update(padding=2, spacing=0, margin=2, label_text_font_size="11px", border_line_alpha=0.0)
         names = {f"{each.name}": each for each in some}
@@ -110,10 +113,11 @@ class TimeLine:
         title = pn.pane.HTML(f"<b>{sensor}</b>", margin=(6, 5, 0, _LEFT_PX))
         return pn.Column(pn.Row(title, choice), pn.pane.Bokeh(plot, sizing_mode="stretch_width"), margin=0)
 
-    def _plot(self, height: int, **more: object) -> figure:
+    def _plot(self, height: int, **more: Any) -> figure:
         plot = figure(
-            height=height, sizing_mode="stretch_width", x_range=self._range, tools="xpan,xwheel_zoom,reset",
-            active_scroll=None, toolbar_location=None, min_border_left=_LEFT_PX, **more,
+            height=height, sizing_mode="stretch_width", x_range=self._range, tools="xpan,xwheel_zoom",
+            active_scroll="xwheel_zoom", toolbar_location=None, min_border_left=_LEFT_PX, min_border_top=3,
+            min_border_bottom=3, **more,
         )  # fmt: skip
         plot.add_layout(self.cursor)
         plot.on_event(Tap, self._tapped)
@@ -121,8 +125,8 @@ class TimeLine:
         plot.grid.grid_line_color = "#eef1f4"
         return plot
 
-    def _tapped(self, event: Tap) -> None:
-        if event.x is not None:
+    def _tapped(self, event: Event) -> None:
+        if isinstance(event, Tap) and event.x is not None:
             self._jump(int(np.argmin(np.abs(self._time_s - event.x))))
 
     def _add(
