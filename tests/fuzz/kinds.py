@@ -21,6 +21,7 @@ from speckle3d.core.surface import Surface
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.curves import write_curves
+from speckle3d.io.growing_sweep import GrowingSweep
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.shapes.surfaces import write_surface
 from speckle3d.io.sweep_writer import write_sweep
@@ -81,6 +82,25 @@ def sweeps(folder):
     write_sweep(paths[1], sweep_examples.rf_sweep(dtype=np.float32), compression="lzf")
     write_sweep(paths[2], sweep_examples.bmode_sweep(), compression=None)
     write_sweep(paths[3], replace(sweep_examples.rf_sweep(), tracker=None, truth=None))
+    return [*paths, *unfinished(folder)]
+
+
+def unfinished(folder):
+    """A recording that was ended by an error, and one whose process was killed."""
+    import shutil
+
+    sweep, paths = sweep_examples.rf_sweep(), [folder / "ended.h5", folder / "killed.h5"]
+    growing = GrowingSweep(paths[0], sweep.grid, sweep.signal)
+    with growing:
+        for i in range(len(sweep)):
+            growing.append(sweep.frames[i], sweep.frame_time_s[i])
+            growing.append_pose(sweep.frame_time_s[i], np.eye(4), i != 3)
+            growing.append_orientation(sweep.frame_time_s[i], [1.0, 0.0, 0.0, 0.0])
+        shutil.copy(paths[0], paths[1])
+        growing.close(complete=False)
+    # Behind the last byte there is room that was taken in advance.
+    with paths[1].open("r+b") as file:
+        file.truncate(paths[0].stat().st_size)
     return paths
 
 
