@@ -157,7 +157,8 @@ def test_bands_hold_95_percent():
     assert triangles.max() == len(rings) - 1
 
 
-@pytest.mark.filterwarnings("ignore:Widget.name is deprecated:PendingDeprecationWarning")
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
 def test_without_a_server_it_is_drawn_to_a_document(made, tmp_path):
     from bokeh.document import Document
 
