@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from typing import Any
 
 import panel as pn
 from panel.viewable import Viewable
@@ -57,19 +58,25 @@ def inside(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, or a single one, without the line of the app."""
     if len(pages) == 1:
         return _viewed(pages[0])
-    views = [pn.Column(sizing_mode="stretch_width") for _ in pages]
+    views = [pn.Column(told(f"Opening {page.title} ..."), sizing_mode="stretch_width") for page in pages]
+    opened = {0}
     tabs = pn.Tabs(
         *((page.title, view) for page, view in zip(pages, views, strict=True)),
         dynamic=True,
         sizing_mode="stretch_width",
     )
 
-    def fill(_: object = None) -> None:
-        if not views[tabs.active].objects:
-            views[tabs.active].append(_viewed(pages[tabs.active]))
+    def make(which: int) -> None:
+        views[which].objects = [_viewed(pages[which])]
+
+    def fill(event: Any) -> None:
+        if event.new not in opened:
+            opened.add(event.new)
+            # When what is there instead has been shown.
+            pn.state.execute(lambda: make(event.new), schedule=True)
 
     tabs.param.watch(fill, "active")
-    fill()
+    make(0)
     return tabs
 
 

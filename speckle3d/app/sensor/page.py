@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from html import escape
 
@@ -53,14 +52,13 @@ class SensorPage:
         self._log, self._mounting = log, sensor_from_image
 
     @cached_property
-    def _readings(self) -> Future[Readings]:
+    def _readings(self) -> Readings:
         """What is found of the log, once for all viewers."""
-        with ThreadPoolExecutor(1) as worker:
-            return worker.submit(Readings.of, self._log)
+        return Readings.of(self._log)
 
     def view(self) -> Viewable:
         """The sentence on the magnetometer above, the probe on the left, readings over time on the right."""
-        readings = self._readings.result()
+        readings = self._readings
         plots = time_plots(readings)
         picture = ProbePicture(self._mounting)
         duration_s = self._log.duration_s
