@@ -23,7 +23,7 @@ def page(browser, recording):
     with viewing(recording[0], "--calibrate", "plane") as address:
         page = opened(browser, address)
         page.locator(".line-told").wait_for()
-        page.set_default_timeout(8000)
+        page.set_default_timeout(30_000)
         yield page
         assert page.complaints == []
 

@@ -87,7 +87,7 @@ class Region:
             self._take(tuple(corners))
 
     def _boxed(self, event: SelectionGeometry) -> None:
-        held = event.geometry
+        held: Any = event.geometry
         if not event.final or held["type"] != "rect":
             return
         left, right, top, bottom = (round(float(held[end]), _DIGITS) for end in ("x0", "x1", "y0", "y1"))
