@@ -34,6 +34,7 @@ from speckle3d.matching.blocks import (
 )
 from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import SpeckleSizes, doubt_images
@@ -198,9 +199,9 @@ def track(
     flags = _flagged(sweep, found, settings)
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
-    pairs, coherence, path = _measured(found.table, flags, reader, settings, times)
+    pairs, coherence, path = measured(found.table, flags, reader, settings, times)
     with times.of("checks of the images"):
-        sound = _sound(found.table, flags)
+        sound = sound_pairs(found.table, flags)
         flags = _with_unjoined(flags, reader, pairs)
         _require_placed(sweep, flags)
         # What stands still would be blamed on the curves.
@@ -211,15 +212,14 @@ def track(
         )
 
     # -> curves of the lens that the depths of the images agree on, and everything read with them
-    mismatch, given = curves.mismatch(settings.curves.same_probe), curves
-    if settings.curves.straighten and mismatch > TISSUE_SIGMA and curves.origin in ("phantom", "data sheet"):
+    given = curves
+    with times.of(STRAIGHTENING):
+        curves, mismatch = straightened_by(factors, curves, coherence, matcher.patches, settings)
+    if curves is not given:
+        reader = reader.with_curves(curves)
+        pairs, coherence, path = measured(found.table, flags, reader, settings, times, path)
         with times.of(STRAIGHTENING):
-            curves, mismatch = straightened(curves, _rows_seen(factors, coherence, matcher), mismatch)
-        if curves is not given:
-            reader = reader.with_curves(curves)
-            pairs, coherence, path = _measured(found.table, flags, reader, settings, times, path)
-            with times.of(STRAIGHTENING):
-                factors = reader.depth_factors(found.table, path, sound, settings.coherence)
+            factors = reader.depth_factors(found.table, path, sound, settings.coherence)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -280,7 +280,7 @@ def track(
         direction_from=source,
         coherence=coherence,
         curves=curves,
-        rows=_rows_seen(factors, coherence, matcher),
+        rows=_rows_seen(factors, coherence, matcher.patches),
         slopes=slopes,
         times=times,
         doubts=(*doubts, *sensors.doubts),
@@ -310,6 +310,17 @@ def match_ahead(
 def _matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
     if len(sweep) < 2:
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
+    return matcher_for(sweep, curves, config)
+
+
+def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
+    """Make the matcher of a sweep's frames, none of which is read.
+
+    Raises
+    ------
+    MismatchError
+        If the curves belong to another probe, frequency, sampling, patch size or depth.
+    """
     matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
     curves.key.require_same(matcher.key)
     unrefuted(doubt_widths(curves), sweep.name, MismatchError)
@@ -338,7 +349,7 @@ def _require_placed(sweep: Sweep, flags: IntArray) -> None:
         )
 
 
-def _measured(
+def measured(
     table: CorrelationTable,
     flags: IntArray,
     reader: PairReader,
@@ -350,7 +361,7 @@ def _measured(
 
     Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
     """
-    sound = _sound(table, flags)
+    sound = sound_pairs(table, flags)
     path = known
     if path is None:
         with times.of(PLANES):
@@ -368,18 +379,35 @@ def _measured(
     return pairs, coherence, path
 
 
-def _sound(table: CorrelationTable, flags: IntArray) -> BoolArray:
+def sound_pairs(table: CorrelationTable, flags: IntArray) -> BoolArray:
     """Pairs of frames that are to be trusted, shape (e,)."""
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
     sound: BoolArray = ~bad[table.first] & ~bad[table.second]
     return sound
 
 
-def _rows_seen(factors: DepthFactors, coherence: Coherence | None, matcher: FrameMatcher) -> RowsSeen:
+def straightened_by(
+    factors: DepthFactors,
+    curves: DecorrelationCurves,
+    coherence: Coherence | None,
+    patches: PatchGrid,
+    config: Config,
+) -> tuple[DecorrelationCurves, float]:
+    """Curves of the lens that the depths of the images agree on, and what is left of their mismatch.
+
+    The curves given, and all of it, if they are to stay as they are.
+    """
+    mismatch = curves.mismatch(config.curves.same_probe)
+    if config.curves.straighten and mismatch > TISSUE_SIGMA and curves.origin in ("phantom", "data sheet"):
+        return straightened(curves, _rows_seen(factors, coherence, patches), mismatch)
+    return curves, mismatch
+
+
+def _rows_seen(factors: DepthFactors, coherence: Coherence | None, patches: PatchGrid) -> RowsSeen:
     """What rows of patches say of the curves."""
     if coherence is None:
         return rows_seen(factors)
-    return rows_seen(factors, matcher.patches.rows_of(coherence.share.mean(axis=0)).mean(axis=-1))
+    return rows_seen(factors, patches.rows_of(coherence.share.mean(axis=0)).mean(axis=-1))
 
 
 def _with_unjoined(flags: IntArray, reader: PairReader, pairs: SignedPairs) -> IntArray:

@@ -13,6 +13,8 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 ARGUMENTS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    # A popup of the browser's own, unseen, that takes a whole core.
+    "--disable-features=WebUIOmniboxAimPopup,WebUIOmniboxPopup",
 ]  # fmt: skip
 SOFTWARE_WEBGL = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 from speckle3d.core.errors import InvalidInputError
+
+_NO_NAME = re.compile(r"^[.\s]|[\s.]$|[/\\:\0-\x1f\x7f]")
+"""In names that are hidden, lead elsewhere or are none on some system."""
+
+_LONGEST = 200
+"""Of the 255 bytes that file systems take, room for the name of a temporary sibling."""
 
 
 class Folder:
@@ -30,8 +37,10 @@ class Folder:
             If the name is not that of a file in the folder itself, or is taken.
         """
         inside = self.path / name
-        if not name.strip() or Path(name).name != name or name.startswith("."):
+        if not name.strip() or _NO_NAME.search(name) or Path(name).name != name:
             raise InvalidInputError(f"expected the name of a file in {self.path}, got {name!r}")
+        if len(name.encode(errors="replace")) > _LONGEST:
+            raise InvalidInputError(f"expected a name of at most {_LONGEST} bytes, got {len(name)} letters")
         if inside.is_symlink() or inside.exists():
             raise InvalidInputError(f"{inside}: expected a new name, got one that is taken")
         return inside

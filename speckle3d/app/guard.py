@@ -117,7 +117,10 @@ class Guard:
         protocols = [each.strip() for each in headers.get("Sec-WebSocket-Protocol", "").split(",")]
         if len(protocols) != 2 or protocols[0] != _WEBSOCKET:
             return False
-        return bool(check_token_signature(protocols[1], secret_key=self.secret_key, signed=True))
+        try:
+            return bool(check_token_signature(protocols[1], secret_key=self.secret_key, signed=True))
+        except (ValueError, KeyError, TypeError, AttributeError):  # it decodes before it has checked
+            return False
 
 
 def _same(given: str, right: str) -> bool:

@@ -35,11 +35,22 @@ def shell(pages: Sequence[Page], title: str) -> Viewable:
 
     A page's view is made when its tab is first opened.
     """
-    pn.extension(raw_css=[_BODY])
+    pn.extension(*extensions(pages), raw_css=[_BODY])
     header = pn.pane.HTML(
         _HEADER.format(name=escape(title, quote=True)), sizing_mode="stretch_width", margin=0
     )
     return pn.Column(header, inside(pages), stylesheets=[STYLE], sizing_mode="stretch_width", margin=0)
+
+
+def in_notebook(pages: Sequence[Page]) -> Viewable:
+    """Pages as tabs, in the app's style."""
+    pn.extension(*extensions(pages))
+    return pn.Column(inside(pages), stylesheets=[STYLE], sizing_mode="stretch_width", margin=0)
+
+
+def extensions(pages: Sequence[Page]) -> list[str]:
+    """Parts of Panel that pages need; a browser has them from the start, or never."""
+    return sorted({name for page in pages for name in getattr(page, "extensions", ())})
 
 
 def inside(pages: Sequence[Page]) -> Viewable:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.page import Page
@@ -18,12 +19,17 @@ from speckle3d.io.readers import find_reader, first_bytes
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 
 if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.core.doubts import Doubt
     from speckle3d.core.reconstruction import Reconstruction
     from speckle3d.core.sweep import Sweep
     from xsens.logs.samples import ImuLog
 
 RECONSTRUCTION = "reconstruction.h5"
 """File of a results folder."""
+
+_WINDOWS_PORT = re.compile(r"COM\d+", re.IGNORECASE)
 
 
 def pages_of(
@@ -68,6 +74,34 @@ def pages_of(
     return _logged(place)
 
 
+def is_port(path: Path) -> bool:
+    """Whether a path is that of a serial port: a device, or a name as COM3."""
+    return path.is_char_device() or _WINDOWS_PORT.fullmatch(str(path)) is not None
+
+
+@contextmanager
+def opened(path: Path, record: Path | None = None, **of_file: Any) -> Iterator[Sequence[Page]]:
+    """Pages of a file, as `pages_of` has them, or of a sensor on a serial port, which runs during the block.
+
+    Raises
+    ------
+    FileError
+        Also if no sensor answers on the port, or what it sends cannot be recorded.
+    InvalidInputError
+        Also if a file is to be recorded.
+    """
+    if is_port(path):
+        from speckle3d.app.sensor.live import LiveSensorPage
+        from speckle3d.app.sensor.watch import SensorWatch
+
+        with SensorWatch(str(path), record) as watch:
+            yield [LiveSensorPage(watch)]
+        return
+    if record is not None:
+        raise InvalidInputError(f"{path}: expected a serial port beside --record, got something else")
+    yield pages_of(path, **of_file)
+
+
 def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
     """Pages of a recording; of a package with a sensor's samples but no frames, the sensor's alone."""
     from speckle3d.sensor_logs import held_log
@@ -79,32 +113,37 @@ def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
     except InvalidInputError:
         with suppress(InvalidInputError, InsufficientDataError):
             if (log := held_log(path)) is not None:
-                return [_sensor(log, Folder(path))]
+                return [_sensor(log)]
         raise
     return _recorded(sweep, path)
 
 
-def _recorded(sweep: Sweep, path: Path, reconstruction: Reconstruction | None = None) -> list[Page]:
+def _recorded(
+    sweep: Sweep,
+    path: Path,
+    reconstruction: Reconstruction | None = None,
+    doubts: Sequence[Doubt] | None = None,
+) -> list[Page]:
     from speckle3d.app.sweep.page import SweepPage
     from speckle3d.sensor_logs import log_of
 
     if not len(sweep):
         raise InvalidInputError(f"{path}: expected frames to look at, got none")
-    folder = Folder(path)
-    pages: list[Page] = [SweepPage(sweep, folder, reconstruction)]
+    pages: list[Page] = [SweepPage(sweep, Folder(path), reconstruction, doubts)]
     if sweep.orientation is not None:
-        pages.append(_sensor(log_of(sweep.orientation, path.name), folder))
+        pages.append(_sensor(log_of(sweep.orientation, path.name), sweep.orientation.sensor_from_image))
     return pages
 
 
 def _reconstructed(path: Path, sweep_file: Path | None, opened: Path) -> list[Page]:
     from speckle3d.app.reconstruction.page import ReconstructionPage
+    from speckle3d.study.details import recorded_doubts
     from speckle3d.study.images import open_reconstruction
 
     found, sweep = open_reconstruction(path, sweep_file)
     found = replace(found, pairs=read_reconstruction(path).pairs)
-    pages = _recorded(sweep, opened, found)
-    viewer = ReconstructionPage(found, sweep, Folder(path))
+    pages = _recorded(sweep, opened, found, recorded_doubts(path, found.provenance))
+    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file)
     # First what was asked for.
     return [viewer, *pages] if opened == path else [pages[0], viewer, *pages[1:]]
 
@@ -116,10 +155,10 @@ def _logged(path: Path) -> list[Page]:
         raise InvalidInputError(
             f"{path}: expected a recording, a log, or a results folder with {RECONSTRUCTION}, got another"
         )
-    return [_sensor(read_log(path), Folder(path))]
+    return [_sensor(read_log(path))]
 
 
-def _sensor(log: ImuLog, folder: Folder) -> Page:
+def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:
     from speckle3d.app.sensor.page import SensorPage
 
-    return SensorPage(log, folder)
+    return SensorPage(log, mounting)

@@ -8,7 +8,10 @@ from panel.viewable import Viewable
 
 
 class Page(Protocol):
-    """What one tab of the app shows."""
+    """What one tab of the app shows.
+
+    One that needs parts of Panel which are loaded by name, as ``plotly``, has them as `extensions`.
+    """
 
     title: str
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 
@@ -91,6 +92,8 @@ class AppServer:
 
     def run(self) -> None:
         """Serve until nobody has looked for a while, or the process is told to end."""
+        # A viewer may leave at any moment.
+        logging.getLogger("bokeh.server.views.ws").addFilter(_is_no_farewell)
         self._server.start()
         looking = PeriodicCallback(self._look, 1000.0 * _LOOK_S)
         looking.start()
@@ -106,3 +109,7 @@ class AppServer:
             self._seen_s = now
         elif now - self._seen_s > self._unseen_s:
             self._server.io_loop.stop()
+
+
+def _is_no_farewell(record: logging.LogRecord) -> bool:
+    return "connection was closed" not in record.getMessage()

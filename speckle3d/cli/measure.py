@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -74,7 +73,7 @@ def measure(
         rows = [_plain(each) for each in found]
         emit_json({"mode": mode or "image", "pick_mm": picked, "measurements": rows})
     else:
-        emit("\n".join([*(_line(each) for each in found), told]))
+        emit("\n".join([*(each.line for each in found), told]))
     if (words := caution(held, mode or "image")) is not None:
         note(words)
 
@@ -93,7 +92,7 @@ def _in_world(
 
 def _plain(found: Measurement) -> dict[str, Any]:
     """A measurement as JSON has it, angles in degrees."""
-    scale, unit = _shown(found)
+    scale, unit = found.shown_in
     low, high = found.interval
     return {
         "kind": found.kind,
@@ -105,16 +104,3 @@ def _plain(found: Measurement) -> dict[str, Any]:
         "interval_95": [low * scale, high * scale],
         "unit": unit,
     }
-
-
-def _line(found: Measurement) -> str:
-    scale, unit = _shown(found)
-    low, high = (end * scale for end in found.interval)
-    numbers = " ".join(str(number + 1) for number in found.points)
-    errors = f"poses {found.pose_sigma * scale:.2f}, picking {found.pick_sigma * scale:.2f}"
-    value, sigma = found.value * scale, found.sigma * scale
-    return f"{found.kind} {numbers}: {value:.2f} +- {sigma:.2f} {unit} [{low:.2f}, {high:.2f}] ({errors})"
-
-
-def _shown(found: Measurement) -> tuple[float, str]:
-    return (1.0, "mm") if found.unit == "mm" else (math.degrees(1.0), "degrees")

@@ -87,6 +87,7 @@ def reconstruct(
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
     from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
+    from speckle3d.io.sweeps import unfinished_note
     from speckle3d.io.voxels.volume_writer import require_suffix
     from speckle3d.study.job import run_job
 
@@ -95,6 +96,8 @@ def reconstruct(
     )
     modes = list(dict.fromkeys(drift or ()))
     sweep = load_sweep(sweep_file)
+    if (unfinished := unfinished_note(sweep_file)) is not None:
+        note(unfinished)
     used = _find_curves(curves_file, sweep_file)
     curves = read_curves(used)
     mount(sweep, calibration or ())

@@ -112,6 +112,7 @@ def reslice(
     from speckle3d.study.posed import USUAL_RANGE_DB
     from speckle3d.study.reslices.cuts import cut_posed
     from speckle3d.study.reslices.places import Place
+    from speckle3d.study.reslices.reslice_figures import save_outlines
 
     options = locals()
     as_volume = out.name.lower().endswith(SUFFIXES)
@@ -142,7 +143,7 @@ def reslice(
 
     modes = tuple(mode or ())
     if outlines:
-        _draw_outlines(out, _open(source, modes, difference_to, options))
+        save_outlines(_open(source, modes, difference_to, options), out)
     elif source.is_file() and may_be_volume(source):
         others = {name: options[name] for name in (*_OF_SWEEPS, "difference_to", "volume", "sweep_file")}
         _require_no_sweep({"mode": modes, **others})
@@ -220,17 +221,6 @@ def _write(picture: CutPicture, out: Path) -> None:
         write_volume(out, cut_as_volume(picture))
     else:
         save_reslices(picture, out)
-
-
-def _draw_outlines(out: Path, opened: OpenedModes) -> None:
-    from speckle3d.imaging.cuts.outlines import frame_outlines
-    from speckle3d.matching.intensity import IntensityExtractor
-    from speckle3d.study.figures import save_figure
-    from speckle3d.study.reslices.reslice_figures import figure_outlines
-
-    grid = IntensityExtractor.for_sweep(opened.posed.sweep).grid
-    outlines = {mode: frame_outlines(grid, poses[0].inv() * poses) for mode, poses in opened.poses.items()}
-    save_figure(figure_outlines(outlines, opened.posed.sweep.name), out)
 
 
 def _require_one_place(given: dict[str, object]) -> None:

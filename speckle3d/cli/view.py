@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import webbrowser
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,12 +21,21 @@ if TYPE_CHECKING:
 @app.command()
 def view(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A recording, a reconstruction, or a log of a sensor.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A recording, a reconstruction or its results folder, a log of an orientation sensor, or "
+            "the serial port of one, as /dev/ttyUSB0 or COM3.",
+        ),
     ],
     reconstruction: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Reconstruction of the recording, to see with it.")
     ] = None,
     sweep: SweepFile = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT", help="Of a sensor on a port: new file for its bytes; else none is kept."),
+    ] = None,
     calibrate: Annotated[
         Literal["plane", "orientation", "wires"] | None,
         typer.Option(
@@ -53,19 +63,22 @@ def view(
     """Look at a file in the browser, on this machine alone; ends ten minutes after the last viewer left."""
     if find_spec("panel") is None:
         raise InvalidInputError("view: expected Panel to be installed: pip install 'speckle3d[app]'")
-    from speckle3d.app.opened import pages_of
+    from speckle3d.app.opened import opened
     from speckle3d.app.server import AppServer
 
-    if calibrate is None:
-        _require_no_phantom(locals())
-        pages = pages_of(file, reconstruction, sweep)
-    else:
-        pages = _phantom(file, calibrate, locals())
-    server = AppServer(pages, file.name, port)
-    note(server.address)
-    if browser:
-        webbrowser.open(server.address_for_once())
-    server.run()
+    with ExitStack() as running:
+        if calibrate is None:
+            _require_no_phantom(locals())
+            pages = running.enter_context(opened(file, record, reconstruction=reconstruction, sweep=sweep))
+        else:
+            _require_phantom_alone(record, reconstruction, sweep)
+            pages = _phantom(file, calibrate, locals())
+        server = AppServer(pages, file.name, port)
+        note(server.address)
+        if browser:
+            webbrowser.open(server.address_for_once())
+        server.run()
+    note(f"{file}: no viewer for ten minutes: ended")
 
 
 _OF_PHANTOMS = ("phantom", "points", "poses", "transform", "pixel_mm", "sensor", "level")
@@ -80,6 +93,13 @@ def _require_no_phantom(options: Mapping[str, Any]) -> None:
         raise InvalidInputError(
             f"--{option}: expected --calibrate plane, orientation or wires with it, got none"
         )
+
+
+def _require_phantom_alone(*others: Path | None) -> None:
+    """Refuse files that go with recordings and sensors beside `--calibrate`."""
+    for name, other in zip(("record", "reconstruction", "sweep"), others, strict=True):
+        if other is not None:
+            raise InvalidInputError(f"--{name}: expected none beside --calibrate, got {other}")
 
 
 def _phantom(file: Path, method: str, options: Mapping[str, Any]) -> Sequence[Page]:

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.doubts import runs_of
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
@@ -47,18 +48,28 @@ def _medians(values: FloatArray) -> FloatArray:
     return np.asarray(median_filter(values, (_WINDOW, *[1] * (values.ndim - 1)), mode="mirror"))
 
 
-def slips(sensor: OrientationSensor | Tracker) -> int:
-    """Number of places where the readings go on elsewhere than they were, faster than any hand."""
+def slips(sensor: OrientationSensor | Tracker) -> IntArray:
+    """Readings that go on elsewhere than those before them were, faster than any hand, shape (places,)."""
     samples, pause = sensor.readings.world_from_sensor, np.diff(sensor.readings.time_s)
     if len(samples) < _WINDOW:
-        return 0
+        return np.zeros(0, dtype=np.int64)
     rotation = samples.rotation if isinstance(samples, RigidTransform) else samples
     rate = (rotation[:-1].inv() * rotation[1:]).magnitude() / pause
     found = rate > max(_SLIP_RAD_S, _SPIKE_SIGMA * float(np.median(rate)))
     if isinstance(samples, RigidTransform):
         speed = np.linalg.norm(np.diff(samples.translation, axis=0), axis=1) / pause
         found |= speed > max(_SLIP_MM_S, _SPIKE_SIGMA * float(np.median(speed)))
-    return int(np.sum(found))
+    return np.flatnonzero(found) + 1
+
+
+def frames_at(
+    sensor: OrientationSensor | Tracker, readings: IntArray, frame_time_s: FloatArray
+) -> tuple[tuple[int, int], ...]:
+    """Frames nearest to some readings; none for those before the first frame or after the last."""
+    time_s = sensor.readings.time_s[readings] + sensor.time_offset_s
+    time_s = time_s[(time_s >= frame_time_s[0]) & (time_s <= frame_time_s[-1])]
+    middle = (frame_time_s[:-1] + frame_time_s[1:]) / 2
+    return runs_of(np.searchsorted(middle, time_s))
 
 
 def without(sensor: Sensor, left_out: BoolArray) -> Sensor:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.doubts import Doubt, runs_of
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.correction.evidence import (
@@ -25,7 +25,7 @@ from speckle3d.correction.evidence import (
     noise_of,
     total_misfit,
 )
-from speckle3d.correction.readings import Sensor, slips, spikes, standstill, without
+from speckle3d.correction.readings import Sensor, frames_at, slips, spikes, standstill, without
 from speckle3d.correction.suspects import Suspect, suspects
 
 TRACKER, ORIENTATION = "tracker", "orientation sensor"
@@ -98,8 +98,8 @@ def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
         With what is left of its sensors' readings.
     tuple of Doubt
     """
-    tracker, about_tracker = _cleaned(sweep.tracker)
-    orientation, about_orientation = _cleaned(sweep.orientation)
+    tracker, about_tracker = _cleaned(sweep.tracker, sweep.frame_time_s)
+    orientation, about_orientation = _cleaned(sweep.orientation, sweep.frame_time_s)
     doubts = (*about_tracker, *about_orientation)
     return (replace(sweep, tracker=tracker, orientation=orientation) if doubts else sweep), doubts
 
@@ -120,7 +120,15 @@ def without_sensors(sweep: Sweep, about: frozenset[str]) -> Sweep:
     )
 
 
-def _cleaned(sensor: Sensor | None) -> tuple[Sensor | None, list[Doubt]]:
+def doubts_of_readings(sweep: Sweep) -> tuple[Doubt, ...]:
+    """What the readings of a sweep's sensors say against themselves, without any image: spikes and jumps."""
+    cleaned, doubts = cleaned_readings(sweep)
+    left = believed(cleaned, doubts)
+    sensors = [sensor for sensor in (left.tracker, left.orientation) if sensor is not None]
+    return (*doubts, *(each for sensor in sensors for each in _slip_doubts(sensor, sweep.frame_time_s)))
+
+
+def _cleaned(sensor: Sensor | None, frame_time_s: FloatArray) -> tuple[Sensor | None, list[Doubt]]:
     wild = np.zeros(0, dtype=bool) if sensor is None else spikes(sensor)
     if sensor is None or not wild.any():
         return sensor, []
@@ -128,7 +136,9 @@ def _cleaned(sensor: Sensor | None) -> tuple[Sensor | None, list[Doubt]]:
     if wild.mean() > _MOST_SPIKES:
         evidence = f"expected a path, but {share}"
         return sensor, [Doubt(name_of(sensor), "noise or scrambled values", evidence, True)]
-    return without(sensor, wild), [Doubt(name_of(sensor), "spikes", f"{share}, and are left out", False)]
+    told = f"{share}, and are left out"
+    where = frames_at(sensor, np.flatnonzero(wild), frame_time_s)
+    return without(sensor, wild), [Doubt(name_of(sensor), "spikes", told, False, where)]
 
 
 def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) -> Trust:
@@ -155,7 +165,11 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) ->
             *_Examination(_Accused(sweep.tracker), seen).doubts()
         ]
         misled |= {doubt.about for doubt in found}
-        doubts += [*found, *_unequal_lengths(sweep.tracker, seen, length_sigma), *_slip_doubts(sweep.tracker)]
+        doubts += [
+            *found,
+            *_unequal_lengths(sweep.tracker, seen, length_sigma),
+            *_slip_doubts(sweep.tracker, seen.time_s),
+        ]
     confirmed = False
     if sweep.orientation is not None and _usable(sweep.orientation, seen):
         accused = _Accused(sweep.orientation)
@@ -169,7 +183,7 @@ def examine_sensors(sweep: Sweep, image: RigidTransform, length_sigma: float) ->
                 replace(each, suspect=f"{each.suspect}, or the tracker", refuted=False) for each in by_tracker
             ]
         found = found or [*examination.weak_doubts(), *_gravity_doubts(sweep.orientation)]
-        found += _slip_doubts(sweep.orientation)
+        found += _slip_doubts(sweep.orientation, seen.time_s)
         confirmed = examination.turn_confirmed() and not any(doubt.refuted for doubt in found)
         doubts += found
     return Trust(tuple(doubts), confirmed, frozenset(misled))
@@ -345,12 +359,13 @@ class _Examination(Generic[Sensor]):
         return f"{seen}{last.noise[part]:.2f} {unit}, got a difference of {last.left[part]:.2f}"
 
 
-def _slip_doubts(sensor: OrientationSensor | Tracker) -> Iterator[Doubt]:
+def _slip_doubts(sensor: OrientationSensor | Tracker, frame_time_s: FloatArray) -> Iterator[Doubt]:
     """Readings that go on elsewhere: a sensor that slipped, or a tracker that found itself anew."""
-    count = slips(sensor)
-    if count:
-        evidence = f"expected a path that a hand can follow, got {count} jumps in it"
-        yield Doubt(name_of(sensor), "slip, or readings lost and found elsewhere", evidence, False)
+    found = slips(sensor)
+    if found.size:
+        evidence = f"expected a path that a hand can follow, got {found.size} jumps in it"
+        where = frames_at(sensor, found, frame_time_s)
+        yield Doubt(name_of(sensor), "slip, or readings lost and found elsewhere", evidence, False, where)
 
 
 def _frozen_doubts(sensor: OrientationSensor | Tracker, seen: MotionEvidence) -> Iterator[Doubt]:
@@ -366,7 +381,7 @@ def _frozen_doubts(sensor: OrientationSensor | Tracker, seen: MotionEvidence) ->
     refuted = still > max(_HELD_S, _MOST_STILL * whole)
     if moved > _MOVED_MM and (refuted or still > _LONGEST_STILL_S):
         evidence = f"expected readings that change, got the same one for {still:.2f} of {whole:.2f} s"
-        yield Doubt(name_of(sensor), "frozen", evidence, refuted)
+        yield Doubt(name_of(sensor), "frozen", evidence, refuted, runs_of(np.flatnonzero(during)))
 
 
 def _turned(sensor: Sensor, turn: Rotation, centre_mm: FloatArray) -> Sensor:

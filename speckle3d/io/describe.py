@@ -88,6 +88,11 @@ def sweep_rows(sweep: Sweep) -> list[Row]:
     ]
 
 
+def _unfinished_rows(path: PathLike) -> list[Row]:
+    is_closed = sweeps.unfinished_note(path) is None
+    return [] if is_closed else [("recording", "goes on, or was ended without being closed", "")]
+
+
 def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
     span = float(times[-1] - times[0])
     rows = [(f"{name} duration".strip(), f"{span:.3f}", "s")]
@@ -260,7 +265,7 @@ def _spoken(name: str) -> tuple[str, str]:
 
 
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
-    sweeps.FORMAT: lambda path: sweep_rows(sweeps.read_sweep(path)),
+    sweeps.FORMAT: lambda path: [*sweep_rows(sweeps.read_sweep(path)), *_unfinished_rows(path)],
     reconstructions.FORMAT: _describe_reconstruction,
     curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,

@@ -27,6 +27,7 @@ from speckle3d.io.hdf5_guard import (
     follow,
     plain_attribute,
     require_held,
+    require_plausible_rows,
     require_readable,
     require_sound_heaps,
     require_texts,
@@ -36,6 +37,8 @@ Node: TypeAlias = h5py.Group | h5py.Dataset
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
+
+_SWMR_WRITE = 0x04
 
 _CHUNK_CACHE_BYTES = 32 * 2**20
 """Room for files whose chunks span several frames; with one chunk per frame it is never filled."""
@@ -175,7 +178,21 @@ def open_hdf5(path: PathLike) -> h5py.File:
             raise FileError(f"{path}: expected an HDF5 file, got something else")
         held = os.stat(path)
         _require_sound_once(os.fspath(path), held.st_ino, held.st_size, held.st_mtime_ns)
-        return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
+        return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES, swmr=_has_writer(path))
+
+
+def _has_writer(path: PathLike) -> bool:
+    """Whether a file is being written in HDF5's single-writer mode, or its writer was killed [1]_.
+
+    It is then to be opened as by a reader beside a writer, which does not look at a file's length.
+
+    References
+    ----------
+    .. [1] HDF5 File Format Specification 3.0, II.A: consistency flags of a superblock of version 3.
+    """
+    with open_regular(path) as stream:
+        start = stream.read(12)
+    return start.startswith(SIGNATURE) and start[8] == 3 and bool(start[11] & _SWMR_WRITE)
 
 
 @lru_cache(maxsize=16)
@@ -275,13 +292,38 @@ def read_checked(
         return np.asarray(node[()], dtype=wanted)
 
 
-def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
-    """Return a data set of `group` that the file holds whole, or raise `InvalidInputError`."""
+def read_rows(group: h5py.Group, name: str, shape: tuple[int | str, ...]) -> npt.NDArray[Any]:
+    """Read the first rows of a data set of finite numbers that grows and may be longer.
+
+    Parameters
+    ----------
+    shape : tuple of int or str
+        The first one says how many rows; a word, that all up to the first unwritten one, NaN, are wanted.
+    """
+    rows = shape[0] if isinstance(shape[0], int) else 0
+    node = require_dataset(group, name, rows)
+    where = locate(group, name)
+    if node.dtype.kind not in "fb" or not _fits(node.shape[1:], shape[1:]) or node.shape[0] < rows:
+        raise InvalidInputError(f"{where}: expected shape {shape} or more, got {node.shape} {node.dtype}")
+    with reading(where), naming(where):
+        require_plausible_rows(node)
+        values = np.asarray(node[()], dtype=np.float64 if node.dtype.kind == "f" else np.bool_)
+    if isinstance(shape[0], int):
+        return values[:rows]
+    unwritten = np.flatnonzero(np.isnan(values))
+    return values[: unwritten[0]] if unwritten.size else values
+
+
+def require_dataset(group: h5py.Group, name: str, rows: int | None = None) -> h5py.Dataset:
+    """Return a data set of `group` that the file holds whole, or raise `InvalidInputError`.
+
+    Of one that grows, `rows` are to be there.
+    """
     node, where = find_member(group, name), locate(group, name)
     if not isinstance(node, h5py.Dataset):
         raise InvalidInputError(f"{where}: expected a data set, got {_kind_of(node)}")
     with reading(where), naming(where):
-        require_held(node)
+        require_held(node, rows)
     return node
 
 

@@ -125,8 +125,13 @@ def _entries_of_heap(path: PathLike, stream: BufferedReader, start: int, file_by
     return entries
 
 
-def require_held(node: h5py.Dataset) -> None:
+def require_held(node: h5py.Dataset, rows: int | None = None) -> None:
     """Refuse a data set that the file itself does not hold whole.
+
+    Parameters
+    ----------
+    rows : int, optional
+        Of a data set that grows: how many along its first axis are to be there; more may or may not be.
 
     Raises
     ------
@@ -138,7 +143,7 @@ def require_held(node: h5py.Dataset) -> None:
         return
     file_bytes = node.file.id.get_filesize()
     if node.chunks is not None:
-        _require_chunks(node, file_bytes)
+        _require_chunks(node, file_bytes, rows)
         return
     declared, stored = bytes_of(node, node.shape), node.id.get_storage_size()
     if stored < declared or stored > file_bytes:
@@ -187,6 +192,19 @@ def require_readable(node: h5py.Dataset) -> None:
             raise InvalidInputError(f"expected {_chunk_count(node)} chunks, got {len(offsets)}")
         for offset in offsets:
             require_whole_chunk(node, offset)
+
+
+def require_plausible_rows(node: h5py.Dataset) -> None:
+    """Refuse a data set that grows, is not compressed and says that it is far longer than the file.
+
+    Raises
+    ------
+    InvalidInputError
+        Also if it is compressed.
+    """
+    if pipeline(node):
+        raise InvalidInputError("expected numbers that are not compressed, in a file that grows")
+    _require_plausible(bytes_of(node, node.shape), node.file.id.get_filesize())
 
 
 def require_texts(node: h5py.Dataset) -> None:
@@ -281,14 +299,20 @@ def _external_names(settings: Any) -> str:
     return printable(repr(name.decode("utf-8", "replace")))
 
 
-def _chunk_count(node: h5py.Dataset) -> int:
-    return math.prod(-(-length // chunk) for length, chunk in zip(node.shape, node.chunks, strict=True))
+def _chunk_count(node: h5py.Dataset, rows: int | None = None) -> int:
+    shape = node.shape if rows is None else (rows, *node.shape[1:])
+    return math.prod(-(-length // chunk) for length, chunk in zip(shape, node.chunks, strict=True))
 
 
-def _require_chunks(node: h5py.Dataset, file_bytes: int) -> None:
+def _require_chunks(node: h5py.Dataset, file_bytes: int, rows: int | None) -> None:
     chunk_bytes = bytes_of(node, node.chunks)
     _require_plausible(chunk_bytes, file_bytes)
-    expected, found = _chunk_count(node), node.id.get_num_chunks()
+    if rows is None:
+        expected, found = _chunk_count(node), node.id.get_num_chunks()
+    else:
+        within: list[Offset] = []
+        node.id.chunk_iter(lambda chunk: _append_if(within, chunk.chunk_offset, rows))
+        expected, found = _chunk_count(node, rows), len(within)
     if found != expected:
         raise InvalidInputError(f"expected {expected} chunks of data, got {found}")
     filtered = bool(pipeline(node))
@@ -304,6 +328,11 @@ def _require_chunks(node: h5py.Dataset, file_bytes: int) -> None:
     if wrong:
         offset, size = wrong[0]
         raise InvalidInputError(f"chunk {offset}: expected {chunk_bytes} bytes, got {size}")
+
+
+def _append_if(kept: list[Offset], offset: Offset, rows: int) -> None:
+    if offset[0] < rows:
+        kept.append(offset)
 
 
 def _require_plausible(size: int, file_bytes: int) -> None:

@@ -112,6 +112,8 @@ class HDF5Slices(LazyFrames):
         Of the data sets: the frames. None where there is one frame and no axis for it.
     turn : callable
         Makes a frame of the data sets' slices, which lack that axis.
+    grows : bool
+        Whether the data sets may hold more frames, which are not looked at.
     """
 
     def __init__(
@@ -122,9 +124,10 @@ class HDF5Slices(LazyFrames):
         turn: Turn,
         shape: tuple[int, int, int],
         dtype: npt.DTypeLike,
+        grows: bool = False,
     ) -> None:
         super().__init__(path, shape, dtype)
-        self.names, self.axis, self.turn = tuple(names), axis, turn
+        self.names, self.axis, self.turn, self.grows = tuple(names), axis, turn, grows
 
     def _opened(self) -> OpenFrames:
         return _OpenSlices(self)
@@ -137,7 +140,9 @@ class _OpenSlices:
     def __init__(self, frames: HDF5Slices) -> None:
         self._file, self._turn = open_hdf5(frames.path), frames.turn
         try:
-            self._parts = [_Part(require_dataset(self._file, name), frames) for name in frames.names]
+            rows = len(frames) if frames.grows else None
+            held = [require_dataset(self._file, name, rows) for name in frames.names]
+            self._parts = [_Part(data, frames) for data in held]
         except BaseException:
             self._file.close()
             raise
@@ -160,7 +165,7 @@ class _Part:
     def __init__(self, data: h5py.Dataset, frames: HDF5Slices) -> None:
         self._data, self._axis = data, frames.axis
         found = 1 if self._axis is None else data.shape[self._axis] if self._axis < data.ndim else 0
-        if found != len(frames):
+        if found != len(frames) and not (frames.grows and found > len(frames)):
             raise InvalidInputError(
                 f"{data.name}: expected {len(frames)} frames on axis {self._axis}, got shape {data.shape}"
             )

@@ -91,7 +91,7 @@ class SweepWriter(HDF5Writer):
         compression: Compression = "gzip",
     ) -> None:
         self._grid, self._signal = grid, signal
-        self._name = _name_for(signal)
+        self._name = name_for(signal)
         super().__init__(path, FORMAT, IQ_VERSION if self._name == "iq" else VERSION)
         self._dtype: np.dtype[Any] = SAMPLE_TYPES[self._name][0] if dtype is None else np.dtype(dtype)
         require_sample_type(self._name, self._dtype, f"{path}: /{self._name}")
@@ -112,7 +112,7 @@ class SweepWriter(HDF5Writer):
             compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
             shuffle=self._compression is not None,
         )
-        node.attrs.update(_attributes(self._grid, self._signal))
+        node.attrs.update(frames_attributes(self._grid, self._signal))
         self._frames = node.id
         self._in_memory = h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
@@ -138,19 +138,8 @@ class SweepWriter(HDF5Writer):
         """
         i = len(self._time_s)
         where = f"{self._path}: /{self._name}[{i}]"
-        expected = (self._grid.vectors, self._grid.samples)
-        if frame.shape != expected:
-            raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
-        wanted: np.dtype[Any] = np.dtype(np.complex64) if self._name == "iq" else self._dtype
-        if not np.can_cast(frame.dtype, wanted, "same_kind") or (
-            self._name == "iq" and frame.dtype.kind != "c"
-        ):
-            raise InvalidInputError(f"{where}: expected samples of type {wanted}, got {frame.dtype}")
-        if frame.dtype.kind in "fc":
-            require_finite(frame, where)
-        if self._paired:
-            frame = _as_pairs(frame, where)
-        self._write(i, np.ascontiguousarray(frame, self._dtype))
+        stored = frame_for(self._name, frame, self._grid, self._dtype, where)
+        self._write(i, stored)
         if self._deflating is None:
             self._require_room()
         self._time_s.append(float(time_s))
@@ -313,7 +302,31 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
         group.attrs["sensor_from_image_wxyz"] = sensor.sensor_from_image.as_quat(scalar_first=True)
 
 
-def _name_for(signal: RFSettings | BModeSettings) -> str:
+def frame_for(
+    name: str, frame: npt.NDArray[Any], grid: ImageGrid, dtype: np.dtype[Any], where: str
+) -> npt.NDArray[Any]:
+    """Frame, shape (vector, sample), as /rf, /iq or /bmode store it: contiguous, I/Q of int16 in pairs.
+
+    Raises
+    ------
+    InvalidInputError
+        If its shape or type is another, or it holds NaN.
+    """
+    expected = (grid.vectors, grid.samples)
+    if frame.shape != expected:
+        raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
+    wanted: np.dtype[Any] = np.dtype(np.complex64) if name == "iq" else dtype
+    if not np.can_cast(frame.dtype, wanted, "same_kind") or (name == "iq" and frame.dtype.kind != "c"):
+        raise InvalidInputError(f"{where}: expected samples of type {wanted}, got {frame.dtype}")
+    if frame.dtype.kind in "fc":
+        require_finite(frame, where)
+    if name == "iq" and dtype == np.int16:
+        frame = _as_pairs(frame, where)
+    return np.ascontiguousarray(frame, dtype)
+
+
+def name_for(signal: RFSettings | BModeSettings) -> str:
+    """Name of the data set of frames of a kind."""
     if not isinstance(signal, RFSettings):
         return "bmode"
     return "iq" if signal.are_complex else "rf"
@@ -338,7 +351,8 @@ def _as_pairs(frame: npt.NDArray[Any], where: str) -> npt.NDArray[np.int16]:
     )
 
 
-def _attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
+def frames_attributes(grid: ImageGrid, signal: RFSettings | BModeSettings) -> dict[str, Any]:
+    """Attributes of the data set of frames."""
     held = signal_attributes(signal) | {"first_sample_depth_mm": grid.first_sample_depth_mm}
     if isinstance(signal, RFSettings):
         band = np.asarray(signal.bandwidth_hz, dtype=float)

@@ -36,14 +36,18 @@ from speckle3d.io.hdf5 import (
     has_member,
     hdf5_claim,
     locate,
+    open_hdf5,
     opened,
     read_attribute,
     read_checked,
+    read_rows,
     read_text,
     read_transforms,
     read_vector_attribute,
+    reading,
     require_dataset,
 )
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import HDF5Slices, Slices
 from speckle3d.io.readers import Reader
 
@@ -51,7 +55,10 @@ FORMAT = "speckle3d.sweep"
 VERSION, IQ_VERSION = 1, 2
 """Of files without and with I/Q, so that older readers still read what they can make sense of."""
 
-KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth"})
+GROWING = "unfinished"
+"""Data set of files that grow as they are recorded: 0 once the recording has been closed."""
+
+KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth", GROWING})
 """Members of the root that these versions of the format give a meaning to."""
 
 SAMPLE_TYPES: dict[str, tuple[np.dtype[Any], ...]] = {
@@ -68,11 +75,14 @@ RF_NUMBERS = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
 class HDF5Frames(HDF5Slices):
     """Frames of a sweep file, read one at a time; pairs of int16 (I/Q) as complex64."""
 
-    def __init__(self, path: PathLike, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+    def __init__(
+        self, path: PathLike, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], grows: bool = False
+    ) -> None:
         in_pairs = len(shape) == 4
         n, vectors, samples = shape[:3]
         turn = complex_of_pairs if in_pairs else as_stored
-        super().__init__(path, [name], 0, turn, (n, vectors, samples), np.complex64 if in_pairs else dtype)
+        kind = np.complex64 if in_pairs else dtype
+        super().__init__(path, [name], 0, turn, (n, vectors, samples), kind, grows)
         self.stored_dtype = dtype
 
 
@@ -97,9 +107,17 @@ def read_sweep(path: PathLike) -> Sweep:
         Naming the file, the data set and the first bad index.
     """
     with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
-        frames, grid, signal = _read_image(file)
+        grows = is_growing(file)
+        times, n = None, None
+        if grows:
+            times = read_rows(file, "frame_time_s", ("frame",))
+            n = times.size
+            if not n:
+                raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
+        frames, grid, signal = _read_image(file, n)
         n = frames.shape[0]
-        times = read_checked(file, "frame_time_s", (n,))
+        if times is None:
+            times = read_checked(file, "frame_time_s", (n,))
         return Sweep(
             frames=frames,
             grid=grid,
@@ -113,9 +131,19 @@ def read_sweep(path: PathLike) -> Sweep:
         )
 
 
-def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
+def is_growing(file: h5py.File) -> bool:
+    """Whether an open file's recording goes on, or has ended without being closed."""
+    if file.swmr_mode:
+        return True
+    return has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_))
+
+
+def _read_image(
+    file: h5py.File, rows: int | None
+) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
+    """Frames of a file; of one that grows, as many as it has times for."""
     name = _name_of_image(file)
-    node = require_dataset(file, name)
+    node = require_dataset(file, name, rows)
     where = locate(file, name)
     dtype = node.dtype.newbyteorder("=")
     require_sample_type(name, dtype, where)
@@ -123,7 +151,10 @@ def _read_image(file: h5py.File) -> tuple[HDF5Frames, ImageGrid, RFSettings | BM
     if node.ndim != 3 + len(pairs) or node.shape[3:] != pairs or 0 in node.shape:
         expected = f"(frame, vector, sample{', 2' if pairs else ''})"
         raise InvalidInputError(f"{where}: expected shape {expected}, got {node.shape}")
-    frames = HDF5Frames(file.filename, name, node.shape, dtype)
+    shape = node.shape if rows is None else (rows, *node.shape[1:])
+    if not shape[0] <= node.shape[0]:
+        raise InvalidInputError(f"{where}: expected {rows} frames or more, got {node.shape[0]}")
+    frames = HDF5Frames(file.filename, name, shape, dtype, rows is not None)
     with naming(where):
         signal = read_signal(node, name)
         return frames, _read_grid(node, signal), signal
@@ -184,8 +215,10 @@ def _read_orientation(file: h5py.File) -> OrientationSensor | None:
     group = find_group(file, "orientation")
     if group is None:
         return None
-    time_s = require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
-    quaternions = read_checked(group, "quaternion_wxyz", (time_s.size, 4))
+    time_s = _read_times(group)
+    if time_s is None:
+        return None
+    quaternions = _read_values(group, "quaternion_wxyz", (time_s.size, 4))
     rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
     vectors = {name: _read_vectors(group, name, time_s.size) for name in INERTIAL if has_member(group, name)}
     mounting, name = None, "sensor_from_image_wxyz"
@@ -197,13 +230,32 @@ def _read_orientation(file: h5py.File) -> OrientationSensor | None:
         return OrientationSensor(TimedRotations(time_s, rotations), mounting, offset_s, **vectors)
 
 
+def _read_times(group: h5py.Group) -> FloatArray | None:
+    """Times of a sensor's readings; None of one that sent nothing during a recording."""
+    if is_growing(group.file):
+        times = read_rows(group, "time_s", ("sample",))
+    else:
+        times = read_checked(group, "time_s", ("sample",))
+    if not times.size and has_member(group.file, GROWING):
+        return None
+    return require_increasing(times, locate(group, "time_s"))
+
+
+def _read_values(group: h5py.Group, name: str, shape: tuple[int, ...]) -> FloatArray:
+    return (read_rows if is_growing(group.file) else read_checked)(group, name, shape)
+
+
 def _read_tracker(file: h5py.File) -> Tracker | None:
     group = find_group(file, "tracker")
     if group is None:
         return None
-    time_s = require_increasing(read_checked(group, "time_s", ("sample",)), locate(group, "time_s"))
+    time_s = _read_times(group)
+    if time_s is None:
+        return None
     valid = _read_valid(group, time_s.size)
-    matrices = read_checked(group, "world_from_sensor", (time_s.size, 4, 4))
+    if not valid.any():
+        return None
+    matrices = _read_values(group, "world_from_sensor", (time_s.size, 4, 4))
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
     poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
@@ -231,15 +283,36 @@ def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
 def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
     if not has_member(group, "valid"):
         return np.ones(samples, dtype=bool)
-    valid = read_checked(group, "valid", (samples,), np.bool_)
-    if samples and not valid.any():
+    valid: BoolArray
+    if is_growing(group.file):
+        valid = read_rows(group, "valid", (samples,)).astype(np.bool_)
+    else:
+        valid = read_checked(group, "valid", (samples,), np.bool_)
+    if samples and not valid.any() and not has_member(group.file, GROWING):
         raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
     return valid
+
+
+def unfinished_note(path: PathLike) -> str | None:
+    """Words for a sweep file whose recording goes on or was not closed; None for any other file."""
+    if not Path(path).is_file() or not h5py.is_hdf5(path):
+        return None
+    with reading(path), open_hdf5(path) as file:
+        if not has_format(file, FORMAT) or not is_growing(file):
+            return None
+        times = read_rows(file, "frame_time_s", ("frame",))
+    return f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far"
+
+
+def _notes(path: Path, _: ImportSettings) -> list[str]:
+    note = unfinished_note(path)
+    return [] if note is None else [note]
 
 
 READER = Reader(
     FORMAT,
     hdf5_claim(lambda file: has_format(file, FORMAT)),
     lambda path, _: read_sweep(path),
+    notes=_notes,
     takes_settings=False,
 )

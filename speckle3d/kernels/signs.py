@@ -97,6 +97,8 @@ def follow_paths(
     unlike: IntArray,
     rules: PathRules,
     best: FloatArray,
+    known: int = 1,
+    known_trend: float = 1.0,
 ) -> None:
     """Place frame after frame by its pairs with earlier ones, on the likeliest paths.
 
@@ -114,6 +116,10 @@ def follow_paths(
     rules : PathRules
     best : float64, shape (n, 2)
         Receives position and slope of every frame on the path of least cost.
+    known : int
+        So many frames at the beginning are in `best` already, and stay.
+    known_trend : float
+        Direction in which these went at last, from -1 to +1. The sign of the first frame on its own is open.
     """
     frames = start.size - 1
     most = 1
@@ -129,7 +135,12 @@ def follow_paths(
     candidates = np.empty((count * 2 * most, 2))
     weight, place = np.empty((most, 3)), np.empty(2)
     kept, settled = 1, 0
-    for f in range(1, frames):
+    if known > 1:
+        trend[0], left[0] = known_trend, True
+        for f in range(known):
+            for k in range(2):
+                paths[0, f, k] = best[f, k]
+    for f in range(known, frames):
         low, pairs = start[f], start[f + 1] - start[f]
         if pairs == 0:
             if rules.hold:

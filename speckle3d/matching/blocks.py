@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
+
+import numpy.typing as npt
 
 from speckle3d.core.arrays import Float32Array
-from speckle3d.core.sweep import Sweep, read_frame
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead, counting_seconds
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
@@ -170,7 +173,7 @@ def match_block(
 
 
 @dataclass(frozen=True)
-class _MadeReady:
+class MadeReady:
     """What is made of a frame on the way to matching it."""
 
     number: int
@@ -179,34 +182,33 @@ class _MadeReady:
     features: FrameFeatures
 
 
-class _BlockMatcher:
-    """Matches the frames of a block; keeps those that later ones are still to be matched with."""
+class FrameByFrame:
+    """Matches frames in order; keeps those that later ones are still to be matched with.
+
+    Parameters
+    ----------
+    matcher : FrameMatcher
+    trajectory : TrajectorySettings
+    times : StageTimes, optional
+        To which the time spent is added.
+    """
 
     def __init__(
-        self,
-        sweep: Sweep,
-        matcher: FrameMatcher,
-        trajectory: TrajectorySettings,
-        quality: QualitySettings,
-        times: StageTimes,
+        self, matcher: FrameMatcher, trajectory: TrajectorySettings, times: StageTimes | None = None
     ) -> None:
-        self._sweep, self._matcher, self._times = sweep, matcher, times
-        self._settings = trajectory
-        self._inspector = FrameInspector(sweep.signal, matcher.patches, quality)
+        self._matcher, self._settings, self._times = matcher, trajectory, times or StageTimes()
         self._schedule = PairSchedule(trajectory)
         self._ready: dict[int, ReadyFrame] = {}
-        self._motion: dict[int, InPlaneMotion] = {}
+        self._motion: dict[int, InPlaneMotion] = {0: InPlaneMotion()}
 
-    def run(self, block: Block, images: ImageSink | None) -> Iterator[MatchedFrame]:
-        if block.first:
-            self._lead_in(block.first)
-        else:
-            self._motion[0] = InPlaneMotion()
-        for made in self._made_ready(range(block.first, block.stop), images):
-            yield MatchedFrame(made.number, made.features, self._advance(made.number, made.ready))
+    def advance(self, frame: int, ready: ReadyFrame) -> dict[int, MatchedPair]:
+        """Match a frame with the earlier ones that the schedule wants, latest first.
 
-    def _advance(self, frame: int, ready: ReadyFrame) -> dict[int, MatchedPair]:
-        """Match a frame with its references, and drop frames that are no longer needed."""
+        Parameters
+        ----------
+        frame : int
+            The number after that of the frame before.
+        """
         with self._times.of(MATCHING):
             self._ready[frame] = ready
             pairs = self._pairs(frame)
@@ -215,6 +217,35 @@ class _BlockMatcher:
             self._ready = {k: v for k, v in self._ready.items() if k in keep}
             self._motion = {k: v for k, v in self._motion.items() if k in keep}
         return pairs
+
+    def lead_in(self, first: int, back: Iterable[tuple[int, ReadyFrame]]) -> None:
+        """Find the key frames before a frame to begin with.
+
+        Key frames are so far apart in travel, not in time: after a pause at the border, only frames from
+        before the pause tell on which side the next ones are.
+
+        Parameters
+        ----------
+        back : iterable of (int, ReadyFrame)
+            Frames before `first`, latest first, taken as far as is needed.
+        """
+        s = self._settings
+        most = s.key_frames + s.far_key_frames
+        recent, keys, sound = range(max(0, first - s.recent), first), [first - 1], None
+        self._motion = {first - 1: InPlaneMotion()}
+        for frame, ready in back:
+            with self._times.of(MATCHING):
+                self._ready[frame] = ready
+                if frame < first - 1:
+                    median = self._lead(keys[-1], frame)
+                    if sound is None and median >= s.least_correlation:
+                        sound = keys[-1]
+                    if median < s.key_correlation:
+                        keys.append(frame)
+                self._ready = {k: v for k, v in self._ready.items() if k in keys or k in recent}
+            if len(keys) >= most and frame <= recent.start:
+                break
+        self._schedule.begin(sorted(keys[:most]), first - 1 if sound is None else sound)
 
     def _pairs(self, frame: int) -> dict[int, MatchedPair]:
         """Match a frame with its references, from a start found against the first that it resembles."""
@@ -245,33 +276,6 @@ class _BlockMatcher:
                 self._motion[frame] = compose(self._motion[before], pairs[before].motion)
         return pairs
 
-    def _lead_in(self, first: int) -> None:
-        """Find the key frames before a block, going back from it no farther than a block is long.
-
-        Key frames are so far apart in travel, not in time: after a pause at the border, only frames from
-        before the pause tell on which side the next ones are.
-        """
-        s = self._settings
-        most = s.key_frames + s.far_key_frames
-        recent, keys, sound = range(max(0, first - s.recent), first), [first - 1], None
-        self._motion[first - 1] = InPlaneMotion()
-        back = range(first - 1, max(-1, first - 1 - max(s.block_frames, s.recent)), -1)
-        with closing(self._made_ready(back)) as earlier:
-            for made in earlier:
-                frame = made.number
-                with self._times.of(MATCHING):
-                    self._ready[frame] = made.ready
-                    if frame < first - 1:
-                        median = self._lead(keys[-1], frame)
-                        if sound is None and median >= s.least_correlation:
-                            sound = keys[-1]
-                        if median < s.key_correlation:
-                            keys.append(frame)
-                    self._ready = {k: v for k, v in self._ready.items() if k in keys or k in recent}
-                if len(keys) >= most and frame <= recent.start:
-                    break
-        self._schedule.begin(sorted(keys[:most]), first - 1 if sound is None else sound)
-
     def _lead(self, key: int, frame: int) -> float:
         """Match a frame with a key frame after it; its motion is the key frame's if they are not alike."""
         fixed, moving = self._ready[key], self._ready[frame]
@@ -281,16 +285,63 @@ class _BlockMatcher:
         self._motion[frame] = compose(self._motion[key], found.motion) if alike else self._motion[key]
         return median
 
-    def _made_ready(self, numbers: range, images: ImageSink | None = None) -> Generator[_MadeReady]:
+
+class FrameMaker:
+    """Makes frames of one sweep ready to be matched, each by itself and on any thread."""
+
+    def __init__(
+        self,
+        signal: RFSettings | BModeSettings,
+        matcher: FrameMatcher,
+        quality: QualitySettings,
+        times: StageTimes | None = None,
+    ) -> None:
+        self._matcher, self._times = matcher, times or StageTimes()
+        self._inspector = FrameInspector(signal, matcher.patches, quality)
+
+    def make(self, number: int, frame: npt.NDArray[Any]) -> MadeReady:
+        """Make one frame ready; `frame` as read, shape (vector, sample)."""
+        with self._times.of("intensity"):
+            echo = self._matcher.echo(frame)
+            features = self._inspector.inspect(frame, echo.intensity)
+            return MadeReady(number, echo.intensity, self._matcher.prepare(echo), features)
+
+
+class _BlockMatcher:
+    """Matches the frames of a block."""
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        matcher: FrameMatcher,
+        trajectory: TrajectorySettings,
+        quality: QualitySettings,
+        times: StageTimes,
+    ) -> None:
+        self._sweep, self._settings, self._times = sweep, trajectory, times
+        self._maker = FrameMaker(sweep.signal, matcher, quality, times)
+        self._matched = FrameByFrame(matcher, trajectory, times)
+
+    def run(self, block: Block, images: ImageSink | None) -> Iterator[MatchedFrame]:
+        if block.first:
+            self._lead_in(block.first)
+        for made in self._made_ready(range(block.first, block.stop), images):
+            yield MatchedFrame(made.number, made.features, self._matched.advance(made.number, made.ready))
+
+    def _lead_in(self, first: int) -> None:
+        """Find the key frames before a block, going back from it no farther than a block is long."""
+        farthest = max(self._settings.block_frames, self._settings.recent)
+        back = range(first - 1, max(-1, first - 1 - farthest), -1)
+        with closing(self._made_ready(back)) as earlier:
+            self._matched.lead_in(first, ((made.number, made.ready) for made in earlier))
+
+    def _made_ready(self, numbers: range, images: ImageSink | None = None) -> Generator[MadeReady]:
         """Yield frames in order, made ready a few ahead of use; images go to their sink in order, too."""
 
-        def make(index: int) -> _MadeReady:
+        def make(index: int) -> MadeReady:
             with self._times.of("reading"):
                 frame = read_frame(self._sweep.frames, index)
-            with self._times.of("intensity"):
-                echo = self._matcher.echo(frame)
-                features = self._inspector.inspect(frame, echo.intensity)
-                return _MadeReady(index, echo.intensity, self._matcher.prepare(echo), features)
+            return self._maker.make(index, frame)
 
         for made in ahead(make, numbers, AHEAD):
             if images:

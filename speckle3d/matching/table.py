@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -74,17 +74,30 @@ class CorrelationTable:
     def __len__(self) -> int:
         return int(self.first.size)
 
+    def part(self, begin: int) -> CorrelationTable:
+        """The pairs from a row on."""
+        return CorrelationTable(
+            self.first[begin:],
+            self.second[begin:],
+            self.correlation[begin:],
+            self.median[begin:],
+            self.motion[begin:],
+        )
+
+    @classmethod
+    def joined(cls, tables: Sequence[CorrelationTable]) -> CorrelationTable:
+        """All pairs of several tables, one at least, in their order."""
+        return cls(
+            np.concatenate([each.first for each in tables]),
+            np.concatenate([each.second for each in tables]),
+            np.concatenate([each.correlation for each in tables]),
+            np.concatenate([each.median for each in tables]),
+            tuple(motion for each in tables for motion in each.motion),
+        )
+
     def followed_by(self, other: CorrelationTable) -> CorrelationTable:
         """Return a table of these pairs and, in the rows after them, another's."""
-        if not len(other):
-            return self
-        return CorrelationTable(
-            np.concatenate([self.first, other.first]),
-            np.concatenate([self.second, other.second]),
-            np.concatenate([self.correlation, other.correlation]),
-            np.concatenate([self.median, other.median]),
-            self.motion + other.motion,
-        )
+        return CorrelationTable.joined([self, other]) if len(other) else self
 
     @cached_property
     def inplane(self) -> FloatArray:

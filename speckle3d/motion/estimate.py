@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -35,6 +36,7 @@ from speckle3d.motion.signs import (
 )
 from speckle3d.motion.trajectory import (
     Trajectory,
+    fixed,
     held,
     joined,
     relative_poses_of,
@@ -75,6 +77,12 @@ class PairReader:
         """Return a reader of the same sweep with other curves."""
         return PairReader(curves, self._patches, self._centre, self._frames, self._planes, self._settings)
 
+    def of_frames(self, frames: int) -> PairReader:
+        """Return a reader of the same images in another number."""
+        other = copy(self)
+        other._frames = frames
+        return other
+
     def rough_path(self, table: CorrelationTable) -> FloatArray:
         """Place each frame after the earlier ones it resembles, by a phantom's curves.
 
@@ -102,7 +110,12 @@ class PairReader:
         )
 
     def measure(
-        self, table: CorrelationTable, path: FloatArray, sound: BoolArray, coherence: Coherence | None
+        self,
+        table: CorrelationTable,
+        path: FloatArray,
+        sound: BoolArray,
+        coherence: Coherence | None,
+        known: int = 0,
     ) -> SignedPairs:
         """Planes and signs of the pairs that are near enough on a path to tell a distance.
 
@@ -114,12 +127,28 @@ class PairReader:
             Pairs both of whose frames are to be trusted.
         coherence : Coherence or None
             With which correlations are read; None for a phantom's curves as they are.
+        known : int
+            So many frames at the beginning are where the path has them.
 
         Raises
         ------
         InsufficientDataError
             If no pair determines a plane.
         """
+        pairs = self.unsigned(table, path, sound, coherence)
+        if not len(pairs):
+            patches = table.correlation.shape[1]
+            raise InsufficientDataError(
+                f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
+                f"{patches} patches: is the image wide enough, and do the curves fit it?"
+            )
+        error = PLAIN_ERROR if coherence is None else ADAPTED_ERROR
+        return self.signed(table, pairs, sound, path[:known], error)[0]
+
+    def unsigned(
+        self, table: CorrelationTable, path: FloatArray, sound: BoolArray, coherence: Coherence | None
+    ) -> SignedPairs:
+        """Planes of the pairs as for `measure`, as far as they are determined; all signs are +1."""
         chosen = self._choose(table, path[:, 0], sound)
         first, second = table.first[chosen], table.second[chosen]
         apart = path[second, 0] - path[first, 0]
@@ -127,18 +156,47 @@ class PairReader:
         planes = self.fitter.fit(
             table.correlation[chosen], table.inplane[chosen, :2], echoes, start_mm=np.abs(apart)
         )
-        pairs = SignedPairs(chosen, first, second, echoes, planes, np.ones(chosen.size))[planes.determined]
-        if not len(pairs):
-            patches = table.correlation.shape[1]
-            raise InsufficientDataError(
-                f"expected frame pairs whose patches determine a plane, got none in {chosen.size} pairs of "
-                f"{patches} patches: is the image wide enough, and do the curves fit it?"
-            )
+        return SignedPairs(chosen, first, second, echoes, planes, np.ones(chosen.size))[planes.determined]
+
+    def roughly(
+        self, table: CorrelationTable, coherence: Coherence | None, apart_mm: FloatArray
+    ) -> SignedPairs:
+        """Planes of frames' pairs with earlier frames that they resemble, wherever they are; all signs +1.
+
+        Parameters
+        ----------
+        apart_mm : ndarray, shape (e,)
+            About how far apart the frames of each pair are, for structure that fades.
+        """
+        rows = self._alike(table)
+        first, second = table.first[rows], table.second[rows]
+        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2, apart_mm[rows])
+        planes = self.fitter.fit(table.correlation[rows], table.inplane[rows, :2], echoes)
+        return SignedPairs(rows, first, second, echoes, planes, np.ones(rows.size))[planes.determined]
+
+    def signed(
+        self,
+        table: CorrelationTable,
+        pairs: SignedPairs,
+        sound: BoolArray,
+        known: FloatArray,
+        error: float = ADAPTED_ERROR,
+    ) -> tuple[SignedPairs, FloatArray]:
+        """Pairs with the signs that belong together, and the likeliest path, shape (n, 2).
+
+        Parameters
+        ----------
+        known : ndarray, shape (m, 2)
+            Path of the first m frames, which stays; of none, if the sweep begins with the table.
+        error : float
+            Of distances, as for `settled_path`.
+        """
         moved, covariance = pairs.planes.coefficients[:, :2], pairs.planes.covariance[:, :2, :2]
         signless = pairs.first, pairs.second, moved, covariance
-        error = PLAIN_ERROR if coherence is None else ADAPTED_ERROR
-        settled = settled_path(self._frames, *signless, error, self._strangers(table, sound))
-        return pairs.with_signs(pair_signs(settled, *signless))
+        settled = settled_path(
+            self._frames, *signless, error, self._strangers(table, sound), hold=len(known) > 0, known=known
+        )
+        return pairs.with_signs(pair_signs(settled, *signless)), settled
 
     def coherence(
         self,
@@ -198,6 +256,16 @@ class PairReader:
             joined(edges, between), self._frames, self._centre, self._settings, with_covariance
         )
 
+    def solve_onto(self, edges: RelativePoses, known: RigidTransform) -> RigidTransform:
+        """Poses of all frames from edges and the poses of the first frames, one at least, which stay."""
+        if len(known) > 1:
+            edges = joined(fixed(known, self._centre), edges)
+        return RigidTransform.concatenate([known, (known[0] * self.solve(edges).poses)[len(known) :]])
+
+    def path_of(self, poses: RigidTransform) -> FloatArray:
+        """Elevational position of the image's centre and slope along x of every pose, shape (n, 2)."""
+        return np.column_stack([poses.apply(self._centre)[:, 2], poses.rotation.as_matrix()[:, 2, 0]])
+
     def unjoined(self, second: IntArray) -> BoolArray:
         """Frames after the first that are the second of no pair, shape (n,)."""
         lone = np.ones(self._frames, dtype=bool)
@@ -208,8 +276,7 @@ class PairReader:
     def path(self, table: CorrelationTable, pairs: SignedPairs, coherence: Coherence | None) -> FloatArray:
         """Elevational position of the image's centre and slope along x of every frame, shape (n, 2)."""
         slopes = self.slopes(pairs, coherence)
-        poses = self.solve(self.edges(table, pairs, slopes.applied(pairs.planes))).poses
-        return np.column_stack([poses.apply(self._centre)[:, 2], poses.rotation.as_matrix()[:, 2, 0]])
+        return self.path_of(self.solve(self.edges(table, pairs, slopes.applied(pairs.planes))).poses)
 
     def consistent(
         self, table: CorrelationTable, pairs: SignedPairs, sensed: Rotation, direction: int

@@ -106,6 +106,14 @@ class PairPlanes:
         return PairPlanes(*(getattr(self, each.name)[pairs] for each in fields(self)))
 
     @classmethod
+    def none(cls, patches: int) -> PairPlanes:
+        """Planes of no pair."""
+        empty = np.zeros((0, patches), dtype=np.float32)
+        return cls(
+            np.zeros((0, 3)), np.zeros((0, 3, 3)), empty.astype(bool), empty, empty, np.zeros(0, dtype=bool)
+        )
+
+    @classmethod
     def concatenate(cls, planes: Sequence[PairPlanes]) -> PairPlanes:
         """Return the planes of several sets of pairs, one after the other."""
         return cls(*(np.concatenate([getattr(p, each.name) for p in planes]) for each in fields(cls)))

@@ -207,7 +207,8 @@ def folded(
         f"sweep's other pairs have, about frame {at + WINDOW // 2}"
     )
     refuted = worst > FOLD_REFUSED and len(patch_centre_mm) >= FOLD_PATCHES
-    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, refuted)
+    where = (at, min(at + WINDOW, len(poses)) - 1)
+    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, refuted, (where,))
 
 
 def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | None:
@@ -233,7 +234,8 @@ def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | Non
         f"expected speckle that joins all frames, got none across frame {', '.join(map(str, cuts[:LISTED]))}"
         f"{more}: what was travelled there is a guess within {HELD_MM:g} mm"
     )
-    return Doubt(IMAGES, "too fast, lifted, or frames lost", evidence, False)
+    where = tuple((k, k) for k in cuts)
+    return Doubt(IMAGES, "too fast, lifted, or frames lost", evidence, False, where)
 
 
 def _distance(relative: RigidTransform, patch_centre_mm: FloatArray) -> FloatArray:

@@ -122,6 +122,7 @@ def settled_path(
     relative_error: float = PLAIN_ERROR,
     strangers: Strangers | None = None,
     hold: bool = False,
+    known: FloatArray | None = None,
 ) -> FloatArray:
     """Follow the most likely paths: elevational position and slope along x of one frame after the other.
 
@@ -142,6 +143,8 @@ def settled_path(
     strangers : Strangers, optional
     hold : bool
         Leave frames that no pair places where the one before them is; else they stay at zero.
+    known : ndarray, shape (m, 2), optional
+        Position and slope of the first m frames, which stay.
 
     Returns
     -------
@@ -167,6 +170,10 @@ def settled_path(
     )
     every = np.arange(frames + 1)
     path = np.zeros((frames, 2))
+    begun, trend = 1, 1.0
+    if known is not None and len(known) > 1:
+        begun, trend = len(known), _trend(known[:, 0])
+        path[:begun] = known
     follow_paths(
         np.searchsorted(second, every),
         np.ascontiguousarray(first),
@@ -176,8 +183,18 @@ def settled_path(
         np.ascontiguousarray(apart.first),
         rules,
         path,
+        begun,
+        trend,
     )
     return path
+
+
+def _trend(position_mm: FloatArray) -> float:
+    """Direction in which frames went at last, averaged over travel as `follow_paths` does."""
+    step = np.diff(position_mm)
+    left = np.cumsum(np.abs(step[::-1]))[::-1]
+    kept = np.exp(-np.append(left, 0.0) / TREND_MM)
+    return float(kept[0] + np.sum(np.sign(step) * (kept[1:] - kept[:-1])))
 
 
 def pair_signs(

@@ -19,6 +19,8 @@ SETTLED = 1e-7
 ROUNDS = 6
 HELD_MM, HELD_RAD = 1.0, 0.05
 """How far a probe may go between two frames: 25 mm and 70 degrees in a second at 25 frames."""
+FIXED_VARIANCE = 1e-8
+"""Of poses that stay, mm^2 and rad^2: far less than any pair's."""
 KNOWN_FRAMES = 80
 """Frames whose covariance is computed; those of the others are interpolated."""
 
@@ -64,6 +66,23 @@ def held(first: IntArray, second: IntArray) -> RelativePoses:
     deviation = np.array([HELD_MM, HELD_MM, HELD_MM, HELD_RAD, HELD_RAD, HELD_RAD])
     poses = RigidTransform.from_translation(np.zeros((first.size, 3)))
     return RelativePoses(first, second, poses, np.tile(np.diag(deviation**2), (first.size, 1, 1)))
+
+
+def fixed(poses: RigidTransform, centre_mm: FloatArray) -> RelativePoses:
+    """Edges from the first of some frames to the others that hold them where they are.
+
+    Parameters
+    ----------
+    poses : RigidTransform, length n
+        ``world_from_image`` of frames 0 to n - 1.
+    centre_mm : ndarray, shape (3,)
+        The image's centre.
+    """
+    centre, others = RigidTransform.from_translation(centre_mm), np.arange(1, len(poses))
+    relative = centre.inv() * (poses[0].inv() * poses[others]) * centre
+    return RelativePoses(
+        np.zeros_like(others), others, relative, np.tile(FIXED_VARIANCE * np.eye(6), (others.size, 1, 1))
+    )
 
 
 def joined(*edges: RelativePoses) -> RelativePoses:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,30 @@ from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
 from speckle3d.scoring.references import SweepCurves
+
+
+def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
+    """Doubts that ``summary.json`` beside a reconstruction holds.
+
+    Parameters
+    ----------
+    path : path
+        The reconstruction's file.
+    provenance : Provenance
+        Of the reconstruction: a summary of another recording does not count.
+
+    Returns
+    -------
+    tuple of Doubt, or None
+        None if no summary of this reconstruction is there.
+    """
+    try:
+        (held,) = json.loads((path.parent / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+        made_from = held["details"]["provenance"]["input_sha256"]
+        doubts = tuple(Doubt(**each) for each in held["doubts"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return doubts if made_from == provenance.input_sha256 else None
 
 
 def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:

@@ -114,6 +114,10 @@ def test_spikes_are_left_out_and_counted(sweep, tracked):
     )
     assert len(bad.tracker.readings) - len(cleaned.tracker.readings) >= (spiked > 10.0).sum()
     assert str(len(bad.tracker.readings) - len(cleaned.tracker.readings)) in doubt.evidence
+    at = bad.tracker.readings.time_s[spiked > 10.0] + bad.tracker.time_offset_s
+    at = at[(at >= sweep.frame_time_s[0]) & (at <= sweep.frame_time_s[-1])]
+    named = np.concatenate([np.arange(first, last + 1) for first, last in doubt.frames])
+    assert np.isin(np.abs(sweep.frame_time_s[:, None] - at).argmin(axis=0), named).all()
     good = correct(tracked, sweep, ["pose"])["pose"].poses
     mended = correct(tracked, bad, ["pose"])["pose"].poses
     ends = [(p[0].inv() * p[-1]).apply(sweep.grid.centre_mm)[2] for p in (good, mended)]

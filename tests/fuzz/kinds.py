@@ -215,6 +215,38 @@ def streams(folder):
     return sorted(folder.glob("*.bin"))
 
 
+def messages(folder):
+    from igtl_examples import stream
+
+    paths = [folder / "small.igtl", folder / "large.igtl"]
+    for path, columns in zip(paths, (6, 127), strict=True):
+        path.write_bytes(stream(columns))
+    return paths
+
+
+def damage_messages(rng, path):
+    """Damage the bytes of a stream, or a header or a body of it whose check sum is made right again."""
+    from igtl_examples import damaged_message, messages_of
+
+    content = path.read_bytes()
+    if rng.random() < 0.3:
+        path.write_bytes(mutations.of_bytes(rng, content))
+        return
+    pieces = messages_of(content)
+    k = int(rng.integers(0, len(pieces)))
+    pieces[k] = damaged_message(rng, pieces[k])
+    path.write_bytes(b"".join(pieces))
+
+
+def read_messages(path):
+    """Take what is whole of a stream, which must not cost the message that follows it."""
+    from igtl_examples import LAST, received
+
+    found = received(path.read_bytes() + LAST)
+    if not found or getattr(found[-1], "device", "") != "Last":
+        raise AssertionError(f"the message behind the damaged ones was lost: {found[-3:]}")
+
+
 def small_sweep(folder):
     """A sweep of 12 frames with both sensors, and the curves for it."""
     import shutil
@@ -384,6 +416,7 @@ def kinds():
     hdf5, text, raw = mutations.of_hdf5, bytes_of(mutations.of_text), bytes_of(mutations.of_bytes)
     return {
         "sweep": Kind(sweeps, read_sweep, hdf5),
+        "igtl": Kind(messages, read_messages, damage_messages),
         "curves": Kind(curves, read_described(read_curves), hdf5),
         "calibration": Kind(calibrations, read_described(read_calibration), hdf5),
         "reconstruction": Kind(reconstructions, read_described(read_reconstruction), hdf5),

@@ -9,7 +9,7 @@ import pytest
 RUN = Path(__file__).with_name("run.py")
 KINDS = (
     "sweep", "curves", "calibration", "reconstruction", "scan", "tum", "toml", "xml", "points", "log",
-    "metaimage", "nrrd", "volume", "surface", "picks", "stream",
+    "metaimage", "nrrd", "volume", "surface", "picks", "stream", "igtl",
 )  # fmt: skip
 OTHERS = ("uff", "zea", "mat", "mat73", "dicom", "ultrasonix")
 """Formats of other systems."""

@@ -91,7 +91,11 @@ def test_a_path_that_turns_where_the_images_do_not_is_doubted():
         doubt = folded(table_of(SWEEP), along(path), PATCHES_MM, np.ones(SWEEP.size, dtype=bool))
         assert doubt is not None
         assert doubt.refuted == refuted
-        assert "about frame" in doubt.evidence
+        ((first, last),) = doubt.frames
+        assert f"about frame {(first + last + 1) // 2}" in doubt.evidence
+        if path is once:
+            # The turn lies at 6 of 12 mm.
+            assert first <= np.searchsorted(SWEEP, 6.0) <= last + 1
 
 
 def test_motion_read_from_noise_on_a_probe_at_rest_is_refused():
@@ -193,6 +197,7 @@ def test_a_sweep_in_pieces_is_flagged_at_each_cut():
     assert doubt is not None
     assert not doubt.refuted
     assert "frame 10, 20:" in doubt.evidence
+    assert doubt.frames == ((10, 10), (20, 20))
 
 
 def test_a_lost_frame_that_others_bridge_is_no_cut():

@@ -9,7 +9,9 @@ import pytest
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.reconstruction import Provenance
 from speckle3d.scoring.lengths import ModeError
+from speckle3d.study.details import recorded_doubts
 from speckle3d.study.results import (
     Summary,
     SweepOutcome,
@@ -70,7 +72,7 @@ def test_table_is_aligned_and_signed_says_the_reference_and_a_name_may_end_in_na
 
 
 METRES = Doubt("tracker", "units", "expected 23 mm, got 0.023", True)
-SPIKES = Doubt("orientation sensor", "spikes", "3 of 90 readings jump", False)
+SPIKES = Doubt("orientation sensor", "spikes", "3 of 90 readings jump", False, ((3, 3), (7, 9)))
 
 
 @pytest.mark.parametrize(
@@ -113,6 +115,17 @@ def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(t
     held = json.loads((tmp_path / "study.json").read_text())["doubts"]
     assert [(each["sweep"], each["suspect"]) for each in held] == [("s", "units"), ("s", "spikes")]
     assert all(line in study.table for line in lines)
+
+
+def test_doubts_are_found_again_beside_the_reconstruction_they_belong_to(tmp_path):
+    made = Provenance("s.h5", "ab12", "1.0")
+    path = tmp_path / "reconstruction.h5"
+    assert recorded_doubts(path, made) is None
+    write_summary(tmp_path, Summary("s", "none", 9, 0.0, [], {"provenance": made}, [METRES, SPIKES]))
+    assert recorded_doubts(path, made) == (METRES, SPIKES)
+    assert recorded_doubts(path, Provenance("s.h5", "cd34", "1.0")) is None
+    (tmp_path / "summary.json").write_text("[1]")
+    assert recorded_doubts(path, made) is None
 
 
 def test_three_files_appear_and_nothing_else(tmp_path):

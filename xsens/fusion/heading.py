@@ -134,11 +134,18 @@ class Headings:
     turn_rad, sd_rad : ndarray, shape (n,)
     disturbed : ndarray of bool, shape (n,)
         Where the reading was hardly believed.
+    stray : ndarray, shape (n,)
+        How much the field changes from place to place, as the models have it that explain the readings best:
+        a fraction of its norm, per component.
+    iron : ndarray, shape (n,)
+        Weight of the models that take iron to be on the sensor, 0 to 1.
     """
 
     turn_rad: FloatArray
     sd_rad: FloatArray
     disturbed: BoolArray
+    stray: FloatArray
+    iron: FloatArray
 
 
 # -- the bank
@@ -196,7 +203,7 @@ class HeadingBank:
                 for row, evidence in zip(rows, found[..., at.EVIDENCE], strict=True)
             ]
         )
-        return _mixed(turns, variances, found[..., at.TRUST], weights, rows[:, at.SEEN] > 0.0)
+        return _mixed(turns, variances, found[..., at.TRUST], weights, rows[:, at.SEEN] > 0.0, self.models)
 
     def evidence(self, bins: FloatArray) -> FloatArray:
         """Logarithm of each model's evidence in all bins, less its handicap, shape (models,).
@@ -267,7 +274,12 @@ def weights_of(evidence: FloatArray) -> FloatArray:
 
 
 def _mixed(
-    turns: FloatArray, variances: FloatArray, trusts: FloatArray, weights: FloatArray, seen: BoolArray
+    turns: FloatArray,
+    variances: FloatArray,
+    trusts: FloatArray,
+    weights: FloatArray,
+    seen: BoolArray,
+    models: tuple[FieldModel, ...],
 ) -> Headings:
     """Mean and deviation of the models' angles, (n, models), by weights, (n, models)."""
     best = np.take_along_axis(turns, weights.argmax(axis=1)[:, None], axis=1)
@@ -275,7 +287,9 @@ def _mixed(
     mean = (weights * off).sum(axis=1)
     variance = (weights * (variances + (off - mean[:, None]) ** 2)).sum(axis=1)
     trust = (weights * trusts).sum(axis=1)
-    return Headings(best[:, 0] + mean, np.sqrt(variance), seen & (trust < _DISTRUSTED))
+    stray = weights @ np.array([model.stray for model in models])
+    iron = weights @ np.array([float(model.iron_put_on > 0.0) for model in models])
+    return Headings(best[:, 0] + mean, np.sqrt(variance), seen & (trust < _DISTRUSTED), stray, iron)
 
 
 def _shared(s: FusionSettings, first_stray: float) -> FloatArray:
@@ -310,7 +324,7 @@ def smooth_headings(bins: FloatArray, settings: FusionSettings) -> Headings:
     for j, model in enumerate(models):
         turns[:, j], variances[:, j] = _backward(bins, model, states[:, j], after[:, j], before[:, j])
     weights = np.tile(weights_of(evidence[chosen]), (len(bins), 1))
-    return _mixed(turns, variances, found[..., at.TRUST], weights, bins[:, at.SEEN] > 0.0)
+    return _mixed(turns, variances, found[..., at.TRUST], weights, bins[:, at.SEEN] > 0.0, models)
 
 
 def _backward(

@@ -42,6 +42,9 @@ class OnlineState:
     resting : bool
     started : bool
         True when the first second, which finds up and north, is over.
+    field_stray, field_iron : float
+        How much the field changes from place to place, and the likelihood of iron on the sensor, as in
+        `Orientation`; NaN before the field was used.
     """
 
     world_from_sensor: Rotation
@@ -50,6 +53,8 @@ class OnlineState:
     disturbed: bool
     resting: bool
     started: bool
+    field_stray: float = math.nan
+    field_iron: float = math.nan
 
 
 class OnlineFilter:
@@ -77,7 +82,8 @@ class OnlineFilter:
         self._level, self._bank = fresh_filter(self._settings), HeadingBank(self._settings)
         self._steps: list[FilterSteps] = []
         self._last: FilterSteps | None = None
-        self._turn_rad, self._heading_sd_rad, self._disturbed = 0.0, math.pi, False
+        self._turn_rad, self._heading_sd_rad = 0.0, math.pi
+        self._field = (False, math.nan, math.nan)
         self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
         self._pending_s = self._skipped_s = self._pause_s = self._forceless_s = 0.0
         self._usual_s = math.nan
@@ -133,7 +139,8 @@ class OnlineFilter:
         if self._settings.use_magnetometer:
             sd_rad[2] = self._heading_sd_rad
         started = bool(last.started[0])
-        return OnlineState(rotation, sd_rad, bias.copy(), self._disturbed, resting, started)
+        disturbed, stray, iron = self._field
+        return OnlineState(rotation, sd_rad, bias.copy(), disturbed, resting, started, stray, iron)
 
     def _judge(self, step_s: float, force: FloatArray) -> None:
         """Raise if the accelerometer is in other units, after a second of it."""
@@ -204,7 +211,7 @@ class OnlineFilter:
         if self._settings.use_magnetometer:
             found = self._bank.follow(*filtered_bins(steps, self._settings))
             self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
-            self._disturbed = bool(found.disturbed[0])
+            self._field = (bool(found.disturbed[0]), float(found.stray[0]), float(found.iron[0]))
 
 
 def _checked(

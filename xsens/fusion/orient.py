@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -45,6 +45,12 @@ class Orientation:
         What was missing or interpolated.
     magnetic : bool
         True if the heading is by the magnetic field, false if it is relative to the start.
+    field_stray : ndarray, shape (m,)
+        How much the field changes from place to place, as this package's filter has it: a fraction of its
+        norm, per component. NaN where no field tells the heading.
+    field_iron : ndarray, shape (m,)
+        Likelihood that iron is on the sensor, 0 to 1, and NaN likewise. A sensor that is turned while it is
+        carried through an uneven field shows nearly the same.
     """
 
     rotations: TimedRotations
@@ -55,6 +61,8 @@ class Orientation:
     method: Method
     notes: tuple[str, ...] = ()
     magnetic: bool = True
+    field_stray: FloatArray = field(default_factory=lambda: np.zeros(0))
+    field_iron: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -138,6 +146,8 @@ def orient(
         method,
         tuple(notes),
         settings.use_magnetometer,
+        joined.field_stray,
+        joined.field_iron,
     )
 
 

@@ -45,6 +45,8 @@ class Estimate:
         About the world's axes.
     bias_rad_s : ndarray, shape (m, 3)
     disturbed, resting : ndarray of bool, shape (m,)
+    field_stray, field_iron : ndarray, shape (m,)
+        As `xsens.fusion.heading.Headings` has them; NaN where no field tells the heading.
     """
 
     xyzw: FloatArray
@@ -52,3 +54,5 @@ class Estimate:
     bias_rad_s: FloatArray
     disturbed: BoolArray
     resting: BoolArray
+    field_stray: FloatArray
+    field_iron: FloatArray

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -11,6 +13,9 @@ from xsens.fusion.heading import HeadingBank, Headings, smooth_headings
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
+
+_Field: TypeAlias = tuple[BoolArray, FloatArray, FloatArray]
+"""Where it was hardly believed, how much it strays, and the weight of iron on the sensor; a row a step."""
 
 
 class StretchFilter:
@@ -27,7 +32,7 @@ class StretchFilter:
         magnetic = settings.use_magnetometer
         steps = forward(samples, settings, self._level, pause_s, heading_apart=magnetic)
         starts, sd = steps.start, steps.claimed_sd_rad
-        disturbed = np.zeros(len(starts), dtype=bool)
+        field = _no_field(len(starts))
         if magnetic:
             self._bank.resume()
             found = self._bank.follow(*filtered_bins(steps, settings))
@@ -35,16 +40,16 @@ class StretchFilter:
             known = np.maximum(_bin_of(steps, settings) - 1, 0)
             starts = _turned(found.turn_rad[known], starts)
             sd = np.column_stack([sd[:, :2], found.sd_rad[known]])
-            disturbed = found.disturbed[known]
+            field = _field_of(found, known)
         xyzw = within_steps(steps, starts, steps.start_bias_rad_s)
-        return _each_sample(steps, xyzw, sd, steps.bias_rad_s, disturbed)
+        return _each_sample(steps, xyzw, sd, steps.bias_rad_s, field)
 
 
 def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     """Orientation of a stretch by all its readings; it must be longer than a second."""
     steps, level = smooth(samples, settings)
     nodes, sd = level.matrices, level.sd_rad
-    disturbed = np.zeros(len(steps.last), dtype=bool)
+    field = _no_field(len(steps.last))
     if settings.use_magnetometer and np.isfinite(steps.field_au[:, 0]).any():
         bias, bias_sd = level.bias_rad_s[1:], level.bias_sd_rad_s[1:]
         bins = averaged_bins(steps, nodes[:-1], bias, bias_sd, sd[1:], settings)
@@ -52,11 +57,21 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
         turn, heading_sd = _at_nodes(steps, found, settings)
         nodes = _turned(turn, nodes)
         sd = np.column_stack([sd[:, :2], heading_sd])
-        disturbed = found.disturbed[_bin_of(steps, settings)]
+        field = _field_of(found, _bin_of(steps, settings))
     elif settings.use_magnetometer:
         sd = np.column_stack([sd[:, :2], np.full(len(sd), np.pi)])
     xyzw = within_steps(steps, nodes[:-1], level.bias_rad_s[:-1], nodes[1:])
-    return _each_sample(steps, xyzw, sd[1:], level.bias_rad_s[1:], disturbed)
+    return _each_sample(steps, xyzw, sd[1:], level.bias_rad_s[1:], field)
+
+
+def _no_field(count: int) -> _Field:
+    """Of steps whose heading no field tells."""
+    return np.zeros(count, dtype=bool), np.full(count, np.nan), np.full(count, np.nan)
+
+
+def _field_of(found: Headings, bins: IntArray) -> _Field:
+    """What the bins of some steps tell of the field."""
+    return found.disturbed[bins], found.stray[bins], found.iron[bins]
 
 
 def _turned(angles_rad: FloatArray, matrices: FloatArray) -> FloatArray:
@@ -79,8 +94,10 @@ def _at_nodes(steps: FilterSteps, found: Headings, settings: FusionSettings) -> 
 
 
 def _each_sample(
-    steps: FilterSteps, xyzw: FloatArray, sd_rad: FloatArray, bias_rad_s: FloatArray, disturbed: BoolArray
+    steps: FilterSteps, xyzw: FloatArray, sd_rad: FloatArray, bias_rad_s: FloatArray, field: _Field
 ) -> Estimate:
     """Give every sample what was found for its step."""
     each = np.repeat(np.arange(len(steps.last)), np.diff(steps.last, prepend=0))
-    return Estimate(xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], steps.resting[each])
+    disturbed, stray, iron = field
+    found = (xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], steps.resting[each])
+    return Estimate(*found, stray[each], iron[each])

@@ -137,7 +137,8 @@ class VqfEngine:
             self._fields.append(not disturbed.all())
         apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)), offline)
         sd = np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi)
-        return Estimate(xyzw, sd, found["bias"][at], disturbed, found["restDetected"][at])
+        resting = found["restDetected"][at]
+        return Estimate(xyzw, sd, found["bias"][at], disturbed, resting, own.field_stray, own.field_iron)
 
     def _offline(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
         """A prior of the bias cannot be given: what is known is taken off the rate and put back after."""

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from xsens.fusion.field import ROUGH
 from xsens.live.device import DeviceInfo
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream
@@ -20,18 +21,12 @@ from xsens.messages.control import MessageId
 from xsens.messages.framing import Framer, Message, encode
 
 if TYPE_CHECKING:
-    from xsens.fusion.online import OnlineFilter
+    from speckle3d.core.arrays import FloatArray
+    from xsens.fusion.online import OnlineFilter, OnlineState
 
 _SEEN = 9
 """States over which the rate is taken: two seconds if they come four times a second, long against the 16 ms
 between two deliveries of an adapter."""
-
-NORM_TOLERANCE, DIP_TOLERANCE_RAD = 0.1, np.deg2rad(10.0)
-"""A field that differs by more from the first second's is disturbed; defaults of VQF (Laidig and Seel,
-Information Fusion 91, 2023)."""
-
-REFERENCE_S = 1.0
-"""Time at the start over which the reference field is averaged."""
 
 _MOST_PENDING = 1 << 14
 """Messages kept until the state is asked for, as many as eight seconds bring at most."""
@@ -58,11 +53,16 @@ class LiveState:
     world_from_sensor : Rotation, optional
         The sensor's own orientation, or the on-line filter's.
     field : float
-        Norm of the magnetic field over that at the start; NaN without a magnetometer.
-    dip_change_rad : float
-        Change of the field's angle to the vertical; NaN without a magnetometer.
+        Norm of the magnetic field, the sensor's unit; NaN without a magnetometer.
+    dip_rad : float
+        Angle of the field below the horizontal; NaN without a magnetometer.
     note : str
         The last problem; empty if there was none.
+    fused : OnlineState, optional
+        What the on-line filter makes of the readings; None before it has begun, or without gyroscope or
+        accelerometer.
+    rate_rad_s : ndarray, shape (3,), optional
+        The gyroscope's last reading.
     """
 
     connected: bool
@@ -73,16 +73,18 @@ class LiveState:
     rate_hz: float
     world_from_sensor: Rotation | None
     field: float
-    dip_change_rad: float
+    dip_rad: float
     note: str
+    fused: OnlineState | None = None
+    rate_rad_s: FloatArray | None = None
 
     @property
     def disturbed(self) -> bool | None:
-        """Whether the field differs from that at the start; None if there is none."""
-        if not np.isfinite(self.field):
+        """Whether the filter does not trust the magnetic field; None until it knows, or without one."""
+        fused = self.fused
+        if fused is None or not fused.started or not np.isfinite(fused.field_stray):
             return None
-        norm_off = abs(self.field - 1.0) > NORM_TOLERANCE
-        return bool(norm_off or abs(self.dip_change_rad) > DIP_TOLERANCE_RAD)
+        return fused.disturbed or fused.field_stray > ROUGH
 
     def line(self) -> str:
         """The state in one line of text."""
@@ -93,9 +95,9 @@ class LiveState:
         if self.world_from_sensor is not None:
             yaw, pitch, roll = self.world_from_sensor.as_euler("ZYX", degrees=True)
             parts.append(f"roll {roll:+.1f} pitch {pitch:+.1f} yaw {yaw:+.1f}")
-        if self.disturbed is not None:
-            verdict = "DISTURBED" if self.disturbed else "clear"
-            parts.append(f"field {self.field:.2f} dip {np.rad2deg(self.dip_change_rad):+.0f} {verdict}")
+        if np.isfinite(self.field):
+            verdict = {None: "", True: " DISTURBED", False: " clear"}[self.disturbed]
+            parts.append(f"field {self.field:.2f} dip {np.rad2deg(self.dip_rad):.0f}{verdict}")
         if self.note and not self.connected:
             parts.append(self.note)
         return " | ".join(parts)
@@ -108,7 +110,6 @@ class Monitor:
         self._lock = Lock()
         self._since_s = time.monotonic()
         self._now = LiveState(False, 0.0, 0, 0, 0, 0.0, None, _NAN, _NAN, "")
-        self._field = _Field()
         self._begin(DeviceInfo(0, _NAN, ()))
 
     def _begin(self, info: DeviceInfo) -> None:
@@ -143,7 +144,7 @@ class Monitor:
         with self._lock:
             self._digest()
             lost = self._now.interruptions + self._now.connected
-            self._set(connected=False, interruptions=lost, world_from_sensor=None, note=reason)
+            self._set(connected=False, interruptions=lost, world_from_sensor=None, fused=None, note=reason)
 
     def state(self) -> LiveState:
         """The state now."""
@@ -170,10 +171,17 @@ class Monitor:
             if self._counter is not None:
                 missing = int(log.counter[0] - self._counter - 1) % (1 << 16)
             self._counter = int(log.counter[-1])
+        fused = self._attitude.follow(log, missing)
+        shown = None if fused is None else fused.world_from_sensor
+        if log.world_from_sensor is not None and log.oriented.any():
+            shown = log.world_from_sensor[log.oriented][-1]
+        rates = log.gyroscope_rad_s
         self._set(
             lost=self._now.lost + log.lost + missing,
-            world_from_sensor=self._attitude.follow(log, missing),
-            **self._field.follow(log),
+            world_from_sensor=shown,
+            fused=fused,
+            rate_rad_s=None if rates is None else rates[-1],
+            **_field_of(log),
         )
 
 
@@ -186,16 +194,14 @@ def warm_up() -> None:
 
 
 class _Attitude:
-    """Latest orientation: the sensor's own if it sends one, else the filter's."""
+    """The filter over the samples of a live sensor."""
 
     def __init__(self, step_s: float) -> None:
         self._filter: OnlineFilter | None = None
         self._step_s = step_s
 
-    def follow(self, log: ImuLog, missing: int) -> Rotation | None:
+    def follow(self, log: ImuLog, missing: int) -> OnlineState | None:
         """Take in some samples, with the number of those missing before them."""
-        if log.world_from_sensor is not None and log.oriented.any():
-            return log.world_from_sensor[log.oriented][-1]
         steps = np.diff(log.time_s)
         if steps.size:
             self._step_s = float(np.median(steps))
@@ -210,33 +216,20 @@ class _Attitude:
             self._filter.push(steps, gyroscope, accelerometer, log.magnetometer_au)
         except InvalidInputError:  # damaged readings: the recording keeps them, the displayed filter restarts
             self._filter = OnlineFilter()
-        state = self._filter.state
-        return None if state is None else state.world_from_sensor
+        return self._filter.state
 
 
-class _Field:
-    """Norm of the magnetic field and its angle to the vertical, compared with those of the first second."""
-
-    def __init__(self) -> None:
-        self._sum = np.zeros(3)
-
-    def follow(self, log: ImuLog) -> dict[str, float]:
-        """Take in some samples; how the field is now, if they tell."""
-        up = log.accelerometer_m_s2
-        if log.world_from_sensor is not None and log.oriented.all():
-            up = log.world_from_sensor.inv().apply([0.0, 0.0, 1.0])
-        if log.magnetometer_au is None or up is None:
-            return {}
-        norm, length = np.linalg.norm(log.magnetometer_au, axis=1), np.linalg.norm(up, axis=1)
-        there = (norm > 0) & (length > 0)  # NaN is not
-        if not there.any():
-            return {}
-        sine = np.einsum("ij,ij->i", log.magnetometer_au[there], up[there]) / (norm * length)[there]
-        norm, dip = norm[there], -np.arcsin(np.clip(sine, -1.0, 1.0))
-        if not self._sum[2] >= REFERENCE_S * log.rate_hz:  # whose rate is NaN if it is a single sample
-            self._sum += [norm.sum(), dip.sum(), norm.size]
-        usual_norm, usual_dip = self._sum[:2] / self._sum[2]
-        return {
-            "field": float(norm.mean() / usual_norm),
-            "dip_change_rad": float(dip.mean() - usual_dip),
-        }
+def _field_of(log: ImuLog) -> dict[str, float]:
+    """Norm of the magnetic field and its angle below the horizontal in some samples, if they tell."""
+    up = log.accelerometer_m_s2
+    if log.world_from_sensor is not None and log.oriented.all():
+        up = log.world_from_sensor.inv().apply([0.0, 0.0, 1.0])
+    if log.magnetometer_au is None or up is None:
+        return {}
+    norm, length = np.linalg.norm(log.magnetometer_au, axis=1), np.linalg.norm(up, axis=1)
+    there = (norm > 0) & (length > 0)  # NaN is not
+    if not there.any():
+        return {}
+    sine = np.einsum("ij,ij->i", log.magnetometer_au[there], up[there]) / (norm * length)[there]
+    dip = -np.arcsin(np.clip(sine, -1.0, 1.0))
+    return {"field": float(norm[there].mean()), "dip_rad": float(dip.mean())}

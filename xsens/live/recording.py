@@ -90,8 +90,7 @@ class Recorder:
         self._baud, self._info = self._settings.baud, DeviceInfo(-1, float("nan"), ())
         device = self._prepared()
         try:
-            if not self._info.oriented:
-                warm_up()
+            warm_up()
             self._file = RawFile(path, append)
         except BaseException:
             device.close()

@@ -1,44 +1,79 @@
-"""The sweep player: frames with a slider."""
+"""The sweep player."""
 
 from __future__ import annotations
 
-import panel as pn
-from bokeh.models import ColumnDataSource
-from bokeh.plotting import figure
+from collections.abc import Sequence
+from functools import cached_property
+
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
+from speckle3d.app.sweep.findings import FrameFindings
+from speckle3d.app.sweep.pairs import SweepPairs
+from speckle3d.app.sweep.player import Player
+from speckle3d.app.sweep.screen import ScreenImages
+from speckle3d.app.sweep.streams import streams_of
+from speckle3d.config import Config, config_from_toml
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
-from speckle3d.study.images import GreyImages
+from speckle3d.correction.trust import believed
 
 
 class SweepPage:
-    """Frames of a sweep.
+    """Frames of a sweep with a slider and the keyboard, their patches, flags, doubts and sensors.
 
     Parameters
     ----------
     sweep : Sweep
     folder : Folder
         Of its file.
+    reconstruction : Reconstruction, optional
+        Made from the sweep, with its frame pairs.
+    doubts : sequence of Doubt, optional
+        What the checks found as it was made; None if that is not known.
     """
 
     title = "Sweep"
 
-    def __init__(self, sweep: Sweep, folder: Folder, reconstruction: Reconstruction | None = None) -> None:
+    def __init__(
+        self,
+        sweep: Sweep,
+        folder: Folder,
+        reconstruction: Reconstruction | None = None,
+        doubts: Sequence[Doubt] | None = None,
+    ) -> None:
         self._sweep, self._folder = sweep, folder
-        self._images = GreyImages(sweep, 60.0, clipped=False)
+        self._reconstruction, self._doubts = reconstruction, doubts
 
     def view(self) -> Viewable:
         """Frames with a slider."""
-        slider = pn.widgets.IntSlider(name="frame", start=0, end=len(self._sweep) - 1)
-        plot = figure(width=500, height=600, match_aspect=True)
-        image = self._images[0]
-        source = ColumnDataSource({"image": [image.T[::-1]]})
-        plot.image("image", x=0, y=0, dw=1, dh=1, source=source)
+        made, config = self._reconstruction, self._config
+        return Player(
+            self._sweep,
+            self._images,
+            SweepPairs(self._sweep, config, None if made is None else made.pairs, self._by_orientation),
+            FrameFindings(self._sweep, config, made, self._doubts),
+            streams_of(self._sweep),
+        ).view()
 
-        def show(event: object) -> None:
-            source.data = {"image": [self._images[int(slider.value or 0)].T[::-1]]}
+    @cached_property
+    def _config(self) -> Config:
+        made = self._reconstruction
+        return config_from_toml(made.config_toml) if made is not None and made.config_toml else Config()
 
-        slider.param.watch(show, "value")
-        return pn.Column(slider, pn.pane.Bokeh(plot))
+    @property
+    def _by_orientation(self) -> bool:
+        """Whether the reconstruction had a sensed orientation to choose patches by."""
+        if self._reconstruction is None:
+            return False
+        sensor = believed(self._sweep, self._doubts or ()).orientation_source
+        # A calibration that was given then is not in the sweep.
+        mounted = bool(self._reconstruction.provenance.calibrations)
+        if sensor is None or not (mounted or sensor.sensor_from_image is not None):
+            return False
+        return self._config.sensors.consistent_subset and bool(sensor.covers(self._sweep.frame_time_s).all())
+
+    @cached_property
+    def _images(self) -> ScreenImages:
+        return ScreenImages(self._sweep, self._config.intensity)

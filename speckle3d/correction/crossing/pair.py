@@ -119,6 +119,39 @@ def crossed(
 
 
 @dataclass(frozen=True)
+class CrossingSoFar:
+    """How two sweeps lie to each other, whether or not a length can be claimed from it.
+
+    Attributes
+    ----------
+    similarity : float
+        Correlation of both sweeps' images where they cross.
+    angle_deg, overlap_mm : float
+        As of `CrossedPair`.
+    """
+
+    similarity: float
+    angle_deg: float
+    overlap_mm: float
+
+
+def crossing_so_far(
+    first: CrossingSweep, second: CrossingSweep, settings: CrossingSettings | None = None
+) -> CrossingSoFar:
+    """Lay two sweeps together, one of which may still be going on.
+
+    Raises
+    ------
+    MismatchError
+        If no place is found that both may show.
+    """
+    matched = _Matched.of(first, second, settings or CrossingSettings())
+    (start, end), _ = matched.found()
+    pair = matched.at(matched.settings.blurs_mm[-1], start.mirrored)
+    return CrossingSoFar(end.correlation, angle_deg(end), overlap_mm(end, pair))
+
+
+@dataclass(frozen=True)
 class _Matched:
     """Both sweeps made ready: as given and mirrored."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -49,6 +50,21 @@ class Measurement:
         """95 % interval of the value; none reaches below zero, or past pi for angles."""
         half, most = NORMAL_95 * self.sigma, np.pi if self.unit == "rad" else np.inf
         return max(self.value - half, 0.0), min(self.value + half, float(most))
+
+    @property
+    def shown_in(self) -> tuple[float, str]:
+        """Factor to the unit that people read, and that unit: mm or degrees."""
+        return (1.0, "mm") if self.unit == "mm" else (math.degrees(1.0), "degrees")
+
+    @property
+    def line(self) -> str:
+        """The value with its standard error, its 95 % interval, and what the error is made of."""
+        scale, unit = self.shown_in
+        low, high = (end * scale for end in self.interval)
+        numbers = " ".join(str(number + 1) for number in self.points)
+        errors = f"poses {self.pose_sigma * scale:.2f}, picking {self.pick_sigma * scale:.2f}"
+        value, sigma = self.value * scale, self.sigma * scale
+        return f"{self.kind} {numbers}: {value:.2f} +- {sigma:.2f} {unit} [{low:.2f}, {high:.2f}] ({errors})"
 
 
 def measured(

@@ -19,6 +19,7 @@ from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
+from speckle3d.imaging.images import Images
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT
@@ -149,13 +150,18 @@ def open_modes(
     own = [mode for mode in modes if mode not in REFERENCES or not is_reconstruction]
     others = sweep_file, settings, calibrations, dynamic_range_db
     first = open_posed(path, own[0] if own else None, *others)
+    return at_modes(first, modes, reference)
+
+
+def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> OpenedModes:
+    """Take an opened sweep at several modes; as for `open_modes`."""
     asked = list(dict.fromkeys(modes)) or [first.mode]
     reference = reference or _known_reference(first.sweep, asked)
     every = {mode: _posed(first, mode) for mode in dict.fromkeys([*asked, reference])}
     shared = reduce(np.intersect1d, [frames for _, frames in every.values()])
     if not shared.size:
         raise InsufficientDataError(
-            f"{path}: expected a frame that has a pose in {' and '.join(every)}, got none"
+            f"{first.sweep.name}: expected a frame that has a pose in {' and '.join(every)}, got none"
         )
     poses = {mode: each[np.isin(frames, shared)] for mode, (each, frames) in every.items()}
     posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
@@ -184,15 +190,27 @@ def cut_posed(
     dynamic_range_db: float = 60.0,
     voxels: tuple[Volume, ByteArray | None] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    made: tuple[Images, ImageGrid] | None = None,
 ) -> CutPicture:
     """Cut a sweep at the poses of every mode, from its frames or from voxels made of it and their states.
+
+    Parameters
+    ----------
+    opened : OpenedModes
+    place : Place
+    dynamic_range_db : float
+    voxels : tuple of Volume and ndarray or None, optional
+    progress : callable, optional
+        Called with the number of images made and of all.
+    made : tuple of Images and ImageGrid, optional
+        What `opened.posed.images` gives, by those who have it.
 
     Raises
     ------
     InvalidInputError
         If the place is incomplete, or shows nothing; says where the sweep is.
     """
-    images, grid = opened.posed.images(dynamic_range_db, progress)
+    images, grid = made or opened.posed.images(dynamic_range_db, progress)
     numbers = opened.posed.frames
     placed = place.counted_in(numbers).cuts(opened.poses, grid, opened.reference)
     if voxels is None:

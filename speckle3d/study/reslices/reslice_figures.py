@@ -20,13 +20,24 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
-from speckle3d.study.figures import UNSEEN, colour_of, label_of, name_figure, new_figure, show_grey, wrapped
+from speckle3d.imaging.cuts.outlines import frame_outlines
+from speckle3d.matching.intensity import IntensityExtractor
+from speckle3d.study.figures import (
+    UNSEEN,
+    colour_of,
+    label_of,
+    name_figure,
+    new_figure,
+    save_figure,
+    show_grey,
+    wrapped,
+)
 from speckle3d.study.reslices.cut_geometry import save_cuts
 from speckle3d.study.reslices.cut_panels import add_axes_in, laid_out, name_axes
-from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, OpenedModes
 
 _BRIGHTEST_PERCENTILE = 99.9
 """A single specular echo must not darken the tissue."""
@@ -87,7 +98,7 @@ def draw_cuts(picture: CutPicture) -> tuple[Figure, dict[str, list[Axes]]]:
         _draw_cut(panels[mode][0], drawn, (label_of(mode), colour), levels, layout.panel_in[0])
         _number_frames(panels[mode][0], drawn, picture.numbers, layout.panel_in[0])
     if reference is not None:
-        contrast = _contrast(cuts[reference], levels)
+        contrast = contrast_of(cuts[reference].image, levels)
         for i, mode in enumerate(cuts):
             panel = layout.add_panel(figure, i, True)
             if mode == reference:
@@ -132,6 +143,36 @@ def figure_outlines(outlines_mm: Mapping[str, FloatArray], title: str = "") -> F
     return figure
 
 
+def save_outlines(opened: OpenedModes, path: Path) -> Path:
+    """Draw the outlines of a sweep's frames at several modes, all from the first one's place; write a PNG.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
+    """
+    grid = IntensityExtractor.for_sweep(opened.posed.sweep).grid
+    outlines = {mode: frame_outlines(grid, poses[0].inv() * poses) for mode, poses in opened.poses.items()}
+    return save_figure(figure_outlines(outlines, opened.posed.sweep.name), path)
+
+
+def overlay(image: Float32Array, reference: Float32Array, contrast: tuple[float, float]) -> FloatArray:
+    """Colours of an image laid over another, shape (rows, columns, 3), 0 to 1: magenta over green.
+
+    Parameters
+    ----------
+    image, reference : ndarray of float32, shape (rows, columns)
+        NaN where nothing was seen.
+    contrast : tuple of float
+        Levels that are dark and bright; see `contrast_of`.
+    """
+    low, high = contrast
+    one, other = (np.clip((each - low) / (high - low), 0.0, 1.0) for each in (image, reference))
+    colours = np.nan_to_num(np.stack([one, other, one], axis=-1))
+    colours[np.isnan(one) & np.isnan(other)] = to_rgb(UNSEEN)
+    return np.asarray(colours)
+
+
 def _reference_last(picture: CutPicture) -> CutPicture:
     order = sorted(picture.cuts, key=lambda mode: mode == picture.reference)
     return replace(picture, cuts={mode: picture.cuts[mode] for mode in order})
@@ -170,12 +211,7 @@ def _draw_overlay(
     axes: Axes, drawn: DrawnCut, reference: DrawnCut, name: str, contrast: tuple[float, float]
 ) -> None:
     """Lay a mode's cut (magenta) over the reference's (green)."""
-    low, high = contrast
-    one, other = (np.clip((each.image - low) / (high - low), 0.0, 1.0) for each in (drawn, reference))
-    colours = np.stack([one, other, one], axis=-1)
-    neither = np.isnan(one) & np.isnan(other)
-    colours = np.nan_to_num(colours)
-    colours[neither] = to_rgb(UNSEEN)
+    colours = overlay(drawn.image, reference.image, contrast)
     axes.imshow(colours, aspect="equal", extent=drawn.cut.extent_mm, interpolation="nearest")
     shown = _shown_frames(len(drawn.frames), 8)
     _draw_frames(axes, reference.frames[shown], _GREEN)
@@ -295,8 +331,9 @@ def _levels(cuts: Mapping[str, DrawnCut], unit: str) -> tuple[float, float]:
     return min(black, brightest - 1e-6), brightest
 
 
-def _contrast(drawn: DrawnCut, levels: tuple[float, float]) -> tuple[float, float]:
-    finite = drawn.image[np.isfinite(drawn.image)]
+def contrast_of(image: Float32Array, levels: tuple[float, float]) -> tuple[float, float]:
+    """Levels that are dark and bright in an overlay on this image; `levels` if it shows nothing."""
+    finite = image[np.isfinite(image)]
     if not finite.size:
         return levels
     low, high = (float(each) for each in np.percentile(finite, _OVERLAY_PERCENTILES))

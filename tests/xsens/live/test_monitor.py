@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import simulated_device as simulated
 from imu_messages import calibration_message, configuration_message, counts_of, mtdata_payloads
+from scipy.spatial.transform import Rotation
 
+from xsens.fusion.online import OnlineState
 from xsens.live.device import DeviceInfo
 from xsens.live.monitor import LiveState, Monitor, _Attitude
 from xsens.logs.samples import ImuLog
@@ -93,15 +95,15 @@ class TestMonitor:
         np.testing.assert_allclose(found, [30.0, 0.0, 0.0], atol=1e-4)
 
     def test_iron_disturbs_the_field_and_clears(self, monitor):
-        monitor.arrived(sent(range(100)))
+        monitor.arrived(sent(range(400)))
         assert monitor.state().disturbed is False
-        monitor.arrived(sent(range(100, 125), iron=0.3))
+        monitor.arrived(sent(range(400, 475), iron=0.3))
         near = monitor.state()
-        # (0.74, 0, -0.9) beside (0.44, 0, -0.9): norm and angle below the horizontal.
-        assert near.field == pytest.approx(np.hypot(0.74, 0.9) / np.hypot(0.44, 0.9), rel=1e-5)
-        assert near.dip_change_rad == pytest.approx(np.arctan2(0.9, 0.74) - np.arctan2(0.9, 0.44), abs=1e-5)
+        # (0.74, 0, -0.9): norm and angle below the horizontal.
+        assert near.field == pytest.approx(np.hypot(0.74, 0.9), rel=1e-5)
+        assert near.dip_rad == pytest.approx(np.arctan2(0.9, 0.74), abs=1e-5)
         assert near.disturbed is True
-        monitor.arrived(sent(range(125, 150)))
+        monitor.arrived(sent(range(475, 625)))
         assert monitor.state().disturbed is False
 
     def test_hours_without_a_question_take_no_more_memory(self, monitor):
@@ -127,7 +129,7 @@ class TestMonitor:
                 payload = (first + index).to_bytes(2, "big") + row.astype(">u2").tobytes() + b"\x20\x00"
                 raw.arrived(encode(Message(MessageId.MT_DATA, payload)))
             field = raw.state().field
-            assert field == pytest.approx(np.hypot(0.44 + first / 1000, 0.9) / np.hypot(0.44, 0.9), rel=1e-3)
+            assert field == pytest.approx(np.hypot(0.44 + first / 1000, 0.9), rel=1e-3)
             turned = raw.state().world_from_sensor.as_euler("ZYX", degrees=True)
             # The filter's at the last sample; a tenth of a degree each, counts of 1/7366.
             np.testing.assert_allclose(turned, [(first + 99) / 10, 0.0, 0.0], atol=0.03)
@@ -138,7 +140,7 @@ class TestLine:
         usual = {
             "connected": True, "elapsed_s": 12.34, "samples": 3000, "lost": 2, "interruptions": 0,
             "rate_hz": 256.0, "world_from_sensor": None, "field": float("nan"),
-            "dip_change_rad": float("nan"), "note": "",
+            "dip_rad": float("nan"), "note": "",
         }  # fmt: skip
         return LiveState(**(usual | changes))
 
@@ -150,11 +152,19 @@ class TestLine:
         assert line.endswith("NOT CONNECTED | 1 interruptions | the port is gone")
 
     @pytest.mark.parametrize(
-        ("field", "dip_deg", "verdict"), [(1.05, 3, "clear"), (1.2, 0, "DISTURBED"), (1, -12, "DISTURBED")]
+        ("disturbed", "stray", "verdict"),
+        [
+            (False, 0.01, " clear"),
+            (True, 0.01, " DISTURBED"),
+            (False, 0.04, " DISTURBED"),
+            (False, float("nan"), ""),
+        ],
     )
-    def test_says_whether_the_field_is_disturbed(self, field, dip_deg, verdict):
-        line = self.state(field=field, dip_change_rad=np.deg2rad(dip_deg)).line()
-        assert line.endswith(f" | field {field:.2f} dip {dip_deg:+d} {verdict}")
+    def test_says_whether_the_filter_believes_the_field(self, disturbed, stray, verdict):
+        no = np.zeros(3)
+        fused = OnlineState(Rotation.identity(), no, no, disturbed, False, True, stray, 0.0)
+        line = self.state(field=1.05, dip_rad=np.deg2rad(64), fused=fused).line()
+        assert line.endswith(f" | field 1.05 dip 64{verdict}")
 
 
 def test_readings_that_the_filter_refuses_do_not_end_the_display():
@@ -164,4 +174,5 @@ def test_readings_that_the_filter_refuses_do_not_end_the_display():
     )
     attitude = _Attitude(0.01)
     attitude.follow(ImuLog(time_s, up, turning), 0)
-    assert attitude.follow(ImuLog(time_s, up, still), 0).magnitude() < 1e-6
+    found = attitude.follow(ImuLog(time_s, up, still), 0)
+    assert found.world_from_sensor.magnitude() < 1e-6

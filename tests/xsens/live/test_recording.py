@@ -166,13 +166,13 @@ class TestRecording:
             assert recorder.state().interruptions == 0
 
     @of_kind(*KINDS)
-    def test_the_filter_is_loaded_before_measuring_begins_if_it_is_needed(self, sensor, path, monkeypatch):
+    def test_the_filter_is_loaded_before_measuring_begins(self, sensor, path, monkeypatch):
         told = []
         monkeypatch.setattr(
             "xsens.live.recording.warm_up", lambda: told.append((sensor.state, path.exists()))
         )
         Recorder(str(sensor.path), path, FAST).close()
-        assert told == ([("configuration", False)] if sensor.kind == "mt9" else [])
+        assert told == [("configuration", False)]
 
     def test_another_sensor_is_not_recorded_into_the_same_file(self, sensor, path):
         with Recorder(str(sensor.path), path, FAST) as recorder:

@@ -1,0 +1,143 @@
+"""A sweep as the messages that PLUS would have sent while it was recorded.
+
+RF has the samples of a vector as the columns of its images, as PLUS sends it, B-mode stands upright.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import Frames, ImageGrid, OrientationSensor, Sweep, Tracker
+from speckle3d.io.igtl.packing import packed_image, packed_transform
+
+_SLICE_MM = 1.0
+"""Thickness that an image is given to be seen with."""
+
+
+@dataclass(frozen=True)
+class Names:
+    """Devices of the messages; ``A_B`` and ``AToB`` are PLUS's ways to say that A is told in B."""
+
+    image: str = "Image_Reference"
+    tracker: str = "ProbeToReference"
+    orientation: str = "ProbeToWorld"
+
+
+@dataclass(frozen=True)
+class Played:
+    """A message and when it was sent, s from the first frame, whose own time it carries.
+
+    Attributes
+    ----------
+    is_frame : bool
+    """
+
+    at_s: float
+    message: bytes
+    is_frame: bool
+
+
+def played(
+    sweep: Sweep,
+    frames: Frames,
+    grid: ImageGrid,
+    upright: bool,
+    names: Names | None = None,
+    later_s: float = 0.0,
+) -> Iterator[Played]:
+    """Make messages of a sweep, in the order of their times.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    frames : Frames
+        To be sent: the sweep's, or images made of them.
+    grid : ImageGrid
+        Of these.
+    upright : bool
+        Whether vectors are columns of the images, or their rows.
+    later_s : float
+        Added to the times in the messages.
+
+    Raises
+    ------
+    InvalidInputError
+        If a message cannot hold the frames, or a time.
+    """
+    names = names or Names()
+    first_s = float(sweep.frame_time_s[0])
+    place = partial(_place, sweep, grid, upright)
+
+    def images() -> Iterator[Played]:
+        for i, time_s in enumerate(sweep.frame_time_s):
+            pixels, components = _pixels(frames, i, upright)
+            message = packed_image(names.image, time_s + later_s, pixels, place(i), components)
+            yield Played(float(time_s) - first_s, message, True)
+
+    streams = [images()]
+    for sensor, name in ((sweep.tracker, names.tracker), (sweep.orientation, names.orientation)):
+        if sensor is not None:
+            streams.append(_readings(sensor, name, first_s, later_s))
+    return heapq.merge(*streams, key=lambda each: each.at_s)
+
+
+def clock_shift_s(sweep: Sweep) -> float:
+    """Whole seconds by which a sweep's times are to be put later: messages hold none below zero."""
+    sensors = [each.readings.time_s for each in (sweep.tracker, sweep.orientation) if each is not None]
+    earliest_s = min(float(times[0]) for times in (sweep.frame_time_s, *sensors))
+    return float(max(0, math.ceil(-earliest_s)))
+
+
+def _readings(
+    sensor: Tracker | OrientationSensor, name: str, first_s: float, later_s: float
+) -> Iterator[Played]:
+    times, poses = sensor.readings.time_s, sensor.readings.world_from_sensor
+    for k, time_s in enumerate(times):
+        matrix = np.eye(4)
+        if isinstance(poses, RigidTransform):
+            matrix = poses[k].as_matrix()
+        else:
+            matrix[:3, :3] = poses[k].as_matrix()
+        # Sent when the image of the same moment is; it tells its own clock.
+        at_s = float(time_s) + sensor.time_offset_s - first_s
+        yield Played(at_s, packed_transform(name, time_s + later_s, matrix), False)
+
+
+def _pixels(frames: Frames, i: int, upright: bool) -> tuple[npt.NDArray[Any], int]:
+    """Pixels (column, row) of a frame, (column, row, 2) of I and Q, and the number of components."""
+    frame = frames[i]
+    if frame.dtype.kind == "c":
+        pairs = np.ascontiguousarray(frame, np.complex64).view(np.float32).reshape(*frame.shape, 2)
+        return (pairs if upright else pairs.transpose(1, 0, 2)), 2
+    if frame.dtype.kind == "f" and upright:
+        frame = np.clip(np.round(frame), 0, 255).astype(np.uint8)
+    return (frame if upright else frame.T), 1
+
+
+def _place(sweep: Sweep, grid: ImageGrid, upright: bool, i: int) -> FloatArray:
+    """Where the pixels of a frame lie, (4, 4): in the world of a calibrated tracker, else in the image."""
+    image_from_pixel = np.eye(4)
+    image_from_pixel[:, :2] = grid.image_from_sample[:, :2]
+    image_from_pixel[:, 3] = grid.image_from_sample[:, 2]
+    image_from_pixel[2, 2] = _SLICE_MM
+    if not upright:
+        # Columns are samples; slices turn round so that the axes stay right-handed.
+        image_from_pixel = image_from_pixel[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])
+    if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
+        try:
+            pose = sweep.tracker.world_from_image(sweep.frame_time_s[i])
+        except InsufficientDataError:  # the tool was not seen
+            return image_from_pixel
+        return pose.as_matrix() @ image_from_pixel
+    return image_from_pixel

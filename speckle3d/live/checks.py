@@ -1,0 +1,64 @@
+"""What a person who holds the probe should do, in words, by the checks that the reconstruction uses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from speckle3d.live.tracking import LivePose
+from speckle3d.matching.quality import FrameFlag
+from speckle3d.matching.schedule import TrajectorySettings
+
+GOOD = "good"
+TOO_FAST, LOST, LIFTED = "too fast", "not overlapping: go back to where it was", "lifted"
+_OF_FLAGS = {
+    FrameFlag.LIFTED: LIFTED,
+    FrameFlag.SATURATED: "gain too high",
+    FrameFlag.NO_SPECKLE: "no speckle",
+    FrameFlag.FROZEN: "image frozen",
+}
+"""In the order in which they are looked for."""
+SEEN_S, STAYS_S = 0.25, 1.0
+"""How long something must be so before it is said, and how long what was said stays: to be read."""
+
+
+def words_for(pose: LivePose, settings: TrajectorySettings) -> str:
+    """What to say of one frame.
+
+    A frame is like none before where no median correlation reaches `least_correlation`, below which the
+    reconstruction uses no pair; it came too fast where it is less like the last one than `clear_correlation`,
+    from where on planes bend.
+    """
+    for flag, words in _OF_FLAGS.items():
+        if pose.flags & flag:
+            return words
+    if pose.flags & FrameFlag.UNMATCHED:
+        return LOST
+    # False for the first frame, which has no correlation.
+    if pose.median < settings.clear_correlation:
+        return TOO_FAST
+    return GOOD
+
+
+@dataclass
+class Words:
+    """Words that change slowly enough to be read.
+
+    Attributes
+    ----------
+    said : str
+    """
+
+    said: str = GOOD
+    _next: str = GOOD
+    _since_s: float = float("-inf")
+    _said_s: float = float("-inf")
+
+    def take(self, words: str, time_s: float) -> bool:
+        """Take what there is to say at a time; true if something else is said from now on."""
+        if words != self._next:
+            self._next, self._since_s = words, time_s
+        settled = time_s - self._since_s >= SEEN_S and time_s - self._said_s >= STAYS_S
+        if self._next == self.said or not settled:
+            return False
+        self.said, self._said_s = self._next, time_s
+        return True

@@ -1,0 +1,161 @@
+"""Images and transforms as they are received, made into what a sweep holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
+from speckle3d.io.igtl.messages import ImageReceived
+from speckle3d.io.import_settings import ImportSettings
+
+_TYPES = {"rf": ("int16", "float32"), "bmode": ("uint8",)}
+
+
+@dataclass(frozen=True)
+class ImageLayout:
+    """How IMAGE messages of one device become frames of a sweep.
+
+    Attributes
+    ----------
+    device : str
+    example : Sweep
+        Of one black frame: grid, signal and type of those that come.
+    samples_along_columns : bool
+        Whether the pixels of a row of the message are one vector's samples, as PLUS sends RF.
+    """
+
+    device: str
+    example: Sweep
+    samples_along_columns: bool
+
+    @classmethod
+    def of(cls, image: ImageReceived, settings: ImportSettings, name: str) -> ImageLayout:
+        """Layout of the images that are like the first one.
+
+        Parameters
+        ----------
+        image : ImageReceived
+        settings : ImportSettings
+            What messages do not say. With a sampling rate or a centre frequency the samples are RF, else grey
+            levels of B-mode, whose pixel sizes are the message's unless given.
+        name : str
+            Of the sweep, for messages.
+
+        Raises
+        ------
+        MissingSettingsError
+            Naming every setting that is needed and not given.
+        InvalidInputError
+            If the pixels are of another shape or type.
+        """
+        of_rf = settings.sampling_rate_hz is not None or settings.centre_frequency_hz is not None
+        where = f"IMAGE {image.device}"
+        pixels = _plane(image, where)
+        known = _TYPES["rf" if of_rf else "bmode"]
+        if pixels.dtype.name not in known:
+            kind = "RF" if of_rf else "B-mode (without --sampling-rate-hz)"
+            raise InvalidInputError(f"{where}: expected {' or '.join(known)} for {kind}, got {pixels.dtype}")
+        grid, signal = (
+            _of_echoes(pixels.T.shape, settings, where)
+            if of_rf
+            else _of_grey(pixels.shape, image.spacing_mm, settings, where)
+        )
+        black = np.zeros((1, grid.vectors, grid.samples), pixels.dtype)
+        example = Sweep(black, grid, signal, np.zeros(1), name=name, probe=settings.probe or "")
+        return cls(image.device, example, of_rf)
+
+    def frame(self, image: ImageReceived) -> npt.NDArray[Any]:
+        """Frame of an image, shape (vector, sample).
+
+        Raises
+        ------
+        InvalidInputError
+            If it is of another shape or type than the first.
+        """
+        where = f"IMAGE {image.device}"
+        pixels = _plane(image, where)
+        frame = pixels.T if self.samples_along_columns else pixels
+        held = self.example.frames
+        if frame.shape != held.shape[1:] or frame.dtype != held.dtype:
+            raise InvalidInputError(
+                f"{where}: expected {held.shape[1:]} of {held.dtype} as the first, got {frame.shape} of "
+                f"{frame.dtype}"
+            )
+        return np.ascontiguousarray(frame)
+
+    @property
+    def image_from_pixel(self) -> FloatArray:
+        """From (column, row, slice, 1) of a message's pixel to the image's mm, shape (4, 4)."""
+        grid = self.example.grid
+        matrix = np.diag([grid.vector_pitch_mm, grid.sample_spacing_mm, 1.0, 1.0])
+        matrix[1, 3] = grid.first_sample_depth_mm
+        if self.samples_along_columns:
+            # Columns are samples, and what is right-handed before must be so after.
+            matrix = matrix[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])
+        return matrix
+
+
+def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
+    """Pixels of a single grey image, shape (column, row)."""
+    pixels = image.pixels
+    if pixels.ndim == 3 and image.components == 1 and pixels.shape[2] == 1:
+        pixels = pixels[:, :, 0]
+    if pixels.ndim != 2:
+        raise InvalidInputError(
+            f"{where}: expected one image of grey levels or echoes, got shape {pixels.shape} with "
+            f"{image.components} components"
+        )
+    # Big-endian pixels are turned round once, here.
+    return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+
+
+def _of_echoes(
+    shape: tuple[int, ...], settings: ImportSettings, where: str
+) -> tuple[ImageGrid, RFSettings | BModeSettings]:
+    if settings.demodulation_frequency_hz is not None:
+        raise InvalidInputError(
+            f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz"
+        )
+    s = settings.over(
+        where,
+        sampling_rate_hz=None,
+        vector_pitch_mm=None,
+        speed_of_sound_m_s=None,
+        centre_frequency_hz=None,
+        bandwidth_hz=None,
+        first_sample_depth_mm=0.0,
+    )
+    signal = RFSettings(
+        s["sampling_rate_hz"], s["speed_of_sound_m_s"], s["centre_frequency_hz"], tuple(s["bandwidth_hz"])
+    )
+    grid = ImageGrid(
+        shape[0], shape[1], s["vector_pitch_mm"], signal.sample_spacing_mm, s["first_sample_depth_mm"]
+    )
+    return grid, signal
+
+
+def _of_grey(
+    shape: tuple[int, ...], spacing_mm: FloatArray, settings: ImportSettings, where: str
+) -> tuple[ImageGrid, RFSettings | BModeSettings]:
+    said = spacing_mm if np.all(spacing_mm[:2] > 0) and not np.all(spacing_mm[:2] == 1.0) else [None, None]
+    s = settings.over(
+        where,
+        column_pitch_mm=said[0],
+        row_spacing_mm=said[1],
+        dynamic_range_db=None,
+        first_sample_depth_mm=0.0,
+    )
+    grid = ImageGrid(
+        shape[0],
+        shape[1],
+        float(s["column_pitch_mm"]),
+        float(s["row_spacing_mm"]),
+        s["first_sample_depth_mm"],
+    )
+    return grid, BModeSettings(s["dynamic_range_db"])

@@ -1,0 +1,104 @@
+"""What is received written down as it comes, on one clock, whatever is made of it later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy.typing as npt
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import transforms_from_matrices
+from speckle3d.io.growing_sweep import GrowingSweep
+from speckle3d.io.igtl.messages import TransformReceived
+from speckle3d.live.frames import ImageLayout
+
+
+@dataclass
+class Counts:
+    """What was written, and what could not be.
+
+    Attributes
+    ----------
+    frames, readings : int
+    refused : int
+        Messages that could not be written; `last_refused` says why the last one could not.
+    last_refused : str
+    """
+
+    frames: int = 0
+    readings: int = 0
+    refused: int = 0
+    last_refused: str = ""
+
+
+class Recording:
+    """A sweep file that grows with every image and transform received.
+
+    Times are the sender's, counted from the first frame's.
+
+    Parameters
+    ----------
+    path : path
+        A new file.
+    layout : ImageLayout
+    first_s : float
+        The first frame's time on the sender's clock.
+    packed : bool
+        Whether frames are compressed.
+    """
+
+    def __init__(self, path: Path, layout: ImageLayout, first_s: float, packed: bool = False) -> None:
+        example = layout.example
+        self.counts, self._first_s = Counts(), first_s
+        self._sweep = GrowingSweep(
+            path,
+            example.grid,
+            example.signal,
+            example.frames.dtype,
+            "gzip" if packed else None,
+            probe=example.probe,
+        )
+
+    def __enter__(self) -> Self:
+        self._sweep.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._sweep.__exit__(kind, error, trace)
+
+    def keep_frame(self, frame: npt.NDArray[Any], sent_s: float) -> float | None:
+        """Write a frame; its time in the sweep, or None if it is not later than the last frame's."""
+        time_s = sent_s - self._first_s
+        try:
+            self._sweep.append(frame, time_s)
+        except InvalidInputError as error:
+            self.refuse(error)
+            return None
+        self.counts.frames += 1
+        return time_s
+
+    def keep_reading(self, transform: TransformReceived, with_position: bool) -> None:
+        """Write a sensor's reading: of a tracker, or with the rotation alone of an orientation sensor."""
+        time_s = transform.time_s - self._first_s
+        where = f"TRANSFORM {transform.device}"
+        try:
+            # Rigid to single precision as it comes.
+            rigid = transforms_from_matrices(transform.matrix[None], where)
+            if with_position:
+                self._sweep.append_pose(time_s, rigid.as_matrix()[0], transform.valid)
+            elif transform.valid:
+                self._sweep.append_orientation(time_s, rigid.rotation.as_quat(scalar_first=True)[0])
+        except InvalidInputError as error:
+            self.refuse(error)
+            return
+        self.counts.readings += 1
+
+    def refuse(self, error: InvalidInputError) -> None:
+        """Count a message that cannot be written."""
+        self.counts.refused += 1
+        self.counts.last_refused = str(error)

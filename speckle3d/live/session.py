@@ -1,0 +1,344 @@
+"""A live session: received, recorded, tracked and sent on, each in a thread of its own.
+
+What is received is recorded before anything else is done with it. Frames that come while earlier ones are
+still being matched wait, `MOST_WAITING` of them; of more every other one is left for later: they are in the
+recording, and the reconstruction at the end has them.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, TypeGuard
+
+import numpy.typing as npt
+
+from speckle3d.config import Config
+from speckle3d.core.arrays import Float32Array
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.threads import on_one_thread
+from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.live.checks import GOOD, Words, words_for
+from speckle3d.live.crossing import CrossingCheck
+from speckle3d.live.frames import ImageLayout
+from speckle3d.live.outgoing import pose_message, volume_message, word_messages
+from speckle3d.live.recording import Recording
+from speckle3d.live.tracking import LivePose, LiveTracker
+from speckle3d.live.volume import GrowingVolume
+
+MOST_BEFORE = 1000
+"""Messages that are kept until the first frame comes."""
+MOST_WAITING = 12
+"""Frames that wait to be matched, half a second of them: more would be late, not better."""
+_LOOK_S = 0.1
+VOLUME_EVERY_S = 1.0
+
+
+class Source(Protocol):
+    """Where messages come from."""
+
+    def receive(self, timeout_s: float) -> list[Received]:
+        """Take all messages in order, waiting for the first one; empty if none came in time."""
+
+
+@dataclass(frozen=True)
+class SessionSettings:
+    """What a session is to do.
+
+    Attributes
+    ----------
+    recording : path
+        New sweep file for everything that is received.
+    image, transform, orientation : str or None
+        Devices whose messages count: by default the first image's; no sensor's.
+    imported : ImportSettings
+        What IMAGE messages do not say.
+    config : Config
+    volume, check, packed : bool
+        Whether to make a growing volume, to give advice, and to compress the recording.
+    """
+
+    recording: Path
+    image: str | None = None
+    transform: str | None = None
+    orientation: str | None = None
+    imported: ImportSettings = field(default_factory=ImportSettings)
+    config: Config = field(default_factory=Config)
+    volume: bool = True
+    check: bool = False
+    packed: bool = False
+
+
+@dataclass
+class Progress:
+    """How a session goes, for a line that is looked at.
+
+    Attributes
+    ----------
+    recorded, matched, left : int
+        Frames in the file, frames placed, and frames left for later.
+    waiting : int
+        Frames about to be matched.
+    delay_s : float
+        From a frame's message to its pose's, the last one.
+    length_mm : float
+        Between the first and the last frame's centres, along the first's elevational axis.
+    words : str
+    volumes : int
+        Sent.
+    refused : int
+        Messages that could not be used; `last_refused` says why.
+    """
+
+    recorded: int = 0
+    matched: int = 0
+    left: int = 0
+    waiting: int = 0
+    delay_s: float = 0.0
+    length_mm: float = 0.0
+    words: str = ""
+    volumes: int = 0
+    refused: int = 0
+    last_refused: str = ""
+
+    @property
+    def line(self) -> str:
+        """All of it in one line."""
+        parts = [
+            f"{self.recorded} frames",
+            f"{self.length_mm:+.1f} mm",
+            f"pose after {1e3 * self.delay_s:.0f} ms",
+        ]
+        parts += [f"{self.left} left for later"] if self.left else []
+        parts += [f"{self.refused} refused ({self.last_refused})"] if self.refused else []
+        return " | ".join([", ".join(parts), self.words] if self.words else [", ".join(parts)])
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    frame: npt.NDArray[Any]
+    time_s: float
+    sent_s: float
+    came_s: float
+
+
+class Session:
+    """Takes messages from a source until it is ended.
+
+    Parameters
+    ----------
+    source : Source
+        As `speckle3d.io.igtl.connection.Connection`.
+    send : sequence of callable
+        Each is given every message to send; none may wait.
+    curves : DecorrelationCurves
+    settings : SessionSettings
+    crossing : CrossingCheck, optional
+        Of the first sweep, for advice while the second one is made.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        send: Sequence[Callable[[bytes], None]],
+        curves: DecorrelationCurves,
+        settings: SessionSettings,
+        crossing: CrossingCheck | None = None,
+    ) -> None:
+        self._source, self._outlets, self._curves, self._settings = source, send, curves, settings
+        self._crossing = crossing
+        self.progress = Progress(words=GOOD if settings.check else "")
+        self.poses: list[LivePose] = []
+        self.tracker: LiveTracker | None = None
+        self._volume: GrowingVolume | None = None
+        self._layout: ImageLayout | None = None
+        self._queue: deque[_Waiting] = deque()
+        self._changed = threading.Condition()
+        self._over = threading.Event()
+        self._failure: Exception | None = None
+        self._words, self._sent_s = Words(), 0.0
+
+    def end(self) -> None:
+        """Let `run` end with what it has."""
+        self._over.set()
+
+    def run(self, duration_s: float | None = None, show: Callable[[Progress], None] | None = None) -> None:
+        """Take messages until ended, for so long at most.
+
+        Parameters
+        ----------
+        show : callable, optional
+            Called several times a second.
+
+        Raises
+        ------
+        Speckle3DError
+            If the recording cannot be written, or images or curves do not fit. What was recorded until then
+            can be read.
+        """
+        until_s = None if duration_s is None else time.monotonic() + duration_s
+        # Readings from before the first frame are kept: that frame lies between two of them.
+        waiting: deque[Received] = deque(maxlen=MOST_BEFORE)
+        layout = first = None
+        while layout is None and not self._is_over(until_s):
+            for message in self._source.receive(_LOOK_S):
+                waiting.append(message)
+                if layout is None and self._is_wanted(message):
+                    layout, first = ImageLayout.of(message, self._settings.imported, message.device), message
+            self._shown(show)
+        if layout is None or first is None:
+            return
+        with (
+            self._tracking(layout),
+            Recording(self._settings.recording, layout, first.time_s, self._settings.packed) as recording,
+        ):
+            self._take_all(waiting, recording, layout)
+            while not self._is_over(until_s):
+                self._take_all(self._source.receive(_LOOK_S), recording, layout)
+                self._shown(show)
+        if self._failure is not None:
+            raise self._failure
+
+    def _is_over(self, until_s: float | None) -> bool:
+        late = until_s is not None and time.monotonic() >= until_s
+        return self._over.is_set() or late or self._failure is not None
+
+    def _shown(self, show: Callable[[Progress], None] | None) -> None:
+        if show:
+            show(self.progress)
+
+    def _is_wanted(self, message: Received) -> TypeGuard[ImageReceived]:
+        return isinstance(message, ImageReceived) and self._settings.image in (None, message.device)
+
+    def _take_all(self, received: Sequence[Received], recording: Recording, layout: ImageLayout) -> None:
+        """Record messages, and have frames matched."""
+        for message in received:
+            if isinstance(message, ImageReceived) and message.device == layout.device:
+                self._take_image(message, recording, layout)
+            elif isinstance(message, TransformReceived):
+                if message.device == self._settings.transform:
+                    recording.keep_reading(message, with_position=True)
+                elif message.device == self._settings.orientation:
+                    recording.keep_reading(message, with_position=False)
+        counts = recording.counts
+        self.progress.recorded = counts.frames
+        if counts.refused:
+            self.progress.refused, self.progress.last_refused = counts.refused, counts.last_refused
+
+    def _take_image(self, image: ImageReceived, recording: Recording, layout: ImageLayout) -> None:
+        came_s = time.monotonic()
+        try:
+            frame = layout.frame(image)
+        except InvalidInputError as error:
+            recording.refuse(error)
+            return
+        time_s = recording.keep_frame(frame, image.time_s)
+        if time_s is None:
+            return
+        with self._changed:
+            self._queue.append(_Waiting(frame, time_s, image.time_s, came_s))
+            if len(self._queue) > MOST_WAITING:
+                # Every other one, so that those that are left out leave no gap that speckle does not cross.
+                thinned = list(self._queue)[::-2][::-1]
+                self.progress.left += len(self._queue) - len(thinned)
+                self._queue = deque(thinned)
+            self.progress.waiting = len(self._queue)
+            self._changed.notify()
+
+    @contextmanager
+    def _tracking(self, layout: ImageLayout) -> Iterator[None]:
+        """Match frames and make volumes in threads that end with the block."""
+        self._layout = layout
+        settings = self._settings
+        work = [self._match]
+        with LiveTracker(layout.example, self._curves, settings.config, images=self._keep) as self.tracker:
+            if settings.volume or self._crossing is not None:
+                self._volume = GrowingVolume(self.tracker.image_grid)
+            work += [self._send_volumes] if settings.volume else []
+            work += [self._look_for_crossing] if self._crossing is not None else []
+            threads = [threading.Thread(target=self._guarded, args=(each,), daemon=True) for each in work]
+            for thread in threads:
+                thread.start()
+            try:
+                yield
+            finally:
+                self._over.set()
+                with self._changed:
+                    self._changed.notify_all()
+                for thread in threads:
+                    thread.join()
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Do work of a thread; an error ends the session with it."""
+        try:
+            work()
+        except Exception as error:  # noqa: BLE001 (raised by `run`)
+            self._failure = error
+
+    def _keep(self, frame: int, intensity: Float32Array) -> None:
+        if self._volume is not None:
+            self._volume.keep(frame, intensity)
+
+    def _match(self) -> None:
+        """Place frames as they come, and say so."""
+        assert self._layout is not None
+        assert self.tracker is not None
+        image_from_pixel, centre_mm = self._layout.image_from_pixel, self._layout.example.grid.centre_mm
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._over.is_set() or bool(self._queue))
+                if not self._queue:
+                    return
+                waiting = self._queue.popleft()
+                self.progress.waiting = len(self._queue)
+            self.tracker.hurried = bool(self._queue)
+            pose = self.tracker.append(waiting.frame, waiting.time_s)
+            self._send(pose_message(pose.world_from_image, image_from_pixel, waiting.sent_s))
+            self.poses.append(pose)
+            self._sent_s = waiting.sent_s
+            self.progress.matched += 1
+            self.progress.delay_s = time.monotonic() - waiting.came_s
+            self.progress.length_mm = float(
+                pose.world_from_image.apply(centre_mm)[2] - self.poses[0].world_from_image.apply(centre_mm)[2]
+            )
+            if self._settings.check:
+                self._advise(pose, waiting.sent_s)
+
+    def _advise(self, pose: LivePose, sent_s: float) -> None:
+        words = words_for(pose, self._settings.config.trajectory)
+        if words == GOOD and self._crossing is not None:
+            words = self._crossing.words
+        if self._words.take(words, pose.time_s):
+            self.progress.words = self._words.said
+            for message in word_messages(self._words.said, self._words.said == GOOD, sent_s):
+                self._send(message)
+
+    def _send_volumes(self) -> None:
+        """Send the volume about once a second."""
+        assert self._volume is not None
+        assert self.tracker is not None
+        seen = 0
+        while not self._over.wait(VOLUME_EVERY_S):
+            poses = self.tracker.poses
+            if len(poses) > max(seen, 1):
+                seen = len(poses)
+                with on_one_thread():
+                    self._send(volume_message(self._volume.compounded(poses), self._sent_s))
+                self.progress.volumes += 1
+
+    def _look_for_crossing(self) -> None:
+        assert self._crossing is not None
+        assert self._volume is not None
+        assert self.tracker is not None
+        self._crossing.keep_looking(self.tracker, self._volume, self._over)
+
+    def _send(self, message: bytes) -> None:
+        for send in self._outlets:
+            send(message)

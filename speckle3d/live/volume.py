@@ -1,0 +1,87 @@
+"""A volume that grows with a sweep: made anew from small images, at the poses as they are known by then."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import ByteArray, Float16Array, Float32Array, IntArray
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.correction.crossing.stack import ImageStack
+from speckle3d.imaging.voxels.grid import spacing_within
+from speckle3d.imaging.voxels.volume import CompoundedVolume, compound
+
+MOST_IMAGES = 1200
+"""Images that are kept, every second one being dropped when there are more: some 30 MB."""
+VOXELS_GB = 0.004
+"""Of a volume that is sent about once a second."""
+RANGE_DB = 60.0
+_BRIGHT_PERCENTILE = 99.9
+
+
+class GrowingVolume:
+    """Keeps small images of a sweep's frames, and makes volumes of them.
+
+    An image sink as of `speckle3d.track`: pass `keep` as ``images``.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+        Of the intensity images.
+    """
+
+    def __init__(self, grid: ImageGrid) -> None:
+        self._pooled = ImageStack(grid)
+        self._images: dict[int, Float16Array] = {}
+        self._every = 1
+        self._lock = threading.Lock()
+
+    @property
+    def grid(self) -> ImageGrid:
+        """Of the small images."""
+        return self._pooled.grid
+
+    @property
+    def image_from_small(self) -> RigidTransform:
+        """Where the small images' first vector lies in the whole image."""
+        return RigidTransform.from_translation([self._pooled.left_mm, 0.0, 0.0])
+
+    def keep(self, index: int, intensity: Float32Array) -> None:
+        """Keep a frame's image, unless those of its neighbours are enough."""
+        if index % self._every:
+            return
+        self._pooled.keep(0, intensity)
+        with self._lock:
+            self._images[index] = self._pooled.kept(0, 1)[0]
+            if len(self._images) > MOST_IMAGES:
+                self._every *= 2
+                self._images = {k: image for k, image in self._images.items() if k % self._every == 0}
+
+    def kept(self) -> tuple[IntArray, Float16Array]:
+        """Numbers of the frames whose images are kept, and these, dB, shape (n, vector, sample)."""
+        with self._lock:
+            numbers = np.array(sorted(self._images), dtype=np.int64)
+            return numbers, np.stack([self._images[k] for k in numbers.tolist()])
+
+    def compounded(self, poses: RigidTransform) -> CompoundedVolume:
+        """Make a volume of grey levels, as coarse as its size asks for.
+
+        Parameters
+        ----------
+        poses : RigidTransform
+            ``world_from_image`` of all frames that were kept, and perhaps others.
+        """
+        numbers, images = self.kept()
+        numbers, images = numbers[numbers < len(poses)], images[: int((numbers < len(poses)).sum())]
+        world_from_small = poses[numbers] * self.image_from_small
+        voxel_mm = max(spacing_within(self.grid, world_from_small, VOXELS_GB), self.grid.vector_pitch_mm)
+        return compound(grey_levels(images), self.grid, world_from_small, voxel_mm, voxel_type="uint8")
+
+
+def grey_levels(images: Float16Array) -> ByteArray:
+    """Grey levels of images in dB, those of the last one deciding what is white."""
+    bright = float(np.percentile(images[-1].astype(np.float32), _BRIGHT_PERCENTILE))
+    levels = 1.0 + (images.astype(np.float32) - bright) / RANGE_DB
+    return np.asarray(np.rint(255.0 * np.clip(levels, 0.0, 1.0)), dtype=np.uint8)

@@ -1,0 +1,83 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from speckle3d.app.sweep.findings import FrameFindings
+from speckle3d.config import Config
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
+from speckle3d.matching.quality import FrameFlag
+
+
+@pytest.fixture(scope="module")
+def spoilt(sweep):
+    """Frame 3 repeats frame 2, 5 and 6 are noise, 8 is clipped."""
+    rng = np.random.default_rng(1)
+    frames = np.stack([sweep.frames[k] for k in range(10)])
+    frames[3] = frames[2]
+    frames[5:7] = np.rint(rng.normal(0.0, 3.5, frames[5:7].shape))
+    limit = np.percentile(np.abs(frames[8]), 90)
+    frames[8] = np.clip(frames[8], -limit, limit)
+    return replace(sweep.part(0, 10), frames=frames)
+
+
+def looked_at(sweep, reconstruction=None, doubts=None):
+    findings = FrameFindings(sweep, Config(), reconstruction, doubts)
+    while findings.flags is None:
+        findings.judge_next()
+    return findings
+
+
+def test_without_a_reconstruction_frames_are_judged_here_and_say_why(spoilt):
+    findings = looked_at(spoilt)
+    flagged = {k: FrameFlag(int(flag)) for k, flag in enumerate(findings.flags) if flag}
+    assert flagged == {
+        3: FrameFlag.FROZEN, 5: FrameFlag.LIFTED, 6: FrameFlag.LIFTED, 8: FrameFlag.SATURATED,
+    }  # fmt: skip
+    assert findings.reasons(0) == []
+    (frozen,), (lifted,), (saturated,) = (findings.reasons(k) for k in (3, 5, 8))
+    assert "frame 2" in frozen
+    assert "0 % of its patches hold speckle, expected at least 15 %" in lifted
+    clipped = 100 * float((np.abs(spoilt.frames[8]) == np.abs(spoilt.frames[8]).max()).mean())
+    assert f"{clipped:.2g} %" in saturated
+    assert "2 %" in saturated
+    assert "4 of 10" in findings.state()
+
+
+def test_how_far_the_look_has_come_is_said(spoilt):
+    findings = FrameFindings(spoilt, Config(), None, None)
+    findings.judge_next()
+    assert findings.flags is None
+    assert "1 of 10" in findings.state()
+    assert findings.reasons(3) == []
+
+
+def test_a_reconstructions_flags_and_doubts_are_taken_as_they_are(spoilt):
+    flags = np.zeros(10, dtype=np.int64)
+    flags[7] = FrameFlag.UNMATCHED
+    doubts = [Doubt("images", "speed", "expected less, got more", False, ((7, 7),))]
+    made = Reconstruction(
+        spoilt.frame_time_s, spoilt.grid, {"image": spoilt.truth}, Provenance("s.h5", "", ""),
+        trust=Trust(np.zeros((10, 6, 6)), flags),
+    )  # fmt: skip
+    findings = FrameFindings(spoilt, Config(), made, doubts)
+    assert findings.judged == 10
+    assert findings.doubts == tuple(doubts)
+    (reason,) = findings.reasons(7)
+    assert reason.startswith("unmatched")
+    assert "0.2" in reason
+    assert findings.reasons(3) == []
+
+
+def test_without_a_reconstruction_the_sensors_readings_are_held_against_themselves(sweep):
+    tracker = sweep.tracker
+    poses = tracker.readings.world_from_sensor.as_matrix()
+    poses[60:62, 0, 3] += 40.0
+    readings = replace(tracker.readings, world_from_sensor=type(sweep.truth).from_matrix(poses))
+    doubted = replace(sweep, tracker=replace(tracker, readings=readings))
+    (doubt,) = FrameFindings(doubted, Config(), None, None).doubts
+    time_s = readings.time_s[60:62] + tracker.time_offset_s
+    nearest = sorted({int(np.argmin(np.abs(sweep.frame_time_s - t))) for t in time_s})
+    assert doubt.suspect == "spikes"
+    assert doubt.frames == ((nearest[0], nearest[-1]),)

@@ -1,0 +1,83 @@
+"""What a file is tells its pages; what has none is one line."""
+
+import numpy as np
+import pytest
+from imu_logs import samples
+
+import speckle3d.app
+from speckle3d.app.opened import opened, pages_of
+from speckle3d.cli import main
+from speckle3d.core.errors import Speckle3DError
+from xsens.logs.samples import ImuLog
+from xsens.logs.textlogs import write_csv
+
+
+def titles(path, **more):
+    return [page.title for page in pages_of(path, **more)]
+
+
+@pytest.fixture
+def log(tmp_path):
+    write_csv(tmp_path / "log.csv", ImuLog(**{**samples(300), "source": "turning"}))
+    return tmp_path / "log.csv"
+
+
+def test_a_sweep_with_a_sensor_has_both_pages_and_a_log_its_own(shipped, log):
+    assert titles(shipped / "phantom.h5") == ["Sweep", "Sensor"]
+    assert titles(log) == ["Sensor"]
+
+
+@pytest.mark.realdata
+def test_a_package_without_frames_still_has_its_sensor(realdata):
+    assert titles(realdata / "clarius" / "wirephantom") == ["Sensor"]
+
+
+def test_what_has_no_page_is_one_line_and_exit_code_2(shipped, log, tmp_path, capsys, monkeypatch):
+    (tmp_path / "empty").write_bytes(b"")
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    cases = [
+        (shipped / "curves.h5",), (shipped,), (tmp_path / "none.h5",), (tmp_path / "empty",),
+        (tmp_path / "picture.png",), (shipped / "README.md",), (log, "--record", tmp_path / "out.mtb"),
+        (log, "--reconstruction", shipped / "phantom.h5"),
+        (shipped / "phantom.h5", "--reconstruction", shipped / "phantom.h5"),
+    ]  # fmt: skip
+    for arguments in cases:
+        monkeypatch.setattr("sys.argv", ["speckle3d", "view", "--no-browser", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        told = capsys.readouterr().err.splitlines()
+        assert (end.value.code, len(told)) == (2, 1), (arguments, told)
+        assert "expected" in told[0]
+
+
+@pytest.mark.slow
+def test_a_port_without_a_sensor_is_an_error_and_leaves_nothing(tmp_path):
+    import os
+    import tty
+
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    (tmp_path / "port").symlink_to(os.ttyname(slave))
+    out = tmp_path / "out.mtb"
+    try:
+        with pytest.raises(Speckle3DError, match="expected a sensor"), opened(tmp_path / "port", out):
+            pass
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert not out.exists()
+
+
+def test_a_notebook_shows_the_same_pages(log):
+    from bokeh.document import Document
+    from bokeh.plotting import figure
+
+    document = Document()
+    shown = speckle3d.app.view(log)
+    document.add_root(shown.get_root(document))
+    document.to_json()  # as it is sent to the notebook
+    assert len(document.roots) == 1
+    plots = list(document.select({"type": figure}))
+    assert {each.yaxis.axis_label for each in plots} >= {"dip, \N{DEGREE SIGN}", "heading, \N{DEGREE SIGN}"}
+    drawn = [each.data["y"] for each in document.models if "y" in getattr(each, "data", {})]
+    assert all(np.isfinite(each).any() for each in drawn)

@@ -1,0 +1,174 @@
+"""Frames served, received and recorded over the loopback: what is lost, its cost, and what a kill leaves.
+
+Run: ``python tests/benchmarks/bench_igtl.py [SECONDS]`` (60; 600 for the README's figure). For RF of 127 x
+3818 samples and B-mode of 640 x 480 pixels, each at 25 frames/s: `speckle3d play` in a process of its own,
+received by a `Connection` and recorded by a `GrowingSweep` here. Every frame carries its number. Printed are
+frames received and recorded, the time from due to recorded, and this process's share of a core. Then the
+server is killed and started again while a recording goes on, and a recorder is killed: what it had told of
+must be in its file.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import numpy as np
+from commands import command
+from sweep_examples import RF
+
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.io.growing_sweep import GrowingSweep
+from speckle3d.io.igtl.connection import Connection
+from speckle3d.io.igtl.messages import ImageReceived
+from speckle3d.io.load import load_sweep
+from speckle3d.io.sweep_writer import write_sweep
+
+RATE_HZ, FRAMES = 25.0, 50
+
+
+def example(kind):
+    """A sweep whose frames carry their numbers in their first samples."""
+    rng = np.random.default_rng(0)
+    if kind == "rf":
+        frames = rng.normal(0, 300, (FRAMES, 127, 3818)).astype(np.int16)
+        grid, signal = ImageGrid(127, 3818, 0.3, RF.sample_spacing_mm), RF
+    else:
+        frames = rng.integers(0, 256, (FRAMES, 640, 480)).astype(np.uint8)
+        grid, signal = ImageGrid(640, 480, 0.1, 0.1), BModeSettings(60.0)
+    frames[:, 0, 0] = np.arange(FRAMES)
+    return Sweep(frames, grid, signal, np.arange(FRAMES) / RATE_HZ)
+
+
+def played(path, port):
+    """Start a server; its process and its port."""
+    process = subprocess.Popen(
+        command("play", path, "--loop", "--port", port), stderr=subprocess.PIPE, text=True
+    )
+    while "waiting" not in (said := process.stderr.readline()):
+        if not said:
+            raise RuntimeError("the server has ended")
+    return process, int(said.split(":")[1])
+
+
+def ended(process, number=signal.SIGTERM):
+    process.send_signal(number)
+    process.communicate()
+
+
+def recorded(path, sweep, port, seconds, told=None, kill=None):
+    """Receive and record; returns numbers of the frames, delays, and the connection's state."""
+    numbers, delays, later_s, last_s = [], [], 0.0, -1.0
+    end = time.monotonic() + seconds
+    with (
+        Connection("127.0.0.1", port) as connection,
+        GrowingSweep(path, sweep.grid, sweep.signal, sweep.frames.dtype) as growing,
+    ):
+        start = None
+        while time.monotonic() < end:
+            if kill is not None and time.monotonic() > end - seconds / 2:
+                kill = kill()
+            for each in connection.receive(0.1):
+                if not isinstance(each, ImageReceived):
+                    continue
+                frame = each.pixels.T if sweep.signal is RF else each.pixels
+                if each.time_s + later_s <= last_s:  # its server has begun anew
+                    later_s, start = last_s + 1.0 - each.time_s, None
+                last_s = each.time_s + later_s
+                growing.append(frame, last_s)
+                numbers.append(int(frame[0, 0]))
+                start = time.monotonic() - last_s if start is None else start
+                delays.append(time.monotonic() - start - last_s)
+                if told is not None:
+                    os.write(told, struct.pack("i", len(growing)))
+        return numbers, delays, connection.state
+
+
+def lost(numbers):
+    """Frames missing between others."""
+    return int(((np.diff(numbers) - 1) % FRAMES).sum())
+
+
+def measure(kind, seconds, folder):
+    sweep = example(kind)
+    write_sweep(folder / f"{kind}.h5", sweep, compression=None)
+    server, port = played(folder / f"{kind}.h5", 0)
+    busy = time.process_time()
+    numbers, delays, state = recorded(folder / "recorded.h5", sweep, port, seconds)
+    busy = (time.process_time() - busy) / seconds
+    ended(server)
+    found = load_sweep(folder / "recorded.h5")
+    same = all(int(found.frames[i][0, 0]) == number for i, number in enumerate(numbers))
+    late = 1e3 * (np.array(delays) - min(delays))
+    print(
+        f"{kind}, {seconds:g} s: {len(numbers)} frames received, {len(found)} recorded "
+        f"({'all the same' if same else 'OTHERS'}), {lost(numbers)} lost, {state.refused} refused; later "
+        f"than the earliest one: median {np.median(late):.1f} ms, 99 % {np.percentile(late, 99):.1f} ms, "
+        f"most {late.max():.1f} ms; {busy:.2f} of a core"
+    )
+    found.frames.close()
+    (folder / "recorded.h5").unlink()
+    return lost(numbers) + (not same)
+
+
+def kill_server(folder):
+    """Kill the server within a recording and start it again."""
+    sweep = example("rf")
+    server, port = played(folder / "rf.h5", 0)
+    servers = [server]
+
+    def kill():
+        ended(servers[0], signal.SIGKILL)
+        servers.append(played(folder / "rf.h5", port)[0])
+
+    numbers, _, state = recorded(folder / "recorded.h5", sweep, port, 20.0, kill=kill)
+    ended(servers[1])
+    found = len(load_sweep(folder / "recorded.h5"))
+    print(
+        f"server killed and started again: {state.reconnections} reconnection, {len(numbers)} frames "
+        f"received, {found} recorded"
+    )
+    (folder / "recorded.h5").unlink()
+    return (state.reconnections != 1) + (found != len(numbers))
+
+
+def kill_recorder(folder):
+    """Kill a recorder while frames come."""
+    sweep, reading_told = example("rf"), os.pipe()
+    server, port = played(folder / "rf.h5", 0)
+    child = os.fork()
+    if not child:
+        recorded(folder / "killed.h5", sweep, port, 60.0, told=reading_told[1])
+        os._exit(0)
+    os.close(reading_told[1])
+    time.sleep(5.0)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    told = struct.unpack("i", os.read(reading_told[0], 2**16)[-4:])[0]
+    ended(server)
+    found = load_sweep(folder / "killed.h5")
+    same = all(int(found.frames[i][0, 0]) == i % FRAMES for i in range(len(found)))
+    print(
+        f"recorder killed: {told} frames told of, {len(found)} in the file, {'whole' if same else 'DAMAGED'}"
+    )
+    return (len(found) < told) + (not same)
+
+
+def main(seconds=60.0):
+    """Run all; returns how much was lost."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        wrong = sum(measure(kind, seconds, folder) for kind in ("rf", "bmode"))
+        return wrong + kill_recorder(folder) + kill_server(folder)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*map(float, sys.argv[1:])))

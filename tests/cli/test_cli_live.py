@@ -1,0 +1,118 @@
+"""`speckle3d live` against a played sweep, as processes of their own."""
+
+import json
+import re
+import signal
+import socket
+import subprocess
+import time
+
+import numpy as np
+import pytest
+from commands import command
+
+import speckle3d as s3
+from speckle3d.io.reconstructions import read_reconstruction
+
+RF = (
+    "--sampling-rate-hz", 2e8 / 3, "--vector-pitch-mm", 0.3, "--speed-of-sound-m-s", 1540,
+    "--centre-frequency-hz", 7.5e6, "--bandwidth-hz", 5e6, 10e6,
+)  # fmt: skip
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return taken.getsockname()[1]
+
+
+def started(*arguments):
+    return subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True)
+
+
+def read_until(process, words):
+    """Lines of its stderr up to one that has these words."""
+    lines = []
+    for line in process.stderr:
+        lines.append(line)
+        if words in line:
+            return lines
+    raise AssertionError("".join(lines))
+
+
+@pytest.fixture
+def player(shipped):
+    """A sweep that is played once, and its port."""
+    port = free_port()
+    playing = started("play", shipped / "phantom.h5", "--port", port)
+    read_until(playing, "waiting for a client")
+    yield port
+    playing.kill()
+    playing.communicate()
+
+
+def waited_for(path, frames):
+    """The sweep as soon as it has so many frames."""
+    for _ in range(600):
+        if path.exists():
+            try:
+                sweep = s3.load_sweep(path)
+            except s3.Speckle3DError:
+                sweep = None
+            if sweep is not None and len(sweep) >= frames:
+                return sweep
+        time.sleep(0.1)
+    raise AssertionError(f"no sweep of {frames} frames in {path}")
+
+
+@pytest.mark.slow
+def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player, shipped, tmp_path):
+    out, curves = tmp_path / "out", shipped / "curves.h5"
+    running = started(
+        "live", f"127.0.0.1:{player}", "-o", out, "--curves", curves, "--transform", "ProbeToReference", *RF
+    )
+    waited_for(out / "sweep.h5", 96)
+    time.sleep(1.0)
+    running.send_signal(signal.SIGINT)
+    _, told = running.communicate(timeout=90)
+    assert running.returncode == 0, told
+    placed = re.search(r"96 frames in .*, (\d+) placed as they came", told)
+    assert int(placed[1]) > 0
+    whole = s3.load_sweep(shipped / "phantom.h5")
+    kept = s3.load_sweep(out / "sweep.h5")
+    np.testing.assert_array_equal(kept.frames[95], whole.frames[95])
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["sweeps"][0]["frames"] == 96
+    made = read_reconstruction(out / "reconstruction.h5").poses["image"]
+    expected = s3.track(kept, s3.load_curves(curves)).image
+    np.testing.assert_allclose(made.as_matrix(), expected.as_matrix(), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_killed_session_leaves_a_readable_sweep(player, shipped, tmp_path):
+    out = tmp_path / "out"
+    running = started(
+        "live", f"127.0.0.1:{player}", "-o", out, "--curves", shipped / "curves.h5", "--no-volume", *RF
+    )
+    waited_for(out / "sweep.h5", 20)
+    running.kill()
+    running.communicate()
+    kept = s3.load_sweep(out / "sweep.h5")
+    assert len(kept) >= 20
+    np.testing.assert_array_equal(kept.frames[19], s3.load_sweep(shipped / "phantom.h5").frames[19])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere", "-o", "out"], "HOST:PORT"),
+        (["localhost:18944", "-o", "out", "--compression", "lzf"], "none or gzip"),
+    ],
+)
+def test_a_wrong_option_is_one_line(arguments, words, shipped, tmp_path):
+    done = subprocess.run(
+        command("live", *arguments, "--curves", shipped / "curves.h5"),
+        capture_output=True, text=True, cwd=tmp_path, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "out").exists()

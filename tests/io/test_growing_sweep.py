@@ -1,0 +1,248 @@
+"""A sweep that grows: read at any moment, after a kill, and when closed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import sweep_examples
+from disks import FULL, limited
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError
+from speckle3d.core.parts import locks
+from speckle3d.core.sweep import stored_dtype
+from speckle3d.io import growing_sweep
+from speckle3d.io.describe import describe
+from speckle3d.io.growing_sweep import GrowingSweep
+from speckle3d.io.load import import_notes, load_sweep
+from speckle3d.io.sweep_writer import write_sweep
+
+SWEEPS = {
+    "rf": sweep_examples.rf_sweep(),
+    "float": sweep_examples.rf_sweep(dtype=np.float32),
+    "iq": sweep_examples.iq_sweep(),
+    "complex": sweep_examples.iq_sweep(paired=False),
+    "bmode": sweep_examples.bmode_sweep(),
+}
+
+
+def growing(path, sweep, compression=None, **more):
+    return GrowingSweep(path, sweep.grid, sweep.signal, stored_dtype(sweep.frames), compression, **more)
+
+
+def fill(target, sweep, frames=None):
+    """Append frames, and the readings up to their times."""
+    matrices = sweep.tracker.readings.world_from_sensor.as_matrix()
+    quaternions = sweep.orientation.readings.world_from_sensor.as_quat(scalar_first=True)
+    done = [0, 0]
+    for i in range(len(sweep) if frames is None else frames):
+        time_s = sweep.frame_time_s[i]
+        target.append(sweep.frames[i], time_s)
+        for which, (sensor, values) in enumerate(
+            ((sweep.tracker, matrices), (sweep.orientation, quaternions))
+        ):
+            put = target.append_orientation if which else target.append_pose
+            times = sensor.readings.time_s
+            while done[which] < times.size and times[done[which]] <= time_s:
+                put(times[done[which]], values[done[which]])
+                done[which] += 1
+    return done
+
+
+def assert_begins(found, sweep, frames, readings):
+    assert (found.grid, found.signal, len(found)) == (sweep.grid, sweep.signal, frames)
+    np.testing.assert_array_equal(found.frame_time_s, sweep.frame_time_s[:frames])
+    for i in range(frames):
+        np.testing.assert_array_equal(found.frames[i], sweep.frames[i])
+    for got, wanted, count in zip(
+        (found.tracker, found.orientation), (sweep.tracker, sweep.orientation), readings, strict=True
+    ):
+        np.testing.assert_array_equal(got.readings.time_s, wanted.readings.time_s[:count])
+        turns = [
+            getattr(each.readings.world_from_sensor, "rotation", each.readings.world_from_sensor).as_matrix()
+            for each in (got, wanted)
+        ]
+        np.testing.assert_allclose(turns[0], turns[1][:count], atol=1e-12)
+
+
+@pytest.mark.parametrize("compression", [None, "gzip"])
+@pytest.mark.parametrize("kind", list(SWEEPS))
+def test_what_was_appended_is_read_while_it_grows_and_when_it_is_closed(tmp_path, kind, compression):
+    sweep, path = SWEEPS[kind], tmp_path / "s.h5"
+    with growing(path, sweep, compression) as target:
+        for i in range(2):
+            target.append(sweep.frames[i], sweep.frame_time_s[i])
+            found = load_sweep(path)
+            assert len(found) == len(target) == i + 1
+            np.testing.assert_array_equal(found.frames[i], sweep.frames[i])
+            assert (found.tracker, found.orientation) == (None, None)
+            assert import_notes(path) == [
+                f"{path}: the recording goes on, or was ended without being closed: {i + 1} frames so far"
+            ]
+            assert ("recording", "goes on, or was ended without being closed", "") in describe(path)
+            found.frames.close()
+    with growing(tmp_path / "whole.h5", sweep, compression) as target:
+        readings = fill(target, sweep)
+    assert_begins(load_sweep(tmp_path / "whole.h5"), sweep, len(sweep), readings)
+    assert import_notes(tmp_path / "whole.h5") == []
+    assert "recording" not in {row[0] for row in describe(tmp_path / "whole.h5")}
+    assert_begins_a_usual_file(tmp_path, sweep)
+
+
+def assert_begins_a_usual_file(folder, sweep):
+    """A closed one opens like any file, and is copied into one without a trace."""
+    with h5py.File(folder / "whole.h5", "r") as file:
+        assert file.attrs["version"] == (2 if "iq" in file else 1)
+        assert not file["unfinished"][()]
+    write_sweep(folder / "copy.h5", load_sweep(folder / "whole.h5"))
+    with h5py.File(folder / "copy.h5", "r") as file:
+        assert "unfinished" not in file
+    np.testing.assert_array_equal(load_sweep(folder / "copy.h5").frames[1], sweep.frames[1])
+
+
+def test_without_a_frame_there_is_no_sweep_and_no_file(tmp_path):
+    with growing(tmp_path / "s.h5", SWEEPS["rf"]) as target:
+        target.append_pose(0.0, np.eye(4))
+        with pytest.raises(InvalidInputError, match="got none so far"):
+            load_sweep(tmp_path / "s.h5")
+    assert not (tmp_path / "s.h5").exists()
+
+
+def test_calibration_probe_and_offset_are_kept(tmp_path):
+    sweep = SWEEPS["rf"]
+    for name, mounting in (
+        ("tracker", sweep.tracker.sensor_from_image),
+        ("orientation", sweep.orientation.sensor_from_image),
+    ):
+        path = tmp_path / f"{name}.h5"
+        more = {"probe": "L14", "sensor_from_image": mounting, "time_offset_s": -0.02}
+        with growing(path, sweep, **more) as target:
+            fill(target, sweep)
+        found = load_sweep(path)
+        sensor = getattr(found, name)
+        assert (found.probe, sensor.time_offset_s) == ("L14", -0.02)
+        np.testing.assert_allclose(sensor.sensor_from_image.as_matrix(), mounting.as_matrix(), atol=1e-12)
+
+
+def test_the_tool_may_be_out_of_sight(tmp_path):
+    sweep, lost = SWEEPS["rf"], np.zeros((4, 4))
+    for seen in (True, False):
+        with growing(tmp_path / f"{seen}.h5", sweep) as target:
+            target.append(sweep.frames[0], 0.0)
+            target.append_pose(0.0, np.eye(4), seen)
+            target.append_pose(0.1, lost, False)
+        found = load_sweep(tmp_path / f"{seen}.h5").tracker
+        assert (found is not None) == seen
+        assert not seen or len(found.readings) == 1
+
+
+@pytest.mark.parametrize(("call", "values", "said"), [
+    ("append", (np.zeros((5, 39), np.int16), 11.0), "shape"),
+    ("append", (np.zeros((5, 40), np.float32), 11.0), "int16"),
+    ("append", (np.zeros((5, 40), np.int16), 10.0), "after 10"),
+    ("append", (np.zeros((5, 40), np.int16), float("nan")), "after 10"),
+    ("append_pose", (9.0, np.eye(4)), "after 9"),
+    ("append_pose", (11.0, 2 * np.eye(4)), "rigid"),
+    ("append_pose", (11.0, np.full((4, 4), np.nan), False), "finite"),
+    ("append_pose", (11.0, np.eye(3)), "4, 4"),
+    ("append_orientation", (9.0, [1.0, 0, 0, 0]), "after 9"),
+    ("append_orientation", (11.0, [1.0, 1, 0, 0]), "unit"),
+    ("append_orientation", (11.0, [1.0, 0, 0]), "4"),
+])  # fmt: skip
+def test_what_is_refused_is_not_in_the_file_and_the_recording_goes_on(tmp_path, call, values, said):
+    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
+    with growing(path, sweep) as target:
+        target.append(sweep.frames[0], 10.0)
+        target.append_pose(9.0, np.eye(4))
+        target.append_orientation(9.0, [1.0, 0, 0, 0])
+        with pytest.raises(InvalidInputError, match=said) as error:
+            getattr(target, call)(*values)
+        assert str(path) in str(error.value)
+        target.append(sweep.frames[1], 12.0)
+        target.append_pose(12.0, np.eye(4))
+    found = load_sweep(path)
+    assert found.frame_time_s.tolist() == [10.0, 12.0]
+    assert (len(found.tracker.readings), len(found.orientation.readings)) == (2, 1)
+
+
+def test_readings_without_frames_are_written_in_a_moment(tmp_path, monkeypatch):
+    monkeypatch.setattr(growing_sweep, "_FLUSH_S", 0.0)
+    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
+    with growing(path, sweep) as target:
+        target.append(sweep.frames[0], 0.0)
+        for k in range(20):
+            target.append_pose(0.01 * k, np.eye(4))
+        with h5py.File(path, "r", swmr=True) as file:
+            assert len(file["tracker/time_s"]) >= 19
+
+
+def test_a_file_that_is_there_stays_as_it_is(tmp_path):
+    (tmp_path / "s.h5").write_text("mine")
+    with pytest.raises(FileError, match="there already"), growing(tmp_path / "s.h5", SWEEPS["rf"]):
+        pass
+    assert (tmp_path / "s.h5").read_text() == "mine"
+    with pytest.raises(FileError, match="folder"), growing(tmp_path / "none" / "s.h5", SWEEPS["rf"]):
+        pass
+    with pytest.raises(InvalidInputError, match="gzip"):
+        growing(tmp_path / "s.h5", SWEEPS["rf"], "lzf")
+
+
+def end_early(path, sweep, frames):
+    with pytest.raises(IndexError), growing(path, sweep) as target:
+        target.append(sweep.frames[fill(target, sweep, frames)[0] + 99], 99.0)
+
+
+def test_an_error_ends_the_recording_and_the_file_says_so(tmp_path):
+    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
+    end_early(path, sweep, 3)
+    assert len(load_sweep(path)) == 3
+    assert "3 frames" in import_notes(path)[0]
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="room on the disk is reserved by POSIX alone")
+@pytest.mark.parametrize("frames", [0, 3])
+def test_a_disk_that_fills_up_ends_the_recording_with_what_is_there(tmp_path, monkeypatch, frames):
+    monkeypatch.setattr(growing_sweep, "_AHEAD_BYTES", 2**14)
+    monkeypatch.setattr(growing_sweep, "_SPARE_BYTES", 2**17)
+    sweep, path = sweep_examples.rf_sweep(vectors=100, samples=1000), tmp_path / "s.h5"
+    size = frames * sweep.frames[0].nbytes + 2**18 if frames else 1000
+    with pytest.raises(NoSpaceError, match=FULL), limited(size), growing(path, sweep) as target:
+        fill(target, sweep)
+    assert path.exists() == (frames > 0)
+    if frames:
+        assert 0 < len(load_sweep(path)) < len(sweep)
+        assert path.stat().st_size < size
+
+
+def test_damage_to_a_file_that_grows_is_an_error_of_one_line(tmp_path):
+    """What a kill cannot leave: fewer frames than times."""
+    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
+    end_early(path, sweep, 4)
+    shutil.copy(path, tmp_path / "t.h5")
+    with h5py.File(tmp_path / "t.h5", "r+") as file:
+        file["rf"].resize(2, axis=0)
+    with pytest.raises(InvalidInputError, match=r"t\.h5: /rf"):
+        load_sweep(tmp_path / "t.h5")
+
+
+def test_a_mounting_is_of_the_sensor_it_fits(tmp_path):
+    with growing(tmp_path / "s.h5", SWEEPS["rf"], sensor_from_image=RigidTransform.identity()) as target:
+        target.append(SWEEPS["rf"].frames[0], 0.0)
+        target.append_pose(0.0, np.eye(4))
+        target.append_orientation(0.0, Rotation.identity().as_quat(scalar_first=True))
+    found = load_sweep(tmp_path / "s.h5")
+    assert found.tracker.sensor_from_image is not None
+    assert found.orientation.sensor_from_image is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(locks() is None, reason="processes that fork")
+def test_killed_at_fifty_moments_all_that_was_appended_is_read():
+    script = Path(__file__).parents[1] / "benchmarks" / "bench_growing.py"
+    done = subprocess.run([sys.executable, script, "50", "7"], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,0 +1,170 @@
+"""Messages in, a recording, poses and words out; without a network."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+import speckle3d as s3
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.igtl.header import HEADER_BYTES
+from speckle3d.io.igtl.messages import ImageReceived, TransformReceived, decode
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.live.frames import ImageLayout
+from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
+from speckle3d.live.session import MOST_WAITING, Session, SessionSettings
+from speckle3d.live.volume import MOST_IMAGES, GrowingVolume
+
+RF = ImportSettings(
+    sampling_rate_hz=2e8 / 3,
+    vector_pitch_mm=0.3,
+    speed_of_sound_m_s=1540.0,
+    centre_frequency_hz=7.5e6,
+    bandwidth_hz=(5e6, 10e6),
+)
+
+
+def image(frame, time_s):
+    """RF as PLUS sends it: samples along the columns."""
+    return ImageReceived("Image_Reference", time_s, frame.T, np.eye(4), np.ones(3))
+
+
+def reading(time_s, device="ProbeToReference"):
+    return TransformReceived(device, time_s, np.eye(4), True)
+
+
+class Messages:
+    """Some messages at a time, then silence until the session has done what is waited for."""
+
+    def __init__(self, batches, done):
+        self.batches, self.done, self.session = list(batches), done, None
+        self.until_s = time.monotonic() + 60
+
+    def receive(self, timeout_s):
+        if self.batches and self.session.progress.waiting < 3:
+            return self.batches.pop(0)
+        time.sleep(0.005)
+        if self.done(self.session.progress) or time.monotonic() > self.until_s:
+            self.session.end()
+        return []
+
+
+def run(batches, done, curves, folder, **settings):
+    """The session after its end, and the messages that it sent."""
+    sent, messages = [], Messages(batches, done)
+    known = SessionSettings(folder / "sweep.h5", imported=RF, **{"volume": False, **settings})
+    messages.session = Session(messages, [sent.append], curves, known)
+    messages.session.run()
+    return messages.session, [decode(each[:HEADER_BYTES], each[HEADER_BYTES:]) for each in sent]
+
+
+@pytest.fixture(scope="module")
+def recorded(shipped):
+    sweep = s3.load_sweep(shipped / "phantom.h5")
+    return [sweep.frames[k] for k in range(14)], s3.load_curves(shipped / "curves.h5")
+
+
+def test_what_is_received_is_recorded_placed_and_sent_on(recorded, tmp_path):
+    frames, curves = recorded
+    batches = [[reading(9.96), reading(9.98)]]
+    batches += [[image(frame, 10.0 + k / 25), reading(10.02 + k / 25)] for k, frame in enumerate(frames)]
+    batches += [[reading(11.0, "StylusToReference")]]
+    session, sent = run(batches, lambda p: p.matched == 14, curves, tmp_path, transform="ProbeToReference")
+    assert (session.progress.recorded, session.progress.left) == (14, 0)
+    poses = [each for each in sent if each.device == POSE]
+    assert [each.time_s for each in poses] == pytest.approx([10.0 + k / 25 for k in range(14)], abs=1e-6)
+    kept = s3.load_sweep(tmp_path / "sweep.h5")
+    np.testing.assert_array_equal(kept.frames[13], frames[13])
+    assert kept.frame_time_s == pytest.approx(np.arange(14) / 25)
+    # Readings before the first frame are there, and another tool's are not.
+    assert kept.tracker.readings.time_s[0] == pytest.approx(-0.04)
+    assert len(kept.tracker.readings) == 16
+    assert kept.tracker.covers(kept.frame_time_s).all()
+
+
+def test_messages_that_make_no_sweep_are_counted_and_cost_nothing_else(recorded, tmp_path):
+    frames, curves = recorded
+    good = [image(frame, 1.0 + k / 25) for k, frame in enumerate(frames[:4])]
+    late, small = image(frames[1], 0.5), image(frames[0][:, :700], 2.0)
+    sheared = TransformReceived("ProbeToReference", 1.2, np.diag([1.0, 1.0, 3.0, 1.0]), True)
+    session, _ = run(
+        [[*good, late, small, sheared, image(frames[4], 3.0)]],
+        lambda p: p.matched == 5,
+        curves,
+        tmp_path,
+        transform="ProbeToReference",
+    )
+    assert (session.progress.recorded, session.progress.refused) == (5, 3)
+    assert "rigid" in session.progress.last_refused
+    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 5
+
+
+@pytest.mark.slow
+def test_frames_that_come_too_fast_are_recorded_and_every_other_one_is_left(recorded, tmp_path):
+    frames, curves = recorded
+    many = [image(frames[k % 14], k / 1000) for k in range(40)]
+    session, _ = run([many], lambda p: p.matched + p.left == 40, curves, tmp_path)
+    progress = session.progress
+    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 40
+    assert progress.left > 0
+    assert progress.matched + progress.left == 40
+    assert "left for later" in progress.line
+    assert progress.waiting <= MOST_WAITING
+
+
+@pytest.mark.slow
+def test_words_and_a_volume_go_out(recorded, tmp_path, monkeypatch):
+    frames, curves = recorded
+    monkeypatch.setattr("speckle3d.live.session.VOLUME_EVERY_S", 0.05)
+    noise = np.random.default_rng(0).integers(-20, 20, frames[0].shape).astype(np.int16)
+    batches = [[image(frame, float(k))] for k, frame in enumerate([*frames[:9], *[noise] * 3])]
+    _, sent = run(
+        batches,
+        lambda p: p.matched == 12 and p.volumes > 0,
+        curves,
+        tmp_path,
+        volume=True,
+        check=True,
+    )
+    words = {each.text for each in sent if each.device == ADVICE}
+    assert words & {"lifted", "no speckle"}
+    volumes = [each for each in sent if each.device == VOLUME]
+    assert volumes[-1].pixels.ndim == 3
+    assert volumes[-1].pixels.max() > 100
+
+
+def test_the_first_image_says_what_is_missing():
+    grey = ImageReceived("Image", 0.0, np.zeros((64, 48), np.uint8), np.eye(4), np.ones(3))
+    with pytest.raises(MissingSettingsError, match="dynamic-range-db"):
+        ImageLayout.of(grey, ImportSettings(), "sweep")
+    with pytest.raises(InvalidInputError, match="uint8"):
+        ImageLayout.of(grey, RF, "sweep")
+
+
+def test_grey_images_stand_upright_and_say_their_pixels():
+    grey = ImageReceived("Image", 0.0, np.zeros((64, 48), np.uint8), np.eye(4), np.array([0.2, 0.1, 1.0]))
+    grid = ImageLayout.of(grey, ImportSettings(dynamic_range_db=60.0), "sweep").example.grid
+    assert (grid.vectors, grid.samples, grid.vector_pitch_mm, grid.sample_spacing_mm) == (64, 48, 0.2, 0.1)
+
+
+def test_a_pose_takes_pixels_to_slicers_axes(recorded):
+    frames, _ = recorded
+    layout = ImageLayout.of(image(frames[0], 0.0), RF, "sweep")
+    world = RigidTransform.from_translation([1.0, 2.0, 3.0])
+    packed = pose_message(world, layout.image_from_pixel, 5.0)
+    found = decode(packed[:HEADER_BYTES], packed[HEADER_BYTES:])
+    # Sample 100 of vector 10: 3 mm along x and 1.155 mm deep in the image; x and y are reversed in RAS.
+    at = found.matrix @ [100, 10, 0, 1]
+    assert at[:3] == pytest.approx([-(1.0 + 3.0), -(2.0 + 1.155), 3.0], abs=1e-4)
+    assert np.linalg.det(found.matrix[:3, :3]) > 0
+
+
+def test_memory_of_the_volume_is_bounded():
+    growing, rng = GrowingVolume(ImageGrid(16, 32, 0.5, 0.5)), np.random.default_rng(0)
+    for k in range(2 * MOST_IMAGES + 5):
+        growing.keep(k, rng.exponential(size=(16, 32)).astype(np.float32))
+    numbers, images = growing.kept()
+    assert numbers.size == len(images) <= MOST_IMAGES
+    assert set(np.diff(numbers)) <= {2, 4}

@@ -1,0 +1,99 @@
+"""Whether the magnetometer can be trusted: judged in fields whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from broad import read_trial
+from field_scenes import EARTH_UT, scene, simulated, with_readings
+
+from xsens.fusion.field import POOR, ROUGH, FieldFound, Trust, dip_rad, field_now, field_of
+from xsens.fusion.online import OnlineFilter
+from xsens.fusion.orient import orient
+
+GOOD = FieldFound(np.radians(1.4), 0.02, 0.01, 0.0, np.radians(3.2), 186.0)
+
+
+def judged(log):
+    return field_of(log, orient(log))
+
+
+def made(kind, amount):
+    rng = np.random.default_rng([20, *kind.encode()])
+    return scene(simulated(rng, 60.0), kind, amount, rng).log
+
+
+def test_an_even_field_is_trusted_and_none_is_not_judged():
+    rng = np.random.default_rng(3)
+    log = simulated(rng, 20.0).log
+    found = judged(log)
+    assert found.trust is Trust.YES
+    assert found.stray < ROUGH
+    assert judged(with_readings(log, magnetometer_au=None)).trust is Trust.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("kind", "amount", "trust", "words"),
+    [("attached", 30.0, Trust.CARE, "iron on the probe"), ("walk", 0.3, Trust.NO, "--no-magnetometer")],
+)
+def test_iron_on_the_probe_and_in_the_room_are_told_apart(kind, amount, trust, words):
+    found = judged(made(kind, amount))
+    assert found.trust is trust
+    assert words in found.sentence()
+
+
+def test_the_filter_comes_to_the_same_while_samples_arrive():
+    rng = np.random.default_rng(4)
+    log = simulated(rng, 15.0).log
+    filter_ = OnlineFilter()
+    filter_.push(np.full(50, 0.01), *(getattr(log, name)[:50] for name in VECTORS))
+    assert field_now(filter_.state, 0.0).trust is Trust.UNKNOWN
+    filter_.push(np.full(len(log) - 50, 0.01), *(getattr(log, name)[50:] for name in VECTORS))
+    assert field_now(filter_.state, 0.0).trust is not Trust.UNKNOWN
+    assert field_now(filter_.state, 0.0).stray < ROUGH
+
+
+VECTORS = ("gyroscope_rad_s", "accelerometer_m_s2", "magnetometer_au")
+
+
+@pytest.mark.parametrize(
+    ("changes", "trust"),
+    [
+        ({}, Trust.YES),
+        ({"iron": 0.9}, Trust.CARE),
+        ({"stray": 1.01 * ROUGH}, Trust.CARE),
+        ({"stray": 1.01 * POOR}, Trust.NO),
+        ({"disbelieved": 0.11}, Trust.CARE),
+        ({"disbelieved": 0.51}, Trust.NO),
+        ({"heading_sd_rad": np.radians(3.1)}, Trust.CARE),
+        ({"heading_sd_rad": np.radians(10.1)}, Trust.NO),
+        ({"stray": np.nan}, Trust.UNKNOWN),
+    ],
+)
+def test_each_doubt_counts_and_is_said(changes, trust):
+    found = replace(GOOD, **changes)
+    assert found.trust is trust
+    assert trust.value in found.sentence()
+    assert ("gyroscope alone does better" in found.sentence()) == (
+        trust is not Trust.UNKNOWN and found.drift_rad < found.heading_sd_rad
+    )
+
+
+def test_the_sentence_has_the_fusions_own_numbers():
+    words = GOOD.sentence().replace("\N{NO-BREAK SPACE}", " ")
+    for number in ("1.4\N{DEGREE SIGN}", "3.2\N{DEGREE SIGN}", "186 s", "1.0 %", "2.0 %"):
+        assert number in words
+
+
+def test_the_dip_is_below_the_horizontal():
+    assert np.degrees(dip_rad(EARTH_UT[None])) == pytest.approx(np.degrees(np.arctan2(45, 18)))
+
+
+@pytest.mark.realdata
+def test_a_magnet_on_the_sensor_is_told_in_a_recorded_trial(realdata):
+    log, _, _ = read_trial(realdata / "broad", "35_disturbed_attached_magnet_4cm")
+    found = judged(log)
+    assert found.trust is Trust.CARE
+    assert found.iron > 0.5
+    log, _, _ = read_trial(realdata / "broad", "05_undisturbed_slow_rotation_with_breaks_B")
+    assert judged(log).trust is Trust.YES
