@@ -42,7 +42,7 @@ def run_and_save(page, name):
     field.fill(name)
     field.press("Enter")
     page.get_by_role("button", name="Save result").click()
-    page.get_by_text("Saved").last.wait_for()
+    page.get_by_text(f"Saved {name}").wait_for()
     return page.locator("pre.calibration").inner_text()
 
 

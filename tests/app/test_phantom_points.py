@@ -25,7 +25,7 @@ def page(browser, recording):
         page.locator(".points-told").wait_for()
         page.get_by_role("button", name="Find points in all frames").click()
         told(page, "points-told", r"in \d+ frames")
-        page.set_default_timeout(8000)
+        page.set_default_timeout(30_000)
         yield page
         assert page.complaints == []
 

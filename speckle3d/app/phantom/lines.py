@@ -122,7 +122,7 @@ class _Tuner:
             self._frames.slider, pn.pane.Bokeh(self._picture.plot), self._told, self._frames.below()
         )
         hint = pn.pane.HTML(
-            "Region: drag a box in the image; or a polygon: hold the button, click corners, hold it.",
+            "Region: drag a box in the image; or, by the polygon tool: hold down, click corners, hold down.",
             margin=(2, 8),
         )
         right = pn.Column(

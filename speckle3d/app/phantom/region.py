@@ -45,7 +45,7 @@ class Region:
             num_objects=1,
             drag=False,
             vertex_renderer=vertices,
-            description="Draw the region",
+            description="Draw the region as a polygon",
         )
         plot.add_tools(
             drawing,
@@ -53,7 +53,8 @@ class Region:
         )
         box = BoxSelectTool(renderers=[vertices], description="Drag a box as the region")
         plot.add_tools(box)
-        plot.toolbar.active_tap, plot.toolbar.active_drag = drawing, box
+        # One tool at a time hears the mouse.
+        plot.toolbar.active_tap, plot.toolbar.active_drag = None, box
         plot.on_event(SelectionGeometry, self._boxed)
         self._text = pn.widgets.TextInput(
             name="",
@@ -86,7 +87,7 @@ class Region:
             self._take(tuple(corners))
 
     def _boxed(self, event: SelectionGeometry) -> None:
-        held = event.geometry
+        held: Any = event.geometry
         if not event.final or held["type"] != "rect":
             return
         left, right, top, bottom = (round(float(held[end]), _DIGITS) for end in ("x0", "x1", "y0", "y1"))
