@@ -13,10 +13,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from browsers import chromium, opened, viewing  # noqa: E402
+from browsers import chromium, opened, viewing
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep  # noqa: E402
-from speckle3d.io.sweep_writer import write_sweep  # noqa: E402
+from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
+from speckle3d.io.sweep_writer import write_sweep
 
 FRAMES = 60
 RF = RFSettings(66.6667e6, 1540.0, 7.5e6, (5e6, 10e6))
