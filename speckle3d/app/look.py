@@ -58,7 +58,7 @@ def inside(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, or a single one, without the line of the app."""
     if len(pages) == 1:
         return _viewed(pages[0])
-    views = [pn.Column(told(f"Opening {page.title} ..."), sizing_mode="stretch_width") for page in pages]
+    views = [pn.Column(_opening(page.title), sizing_mode="stretch_width") for page in pages]
     opened = {0}
     tabs = pn.Tabs(
         *((page.title, view) for page, view in zip(pages, views, strict=True)),
@@ -86,6 +86,11 @@ def _viewed(page: Page) -> Viewable:
         return page.view()
     except Speckle3DError as error:
         return told(str(error))
+
+
+def _opening(title: str) -> Viewable:
+    words = f"Opening {escape(title)} ..."
+    return pn.pane.HTML(f'<div role="status" style="color:#6b7780;padding:8px 12px">{words}</div>', margin=10)
 
 
 def told(words: str) -> Viewable:

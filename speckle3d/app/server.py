@@ -52,6 +52,7 @@ class AppServer:
 
     def __init__(self, pages: Sequence[Page], title: str, port: int = 0, unseen_s: float = UNSEEN_S) -> None:
         self._unseen_s, self._seen_s = unseen_s, time.monotonic()
+        self._sessions: set[str] = set()
         self._guard = Guard()
         try:
             sockets = bind_sockets(port, LOOPBACK)
@@ -104,8 +105,11 @@ class AppServer:
             self._server.stop(wait=False)
 
     def _look(self) -> None:
-        now = time.monotonic()
-        if any(session.connection_count for session in self._server.get_sessions()):
+        now, before = time.monotonic(), self._sessions
+        sessions = self._server.get_sessions()
+        self._sessions = {session.id for session in sessions}
+        # A page that was sent a moment ago has no connection yet.
+        if self._sessions - before or any(session.connection_count for session in sessions):
             self._seen_s = now
         elif now - self._seen_s > self._unseen_s:
             self._server.io_loop.stop()

@@ -109,7 +109,7 @@ def test_it_ends_when_nobody_looks(browser, shipped):
     code = (
         "import sys; from pathlib import Path; from speckle3d.app.opened import pages_of; "
         "from speckle3d.app.server import AppServer; path = Path(sys.argv[1]); "
-        "server = AppServer(pages_of(path), path.name, unseen_s=2.0); "
+        "server = AppServer(pages_of(path), path.name, unseen_s=3.0); "
         "print(server.address_for_once(), flush=True); server.run()"
     )
     with subprocess.Popen(
@@ -117,7 +117,7 @@ def test_it_ends_when_nobody_looks(browser, shipped):
     ) as server:
         page = opened(browser, server.stdout.readline().strip())
         page.wait_for_selector("canvas")
-        page.wait_for_timeout(4000)
+        page.wait_for_timeout(5000)
         assert server.poll() is None  # while someone looks
         page.close()
         assert server.wait(15) == 0
