@@ -1,7 +1,8 @@
 """How long a frame of the sweep player takes, from a key to what the browser has drawn.
 
-Run: ``python tests/benchmarks/bench_player.py`` (needs Playwright and Chromium). Frames are of 127 vectors by 3818
-samples of RF, and of 640 x 480 B-mode; patches are off, then coloured by correlation, which is computed for each.
+Run: ``python tests/benchmarks/bench_player.py`` (needs Playwright and Chromium). Frames are RF of 127
+vectors by 3818 samples and B-mode of 640 x 480; patches are off, then coloured by correlation, computed for
+each frame. Not to be run with real-time priority: browsers wait busily, and then nothing else runs.
 """
 
 import statistics
@@ -13,10 +14,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from browsers import chromium, opened, viewing  # noqa: E402
+from browsers import chromium, opened, viewing
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep  # noqa: E402
-from speckle3d.io.sweep_writer import write_sweep  # noqa: E402
+from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
+from speckle3d.io.sweep_writer import write_sweep
 
 FRAMES = 60
 RF = RFSettings(66.6667e6, 1540.0, 7.5e6, (5e6, 10e6))
@@ -67,7 +68,9 @@ def main():
                     took = sorted(measured(page))
                     worst = took[int(0.95 * len(took))]
                     print(
-                        f"{name}, patches {colouring}: median {statistics.median(took):.0f} ms, 95 % {worst:.0f} ms"
+                        f"{name}, patches {colouring}: median {statistics.median(took):.0f} ms, "
+                        f"95 % {worst:.0f} ms",
+                        flush=True,
                     )
 
 

@@ -33,7 +33,7 @@ def drawn(player):
 
 def press(player, *keys):
     for key in keys:
-        player._keys.pressed = f"{key} {player._count}"
+        player._keys.pressed = [*player._keys.pressed, [player._keys_heard + 1, key]]
         drawn(player)
 
 
@@ -53,6 +53,16 @@ def test_keys_move_the_frame_the_slider_the_cursor_and_the_words(player, sweep, 
     assert player._slider.value == frame
     assert player._line.cursor.location == sweep.frame_time_s[frame]
     assert f"Frame {frame}</b> of 0 to 95" in player._told.object
+
+
+def test_keys_that_come_together_all_count_and_each_once(player):
+    player._keys.pressed = [[1, "ArrowRight"], [2, "PageDown"], [3, "ArrowRight"]]
+    assert player.frame == 12
+    player._keys.pressed = [[2, "PageDown"], [3, "ArrowRight"], [4, "ArrowLeft"]]
+    assert player.frame == 11
+    # A page that was left and is seen again counts anew.
+    player._keys.pressed = [[1, "ArrowLeft"]]
+    assert player.frame == 10
 
 
 def test_what_is_sent_is_the_frames_image(player):
