@@ -1,7 +1,8 @@
 """How long a frame of the sweep player takes, from a key to what the browser has drawn.
 
-Run: ``python tests/benchmarks/bench_player.py`` (needs Playwright and Chromium). Frames are of 127 vectors by 3818
-samples of RF, and of 640 x 480 B-mode; patches are off, then coloured by correlation, which is computed for each.
+Run: ``python tests/benchmarks/bench_player.py`` (needs Playwright and Chromium). Frames are RF of 127
+vectors by 3818 samples and B-mode of 640 x 480; patches are off, then coloured by correlation, computed for
+each frame. Not to be run with real-time priority: browsers wait busily, and then nothing else runs.
 """
 
 import statistics
@@ -67,7 +68,9 @@ def main():
                     took = sorted(measured(page))
                     worst = took[int(0.95 * len(took))]
                     print(
-                        f"{name}, patches {colouring}: median {statistics.median(took):.0f} ms, 95 % {worst:.0f} ms"
+                        f"{name}, patches {colouring}: median {statistics.median(took):.0f} ms, "
+                        f"95 % {worst:.0f} ms",
+                        flush=True,
                     )
 
 

@@ -9,16 +9,19 @@ from panel.reactive import ReactiveHTML
 
 
 class Keys(ReactiveHTML):  # type: ignore[misc]
-    """Tells keys that were pressed while the page is seen and no text is being written.
+    """Tells keys that are pressed while the page is seen and no text is being written.
 
     Attributes
     ----------
-    pressed : str
-        The last key, by its name in the browser, with "Shift+" before it if held, and a count behind, so that
-        the same key twice is two.
+    pressed : list of [int, str]
+        The last keys, oldest first: how many there were with each, and its name in the browser, with "Shift+"
+        before it if held. Changes that come quickly one after the other are told as one.
     """
 
-    pressed = param.String(default="")
+    pressed = param.List(default=[])
+
+    # Panel waits for so many milliseconds whether more changes come.
+    _debounce: ClassVar[int] = 1
 
     _template = '<div id="anchor" style="width:0;height:0"></div>'
 
@@ -29,6 +32,7 @@ class Keys(ReactiveHTML):  # type: ignore[misc]
             target.isContentEditable || target.tagName === "TEXTAREA" ||
             (target.tagName === "INPUT" && !["button", "checkbox", "radio", "range"].includes(target.type)));
           state.count = 0;
+          state.keys = [];
           state.heard = (event) => {
             if (event.ctrlKey || event.altKey || event.metaKey || !ours.includes(event.key)) return;
             if (!anchor.isConnected || anchor.getClientRects().length === 0) return;
@@ -37,7 +41,9 @@ class Keys(ReactiveHTML):  # type: ignore[misc]
             event.preventDefault();
             event.stopImmediatePropagation();
             state.count += 1;
-            data.pressed = (event.shiftKey ? "Shift+" : "") + event.key + " " + state.count;
+            const key = (event.shiftKey ? "Shift+" : "") + event.key;
+            state.keys = [...state.keys, [state.count, key]].slice(-64);
+            data.pressed = state.keys;
           };
           // A button is pressed when Space comes up again.
           state.kept = (event) => {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -13,12 +13,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.sweep import Sweep
-from speckle3d.matching.chosen import match_again
-from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.core.sweep import Sweep, read_frame
+from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 
 NEIGHBOURS = 8
 """Frames before and after with which a frame can be compared where no reconstruction says which are alike."""
+
+_KEPT_FRAMES = 4
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ class SweepPairs:
     ) -> None:
         self._sweep, self._config, self._pairs = sweep, config, pairs
         self.by_orientation = by_orientation
+        # The next frame is most often compared with this one.
+        self._ready = lru_cache(maxsize=_KEPT_FRAMES)(self._make_ready)
         self._most: dict[int, tuple[float, float]] = {}
 
     @property
@@ -117,13 +120,14 @@ class SweepPairs:
         correlation, row = nothing, self._row(first, second)
         first_from_second = RigidTransform.identity()
         if with_correlation or row is None:
-            table = match_again(self._sweep, self._matcher, [(first, second)])
-            correlation = table.correlation[0].astype(float)
-            x, y, roll = table.inplane[0]
+            fixed, moving = self._ready(first), self._ready(second)
+            match = self._matcher.match(fixed, moving, self._matcher.search(fixed, moving))
+            correlation = match.correlation
+            x, y, roll = match.motion.x_mm, match.motion.y_mm, match.motion.roll_rad
             centre = RigidTransform.from_translation(self._matcher.centre_mm)
             turned = RigidTransform.from_rotation(Rotation.from_rotvec([0.0, 0.0, roll]))
             # Of frames that have nothing in common any motion is found.
-            if table.median[0] >= self._config.trajectory.least_correlation:
+            if match.median >= self._config.trajectory.least_correlation:
                 shifted = RigidTransform.from_translation([x, y, 0.0])
                 first_from_second = shifted * centre * turned * centre.inv()
         if row is not None and self._pairs is not None:
@@ -141,6 +145,9 @@ class SweepPairs:
             self._pairs.used[row],
             (apart, float(np.sqrt(self._pairs.covariance[row, 2, 2]))),
         )
+
+    def _make_ready(self, frame: int) -> ReadyFrame:
+        return self._matcher.prepare(self._matcher.echo(read_frame(self._sweep.frames, frame)))
 
     def _row(self, first: int, second: int) -> int | None:
         if self._pairs is None:

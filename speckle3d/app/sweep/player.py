@@ -56,6 +56,7 @@ class Player:
         self.frame = 0
         self._shown, self._count, self._sent_s = -1, 0, -np.inf
         self._lag, self._began, self._filling = -1, (0.0, 0.0), False
+        self._keys_heard = 0
         last = len(sweep) - 1
         self._picture = Picture(images.extent_mm(), pairs.patch_mm)
         self._line = TimeLine(sweep.frame_time_s, self.go)
@@ -82,7 +83,7 @@ class Player:
         """Return what is shown."""
         self._slider.param.watch(self._slid, "value")
         self._play.param.watch(self._started, "value")
-        self._keys.param.watch(lambda event: self._pressed(event.new), "pressed")
+        self._keys.param.watch(self._heard, "pressed")
         self._range.param.watch(self._again, "value")
         self._opacity.param.watch(self._again, "value")
         self._colouring.param.watch(self._again, "value")
@@ -158,9 +159,17 @@ class Player:
         if event.new != self._shown:
             self.go(event.new)
 
+    def _heard(self, event: param.parameterized.Event) -> None:
+        # Counted anew where the page was left and opened again.
+        last = event.new[-1][0] if event.new else 0
+        known = self._keys_heard if self._keys_heard <= last else 0
+        self._keys_heard = last
+        for count, key in event.new:
+            if count > known:
+                self._pressed(key)
+
     def _pressed(self, key: str) -> None:
-        name = key.rpartition(" ")[0]
-        held, _, name = name.rpartition("+")
+        held, _, name = key.rpartition("+")
         step = LEAP if held else 1
         if name == " ":
             self._play.value = not self._play.value

@@ -22,7 +22,7 @@ LIFTED = slice(30, 35)
 
 @pytest.fixture(scope="module")
 def files(sweep, curves, tmp_path_factory):
-    """The first 48 frames of the shipped sweep with the probe lifted in five of them, and their poses; the tracker jumps and comes back."""
+    """48 frames, the probe lifted in five of them, a tracker that jumps and comes back; and its poses."""
     folder = tmp_path_factory.mktemp("player")
     part = sweep.part(0, 48)
     frames = np.stack([part.frames[k] for k in range(len(part))])
