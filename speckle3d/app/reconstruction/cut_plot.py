@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -20,6 +21,8 @@ from speckle3d.study.reslices.reslice_figures import contrast_of, overlay
 FREE, FRAME, LATERAL, DEPTH = "#ff4fc3", "#ffd700", "#4fc3ff", "#8de04f"
 """Colours of the free plane's lines and of the other cuts'."""
 _HANDLE_PX = 11
+HELD_S = 0.8
+"""For so long after its last move a handle counts as held: the browser does not tell when it is let go."""
 _MARGIN = 0.03
 
 
@@ -202,6 +205,7 @@ class Handle:
     ) -> None:
         self.at = np.zeros(2)
         self._plot, self._moved, self._placing = plot, moved, False
+        self._dragged_s = -np.inf
         look: dict[str, Any] = {"border_radius": _HANDLE_PX if round_ else 0}
         self.box = BoxAnnotation(
             left=0, right=1, top=0, bottom=1, editable=True, movable="both", resizable="none",
@@ -212,6 +216,11 @@ class Handle:
         for side in ("left", "right", "top", "bottom"):
             self.box.on_change(side, lambda attr, old, new: self._dragged())
         plot.plot.add_layout(self.box)
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the mouse moved it a moment ago; placed now, it would be torn between both."""
+        return time.monotonic() - self._dragged_s < HELD_S
 
     def place(self, at_mm: FloatArray | None) -> None:
         """Put it somewhere, or nowhere."""
@@ -232,5 +241,6 @@ class Handle:
         box: Any = self.box
         new = np.array([(box.left + box.right) / 2, (box.top + box.bottom) / 2], dtype=float)
         old, self.at = self.at, new
+        self._dragged_s = time.monotonic()
         if not np.array_equal(old, new):
             self._moved(old, new)

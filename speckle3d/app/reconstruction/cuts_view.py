@@ -77,7 +77,6 @@ class CutsView:
             self._movers[name] = Handle(self.plots[name], FREE, False, self._mover(name))
             self._turners[name] = Handle(self.plots[name], FREE, True, self._turner(name))
         self._placing = False
-        self._dragged: Handle | None = None
         self._frame_lines: dict[Name, tuple[tuple[int, int], FloatArray]] = {}
 
     def layout(self) -> Viewable:
@@ -97,11 +96,11 @@ class CutsView:
         for name in NAMES:
             self._draw_lines(name)
 
-    def draw_handles(self) -> None:
-        """Put handles where the lines are, but for what the mouse holds."""
+    def draw_handles(self) -> bool:
+        """Put handles where the lines are, but for what the mouse holds; tell whether it holds one."""
         for name in ORTHOGONAL:
             self._place_handles(name, self._line_of_plane(name))
-        self._dragged = None
+        return any(each.is_held for each in (*self._movers.values(), *self._turners.values()))
 
     def show_cut(self, name: Name, picture: CutPicture, is_fine: bool) -> None:
         """Show a cut of the modes."""
@@ -116,7 +115,8 @@ class CutsView:
         self.plots[name].show(colours, main.cut.extent_mm)
         said = f"free {picture.place}" if name == "free" else picture.place
         if other and not self.shown.is_difference:
-            said = f"{label_of(mode)}: {said.split(', seen')[0]}"
+            where = "free plane" if name == "free" else picture.place.split(", seen")[0]
+            said = f"{label_of(mode)}: {where}"
         said = said if is_fine else f"{said} (voxels)"
         self.plots[name].name_axes(said, picture.axes)
         if other and not self.shown.is_difference:
@@ -209,14 +209,13 @@ class CutsView:
         box = self.plots[name].box
         reach = _ARM * min(abs(box.right - box.left), abs(box.bottom - box.top))
         # What the mouse holds stays where the mouse is.
-        if self._dragged is not mover and self._dragged is not turner:
+        if not mover.is_held and not turner.is_held:
             mover.place(at)
-        if self._dragged is not turner:
+        if not turner.is_held:
             turner.place(mover.at + along * reach)
 
     def _mover(self, name: Name) -> Callable[[FloatArray, FloatArray], None]:
         def moved(old: FloatArray, new: FloatArray) -> None:
-            self._dragged = self._movers[name]
             self._changed(plane=self._axes.moved(self.shown.plane, self._plane(name), old, new))
 
         return moved
@@ -226,7 +225,6 @@ class CutsView:
             pivot = self._movers[name].at
             (x, y), (u, v) = old - pivot, new - pivot
             angle = float(np.arctan2(x * v - y * u, x * u + y * v))
-            self._dragged = self._turners[name]
             self._changed(plane=self._axes.turned(self.shown.plane, self._plane(name), pivot, angle))
 
         return turned

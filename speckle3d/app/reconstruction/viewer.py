@@ -55,6 +55,7 @@ class Viewer:
             FreePlane(0.0, 45.0, 0.0),
         )  # fmt: skip
         self._due: set[Callable[[], None]] = set()
+        self._shares: dict[str, float] = {}
         self._is_gone = False
         if self._document is not None:
             self._document.on_session_destroyed(self._leave)
@@ -128,10 +129,12 @@ class Viewer:
 
     def _draw_numbers(self) -> None:
         with pn.io.hold(self._document):
-            self._cuts.draw_handles()
+            is_held = self._cuts.draw_handles()
             self._controls.show(self.shown)
             self._bands.cursor.location = self.shown.frame
             self._saving.show(self.shown)
+        if is_held and self._is_served:
+            self._once(self._draw_numbers, _REST_MS)
 
     def _draw_space(self) -> None:
         planes = self._cuts.planes
@@ -163,8 +166,15 @@ class Viewer:
         self._later(show)
 
     def _tell_progress(self, mode: str, share: float) -> None:
-        making = "" if share == 1.0 else f"making voxels of {label_of(mode)}: {100 * share:.0f} %"
-        self._later(lambda: setattr(self._status, "object", making or self._colours()))
+        # Turns may come in another order than they were asked for.
+        self._shares[mode] = max(share, self._shares.get(mode, 0.0))
+        self._later(self._say_progress)
+
+    def _say_progress(self) -> None:
+        making = [
+            f"{label_of(mode)} {100 * share:.0f} %" for mode, share in self._shares.items() if share < 1.0
+        ]
+        self._status.object = f"making voxels: {', '.join(making)}" if making else self._colours()
 
     def _colours(self) -> str:
         """What the colours of a difference mean."""
@@ -188,11 +198,16 @@ class Viewer:
 
         self._later(do, after_ms)
 
+    @property
+    def _is_served(self) -> bool:
+        """Whether there is a server with turns to wait for."""
+        return self._document is not None and self._document.session_context is not None
+
     def _later(self, act: Callable[[], None], after_ms: int = 0) -> None:
         """Do something in the viewer's own turn; at once where there is no server, as in notebooks."""
         if self._is_gone:
             return
-        if self._document is None or self._document.session_context is None:
+        if self._document is None or not self._is_served:
             act()
         elif after_ms:
             self._document.add_timeout_callback(act, after_ms)
