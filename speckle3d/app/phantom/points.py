@@ -154,7 +154,7 @@ class _Picker:
             text_color=FOUND, text_font_size="11px",
         )  # fmt: skip
         self._tool = PointDrawTool(
-            renderers=[drawn],  # type: ignore[list-item]
+            renderers=[drawn],
             empty_value="",
             num_objects=0 if self._wired.names else 1,
             description="Points",
