@@ -57,6 +57,7 @@ class Player:
         self._shown, self._count, self._sent_s = -1, 0, -np.inf
         self._lag, self._began, self._filling = -1, (0.0, 0.0), False
         self._keys_heard = 0
+        self._pair: Compared | None = None
         last = len(sweep) - 1
         self._picture = Picture(images.extent_mm(), pairs.patch_mm)
         self._line = TimeLine(sweep.frame_time_s, self.go)
@@ -132,6 +133,8 @@ class Player:
     def _doubts(self) -> Viewable:
         """What is doubted of the recording, with buttons that lead to the frames of each."""
         doubts = self._findings.doubts
+        if not self._findings.are_of_reconstruction and not self._streams:
+            return pn.Column()
         kept = self._findings.are_of_reconstruction
         heading = (
             "What the checks found (purple below)"
@@ -227,7 +230,8 @@ class Player:
             self._picture.show(image, self._count)
             self._slider.value = frame
             self._line.move(frame)
-            self._told.object = self._words(frame, self._draw_patches(frame))
+            self._pair = self._draw_patches(frame)
+            self._told.object = self._words(frame, self._pair)
 
     def _draw_patches(self, frame: int) -> Compared | None:
         by = str(self._colouring.value)
@@ -261,6 +265,8 @@ class Player:
     def _told_of_findings(self) -> None:
         self._line.mark(self._findings.flags, self._findings.doubts)
         self._judged.object = escape(self._findings.state())
+        if self._findings.flags is not None and self._shown >= 0:
+            self._told.object = self._words(self._shown, self._pair)
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,10 @@ def seen(sweep, shipped):
         SweepPage(sweep, Folder(shipped / "phantom.h5"), doubts=doubts).view()
     (player,) = made
     assert player._findings.flags is None
+    assert "no flag" not in player._told.object
     while player._findings.flags is None:
         player._tick()
+    assert "no flag" in player._told.object
     return player
 
 
@@ -166,6 +168,7 @@ def test_doubts_are_marked_at_their_frames_and_said_without_their_markup(player,
 
 
 def test_frames_were_judged_while_nothing_played(player):
+    assert "no flag" in player._told.object
     assert "None of 96 frames flagged" in player._judged.object
 
 
