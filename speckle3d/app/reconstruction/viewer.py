@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import panel as pn
 from panel.viewable import Viewable
+from tornado.ioloop import IOLoop
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.reconstruction.bands import QUANTITIES, BandsPlot
@@ -48,6 +50,8 @@ class Viewer:
     def __init__(self, material: Material, folder: Folder, sweep_file: Path | None) -> None:
         self._material = material
         self._document = pn.state.curdoc
+        if self._is_served:
+            self._loop = IOLoop.current()
         grid, frames = material.grid, len(material.reconstruction.frame_time_s)
         middle = (grid.first_sample_depth_mm + grid.depth_mm) / 2
         self.shown = Shown(
@@ -209,7 +213,11 @@ class Viewer:
             return
         if self._document is None or not self._is_served:
             act()
-        elif after_ms:
-            self._document.add_timeout_callback(act, after_ms)
+            return
+        add: Callable[[], object]
+        if after_ms:
+            add = partial(self._document.add_timeout_callback, act, after_ms)
         else:
-            self._document.add_next_tick_callback(act)
+            add = partial(self._document.add_next_tick_callback, act)
+        # Turns that another thread asks for while changes are held back would be lost.
+        self._loop.add_callback(add)
