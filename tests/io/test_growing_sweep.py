@@ -204,6 +204,20 @@ def test_an_error_ends_the_recording_and_the_file_says_so(tmp_path):
     assert "3 frames" in import_notes(path)[0]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="HDF5 is told how often to read through its library")
+def test_a_damaged_file_of_a_killed_writer_is_refused_and_no_wait_for_good(tmp_path):
+    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
+    with growing(path, sweep) as target:
+        fill(target, sweep)
+        content = bytearray(path.read_bytes())
+    # A header of an object, whose check sum is then wrong, as it is for a moment while it is written.
+    at = content.index(b"OHDR") + 20
+    content[at] ^= 1
+    (tmp_path / "t.h5").write_bytes(content)
+    with pytest.raises(FileError, match=r"t\.h5: cannot be read"):
+        load_sweep(tmp_path / "t.h5")
+
+
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="room on the disk is reserved by POSIX alone")
 @pytest.mark.parametrize("frames", [0, 3])
 def test_a_disk_that_fills_up_ends_the_recording_with_what_is_there(tmp_path, monkeypatch, frames):
