@@ -149,7 +149,6 @@ def _no_patches() -> dict[str, list[object]]:
         "value",
         "alpha",
         "line",
-        "hatch",
         "state",
         "distance",
         "sigma",
