@@ -1,7 +1,7 @@
 """How far live poses are from off-line ones.
 
 Run: ``python tests/benchmarks/bench_live_poses.py CURVES SWEEP... [--step 4]``. For each sweep, distances of
-the image's centre, mm: of the pose first given for a frame from the last one of `track` on the frames up to it
+the image's centre, mm: of the pose first given for a frame from the last of `track` on the frames up to it
 (median and most over every fourth frame), and from the whole sweep's (most); of that part's pose from the
 whole sweep's (most), which no live method can know; and of all poses, once the sweep has ended, from the
 whole sweep's (most). They are those to a path or to its mirror image, whichever is nearer: images do not tell
