@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from speckle3d.live.session import Session
 
 _LOG_EVERY_S = 5.0
+_SILENT_S = 2.0
+"""After which a connection on which nothing comes is told of."""
 _ENDS = ("SIGINT", "SIGTERM", "SIGHUP")
 _SWITCH_S = 5e-4
 """For which one thread keeps the interpreter at most; Python's 5 ms a frame would wait for many times."""
@@ -176,9 +178,11 @@ def _require_possible(options: dict[str, Any]) -> None:
 
 def _trouble(state: LinkState, server: str) -> str:
     """What is wrong with a connection; empty if nothing is."""
-    told = [] if state.connected else [f"waiting for {server}"]
-    if not state.connected and state.last_failure:
-        told[0] += f" ({state.last_failure})"
+    told = []
+    if not state.connected:
+        told.append(f"waiting for {server}" + (f" ({state.last_failure})" if state.last_failure else ""))
+    elif state.silent_s > _SILENT_S:
+        told.append(f"nothing comes from {server}")
     if state.refused:
         told.append(f"{state.refused} messages refused ({state.last_refused})")
     return ", ".join(told)
