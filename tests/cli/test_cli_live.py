@@ -12,6 +12,7 @@ import pytest
 from commands import command
 
 import speckle3d as s3
+from speckle3d.cli import _run
 from speckle3d.cli.live import _require_possible, _trouble
 from speckle3d.io.igtl.link import LinkState
 from speckle3d.io.reconstructions import read_reconstruction
@@ -117,6 +118,19 @@ def test_told_to_end_it_closes_the_recording_first(player, shipped, tmp_path):
     assert "Traceback" not in told
     assert unfinished_note(out / "sweep.h5") is None
     assert len(s3.load_sweep(out / "sweep.h5")) >= 10
+
+
+def test_an_error_that_a_signal_made_is_no_traceback(monkeypatch, capsys):
+    def failing(**_):
+        raise SystemError("compiled by halves")
+
+    monkeypatch.setattr("speckle3d.cli.app", failing)
+    with pytest.raises(SystemExit) as ended:
+        _run([signal.SIGTERM])
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "speckle3d: stopped\n"
+    with pytest.raises(SystemError, match="halves"):
+        _run([])
 
 
 @pytest.mark.parametrize(
