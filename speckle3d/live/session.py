@@ -25,7 +25,7 @@ from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.threads import on_one_thread
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.live.checks import GOOD, Words, words_for
+from speckle3d.live.checks import GOOD, LOST, TOO_FAST, Words, words_for
 from speckle3d.live.crossing import CrossingCheck
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import pose_message, volume_message, word_messages
@@ -80,6 +80,7 @@ class SessionSettings:
 
 @dataclass(frozen=True)
 class _Waiting:
+    number: int
     frame: npt.NDArray[Any]
     time_s: float
     sent_s: float
@@ -212,7 +213,7 @@ class Session:
         if time_s is None:
             return
         with self._changed:
-            self._queue.append(_Waiting(frame, time_s, image.time_s, came_s))
+            self._queue.append(_Waiting(recording.counts.frames, frame, time_s, image.time_s, came_s))
             if len(self._queue) > MOST_WAITING:
                 # Every other one, so that those that are left out leave no gap that speckle does not cross.
                 thinned = list(self._queue)[::-2][::-1]
@@ -262,6 +263,7 @@ class Session:
         assert self._layout is not None
         assert self.tracker is not None
         image_from_pixel, centre_mm = self._layout.image_from_pixel, self._layout.example.grid.centre_mm
+        before = 0
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._over.is_set() or bool(self._queue))
@@ -280,10 +282,14 @@ class Session:
                 pose.world_from_image.apply(centre_mm)[2] - self.poses[0].world_from_image.apply(centre_mm)[2]
             )
             if self._settings.check:
-                self._advise(pose, waiting.sent_s)
+                self._advise(pose, waiting.sent_s, waiting.number - before > 1)
+            before = waiting.number
 
-    def _advise(self, pose: LivePose, sent_s: float) -> None:
+    def _advise(self, pose: LivePose, sent_s: float, after_gap: bool) -> None:
         words = words_for(pose, self._settings.config.trajectory)
+        if after_gap and words in (TOO_FAST, LOST):
+            # Frames between were left for later: the gap is none of the person's.
+            return
         if words == GOOD and self._crossing is not None:
             words = self._crossing.words
         if self._words.take(words, pose.time_s):

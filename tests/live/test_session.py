@@ -12,11 +12,14 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.igtl.header import HEADER_BYTES
 from speckle3d.io.igtl.messages import ImageReceived, TransformReceived, decode
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.live.checks import GOOD, LOST, TOO_FAST
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
 from speckle3d.live.progress import Devices
 from speckle3d.live.session import MOST_BEFORE, MOST_WAITING, Session, SessionSettings
+from speckle3d.live.tracking import LivePose
 from speckle3d.live.volume import MOST_IMAGES, GrowingVolume
+from speckle3d.matching.quality import FrameFlag
 
 RF = ImportSettings(
     sampling_rate_hz=2e8 / 3,
@@ -200,6 +203,20 @@ def test_when_placing_fails_recording_goes_on(recorded, tmp_path, monkeypatch):
     assert isinstance(session.failure, np.linalg.LinAlgError)
     assert "placing ended, recording goes on: LinAlgError('singular')" in session.progress.line
     assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 14
+
+
+def test_a_gap_that_frames_left_for_later_make_is_not_called_too_fast(monkeypatch, tmp_path):
+    session = Session(None, [], None, SessionSettings(tmp_path / "sweep.h5", check=True))
+    said = []
+    monkeypatch.setattr("speckle3d.live.session.Words.take", lambda _, words, __: said.append(words))
+    unlike, lost, like = (
+        LivePose(1, 0.0, RigidTransform.identity(), flags, median, median, 0)
+        for flags, median in ((0, 0.05), (int(FrameFlag.UNMATCHED), 0.01), (0, 0.9))
+    )
+    for pose in (unlike, lost, like):
+        for after_gap in (False, True):
+            session._advise(pose, 0.0, after_gap)
+    assert said == [TOO_FAST, LOST, GOOD, GOOD]
 
 
 def test_what_waits_at_the_end_is_recorded(recorded, tmp_path):
