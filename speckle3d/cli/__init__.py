@@ -99,6 +99,8 @@ def _run(heard: list[int]) -> None:
     except typer.Exit as leave:
         sys.exit(leave.exit_code)
     except Exception as error:
+        if heard:  # a signal that is dropped within a compilation makes it fail in its own way
+            _fail("stopped", 128 + heard[0])
         # Typer's own usage errors carry an exit code; anything else is a bug and shows its traceback.
         if not hasattr(error, "format_message"):
             raise

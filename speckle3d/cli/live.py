@@ -15,16 +15,23 @@ import typer
 from speckle3d.cli.common import CalibrationFiles, ConfigFile, app, emit, load_settings, note, progress_bar
 from speckle3d.cli.importing import Importing, Number
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.printable import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from types import FrameType
 
     from speckle3d.config import Config
     from speckle3d.core.curves import DecorrelationCurves
+    from speckle3d.io.igtl.link import LinkState
     from speckle3d.live.crossing import CrossingCheck
-    from speckle3d.live.session import Progress, Session
+    from speckle3d.live.progress import Progress
+    from speckle3d.live.session import Session
 
 _LOG_EVERY_S = 5.0
+_SILENT_S = 2.0
+"""After which a connection on which nothing comes is told of."""
+_ENDS = ("SIGINT", "SIGTERM", "SIGHUP")
 _SWITCH_S = 5e-4
 """For which one thread keeps the interpreter at most; Python's 5 ms a frame would wait for many times."""
 
@@ -55,10 +62,16 @@ def live(
     centre_frequency_hz: Number = None,
     bandwidth_hz: Annotated[tuple[float, float] | None, typer.Option()] = None,
     first_sample_depth_mm: Number = None,
-    column_pitch_mm: Number = None,
-    row_spacing_mm: Number = None,
+    column_pitch_mm: Annotated[
+        float | None, typer.Option(help="Distance between columns of B-mode; by default the message's.")
+    ] = None,
+    row_spacing_mm: Annotated[
+        float | None, typer.Option(help="Distance between rows of B-mode; by default the message's.")
+    ] = None,
     dynamic_range_db: Number = None,
-    probe: Annotated[str | None, typer.Option(metavar="MODEL")] = None,
+    probe: Annotated[
+        str | None, typer.Option(metavar="MODEL", help="Model of the probe, as in the curves.")
+    ] = None,
     serve: Annotated[
         int | None,
         typer.Option(metavar="PORT", min=0, max=65535, help="Serve poses and volume to others, too; 0: any."),
@@ -99,6 +112,7 @@ def live(
     if compression not in ("none", "gzip"):
         raise InvalidInputError(f"--compression: expected none or gzip, got {compression!r}")
     config, curves = load_settings(config_file), read_curves(curves_file)
+    _require_possible(options)
     recorded = out / "sweep.h5"
     if recorded.exists():
         raise InvalidInputError(f"{recorded}: there already; expected a folder without a recorded sweep")
@@ -126,10 +140,13 @@ def live(
         outlets = [connection.send] if served is None else [connection.send, served.send]
         note(f"listening to {server}")
         session = Session(connection, outlets, curves, settings, first)
-        _run(
-            session, duration_s, _Line(lambda: "" if connection.state.connected else f"waiting for {server}")
-        )
+        _run(session, duration_s, _Line(lambda: _trouble(connection.state, server)))
+        if not session.progress.recorded:
+            reasons = filter(None, (session.progress.missing, _trouble(connection.state, server)))
+            raise InvalidInputError(f"{server}: no images came: {'; '.join(reasons) or 'none was sent'}")
     _reconstruct(session, recorded, curves, out, options)
+    if session.failure is not None:
+        raise session.failure
 
 
 def _address(server: str) -> tuple[str, int]:
@@ -137,6 +154,38 @@ def _address(server: str) -> tuple[str, int]:
     if not (colon and host and port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
         raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
     return host.strip("[]"), int(port)
+
+
+def _require_possible(options: dict[str, Any]) -> None:
+    """Refuse now what the reconstruction at the end would refuse for want of an option."""
+    from speckle3d.io.calibrations import read_calibration
+    from speckle3d.study.request import SUBSET
+
+    tracker, sensors = ("transform",), ("transform", "orientation")
+    needs = {"pose": tracker, "orientation": sensors, SUBSET: sensors, "crossed": ("crossing_file",)}
+    needs["fused"] = (*sensors, "crossing_file")
+    for mode in options["drift"] or ():
+        if mode not in needs:
+            raise InvalidInputError(f"--drift: expected one of {', '.join(needs)}, got {mode!r}")
+        if not any(options[each] for each in needs[mode]):
+            wanted = " or ".join(f"--{each.removesuffix('_file')}" for each in needs[mode])
+            raise InvalidInputError(f"--drift {mode}: expected {wanted} beside it, got none")
+    for path in options["calibration"] or ():
+        name = "transform" if read_calibration(path).sensor == "tracker" else "orientation"
+        if not options[name]:
+            raise InvalidInputError(f"{path}: expected --{name} beside it, which it is for, got none")
+
+
+def _trouble(state: LinkState, server: str) -> str:
+    """What is wrong with a connection; empty if nothing is."""
+    told = []
+    if not state.connected:
+        told.append(f"waiting for {server}" + (f" ({state.last_failure})" if state.last_failure else ""))
+    elif state.silent_s > _SILENT_S:
+        told.append(f"nothing comes from {server}")
+    if state.refused:
+        told.append(f"{state.refused} messages refused ({state.last_refused})")
+    return ", ".join(told)
 
 
 def _first_sweep(path: Path, curves: DecorrelationCurves, config: Config) -> CrossingCheck:
@@ -148,15 +197,29 @@ def _first_sweep(path: Path, curves: DecorrelationCurves, config: Config) -> Cro
 
 
 def _run(session: Session, duration_s: float | None, line: _Line) -> None:
-    """Run until Ctrl-C, or for so long."""
-    before, interval_s = signal.signal(signal.SIGINT, lambda *_: session.end()), sys.getswitchinterval()
+    """Run until Ctrl-C, or for so long; other signals that ask for the end are heard once all is recorded."""
+    heard: list[int] = []
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        heard.append(number)
+        session.end()
+
+    numbers = [getattr(signal, name) for name in _ENDS if hasattr(signal, name)]
+    before = {each: was for each in numbers if (was := signal.getsignal(each)) is not signal.SIG_IGN}
+    interval_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
+    for each in before:
+        signal.signal(each, end)
     try:
         session.run(duration_s, line.show)
     finally:
         sys.setswitchinterval(interval_s)
-        signal.signal(signal.SIGINT, before)
+        for each, was in before.items():
+            signal.signal(each, was)
         line.end()
+    for each in heard:
+        if each != signal.SIGINT:
+            signal.raise_signal(each)
 
 
 class _Line:
@@ -177,7 +240,7 @@ class _Line:
         text = " | ".join(filter(None, (progress.line, self._trouble())))
         now = time.monotonic()
         if self._is_terminal:
-            sys.stderr.write(f"\r\x1b[K{text[: _columns()]}")
+            sys.stderr.write(f"\r\x1b[K{printable(text)[: _columns()]}")
             sys.stderr.flush()
         elif progress.words != self._words or (now - self._told_s > _LOG_EVERY_S and text != self._last):
             note(text)
@@ -204,9 +267,11 @@ def _reconstruct(
 
     done = session.progress
     if done.recorded < 2:
-        raise InvalidInputError(f"{recorded}: expected images to reconstruct, got {done.recorded}")
+        raise InvalidInputError(f"{recorded}: expected two images to reconstruct, got {done.recorded}")
     left = f"; {done.left} were left for now" if done.left else ""
     note(f"{done.recorded} frames in {recorded}, {done.matched} placed as they came{left}")
+    if done.missing:
+        note(done.missing)
     crossing = options["crossing_file"]
     modes = list(dict.fromkeys(options["drift"] or ()))
     if crossing is not None and not {"crossed", "fused"}.intersection(modes):

@@ -12,9 +12,9 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
 from speckle3d.io.igtl.messages import ImageReceived
-from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 
-_TYPES = {"rf": ("int16", "float32"), "bmode": ("uint8",)}
+_ECHOES, _GREY_LEVELS = ("int16", "float32"), "uint8"
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class ImageLayout:
         ----------
         image : ImageReceived
         settings : ImportSettings
-            What messages do not say. With a sampling rate or a centre frequency the samples are RF, else grey
-            levels of B-mode, whose pixel sizes are the message's unless given.
+            What messages do not say. Pixels of 8 bits are grey levels of B-mode, whose sizes are the
+            message's unless given, others are samples of RF.
         name : str
             Of the sweep, for messages.
 
@@ -54,18 +54,31 @@ class ImageLayout:
         InvalidInputError
             If the pixels are of another shape or type.
         """
-        of_rf = settings.sampling_rate_hz is not None or settings.centre_frequency_hz is not None
         where = f"IMAGE {image.device}"
         pixels = _plane(image, where)
-        known = _TYPES["rf" if of_rf else "bmode"]
-        if pixels.dtype.name not in known:
-            kind = "RF" if of_rf else "B-mode (without --sampling-rate-hz)"
-            raise InvalidInputError(f"{where}: expected {' or '.join(known)} for {kind}, got {pixels.dtype}")
-        grid, signal = (
-            _of_echoes(pixels.T.shape, settings, where)
-            if of_rf
-            else _of_grey(pixels.shape, image.spacing_mm, settings, where)
-        )
+        of_rf = pixels.dtype.name in _ECHOES
+        of_echoes = f"{' or '.join(_ECHOES)} for RF"
+        if not of_rf and pixels.dtype.name != _GREY_LEVELS:
+            raise InvalidInputError(
+                f"{where}: expected {_GREY_LEVELS} for B-mode or {of_echoes}, got {pixels.dtype}"
+            )
+        if not of_rf and (settings.sampling_rate_hz or settings.centre_frequency_hz):
+            raise InvalidInputError(
+                f"{where}: expected {of_echoes} with --sampling-rate-hz or --centre-frequency-hz, "
+                f"got {pixels.dtype}"
+            )
+        try:
+            grid, signal = (
+                _of_echoes(pixels.T.shape, settings, where)
+                if of_rf
+                else _of_grey(pixels.shape, image.spacing_mm, settings, where)
+            )
+        except MissingSettingsError as error:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in error.settings)
+            raise MissingSettingsError(
+                f"{where}: its messages do not say what {'RF' if of_rf else 'B-mode'} needs, so give "
+                f"{options} (`speckle3d live --help` tells what they are)"
+            ) from None
         black = np.zeros((1, grid.vectors, grid.samples), pixels.dtype)
         example = Sweep(black, grid, signal, np.zeros(1), name=name, probe=settings.probe or "")
         return cls(image.device, example, of_rf)

@@ -52,7 +52,7 @@ class Recording:
 
     def __init__(self, path: Path, layout: ImageLayout, first_s: float, packed: bool = False) -> None:
         example = layout.example
-        self.counts, self._first_s = Counts(), first_s
+        self.counts, self._first_s, self._last_s = Counts(), first_s, float("-inf")
         self._sweep = GrowingSweep(
             path,
             example.grid,
@@ -75,11 +75,16 @@ class Recording:
         """Write a frame; its time in the sweep, or None if it is not later than the last frame's."""
         time_s = sent_s - self._first_s
         try:
+            if time_s <= self._last_s:
+                back_s = self._last_s - time_s
+                raise InvalidInputError(
+                    f"IMAGE: expected a later time than the last, got {back_s:g} s before"
+                )
             self._sweep.append(frame, time_s)
         except InvalidInputError as error:
             self.refuse(error)
             return None
-        self.counts.frames += 1
+        self.counts.frames, self._last_s = self.counts.frames + 1, time_s
         return time_s
 
     def keep_reading(self, transform: TransformReceived, with_position: bool) -> None:

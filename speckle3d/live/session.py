@@ -21,24 +21,26 @@ import numpy.typing as npt
 from speckle3d.config import Config
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.threads import on_one_thread
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.live.checks import GOOD, Words, words_for
+from speckle3d.live.checks import GOOD, LOST, TOO_FAST, Words, words_for
 from speckle3d.live.crossing import CrossingCheck
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import pose_message, volume_message, word_messages
+from speckle3d.live.progress import Devices, Progress
 from speckle3d.live.recording import Recording
 from speckle3d.live.tracking import LivePose, LiveTracker
 from speckle3d.live.volume import GrowingVolume
 
 MOST_BEFORE = 1000
-"""Messages that are kept until the first frame comes."""
+"""Transforms that are kept until the first frame comes."""
 MOST_WAITING = 12
 """Frames that wait to be matched, half a second of them: more would be late, not better."""
 _LOOK_S = 0.1
 VOLUME_EVERY_S = 1.0
+_DONE_BY = {"_match": "placing", "_send_volumes": "volumes", "_look_for_crossing": "crossing check"}
 
 
 class Source(Protocol):
@@ -76,53 +78,9 @@ class SessionSettings:
     packed: bool = False
 
 
-@dataclass
-class Progress:
-    """How a session goes, for a line that is looked at.
-
-    Attributes
-    ----------
-    recorded, matched, left : int
-        Frames in the file, frames placed, and frames left for later.
-    waiting : int
-        Frames about to be matched.
-    delay_s : float
-        From a frame's message to its pose's, the last one.
-    length_mm : float
-        Between the first and the last frame's centres, along the first's elevational axis.
-    words : str
-    volumes : int
-        Sent.
-    refused : int
-        Messages that could not be used; `last_refused` says why.
-    """
-
-    recorded: int = 0
-    matched: int = 0
-    left: int = 0
-    waiting: int = 0
-    delay_s: float = 0.0
-    length_mm: float = 0.0
-    words: str = ""
-    volumes: int = 0
-    refused: int = 0
-    last_refused: str = ""
-
-    @property
-    def line(self) -> str:
-        """All of it in one line."""
-        parts = [
-            f"{self.recorded} frames",
-            f"{self.length_mm:+.1f} mm",
-            f"pose after {1e3 * self.delay_s:.0f} ms",
-        ]
-        parts += [f"{self.left} left for later"] if self.left else []
-        parts += [f"{self.refused} refused ({self.last_refused})"] if self.refused else []
-        return " | ".join([", ".join(parts), self.words] if self.words else [", ".join(parts)])
-
-
 @dataclass(frozen=True)
 class _Waiting:
+    number: int
     frame: npt.NDArray[Any]
     time_s: float
     sent_s: float
@@ -142,6 +100,11 @@ class Session:
     settings : SessionSettings
     crossing : CrossingCheck, optional
         Of the first sweep, for advice while the second one is made.
+
+    Attributes
+    ----------
+    failure : Exception or None
+        Why frames could no longer be placed, or volumes made of them: recording went on.
     """
 
     def __init__(
@@ -162,7 +125,8 @@ class Session:
         self._queue: deque[_Waiting] = deque()
         self._changed = threading.Condition()
         self._over = threading.Event()
-        self._failure: Exception | None = None
+        self.failure: Exception | None = None
+        self._devices = Devices(settings.image, settings.transform, settings.orientation)
         self._words, self._sent_s = Words(), 0.0
 
     def end(self) -> None:
@@ -181,17 +145,21 @@ class Session:
         ------
         Speckle3DError
             If the recording cannot be written, or images or curves do not fit. What was recorded until then
-            can be read.
+            can be read. What goes wrong while frames are placed is no reason to end: see `failure`.
         """
         until_s = None if duration_s is None else time.monotonic() + duration_s
         # Readings from before the first frame are kept: that frame lies between two of them.
-        waiting: deque[Received] = deque(maxlen=MOST_BEFORE)
+        waiting: deque[Received] = deque()
         layout = first = None
         while layout is None and not self._is_over(until_s):
             for message in self._source.receive(_LOOK_S):
-                waiting.append(message)
+                self._devices.hear(message)
                 if layout is None and self._is_wanted(message):
                     layout, first = ImageLayout.of(message, self._settings.imported, message.device), message
+                if layout is not None or isinstance(message, TransformReceived):
+                    waiting.append(message)
+                if layout is None and len(waiting) > MOST_BEFORE:
+                    waiting.popleft()
             self._shown(show)
         if layout is None or first is None:
             return
@@ -203,14 +171,15 @@ class Session:
             while not self._is_over(until_s):
                 self._take_all(self._source.receive(_LOOK_S), recording, layout)
                 self._shown(show)
-        if self._failure is not None:
-            raise self._failure
+            # What has come and waits for the disk is part of the sweep, too.
+            self._take_all(self._source.receive(0.0), recording, layout)
 
     def _is_over(self, until_s: float | None) -> bool:
         late = until_s is not None and time.monotonic() >= until_s
-        return self._over.is_set() or late or self._failure is not None
+        return self._over.is_set() or late
 
     def _shown(self, show: Callable[[Progress], None] | None) -> None:
+        self.progress.missing = self._devices.missing
         if show:
             show(self.progress)
 
@@ -220,6 +189,7 @@ class Session:
     def _take_all(self, received: Sequence[Received], recording: Recording, layout: ImageLayout) -> None:
         """Record messages, and have frames matched."""
         for message in received:
+            self._devices.hear(message)
             if isinstance(message, ImageReceived) and message.device == layout.device:
                 self._take_image(message, recording, layout)
             elif isinstance(message, TransformReceived):
@@ -243,7 +213,7 @@ class Session:
         if time_s is None:
             return
         with self._changed:
-            self._queue.append(_Waiting(frame, time_s, image.time_s, came_s))
+            self._queue.append(_Waiting(recording.counts.frames, frame, time_s, image.time_s, came_s))
             if len(self._queue) > MOST_WAITING:
                 # Every other one, so that those that are left out leave no gap that speckle does not cross.
                 thinned = list(self._queue)[::-2][::-1]
@@ -276,11 +246,13 @@ class Session:
                     thread.join()
 
     def _guarded(self, work: Callable[[], None]) -> None:
-        """Do work of a thread; an error ends the session with it."""
+        """Do work of a thread; an error ends this work alone, since what is received must be recorded."""
         try:
             work()
-        except Exception as error:  # noqa: BLE001 (raised by `run`)
-            self._failure = error
+        except Exception as error:  # noqa: BLE001 (told in the line, and kept for who runs the session)
+            self.failure = error
+            said = str(error) if isinstance(error, Speckle3DError) else repr(error)
+            self.progress.failed = f"{_DONE_BY[work.__name__]} ended, recording goes on: {said}"
 
     def _keep(self, frame: int, intensity: Float32Array) -> None:
         if self._volume is not None:
@@ -291,6 +263,7 @@ class Session:
         assert self._layout is not None
         assert self.tracker is not None
         image_from_pixel, centre_mm = self._layout.image_from_pixel, self._layout.example.grid.centre_mm
+        before = 0
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._over.is_set() or bool(self._queue))
@@ -309,10 +282,14 @@ class Session:
                 pose.world_from_image.apply(centre_mm)[2] - self.poses[0].world_from_image.apply(centre_mm)[2]
             )
             if self._settings.check:
-                self._advise(pose, waiting.sent_s)
+                self._advise(pose, waiting.sent_s, waiting.number - before > 1)
+            before = waiting.number
 
-    def _advise(self, pose: LivePose, sent_s: float) -> None:
+    def _advise(self, pose: LivePose, sent_s: float, after_gap: bool) -> None:
         words = words_for(pose, self._settings.config.trajectory)
+        if after_gap and words in (TOO_FAST, LOST):
+            # Frames between were left for later: the gap is none of the person's.
+            return
         if words == GOOD and self._crossing is not None:
             words = self._crossing.words
         if self._words.take(words, pose.time_s):

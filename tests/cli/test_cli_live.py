@@ -12,7 +12,11 @@ import pytest
 from commands import command
 
 import speckle3d as s3
+from speckle3d.cli import _run
+from speckle3d.cli.live import _require_possible, _trouble
+from speckle3d.io.igtl.link import LinkState
 from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.sweeps import unfinished_note
 
 RF = (
     "--sampling-rate-hz", 2e8 / 3, "--vector-pitch-mm", 0.3, "--speed-of-sound-m-s", 1540,
@@ -98,6 +102,66 @@ def test_a_killed_session_leaves_a_readable_sweep(player, shipped, tmp_path):
     kept = s3.load_sweep(out / "sweep.h5")
     assert len(kept) >= 20
     np.testing.assert_array_equal(kept.frames[19], s3.load_sweep(shipped / "phantom.h5").frames[19])
+
+
+@pytest.mark.slow
+def test_told_to_end_it_closes_the_recording_first(player, shipped, tmp_path):
+    out = tmp_path / "out"
+    running = started(
+        "live", f"127.0.0.1:{player}", "-o", out, "--curves", shipped / "curves.h5", "--no-volume", *RF
+    )
+    waited_for(out / "sweep.h5", 10)
+    running.send_signal(signal.SIGTERM)
+    _, told = running.communicate(timeout=60)
+    assert running.returncode == 128 + signal.SIGTERM
+    assert told.splitlines()[-1] == "speckle3d: stopped"
+    assert "Traceback" not in told
+    assert unfinished_note(out / "sweep.h5") is None
+    assert len(s3.load_sweep(out / "sweep.h5")) >= 10
+
+
+def test_an_error_that_a_signal_made_is_no_traceback(monkeypatch, capsys):
+    def failing(**_):
+        raise SystemError("compiled by halves")
+
+    monkeypatch.setattr("speckle3d.cli.app", failing)
+    with pytest.raises(SystemExit) as ended:
+        _run([signal.SIGTERM])
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "speckle3d: stopped\n"
+    with pytest.raises(SystemError, match="halves"):
+        _run([])
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (LinkState(), "waiting for there:1"),
+        (LinkState(last_failure="refused"), "waiting for there:1 (refused)"),
+        (LinkState(connected=True, silent_s=0.1), ""),
+        (LinkState(connected=True, silent_s=9.0), "nothing comes from there:1"),
+        (LinkState(connected=True, refused=2, last_refused="check sum"), "2 messages refused (check sum)"),
+    ],
+)
+def test_the_line_says_what_is_wrong_with_the_connection(state, words):
+    assert _trouble(state, "there:1") == words
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"drift": ["post"]}, "expected one of pose, orientation"),
+        ({"drift": ["pose"], "orientation": "P"}, "--drift pose: expected --transform beside it"),
+        ({"drift": ["crossed"]}, "--drift crossed: expected --crossing beside it"),
+        ({"drift": ["fused"]}, "expected --transform or --orientation or --crossing"),
+        ({"calibration": ["none.toml"]}, "none.toml"),
+    ],
+)
+def test_what_would_be_refused_at_the_end_is_refused_before(given, words):
+    options = dict.fromkeys(("drift", "calibration", "transform", "orientation", "crossing_file"))
+    with pytest.raises(s3.Speckle3DError, match=words):
+        _require_possible(options | given)
+    _require_possible(options | {"drift": ["pose", "fused"], "transform": "P"})
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,14 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.igtl.header import HEADER_BYTES
 from speckle3d.io.igtl.messages import ImageReceived, TransformReceived, decode
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.live.checks import GOOD, LOST, TOO_FAST
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
-from speckle3d.live.session import MOST_WAITING, Session, SessionSettings
+from speckle3d.live.progress import Devices
+from speckle3d.live.session import MOST_BEFORE, MOST_WAITING, Session, SessionSettings
+from speckle3d.live.tracking import LivePose
 from speckle3d.live.volume import MOST_IMAGES, GrowingVolume
+from speckle3d.matching.quality import FrameFlag
 
 RF = ImportSettings(
     sampling_rate_hz=2e8 / 3,
@@ -141,6 +145,101 @@ def test_the_first_image_says_what_is_missing():
         ImageLayout.of(grey, ImportSettings(), "sweep")
     with pytest.raises(InvalidInputError, match="uint8"):
         ImageLayout.of(grey, RF, "sweep")
+
+
+def test_what_rf_lacks_is_asked_for_at_once_by_the_options_of_this_command():
+    echoes = ImageReceived("Image", 0.0, np.zeros((64, 48), np.int16), np.eye(4), np.ones(3))
+    with pytest.raises(MissingSettingsError) as caught:
+        ImageLayout.of(echoes, ImportSettings(speed_of_sound_m_s=1540.0), "sweep")
+    words = str(caught.value)
+    for option in ("sampling-rate-hz", "vector-pitch-mm", "centre-frequency-hz", "bandwidth-hz"):
+        assert f"--{option}" in words
+    assert "speed-of-sound" not in words
+    assert "convert" not in words
+    assert ".toml" not in words
+
+
+def test_devices_that_never_come_are_named_beside_those_that_do():
+    devices = Devices("Image", "ProbeToReference", None)
+    assert devices.missing == "no IMAGE Image yet; no TRANSFORM ProbeToReference yet"
+    echoes = ImageReceived("Image", 0.0, np.zeros((4, 4), np.int16), np.eye(4), np.ones(3))
+    for k in range(1000):
+        devices.hear(reading(0.0, f"Stylus{k % 2}To{k}"))
+    devices.hear(echoes)
+    assert devices.missing.startswith("no TRANSFORM ProbeToReference, but Stylus0To0, ")
+    assert len(devices.missing) < 2000
+    devices.hear(reading(0.0))
+    assert devices.missing == ""
+
+
+def test_a_flood_before_and_behind_the_first_frame_costs_no_frame(recorded, tmp_path):
+    frames, curves = recorded
+    other = ImageReceived("Camera", 0.0, np.zeros((9, 9, 3), np.uint8), np.eye(4), np.ones(3), 3)
+    before = [reading(k / 1000) for k in range(MOST_BEFORE + 50)]
+    behind = [reading(10.0 + k / 1000, "StylusToReference") for k in range(1, MOST_BEFORE + 50)]
+    session, _ = run(
+        [[other, *before, image(frames[0], 5.0), *behind, image(frames[1], 5.04)]],
+        lambda p: p.matched == 2,
+        curves,
+        tmp_path,
+        image="Image_Reference",
+        transform="ProbeToReference",
+    )
+    assert session.progress.recorded == 2
+    assert session.progress.missing == ""
+    kept = s3.load_sweep(tmp_path / "sweep.h5")
+    assert kept.tracker.readings.time_s[-1] == pytest.approx((MOST_BEFORE + 49) / 1000 - 5.0)
+
+
+def test_when_placing_fails_recording_goes_on(recorded, tmp_path, monkeypatch):
+    frames, curves = recorded
+
+    def failing(*_):
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr("speckle3d.live.session.LiveTracker.append", failing)
+    first, *rest = [image(frame, k / 25) for k, frame in enumerate(frames)]
+    session, _ = run([[first], rest], lambda p: p.recorded == 14 and p.failed, curves, tmp_path)
+    assert isinstance(session.failure, np.linalg.LinAlgError)
+    assert "placing ended, recording goes on: LinAlgError('singular')" in session.progress.line
+    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 14
+
+
+def test_a_gap_that_frames_left_for_later_make_is_not_called_too_fast(monkeypatch, tmp_path):
+    session = Session(None, [], None, SessionSettings(tmp_path / "sweep.h5", check=True))
+    said = []
+    monkeypatch.setattr("speckle3d.live.session.Words.take", lambda _, words, __: said.append(words))
+    unlike, lost, like = (
+        LivePose(1, 0.0, RigidTransform.identity(), flags, median, median, 0)
+        for flags, median in ((0, 0.05), (int(FrameFlag.UNMATCHED), 0.01), (0, 0.9))
+    )
+    for pose in (unlike, lost, like):
+        for after_gap in (False, True):
+            session._advise(pose, 0.0, after_gap)
+    assert said == [TOO_FAST, LOST, GOOD, GOOD]
+
+
+def test_what_waits_at_the_end_is_recorded(recorded, tmp_path):
+    frames, curves = recorded
+
+    class Behind(Messages):
+        """Ended while messages wait."""
+
+        def receive(self, timeout_s):
+            if len(self.batches) == 1:
+                self.session.end()
+                if timeout_s:
+                    return []
+            return self.batches.pop(0) if self.batches else []
+
+    messages = Behind(
+        [[image(frames[0], 0.0)], [image(frame, 1.0 + k) for k, frame in enumerate(frames)]], None
+    )
+    settings = SessionSettings(tmp_path / "sweep.h5", imported=RF, volume=False)
+    messages.session = Session(messages, [], curves, settings)
+    messages.session.run()
+    assert messages.session.progress.recorded == 15
+    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 15
 
 
 def test_grey_images_stand_upright_and_say_their_pixels():

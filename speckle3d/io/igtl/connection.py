@@ -87,7 +87,7 @@ class Connection:
         while not self._over.is_set():
             try:
                 connected = socket.create_connection(self._address, timeout=_CONNECT_S)
-            except OSError as error:
+            except (OSError, UnicodeError) as error:  # Unicode: a host that cannot be a name
                 self._inbox.note(False, str(error))
                 self._over.wait(pause_s)
                 pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)

@@ -215,3 +215,9 @@ def test_pyigtl_connects_to_our_server():
         finally:
             if client is not None:
                 client.stop()
+
+
+def test_a_host_that_cannot_be_a_name_is_told_and_does_not_end_the_thread():
+    with Connection("a..b", 18944) as connection:
+        until(lambda: "label" in connection.state.last_failure)
+        assert not connection.state.connected

@@ -1,0 +1,93 @@
+"""How a live session goes, for a line that is looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
+
+_MOST_DEVICES = 64
+"""Of which the line may speak, however many names a peer sends."""
+
+
+@dataclass
+class Progress:
+    """How a session goes, for a line that is looked at.
+
+    Attributes
+    ----------
+    recorded, matched, left : int
+        Frames in the file, frames placed, and frames left for later.
+    waiting : int
+        Frames about to be matched.
+    delay_s : float
+        From a frame's message to its pose's, the last one.
+    length_mm : float
+        Between the first and the last frame's centres, along the first's elevational axis.
+    words : str
+    volumes : int
+        Sent.
+    refused : int
+        Messages that could not be used; `last_refused` says why.
+    missing : str
+        Which device that was asked for has sent nothing, and which others have.
+    failed : str
+        Why frames are no longer placed, or volumes no longer sent; they are recorded all the same.
+    """
+
+    recorded: int = 0
+    matched: int = 0
+    left: int = 0
+    waiting: int = 0
+    delay_s: float = 0.0
+    length_mm: float = 0.0
+    words: str = ""
+    volumes: int = 0
+    refused: int = 0
+    last_refused: str = ""
+    missing: str = ""
+    failed: str = ""
+
+    @property
+    def line(self) -> str:
+        """All of it in one line."""
+        parts = [
+            f"{self.recorded} frames",
+            f"{self.length_mm:+.1f} mm",
+            f"pose after {1e3 * self.delay_s:.0f} ms",
+        ]
+        parts += [f"{self.left} left for later"] if self.left else []
+        parts += [f"{self.refused} refused ({self.last_refused})"] if self.refused else []
+        return " | ".join(filter(None, (", ".join(parts), self.words, self.missing, self.failed)))
+
+
+class Devices:
+    """Which devices were asked for, and which have sent something.
+
+    Parameters
+    ----------
+    image, transform, orientation : str or None
+        Those that were asked for, by name.
+    """
+
+    def __init__(self, image: str | None, transform: str | None, orientation: str | None) -> None:
+        named = (("IMAGE", image), ("TRANSFORM", transform), ("TRANSFORM", orientation))
+        self._wanted = [(kind, name) for kind, name in named if name is not None]
+        self._heard: set[tuple[str, str]] = set()
+
+    def hear(self, message: Received) -> None:
+        """Note who sent a message."""
+        if isinstance(message, ImageReceived | TransformReceived):
+            sender = ("IMAGE" if isinstance(message, ImageReceived) else "TRANSFORM", message.device)
+            if sender in self._wanted or len(self._heard) < _MOST_DEVICES:
+                self._heard.add(sender)
+
+    @property
+    def missing(self) -> str:
+        """Which of those that were asked for have sent nothing, beside others that have; empty if none."""
+        told = []
+        for kind, name in self._wanted:
+            if (kind, name) not in self._heard:
+                others = ", ".join(sorted(device for each, device in self._heard if each == kind))
+                told.append(f"no {kind} {name}" + (f", but {others}" if others else " yet"))
+        return "; ".join(told)
