@@ -11,7 +11,7 @@ from bokeh.palettes import Viridis256
 from bokeh.plotting import figure
 
 from speckle3d.app.sweep.pairs import PatchValues
-from speckle3d.core.arrays import ByteArray
+from speckle3d.core.arrays import ByteArray, FloatArray
 
 HEIGHT_PX, WIDEST_PX = 350, 560
 """Of the picture itself, so that a page fits on a screen of 1366 x 768."""
@@ -19,6 +19,7 @@ HEIGHT_PX, WIDEST_PX = 350, 560
 COLOURINGS = {"distance": "distance (mm)", "sigma": "sigma of distance (mm)", "correlation": "correlation"}
 """What patches can be coloured by, and how the scale is labelled."""
 
+_REJECTED = "#ff4d4d"
 _GREYS = [f"#{k:02x}{k:02x}{k:02x}" for k in range(256)]
 
 
@@ -56,6 +57,7 @@ class Picture:
             CustomJS(args={"drawn": self.drawn}, code="drawn.data = {count: Array.from(cb_obj.data.count)}"),
         )
         self._patches = ColumnDataSource(_no_patches())
+        self._crosses = ColumnDataSource({name: [] for name in ("x0", "y0", "x1", "y1")})
         self._colours = LinearColorMapper(palette=Viridis256, low=0.0, high=1.0, nan_color="rgba(0,0,0,0)")
         self.plot = figure(
             frame_width=max(round(width * scale), 90), frame_height=round(height * scale),
@@ -73,9 +75,10 @@ class Picture:
         drawn = self.plot.rect(
             "x", "y", width=patch_mm[0], height=patch_mm[1], angle="angle", source=self._patches,
             fill_color={"field": "value", "transform": self._colours}, fill_alpha="alpha",
-            line_color="line", line_width=1, hatch_pattern="hatch", hatch_color="#ffffff", hatch_alpha=0.9,
-            hatch_scale=8, hatch_weight=1,
+            line_color="line", line_width=1,
         )  # fmt: skip
+        # Hatching would make a canvas for every patch of every frame.
+        self.plot.segment("x0", "y0", "x1", "y1", source=self._crosses, line_color=_REJECTED, line_width=1.2)
         told = [
             ("patch", "@state"), ("distance", "@distance{0.000} ± @sigma{0.000} mm"),
             ("correlation", "@correlation{0.000}"), ("at", "@x{0.0}, @y{0.0} mm"),
@@ -92,6 +95,7 @@ class Picture:
         """Draw no patches."""
         self._bar.visible = False
         self._patches.data = _no_patches()
+        self._cross(np.empty((0, 2)))
 
     def colour(self, patches: PatchValues, by: str, most: float, opacity: float) -> PatchCount:
         """Draw patches coloured by a quantity from zero to `most`."""
@@ -104,20 +108,26 @@ class Picture:
         state = _states(patches)
         self._colours.high, self._bar.title = most, COLOURINGS[by]
         known = np.isfinite(values[by])
+        self._cross(patches.centre_mm[[each == "rejected" for each in state]])
         self._patches.data = {
             "x": patches.centre_mm[:, 0],
             "y": patches.centre_mm[:, 1],
             "angle": np.full(len(state), patches.turn_rad),
             "value": values[by],
             "alpha": np.where(known, opacity, 0.0),
-            "line": ["#ff4d4d" if each == "rejected" else "#ffffff" for each in state],
-            "hatch": ["diagonal_cross" if each == "rejected" else " " for each in state],
+            "line": [_REJECTED if each == "rejected" else "#ffffff" for each in state],
             "state": state,
             "distance": patches.distance_mm,
             "sigma": patches.sigma_mm,
             "correlation": patches.correlation,
         }
         return PatchCount(*(state.count(name) for name in ("used", "rejected", "without distance")))
+
+    def _cross(self, centre_mm: FloatArray) -> None:
+        """Cross patches out."""
+        half = 0.5 * np.array([self._patch_mm, (self._patch_mm[0], -self._patch_mm[1])])
+        begin, end = (np.concatenate([centre_mm + sign * each for each in half]) for sign in (-1, 1))
+        self._crosses.data = {"x0": begin[:, 0], "y0": begin[:, 1], "x1": end[:, 0], "y1": end[:, 1]}
 
 
 def _states(patches: PatchValues) -> list[str]:
@@ -139,7 +149,6 @@ def _no_patches() -> dict[str, list[object]]:
         "value",
         "alpha",
         "line",
-        "hatch",
         "state",
         "distance",
         "sigma",
