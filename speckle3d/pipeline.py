@@ -15,9 +15,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.checks import doubts_of_curves, doubts_of_path, doubts_of_standing, examined_sensors
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.curves import TISSUE_SIGMA, DecorrelationCurves
+from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
-from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
+from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
@@ -34,19 +34,19 @@ from speckle3d.matching.blocks import (
 )
 from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import SpeckleSizes, doubt_images
 from speckle3d.motion.coherence import Coherence, scale_sigma
-from speckle3d.motion.curve_doubts import DepthFactors, doubt_depths, doubt_widths
-from speckle3d.motion.curve_prior import RowsSeen, rows_seen, straightened
+from speckle3d.motion.curve_doubts import doubt_depths
+from speckle3d.motion.curve_prior import RowsSeen
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.signs import SignedPairs
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance, with_common_scale
+from speckle3d.stages import PLANES, matcher_for, measured, rows_of, sound_pairs, straightened_by
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
@@ -54,8 +54,8 @@ PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 MOST_LOST = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
-PLANES, STRAIGHTENING = "distances and planes", "curves"
-"""Names of stages in `StageTimes`."""
+STRAIGHTENING = "curves"
+"""Name of a stage in `StageTimes`."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +280,7 @@ def track(
         direction_from=source,
         coherence=coherence,
         curves=curves,
-        rows=_rows_seen(factors, coherence, matcher.patches),
+        rows=rows_of(factors, coherence, matcher.patches),
         slopes=slopes,
         times=times,
         doubts=(*doubts, *sensors.doubts),
@@ -313,22 +313,6 @@ def _matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> F
     return matcher_for(sweep, curves, config)
 
 
-def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
-    """Make the matcher of a sweep's frames, none of which is read.
-
-    Raises
-    ------
-    MismatchError
-        If the curves belong to another probe, frequency, sampling, patch size or depth.
-    """
-    matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
-    curves.key.require_same(matcher.key)
-    unrefuted(doubt_widths(curves), sweep.name, MismatchError)
-    with naming(sweep.name):
-        matcher.keep_depths(curves.depth_mm)
-    return matcher
-
-
 def _flagged(sweep: Sweep, found: MatchedSweep, config: Config) -> IntArray:
     """Flags of all frames, if few enough have one."""
     flags = flag_frames(found.features, config.quality)
@@ -347,67 +331,6 @@ def _require_placed(sweep: Sweep, flags: IntArray) -> None:
             f"{sweep.name}: expected frames with speckle in common, got {lost} of {len(sweep)} that cannot "
             f"be placed: {'; '.join(describe(flags))}"
         )
-
-
-def measured(
-    table: CorrelationTable,
-    flags: IntArray,
-    reader: PairReader,
-    config: Config,
-    times: StageTimes,
-    known: FloatArray | None = None,
-) -> tuple[SignedPairs, Coherence | None, FloatArray]:
-    """Signed planes of all usable pairs, the coherence they were read with, and the path they give.
-
-    Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
-    """
-    sound = sound_pairs(table, flags)
-    path = known
-    if path is None:
-        with times.of(PLANES):
-            path = reader.rough_path(table)
-    if not config.coherence.adapt:
-        with times.of(PLANES):
-            pairs = reader.measure(table, path, sound, None)
-        return pairs, None, reader.path(table, pairs, None)
-    for known_scale in (False, True):
-        with times.of("coherence"):
-            coherence, path = reader.coherence(table, path, sound, config.coherence, known_scale)
-        with times.of(PLANES):
-            pairs = reader.measure(table, path, sound, coherence)
-            path = reader.path(table, pairs, coherence)
-    return pairs, coherence, path
-
-
-def sound_pairs(table: CorrelationTable, flags: IntArray) -> BoolArray:
-    """Pairs of frames that are to be trusted, shape (e,)."""
-    bad = (flags & ~FrameFlag.UNMATCHED) != 0
-    sound: BoolArray = ~bad[table.first] & ~bad[table.second]
-    return sound
-
-
-def straightened_by(
-    factors: DepthFactors,
-    curves: DecorrelationCurves,
-    coherence: Coherence | None,
-    patches: PatchGrid,
-    config: Config,
-) -> tuple[DecorrelationCurves, float]:
-    """Curves of the lens that the depths of the images agree on, and what is left of their mismatch.
-
-    The curves given, and all of it, if they are to stay as they are.
-    """
-    mismatch = curves.mismatch(config.curves.same_probe)
-    if config.curves.straighten and mismatch > TISSUE_SIGMA and curves.origin in ("phantom", "data sheet"):
-        return straightened(curves, _rows_seen(factors, coherence, patches), mismatch)
-    return curves, mismatch
-
-
-def _rows_seen(factors: DepthFactors, coherence: Coherence | None, patches: PatchGrid) -> RowsSeen:
-    """What rows of patches say of the curves."""
-    if coherence is None:
-        return rows_seen(factors)
-    return rows_seen(factors, patches.rows_of(coherence.share.mean(axis=0)).mean(axis=-1))
 
 
 def _with_unjoined(flags: IntArray, reader: PairReader, pairs: SignedPairs) -> IntArray:

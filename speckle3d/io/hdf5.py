@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import os
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
@@ -24,6 +23,8 @@ from speckle3d.core.files import PathLike as PathLike
 from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.parts import DiskFile, cannot_write, clear_parts, marked, part_beside
+from speckle3d.io.hdf5_beside import CHUNK_CACHE_BYTES, has_writer, open_beside_writer
+from speckle3d.io.hdf5_beside import SIGNATURE as SIGNATURE
 from speckle3d.io.hdf5_guard import (
     follow,
     plain_attribute,
@@ -35,17 +36,6 @@ from speckle3d.io.hdf5_guard import (
 )
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
-
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
-"""First bytes of an HDF5 file without a user block."""
-
-_SWMR_WRITE = 0x04
-
-_READ_ATTEMPTS = 20
-"""Of what may be half written: a millisecond in all."""
-
-_CHUNK_CACHE_BYTES = 32 * 2**20
-"""Room for files whose chunks span several frames; with one chunk per frame it is never filled."""
 
 _READ_FAILURES = (
     OSError,
@@ -182,39 +172,9 @@ def open_hdf5(path: PathLike) -> h5py.File:
             raise FileError(f"{path}: expected an HDF5 file, got something else")
         held = os.stat(path)
         _require_sound_once(os.fspath(path), held.st_ino, held.st_size, held.st_mtime_ns)
-        if _has_writer(path):
-            return _open_beside_writer(path)
-        return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
-
-
-def _open_beside_writer(path: PathLike) -> h5py.File:
-    """Open a file that is being written, or whose writer was killed.
-
-    What is half written is read anew, a hundred times by HDF5's own choice, each after twice the time: in a
-    damaged file, for good. h5py has no word for fewer, so HDF5 itself is told.
-    """
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    slots, buckets, _, weight = access.get_cache()
-    access.set_cache(slots, buckets, _CHUNK_CACHE_BYTES, weight)
-    with suppress(OSError, AttributeError):  # Windows does not give away what a library loads
-        tell = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
-        tell(ctypes.c_int64(access.id), ctypes.c_uint(_READ_ATTEMPTS))
-    flags = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
-    return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
-
-
-def _has_writer(path: PathLike) -> bool:
-    """Whether a file is being written in HDF5's single-writer mode, or its writer was killed [1]_.
-
-    It is then to be opened as by a reader beside a writer, which does not look at a file's length.
-
-    References
-    ----------
-    .. [1] HDF5 File Format Specification 3.0, II.A: consistency flags of a superblock of version 3.
-    """
-    with open_regular(path) as stream:
-        start = stream.read(12)
-    return start.startswith(SIGNATURE) and start[8] == 3 and bool(start[11] & _SWMR_WRITE)
+        if has_writer(path):
+            return open_beside_writer(path)
+        return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE_BYTES)
 
 
 @lru_cache(maxsize=16)

@@ -20,7 +20,7 @@ from speckle3d.matching.quality import FrameFlag
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.signs import SignedPairs
-from speckle3d.pipeline import measured, sound_pairs, straightened_by
+from speckle3d.stages import measured, sound_pairs, straightened_by
 
 LATEST = 150
 """Frames over which coherence is learnt anew while a sweep is longer: five times `CoherenceSettings`' block.

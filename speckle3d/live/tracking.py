@@ -34,7 +34,7 @@ from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
 from speckle3d.motion.uncertainty import SlopeEvidence
-from speckle3d.pipeline import matcher_for
+from speckle3d.stages import matcher_for
 
 ANEW = 4
 """Frames up to which everything is estimated anew with each."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -28,6 +28,8 @@ cuts = st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3)).map(
     )
 )
 
+few = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
 
 def off_plane_mm(plane, points_mm):
     normal = AXES.axes_of(plane).as_matrix()[:, 2]
@@ -52,6 +54,7 @@ def test_its_turn_is_that_of_a_turned_frame():
     )
 
 
+@few
 @given(planes, cuts)
 def test_its_line_in_a_cut_is_in_both(plane, cut):
     found = AXES.line_in(plane, cut)
@@ -62,6 +65,7 @@ def test_its_line_in_a_cut_is_in_both(plane, cut):
     np.testing.assert_allclose(off_plane_mm(plane, cut.world_from_mm(*points.T)), 0.0, atol=1e-9)
 
 
+@few
 @given(planes, cuts, places, places)
 def test_a_moved_point_of_the_plane_stays_on_it(plane, cut, old, step):
     before = off_plane_mm(plane, cut.world_from_mm(*old))
@@ -70,6 +74,7 @@ def test_a_moved_point_of_the_plane_stays_on_it(plane, cut, old, step):
     assert (moved.turn_deg, moved.tilt_deg) == (plane.turn_deg, plane.tilt_deg)
 
 
+@few
 @given(planes, cuts, places, st.floats(-3.0, 3.0))
 def test_a_turned_plane_holds_the_pivot_and_turns_its_line(plane, cut, pivot, angle):
     turned = AXES.turned(plane, cut, pivot, angle)

@@ -13,7 +13,8 @@ from speckle3d.live import revising, tracking
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.matching.blocks import Block, FrameByFrame, FrameMaker, MatchedBlock, match_block
 from speckle3d.matching.quality import FrameFlag
-from speckle3d.pipeline import matcher_for, track
+from speckle3d.pipeline import track
+from speckle3d.stages import matcher_for
 
 FRAMES = 24
 
