@@ -89,7 +89,7 @@ def _viewed(page: Page) -> Viewable:
 
 
 def _opening(title: str) -> Viewable:
-    words = f"Opening {escape(title)} ..."
+    words = f"Opening {escape(title)} ... (the first time after an installation: up to a minute)"
     return pn.pane.HTML(f'<div role="status" style="color:#6b7780;padding:8px 12px">{words}</div>', margin=10)
 
 

@@ -110,10 +110,10 @@ def _recording(path: Path, settings: ImportSettings | None) -> list[Page]:
         sweep = load_sweep(path, settings)
     except MissingSettingsError:
         raise
-    except InvalidInputError:
+    except InvalidInputError as error:
         with suppress(InvalidInputError, InsufficientDataError):
             if (log := held_log(path)) is not None:
-                return [_sensor(log)]
+                return [_sensor(replace(log, notes=(*log.notes, f"frames are not shown: {error}")))]
         raise
     return _recorded(sweep, path)
 

@@ -29,7 +29,10 @@ def test_a_sweep_with_a_sensor_has_both_pages_and_a_log_its_own(shipped, log):
 
 @pytest.mark.realdata
 def test_a_package_without_frames_still_has_its_sensor(realdata):
-    assert titles(realdata / "clarius" / "wirephantom") == ["Sensor"]
+    (page,) = pages_of(realdata / "clarius" / "wirephantom")
+    assert page.title == "Sensor"
+    assert "frames are not shown: " in page._log.notes[-1]
+    assert "sidecars alone" in page._log.notes[-1]
 
 
 def test_what_has_no_page_is_one_line_and_exit_code_2(shipped, log, tmp_path, capsys, monkeypatch):

@@ -122,6 +122,7 @@ class _Tuner:
             self._frames.slider, pn.pane.Bokeh(self._picture.plot), self._told, self._frames.below()
         )
         hint = pn.pane.HTML(
+            "In the image: the line found (blue) and the edges that agree with it (orange rings).<br>"
             "Region: drag a box in the image; or, by the polygon tool: hold down, click corners, hold down.",
             margin=(2, 8),
         )

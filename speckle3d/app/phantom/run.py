@@ -95,13 +95,14 @@ class RunPane:
         self._save.on_click(in_turn(self._write))
 
     def view(self) -> Viewable:
-        """The button, the verdict, the table, and saving."""
+        """The button, the verdict, saving, and the table."""
         return pn.Column(
             pn.Row(self.button, self._work.bar),
             self._verdict,
-            self._table,
             pn.Row(self._save, self._name),
             self._saved,
+            # Last, so that what is told of saving is seen without scrolling.
+            self._table,
         )
 
     def outdate(self) -> None:

@@ -44,13 +44,16 @@ class FrameStrip:
             frame_height=70,
             x_range=Range1d(start=-0.5, end=count - 0.5),
             y_range=Range1d(start=0.0, end=1.0),
-            x_axis_label="frame: click to see it, double click to leave it out or take it in",
-            y_axis_label="residual",
+            x_axis_label="frame (click: see it; double click: leave it out, take it in)   "
+            "blue: used, orange: not used, grey: left out",
             tools="",
             toolbar_location=None,
             name="strip",
         )
+        self.plot.xaxis.axis_label_text_font_size = "12px"
         self.plot.grid.visible = False
+        # Without a calibration there are no residuals.
+        self.plot.yaxis.visible = False
         self.plot.yaxis.ticker = BasicTicker(desired_num_ticks=3)
         bars = self.plot.vbar(
             "frame", width=0.9, bottom=0, top=1e6, color="colour", alpha=0.55, source=self._frames
@@ -101,6 +104,7 @@ class FrameStrip:
         self._frames.data = {"frame": np.arange(self._count), "colour": colour, "told": told}
 
     def _measure(self, solution: ChainSolution | None) -> None:
+        self.plot.yaxis.visible = solution is not None
         if solution is None:
             self._residuals.data = {"frame": [], "residual": []}
             return

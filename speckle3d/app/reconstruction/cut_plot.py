@@ -119,6 +119,8 @@ class CutPlot:
             axis.axis_label_text_font_style = "normal"
             axis.axis_label_text_font_size = axis.major_label_text_font_size = "11px"
             axis.axis_label_standoff = 2
+            # Until it is known what they say.
+            axis.major_label_text_alpha = 0.0
         blank = np.zeros((1, 1), np.uint32)
         self.image = ColumnDataSource({"image": [blank], "x": [0.0], "y": [0.0], "w": [1.0], "h": [1.0]})
         self.plot.image_rgba("image", "x", "y", "w", "h", source=self.image)
@@ -165,6 +167,8 @@ class CutPlot:
         """Write where the cut is, and what its axes are."""
         self.title(title)
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{each} / mm" for each in axes)
+        for axis in self.plot.axis:
+            axis.major_label_text_alpha = 1.0
 
     def show_lines(self, lines: Sequence[tuple[FloatArray, str]]) -> None:
         """Draw lines, shape (m, 2) each, in their colours."""

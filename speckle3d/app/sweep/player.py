@@ -62,7 +62,12 @@ class Player:
         self._picture = Picture(images.extent_mm(), pairs.patch_mm)
         self._line = TimeLine(sweep.frame_time_s, self.go)
         self._slider = pn.widgets.IntSlider(
-            name="frame", start=0, end=max(last, 1), disabled=last == 0, width=330, margin=(5, 10)
+            name="frame",
+            start=0,
+            end=max(last, 1),
+            disabled=last == 0,
+            sizing_mode="stretch_width",
+            margin=(5, 20, 5, 10),
         )
         self._play = pn.widgets.Toggle(name="▶ play", width=80, margin=(12, 5), disabled=last == 0)
         self._range = pn.widgets.IntSlider(
@@ -70,8 +75,9 @@ class Player:
         )
         colourings = list(COLOURINGS) if pairs.are_reconstructed else ["correlation"]
         self._colouring = pn.widgets.RadioButtonGroup(
-            options=["none", *colourings], value="none", button_type="default", button_style="outline"
-        )
+            options=["none", *colourings], value=colourings[0] if pairs.are_reconstructed else "none",
+            button_type="default", button_style="outline",
+        )  # fmt: skip
         self._other = pn.widgets.Select(options={}, width=230, disabled=True)
         self._opacity = pn.widgets.IntSlider(
             name="opacity (%)", start=10, end=100, step=10, value=50, width=150
@@ -104,26 +110,27 @@ class Player:
 
     def _laid_out(self) -> Viewable:
         chosen = pn.Column(
-            self._told,
-            pn.layout.Divider(margin=(0, 5)),
-            pn.pane.HTML("<b>Patches coloured by</b>", margin=(0, 10)),
+            pn.pane.HTML("<b>Patches coloured by</b>", margin=(5, 10, 0, 10)),
             self._colouring,
             pn.Row(pn.pane.HTML("of the pair with", margin=(12, 2, 0, 10)), self._other),
             pn.Row(self._opacity, *([self._range] if self._images.of_echoes else [])),
+            width=410,
+        )
+        # Beside what stretches, a plot alone would stretch as well.
+        picture = pn.Column(pn.pane.Bokeh(self._picture.plot, margin=0), margin=0)
+        found = pn.Column(
+            self._told,
             self._judged,
             self._doubts(),
             sizing_mode="stretch_width",
-        )
-        picture = pn.Column(
-            pn.pane.Bokeh(self._picture.plot, margin=0),
-            pn.Row(self._play, self._slider, self._keys, margin=0),
-            pn.pane.HTML(_KEYS, margin=(0, 10), width=430),
         )
         below = self._line.streams(self._streams) or [
             pn.pane.HTML("No sensor was recorded with this sweep.", margin=(5, 10))
         ]
         return pn.Column(
-            pn.Row(picture, chosen, sizing_mode="stretch_width"),
+            pn.Row(picture, chosen, found, sizing_mode="stretch_width"),
+            pn.Row(self._play, self._slider, self._keys, sizing_mode="stretch_width", margin=0),
+            pn.pane.HTML(_KEYS, margin=(0, 10)),
             pn.pane.Bokeh(self._line.marks, sizing_mode="stretch_width", margin=0),
             pn.Row(*below, sizing_mode="stretch_width"),
             sizing_mode="stretch_width",

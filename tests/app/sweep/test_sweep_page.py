@@ -80,6 +80,7 @@ def test_keys_step_leap_and_end_wherever_the_focus_is(page, files):
     at(page, 11)
     images = ScreenImages(load_sweep(files[0]))
     np.testing.assert_array_equal(shown(page), images.image(11))
+    page.get_by_text("patches in the consistent subset").wait_for()
     # On a button, which Space would press, and on a slider, which arrows would move.
     page.get_by_role("button", name="none").focus()
     page.keyboard.press("End")
@@ -103,7 +104,7 @@ def test_in_a_text_field_keys_write(page):
 
 
 def test_the_slider_moves_the_frame(page):
-    bar = page.locator(".noUi-connects").first.bounding_box()
+    bar = page.locator(".noUi-connects").last.bounding_box()
     page.mouse.click(bar["x"] + bar["width"] / 2, bar["y"] + bar["height"] / 2)
     page.get_by_text("Frame 0", exact=True).wait_for(state="detached")
     middle = page.locator("b", has_text="Frame ").first.inner_text()
