@@ -16,6 +16,7 @@ from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.app.page import Page
+    from speckle3d.io.import_settings import ImportSettings
 
 
 @app.command()
@@ -51,6 +52,9 @@ def view(
     poses: Poses = None,
     transform: Transform = None,
     pixel_mm: PixelMm = None,
+    dynamic_range_db: Annotated[
+        float | None, typer.Option(help="Of a recording's grey levels, if it does not say.")
+    ] = None,
     sensor: Annotated[
         Literal["orientation", "tracker"], typer.Option(help="Orientation: which sensor's.")
     ] = "orientation",
@@ -69,7 +73,10 @@ def view(
     with ExitStack() as running:
         if calibrate is None:
             _require_no_phantom(locals())
-            pages = running.enter_context(opened(file, record, reconstruction=reconstruction, sweep=sweep))
+            given = _settings(pixel_mm, dynamic_range_db)
+            pages = running.enter_context(
+                opened(file, record, reconstruction=reconstruction, sweep=sweep, settings=given)
+            )
         else:
             _require_phantom_alone(record, reconstruction, sweep)
             pages = _phantom(file, calibrate, locals())
@@ -82,12 +89,28 @@ def view(
 
 
 _OF_PHANTOMS = ("phantom", "points", "poses", "transform", "pixel_mm", "sensor", "level")
+_OF_RECORDINGS = ("pixel_mm",)
+"""Those that serve without a phantom, too."""
+
+
+def _settings(pixel_mm: tuple[float, float] | None, dynamic_range_db: float | None) -> ImportSettings:
+    """What a recording does not say, for looking at it."""
+    from speckle3d.io.import_settings import ImportSettings
+
+    column_mm, row_mm = pixel_mm or (None, None)
+    options = {
+        "column_pitch_mm": column_mm,
+        "row_spacing_mm": row_mm,
+        "dynamic_range_db": dynamic_range_db,
+    }
+    return from_options(ImportSettings, options)
 
 
 def _require_no_phantom(options: Mapping[str, Any]) -> None:
     """Refuse options of phantoms without `--calibrate`, which they go with."""
     plain = {"phantom": "cross", "sensor": "orientation", "level": False}
-    given = [name for name in _OF_PHANTOMS if options[name] != plain.get(name)]
+    names = [name for name in _OF_PHANTOMS if name not in _OF_RECORDINGS]
+    given = [name for name in names if options[name] != plain.get(name)]
     if given:
         option = given[0].replace("_", "-")
         raise InvalidInputError(
