@@ -29,6 +29,8 @@ class Progress:
         Sent.
     refused : int
         Messages that could not be used; `last_refused` says why.
+    restarts : int
+        How often the sender's clock began anew.
     missing : str
         Which device that was asked for has sent nothing, and which others have.
     failed : str
@@ -44,6 +46,7 @@ class Progress:
     words: str = ""
     volumes: int = 0
     refused: int = 0
+    restarts: int = 0
     last_refused: str = ""
     missing: str = ""
     failed: str = ""
@@ -57,6 +60,7 @@ class Progress:
             f"pose after {1e3 * self.delay_s:.0f} ms",
         ]
         parts += [f"{self.left} left for later"] if self.left else []
+        parts += [f"the sender's clock began anew {self.restarts} times"] if self.restarts else []
         parts += [f"{self.refused} refused ({self.last_refused})"] if self.refused else []
         return " | ".join(filter(None, (", ".join(parts), self.words, self.missing, self.failed)))
 

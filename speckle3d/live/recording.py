@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,19 +26,27 @@ class Counts:
     frames, readings : int
     refused : int
         Messages that could not be written; `last_refused` says why the last one could not.
+    restarts : int
+        How often the sender's clock began anew.
     last_refused : str
     """
 
     frames: int = 0
     readings: int = 0
     refused: int = 0
+    restarts: int = 0
     last_refused: str = ""
+
+
+RESTARTED_S = 1.0
+"""A frame so long before the last one shows that the sender was started anew."""
 
 
 class Recording:
     """A sweep file that grows with every image and transform received.
 
-    Times are the sender's, counted from the first frame's.
+    Times are the sender's, counted from the first frame's. If its clock begins anew, they go on by what has
+    passed here; so they do if messages have no time, which OpenIGTLink writes as zero.
 
     Parameters
     ----------
@@ -53,6 +62,8 @@ class Recording:
     def __init__(self, path: Path, layout: ImageLayout, first_s: float, packed: bool = False) -> None:
         example = layout.example
         self.counts, self._first_s, self._last_s = Counts(), first_s, float("-inf")
+        self._began_s = self._came_s = time.monotonic()
+        self._timeless = False
         self._sweep = GrowingSweep(
             path,
             example.grid,
@@ -73,7 +84,13 @@ class Recording:
 
     def keep_frame(self, frame: npt.NDArray[Any], sent_s: float) -> float | None:
         """Write a frame; its time in the sweep, or None if it is not later than the last frame's."""
-        time_s = sent_s - self._first_s
+        now_s = time.monotonic()
+        if self.counts.frames and sent_s == 0.0:
+            self._timeless = True
+        elif sent_s - self._first_s < self._last_s - RESTARTED_S:
+            self._first_s = sent_s - (self._last_s + now_s - self._came_s)
+            self.counts.restarts += 1
+        time_s = self._time_of(sent_s, now_s)
         try:
             if time_s <= self._last_s:
                 back_s = self._last_s - time_s
@@ -84,12 +101,12 @@ class Recording:
         except InvalidInputError as error:
             self.refuse(error)
             return None
-        self.counts.frames, self._last_s = self.counts.frames + 1, time_s
+        self.counts.frames, self._last_s, self._came_s = self.counts.frames + 1, time_s, now_s
         return time_s
 
     def keep_reading(self, transform: TransformReceived, with_position: bool) -> None:
         """Write a sensor's reading: of a tracker, or with the rotation alone of an orientation sensor."""
-        time_s = transform.time_s - self._first_s
+        time_s = self._time_of(transform.time_s, time.monotonic())
         where = f"TRANSFORM {transform.device}"
         try:
             # Rigid to single precision as it comes.
@@ -102,6 +119,9 @@ class Recording:
             self.refuse(error)
             return
         self.counts.readings += 1
+
+    def _time_of(self, sent_s: float, now_s: float) -> float:
+        return now_s - self._began_s if self._timeless else sent_s - self._first_s
 
     def refuse(self, error: InvalidInputError) -> None:
         """Count a message that cannot be written."""

@@ -199,6 +199,7 @@ class Session:
                     recording.keep_reading(message, with_position=False)
         counts = recording.counts
         self.progress.recorded = counts.frames
+        self.progress.restarts = counts.restarts
         if counts.refused:
             self.progress.refused, self.progress.last_refused = counts.refused, counts.last_refused
 

@@ -1,0 +1,55 @@
+"""What is received written down on one clock."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from sweep_examples import RF
+
+import speckle3d as s3
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.live import recording
+from speckle3d.live.frames import ImageLayout
+from speckle3d.live.recording import Recording
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """Records frames that come at some times here, with some times of the sender's; the sweep's times."""
+
+    def keep(here_s, sent_s):
+        frame = np.ones((4, 8), dtype=np.int16)
+        grid = ImageGrid(4, 8, 0.3, RF.sample_spacing_mm)
+        example = Sweep(frame[None], grid, RF, np.zeros(1))
+        clock = iter([here_s[0], *here_s])
+        monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+        with Recording(tmp_path / "sweep.h5", ImageLayout("Image", example, True), sent_s[0]) as made:
+            for sent in sent_s:
+                made.keep_frame(frame, sent)
+        return s3.load_sweep(tmp_path / "sweep.h5").frame_time_s, made.counts
+
+    return keep
+
+
+def test_times_are_the_senders(kept):
+    times, counts = kept([0.0, 0.3, 0.31], [50.0, 50.04, 50.08])
+    np.testing.assert_allclose(times, [0.0, 0.04, 0.08], atol=1e-9)
+    assert (counts.restarts, counts.refused) == (0, 0)
+
+
+def test_a_clock_that_begins_anew_goes_on_by_what_passed_here(kept):
+    times, counts = kept([0.0, 0.04, 2.0, 2.04], [50.0, 50.04, 3.0, 3.04])
+    np.testing.assert_allclose(times, [0.0, 0.04, 2.0, 2.04], atol=1e-9)
+    assert (counts.restarts, counts.refused) == (1, 0)
+
+
+def test_messages_without_a_time_have_that_of_their_coming(kept):
+    times, counts = kept([7.0, 7.05, 7.09], [0.0, 0.0, 0.0])
+    np.testing.assert_allclose(times, [0.0, 0.05, 0.09], atol=1e-9)
+    assert counts.refused == 0
+
+
+def test_a_frame_a_little_before_the_last_is_refused(kept):
+    times, counts = kept([0.0, 0.04, 0.08], [50.0, 50.04, 50.03])
+    assert times.size == 2
+    assert (counts.restarts, counts.refused) == (0, 1)
