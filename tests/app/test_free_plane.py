@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.app.reconstruction.free_plane import FreePlane, SweepAxes
+from speckle3d.app.reconstruction.cuts.free_plane import FreePlane, SweepAxes
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.cuts.oblique import turned_frame_plane
 from speckle3d.imaging.cuts.planes import ReslicePlane

@@ -11,11 +11,11 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.reconstruction.commands import measure_command, reslice_command
-from speckle3d.app.reconstruction.material import KeptImages, Material
+from speckle3d.app.reconstruction.cuts.material import KeptImages, Material
+from speckle3d.app.reconstruction.cuts.newest import Newest
+from speckle3d.app.reconstruction.cuts.shown import NAMES, Shown, cut_of_voxels
 from speckle3d.app.reconstruction.measuring import Picked
-from speckle3d.app.reconstruction.newest import Newest
 from speckle3d.app.reconstruction.page import ReconstructionPage
-from speckle3d.app.reconstruction.shown import NAMES, Shown, cut_of_voxels
 from speckle3d.app.reconstruction.space import RADIUS_95, band, ellipsoid
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.reconstruction.free_plane import FreePlane
-from speckle3d.app.reconstruction.material import Material
+from speckle3d.app.reconstruction.cuts.free_plane import FreePlane
+from speckle3d.app.reconstruction.cuts.material import Material
 from speckle3d.app.reconstruction.viewer import Viewer
 from speckle3d.study.images import open_reconstruction
 

@@ -7,8 +7,8 @@ from bokeh.models import ColumnDataSource
 from bokeh.models.annotations import Span
 from bokeh.plotting import figure
 
-from speckle3d.app.reconstruction.cut_plot import FRAME
-from speckle3d.app.reconstruction.material import Material
+from speckle3d.app.reconstruction.cuts.cut_plot import FRAME
+from speckle3d.app.reconstruction.cuts.material import Material
 from speckle3d.imaging.measures.measure import NORMAL_95
 from speckle3d.scoring.references import sweep_curves
 from speckle3d.study.figures import CURVE_LABELS, colour_of

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from speckle3d.app.reconstruction.shown import Shown
+from speckle3d.app.reconstruction.cuts.shown import Shown
 from speckle3d.core.arrays import FloatArray
 from speckle3d.study.reslices.places import Place
 

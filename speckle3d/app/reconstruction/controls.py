@@ -11,10 +11,10 @@ import numpy as np
 import panel as pn
 from panel.viewable import Viewable
 
-from speckle3d.app.reconstruction.cut_plot import DEPTH, FRAME, FREE, LATERAL
-from speckle3d.app.reconstruction.free_plane import FreePlane
-from speckle3d.app.reconstruction.material import Material
-from speckle3d.app.reconstruction.shown import Shown
+from speckle3d.app.reconstruction.cuts.cut_plot import DEPTH, FRAME, FREE, LATERAL
+from speckle3d.app.reconstruction.cuts.free_plane import FreePlane
+from speckle3d.app.reconstruction.cuts.material import Material
+from speckle3d.app.reconstruction.cuts.shown import Shown
 from speckle3d.study.figures import label_of
 
 _ALONE = ""

@@ -7,7 +7,7 @@ from pathlib import Path
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.reconstruction.material import Material
+from speckle3d.app.reconstruction.cuts.material import Material
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
 

@@ -11,9 +11,9 @@ from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.reconstruction.commands import reslice_command
-from speckle3d.app.reconstruction.cuts_view import TITLES
-from speckle3d.app.reconstruction.material import Material
-from speckle3d.app.reconstruction.shown import Name, Shown
+from speckle3d.app.reconstruction.cuts.cuts_view import TITLES
+from speckle3d.app.reconstruction.cuts.material import Material
+from speckle3d.app.reconstruction.cuts.shown import Name, Shown
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.study.reslices.cuts import cut_posed
 from speckle3d.study.reslices.reslice_figures import save_outlines, save_reslices

@@ -11,9 +11,9 @@ from plotly.colors import hex_to_rgb
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
-from speckle3d.app.reconstruction.cut_plot import DEPTH, FRAME, FREE, LATERAL
-from speckle3d.app.reconstruction.material import Material
-from speckle3d.app.reconstruction.shown import Name
+from speckle3d.app.reconstruction.cuts.cut_plot import DEPTH, FRAME, FREE, LATERAL
+from speckle3d.app.reconstruction.cuts.material import Material
+from speckle3d.app.reconstruction.cuts.shown import Name
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.cuts.planes import ReslicePlane

@@ -16,13 +16,13 @@ from tornado.ioloop import IOLoop
 from speckle3d.app.folder import Folder
 from speckle3d.app.reconstruction.bands import QUANTITIES, BandsPlot
 from speckle3d.app.reconstruction.controls import Controls
-from speckle3d.app.reconstruction.cuts_view import CutsView
-from speckle3d.app.reconstruction.cutter import Cutter
-from speckle3d.app.reconstruction.free_plane import FreePlane
-from speckle3d.app.reconstruction.material import Material
+from speckle3d.app.reconstruction.cuts.cuts_view import CutsView
+from speckle3d.app.reconstruction.cuts.cutter import Cutter
+from speckle3d.app.reconstruction.cuts.free_plane import FreePlane
+from speckle3d.app.reconstruction.cuts.material import Material
+from speckle3d.app.reconstruction.cuts.shown import Name, Shown
 from speckle3d.app.reconstruction.measure_view import MeasureView
 from speckle3d.app.reconstruction.saving import Saving
-from speckle3d.app.reconstruction.shown import Name, Shown
 from speckle3d.app.reconstruction.space import figure_space
 from speckle3d.core.arrays import FloatArray
 from speckle3d.study.figures import label_of

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.app.reconstruction.free_plane import SweepAxes
-from speckle3d.app.reconstruction.newest import Newest
+from speckle3d.app.reconstruction.cuts.free_plane import SweepAxes
+from speckle3d.app.reconstruction.cuts.newest import Newest
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction

@@ -10,7 +10,7 @@ import panel as pn
 from bokeh.models.annotations import Span
 from panel.viewable import Viewable
 
-from speckle3d.app.reconstruction.cut_plot import (
+from speckle3d.app.reconstruction.cuts.cut_plot import (
     DEPTH,
     FRAME,
     FREE,
@@ -21,9 +21,9 @@ from speckle3d.app.reconstruction.cut_plot import (
     grey,
     laid_over,
 )
-from speckle3d.app.reconstruction.free_plane import SweepAxes
-from speckle3d.app.reconstruction.material import Material
-from speckle3d.app.reconstruction.shown import LEVELS_DB, NAMES, Name, Shown
+from speckle3d.app.reconstruction.cuts.free_plane import SweepAxes
+from speckle3d.app.reconstruction.cuts.material import Material
+from speckle3d.app.reconstruction.cuts.shown import LEVELS_DB, NAMES, Name, Shown
 from speckle3d.core.arrays import FloatArray
 from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.study.figures import label_of

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from speckle3d.app.reconstruction.free_plane import FreePlane, SweepAxes
-from speckle3d.app.reconstruction.material import Material
+from speckle3d.app.reconstruction.cuts.free_plane import FreePlane, SweepAxes
+from speckle3d.app.reconstruction.cuts.material import Material
 from speckle3d.imaging.cuts.reslice import reslice_volume
 from speckle3d.imaging.voxels.volume import CompoundedVolume
 from speckle3d.study.posed import USUAL_RANGE_DB

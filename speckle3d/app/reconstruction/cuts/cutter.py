@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from speckle3d.app.reconstruction.material import Material, NotWanted
-from speckle3d.app.reconstruction.newest import Newest
-from speckle3d.app.reconstruction.shown import NAMES, Name, Shown, cut_of_voxels
+from speckle3d.app.reconstruction.cuts.material import Material, NotWanted
+from speckle3d.app.reconstruction.cuts.newest import Newest
+from speckle3d.app.reconstruction.cuts.shown import NAMES, Name, Shown, cut_of_voxels
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.study.reslices.cuts import CutPicture, cut_posed
 
