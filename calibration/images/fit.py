@@ -165,7 +165,11 @@ def settle(refined: Refined, share: bool = False) -> tuple[Refined, FloatArray]:
     now, converged = refined, False
     for _ in range(_MOST_STEPS):
         step = np.zeros(len(LEVERS_MM))
-        step[list(now.free)] = np.linalg.solve(bend, now.system[1])
+        try:
+            step[list(now.free)] = np.linalg.solve(bend, now.system[1])
+        except np.linalg.LinAlgError:
+            # Some motion changes nothing at all; whether enough is determined is asked later.
+            break
         size = float(np.abs(step * LEVERS_MM).max())
         step *= min(1.0, _LONGEST_MM / size) if size > 0.0 else 1.0
         moved = now
