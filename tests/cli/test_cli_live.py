@@ -171,12 +171,7 @@ def test_what_would_be_refused_at_the_end_is_refused_before(given, words):
         (["localhost:18944", "-o", "out", "--compression", "lzf"], "none or gzip"),
     ],
 )
-def test_a_wrong_option_is_one_line(arguments, words, shipped, tmp_path):
-    done = subprocess.run(
-        command("live", *arguments, "--curves", shipped / "curves.h5"),
-        capture_output=True, text=True, cwd=tmp_path, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+def test_a_wrong_option_is_one_line(refused, arguments, words, shipped, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert words in refused("live", *arguments, "--curves", shipped / "curves.h5")
     assert not (tmp_path / "out").exists()
