@@ -63,7 +63,8 @@ def viewing(*arguments):
 def opened(browser, address, width=1366, height=768):
     """A page with what it complained of and asked for in `complaints` and `requests`."""
     page = browser.new_page(viewport={"width": width, "height": height})
-    page.set_default_timeout(60_000)
+    # Where no kernel has been compiled yet, that comes first.
+    page.set_default_timeout(240_000)
     page.complaints, page.requests = [], []
     page.on("console", lambda m: page.complaints.append(m.text) if m.type == "error" else None)
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
