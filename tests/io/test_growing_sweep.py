@@ -256,7 +256,7 @@ def test_a_mounting_is_of_the_sensor_it_fits(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(locks() is None, reason="processes that fork")
-def test_killed_at_fifty_moments_all_that_was_appended_is_read():
+def test_killed_at_some_moments_all_that_was_appended_is_read():
     script = Path(__file__).parents[1] / "benchmarks" / "bench_growing.py"
-    done = subprocess.run([sys.executable, script, "50", "7"], capture_output=True, text=True, timeout=300)
+    done = subprocess.run([sys.executable, script, "15", "7"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
