@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import textwrap
 from pathlib import Path
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict
+from pydantic.fields import FieldInfo
 
+from speckle3d.core.units import unit_of
 from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.correction.fused.settings import FusedSettings
@@ -23,6 +27,8 @@ from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.planes import PlaneSettings
+
+_COMMENT_WIDTH = 100
 
 
 class Config(BaseModel):
@@ -62,9 +68,33 @@ class Config(BaseModel):
             values["drift"]["curves"] = drift_curves
         return validated(values, "configuration", Config)
 
-    def to_toml(self) -> str:
-        """Write every setting as TOML text, which `config_from_toml` reads back."""
-        return tomlkit.dumps(self.model_dump(mode="json"))
+    def to_toml(self, comments: bool = False) -> str:
+        """Write every setting as TOML text, which `config_from_toml` reads back.
+
+        Parameters
+        ----------
+        comments : bool
+            Put before each setting what it is, its unit and its default.
+        """
+        values = self.model_dump(mode="json")
+        if not comments:
+            return tomlkit.dumps(values)
+        document = tomlkit.document()
+        for stage, settings in values.items():
+            table = tomlkit.table()
+            for name, field in type(getattr(self, stage)).model_fields.items():
+                for line in _comment(name, field):
+                    table.add(tomlkit.comment(line))
+                table.add(name, settings[name])
+            document.add(stage, table)
+        return tomlkit.dumps(document)
+
+
+def _comment(name: str, field: FieldInfo) -> list[str]:
+    """Lines of what a setting is, its unit and its default."""
+    unit, default = unit_of(name), json.dumps(field.default)
+    told = f"{field.description} Default {default}{f' {unit}' if unit else ''}."
+    return textwrap.wrap(told, _COMMENT_WIDTH)
 
 
 def config_from_toml(text: str, where: str = "configuration") -> Config:

@@ -35,6 +35,7 @@ from speckle3d.cli import (  # noqa: F401
     reconstruction,
     reslices,
     scenes,
+    simulate,
     surfaces,
     trajectory,
     view,

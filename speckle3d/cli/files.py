@@ -16,7 +16,6 @@ from speckle3d.cli.common import (
     app,
     emit,
     emit_rows,
-    from_options,
     note,
     progress_bar,
 )
@@ -32,7 +31,7 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from speckle3d.simulation.settings import SimulatedSweep
+    pass
 
 
 @app.command()
@@ -48,91 +47,10 @@ def info(
 
 @app.command()
 def config() -> None:
-    """Print the default configuration as TOML."""
+    """Print every setting with what it is, its unit and its default, as TOML."""
     from speckle3d.config import Config
 
-    emit(Config().to_toml())
-
-
-@app.command()
-def simulate(
-    out: Annotated[Path, typer.Argument(help="Sweep file to write.")],
-    preset: Annotated[
-        str, typer.Option(help="phantom, tissue, reversal, rotation, crossed, stepped or plane.")
-    ] = "phantom",
-    seed: Annotated[int, typer.Option(help="Same seed and settings, same sweep.")] = 0,
-    vectors: Annotated[int | None, typer.Option(help="Vectors in a frame (127).")] = None,
-    samples: Annotated[int | None, typer.Option(help="Samples in a vector (3818).")] = None,
-    length_mm: Annotated[float | None, typer.Option(help="Length of the sweep (20).")] = None,
-    frames: Annotated[int | None, typer.Option(help="Frames; by default eight per mm.")] = None,
-    steps: Annotated[int | None, typer.Option(help="stepped: frames in a block.")] = None,
-    step_mm: Annotated[float | None, typer.Option(help="stepped: distance between them.")] = None,
-    blocks: Annotated[int | None, typer.Option(help="stepped: independent blocks.")] = None,
-    turn_deg: Annotated[float | None, typer.Option(help="rotation: the deliberate turn.")] = None,
-    turn_axis: Annotated[str | None, typer.Option(help="rotation: tilt or yaw.")] = None,
-    crossing_deg: Annotated[float | None, typer.Option(help="crossed: angle of the sweeps (90).")] = None,
-    fan_deg: Annotated[float | None, typer.Option(help="crossed: tilt within each sweep (0).")] = None,
-    uncalibrated: Annotated[
-        bool | None, typer.Option("--uncalibrated", help="crossed: do not say how the sensors are mounted.")
-    ] = None,
-    reverse: Annotated[bool | None, typer.Option("--reverse", help="rotation: come back.")] = None,
-    drift_mm: Annotated[float | None, typer.Option(help="Slow lateral and axial wander (0.5).")] = None,
-    wobble_mm: Annotated[
-        float | None, typer.Option(help="Deliberate to and fro along the sweep (0).")
-    ] = None,
-    wobble_hz: Annotated[float | None, typer.Option(help="Its frequency (3).")] = None,
-    tremor_mm: Annotated[float | None, typer.Option(help="Tremor of the hand in each axis (0.012).")] = None,
-    snr_db: Annotated[float | None, typer.Option(help="Speckle over electronic noise (40).")] = None,
-    reflector: Annotated[
-        str | None, typer.Option(help="plane: wall, or bar (the Cambridge phantom).")
-    ] = None,
-    duration_s: Annotated[float | None, typer.Option(help="plane: how long the scan lasts (30).")] = None,
-    tilt_range_deg: Annotated[float | None, typer.Option(help="plane: tilt, either way (25).")] = None,
-    roll_range_deg: Annotated[float | None, typer.Option(help="plane: roll, either way (11).")] = None,
-    yaw_range_deg: Annotated[float | None, typer.Option(help="plane: yaw, either way (90).")] = None,
-    depth_range_mm: Annotated[
-        tuple[float, float] | None, typer.Option(help="plane: depths of the floor (12 34).")
-    ] = None,
-    floor_slope_deg: Annotated[float | None, typer.Option(help="plane: slope of the floor (0).")] = None,
-    sensor_noise: Annotated[
-        float | None, typer.Option(help="plane: factor on the noise of both sensors (1).")
-    ] = None,
-    signal: Annotated[str | None, typer.Option(help="What is stored: rf, iq or bmode (rf).")] = None,
-    demodulation_frequency_hz: Annotated[
-        float | None, typer.Option(help="iq: what the echoes are shifted down by (their centre frequency).")
-    ] = None,
-    decimation: Annotated[
-        int | None, typer.Option(help="iq, bmode: samples of the echoes in one that is stored.")
-    ] = None,
-    dynamic_range_db: Annotated[
-        float | None, typer.Option(help="bmode: from black to white, 8 bits (60).")
-    ] = None,
-) -> None:
-    """Simulate a sweep with truth; `crossed` writes a second file beside the first, named ...-crossing."""
-    from speckle3d.io.fileset import FileSet
-    from speckle3d.simulation.presets import SimulationSettings
-    from speckle3d.simulation.presets import simulate as prepare
-
-    settings = from_options(SimulationSettings, locals())
-    with progress_bar("computing the beam"):
-        prepared = prepare(settings)
-    paths = [out, out.with_name(f"{out.stem}-crossing{out.suffix}")][: len(prepared)]
-    for path in paths:
-        require_own_place(path, "simulation")
-    if len(paths) == 1:
-        _write(out, prepared[0])
-        return
-    # A pair is replaced together: two sweeps of different simulations do not cross.
-    with FileSet(out.name, (paths[1].name,)).replaced(out.parent) as part:
-        for path, simulated in zip(paths, prepared, strict=True):
-            _write(part / path.name, simulated)
-
-
-def _write(path: Path, simulated: SimulatedSweep) -> None:
-    from speckle3d.io.sweep_writer import write_sweep
-
-    with progress_bar(f"simulating {path.name}") as progress:
-        write_sweep(path, simulated.sweep, progress, simulation=simulated.description())
+    emit(Config().to_toml(comments=True))
 
 
 @app.command(cls=Importing)

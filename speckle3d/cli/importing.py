@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 Number = Annotated[float | None, typer.Option()]
 PlusConfig = Annotated[str | None, typer.Option(metavar="FILE")]
 ReferenceTransform = Annotated[str | None, typer.Option(metavar="NAME")]
+_PANEL = "What the recording does not say"
 
 
 class Importing(TyperCommand):
@@ -24,12 +25,17 @@ class Importing(TyperCommand):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help, with descriptions of settings where an option has none of its own."""
+        self.describe()
+        super().format_help(ctx, formatter)
+
+    def describe(self) -> None:
+        """Give options that are settings the settings' descriptions, and a panel of their own."""
         from speckle3d.io.import_settings import ImportSettings
 
         for param in self.params:
             if isinstance(param, TyperOption) and param.name in ImportSettings.model_fields:
                 param.help = param.help or ImportSettings.model_fields[param.name].description
-        super().format_help(ctx, formatter)
+                param.rich_help_panel = _PANEL
 
 
 def given_settings(source: Path, options: Mapping[str, Any]) -> ImportSettings:

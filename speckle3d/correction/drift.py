@@ -28,36 +28,37 @@ from speckle3d.correction.curves import (
 
 
 class DriftSettings(BaseModel):
-    """How drift is corrected.
-
-    Attributes
-    ----------
-    curves : {"time", "distance"}
-        "time": the published cubics in t = f / F. "distance": the cubics of z, tilt and yaw multiply the
-        signed estimated step, so that a correction turns round with the probe.
-    loss_epsilon_mm : float
-        Distance below which the unsquared corner distance is rounded off to be differentiable.
-    minimum_frames : int
-        Shortest sweep that is corrected.
-    minimum_coverage : float
-        Least share of the frames that need a sensor reading.
-    maximum_end_gap : float
-        Largest share of the frames that may lack a reading at either end, where curves would extrapolate.
-    minimum_travel_mm : float
-        Least sum of |step| for which "distance" curves are defined.
-    tolerance : float
-        Relative change of cost and coefficients at which the optimisation stops.
-    """
+    """How drift is corrected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    curves: Curves = "time"
-    loss_epsilon_mm: float = Field(0.01, gt=0)
-    minimum_frames: int = Field(10, ge=COEFFICIENTS)
-    minimum_coverage: float = Field(0.8, ge=0, le=1)
-    maximum_end_gap: float = Field(0.1, ge=0, le=1)
-    minimum_travel_mm: float = Field(0.1, gt=0)
-    tolerance: float = Field(1e-6, gt=0)
+    curves: Curves = Field(
+        "time",
+        description="time: the published cubics in t = f / F. distance: the cubics of z, tilt and yaw "
+        "multiply the signed estimated step, so that a correction turns round with the probe.",
+    )
+    loss_epsilon_mm: float = Field(
+        0.01,
+        gt=0,
+        description="Distance below which the unsquared corner distance is rounded off to be differentiable.",
+    )
+    minimum_frames: int = Field(10, ge=COEFFICIENTS, description="Shortest sweep that is corrected, frames.")
+    minimum_coverage: float = Field(
+        0.8, ge=0, le=1, description="Least share of the frames that need a sensor reading."
+    )
+    maximum_end_gap: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="Largest share of the frames that may lack a reading at either end, where curves would "
+        "extrapolate.",
+    )
+    minimum_travel_mm: float = Field(
+        0.1, gt=0, description="Least sum of |step| for which curves in distance are defined."
+    )
+    tolerance: float = Field(
+        1e-6, gt=0, description="Relative change of cost and coefficients at which the optimisation stops."
+    )
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
 from speckle3d.io.deflate import deflated, shuffled
 from speckle3d.io.hdf5 import PathLike, require_target
+from speckle3d.io.meanings import label
 from speckle3d.io.sweep_writer import Compression, frame_for, frames_attributes, name_for
 from speckle3d.io.sweeps import FORMAT, GROWING, IQ_VERSION, SAMPLE_TYPES, VERSION, require_sample_type
 
@@ -245,6 +246,7 @@ class GrowingSweep:
             wxyz = self._mounting.as_quat(scalar_first=True)
             self._orientation.group.attrs["sensor_from_image_wxyz"] = wxyz
         self._growing = file.create_dataset(GROWING, data=np.uint8(1))
+        label(file)
 
     def _write_readings(self, frame_bytes: int = 0) -> None:
         """Write readings that wait, once there is room for them and for the next frame."""

@@ -34,6 +34,7 @@ from speckle3d.io.hdf5_guard import (
     require_sound_heaps,
     require_texts,
 )
+from speckle3d.io.meanings import label
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
 
@@ -117,6 +118,7 @@ def atomic_hdf5(path: PathLike, format_name: str, version: int = 1) -> Iterator[
         file.attrs["format"] = format_name
         file.attrs["version"] = version
         yield file
+        label(file)
 
 
 class HDF5Writer:
@@ -156,6 +158,7 @@ class HDF5Writer:
     def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
         if error is None:
             self._finish()
+            label(self._file)
 
 
 def open_hdf5(path: PathLike) -> h5py.File:

@@ -207,8 +207,12 @@ _BEAM_MM = 0.8
 """Thickness of the focused beam: it covers this much of a wall, but only `bar_mm` of a bar."""
 
 
-def water_bath(entropy: int, reflector: Reflector) -> WaterBath:
-    """Make a bath with a little dust in its water, 34 dB weaker than speckle of unit strength."""
+def water_haze(entropy: int, down_to_mm: float = 0.0) -> TiledMedium:
+    """Make a little dust in water, 34 dB weaker than speckle of unit strength."""
     still = Waves(np.zeros((0, 5)))
-    haze = TiledMedium(entropy, 2.0, 0.0, [Layer(-60.0, still, 0.02)], depth_mm=(-60.0, 0.0))
-    return WaterBath(haze, RoughSheet(entropy), reflector)
+    return TiledMedium(entropy, 2.0, 0.0, [Layer(-60.0, still, 0.02)], depth_mm=(-60.0, down_to_mm))
+
+
+def water_bath(entropy: int, reflector: Reflector) -> WaterBath:
+    """Make a bath with a little dust in its water."""
+    return WaterBath(water_haze(entropy), RoughSheet(entropy), reflector)

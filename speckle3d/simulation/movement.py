@@ -30,6 +30,10 @@ _SWINGS = np.array([2.3, 3.7, 2.9, 6.5, 1.6, 4.3])
 """Swings during the scan of each column of `FloorScan`: incommensurate, so that all combinations occur."""
 
 _ROAMING_MM = 15.0
+_LATERAL_SHARE = 0.35
+"""Of the face: how far a point that is kept in the image goes to either side."""
+_OFF_POINT_MM = 0.15
+"""How far a hand that watches the image misses a point; the focused beam is 0.4 mm to either side."""
 """How far either way the probe wanders over the floor."""
 
 
@@ -188,23 +192,51 @@ class FloorScan(Trajectory):
         return RigidTransform.from_components(met - rotation.apply(below), rotation)
 
 
+@dataclass(frozen=True)
+class PointScan(Trajectory):
+    """A motion about the origin of the medium, which stays in the image or beside it.
+
+    The columns of `knots` are where that point is in the image: lateral from the image's middle, depth, out
+    of the plane (mm); then tilt, yaw, roll (rad), of which yaw comes first, as in a `FloorScan`.
+    """
+
+    def _start_from_image(self, columns: FloatArray) -> RigidTransform:
+        rotation = Rotation.from_euler("YXZ", columns[..., [4, 3, 5]])
+        return RigidTransform.from_components(-rotation.apply(self.pivot_mm + columns[..., :3]), rotation)
+
+
 def scan_floor(
     settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: np.random.Generator
 ) -> FloorScan:
     """Turn and lift the probe over the ranges in `settings`, all axes at once, as a hand would."""
+    time, columns = _scan(settings, (_ROAMING_MM, _ROAMING_MM), rng)
+    return FloorScan(time, columns, np.array([face_mm / 2.0, 0.0, 0.0]), RigidTransform.identity(), world)
+
+
+def scan_point(
+    settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: np.random.Generator
+) -> PointScan:
+    """Keep a point in the image while the probe turns and lifts over the ranges in `settings`."""
+    time, columns = _scan(settings, (_LATERAL_SHARE * face_mm, _OFF_POINT_MM), rng)
+    return PointScan(time, columns, np.array([face_mm / 2.0, 0.0, 0.0]), RigidTransform.identity(), world)
+
+
+def _scan(
+    settings: SimulationSettings, reach_mm: tuple[float, float], rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Times, and swings of six columns; `reach_mm` is of the first and third."""
     duration, tremor = settings.duration_s, HandMotion()
     time = hand_knots(duration)
     nearest, farthest = settings.depth_range_mm
     turns = np.deg2rad([settings.tilt_range_deg, settings.yaw_range_deg, settings.roll_range_deg])
-    reach = np.array([_ROAMING_MM, (farthest - nearest) / 2.0, _ROAMING_MM, *turns])
+    reach = np.array([reach_mm[0], (farthest - nearest) / 2.0, reach_mm[1], *turns])
     columns = np.empty((time.size, 6))
     for axis in range(6):
         fast = tremor.tremor_mm if axis < 3 else tremor.tremor_rad
         columns[:, axis] = reach[axis] * _swings(time / duration, _SWINGS[axis], rng)
         columns[:, axis] += fast * band_noise(time, tremor.tremor_band_hz, rng)
     columns[:, 1] += (nearest + farthest) / 2.0
-    pivot = np.array([face_mm / 2.0, 0.0, 0.0])
-    return FloorScan(time, columns, pivot, RigidTransform.identity(), world)
+    return time, columns
 
 
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:

@@ -18,6 +18,7 @@ from speckle3d.simulation.movement import (
     frame_times,
     hand_sweep,
     scan_floor,
+    scan_point,
     stepped_poses,
     turned_about,
     world_from_medium,
@@ -32,17 +33,18 @@ from speckle3d.simulation.sensors import (
     with_noise,
 )
 from speckle3d.simulation.settings import Preset, SimulatedSweep, SimulationSettings
+from speckle3d.simulation.wires import crossed_threads
 
 __all__ = ["Preset", "SimulatedSweep", "SimulationSettings", "simulate"]
 
-_PLANE_FRAMES = 150
+_PHANTOM_FRAMES = 150
 
 _BATH_MM = (320.0, -150.0, -240.0)
 """Place of the bath in the tracker's world, off its axes."""
 
 _MOUNTING_RAD = tuple(np.deg2rad([-0.55, 44.22, -90.37]).tolist())
 _MOUNTING_MM = (-270.86, 4.86, -65.08)
-"""The mounting of table 3 of TR 303 (Prager et al., 1997), for scans of a plane."""
+"""The mounting of table 3 of TR 303 (Prager et al., 1997)."""
 
 
 def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
@@ -69,10 +71,10 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     seeds = np.random.SeedSequence(settings.seed)
     medium_seed, heading_seed, *sweep_seeds = seeds.spawn(4)
     heading_rng = np.random.default_rng(heading_seed)
-    if settings.preset == "plane":
-        bath = water_bath(_entropy(medium_seed), settings.reflector)
+    if settings.preset in ("plane", "wires"):
         world = _world_from_bath(settings, heading_rng)
-        return (_plane(_Scene(settings, tabulate_beam(Probe()), bath, world), sweep_seeds[0]),)
+        bath = _in_water(settings, _entropy(medium_seed))
+        return (_calibration_scan(_Scene(settings, tabulate_beam(Probe()), bath, world), sweep_seeds[0]),)
     medium = _MEDIUM[settings.preset](_entropy(medium_seed), settings.length_mm)
     beam = tabulate_beam(Probe(), attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
     world = world_from_medium(float(heading_rng.uniform(-np.pi, np.pi)))
@@ -164,24 +166,34 @@ def _hand_held(scene: _Scene, seed: np.random.SeedSequence, number: int) -> Simu
     rng = np.random.default_rng(motion_seed)
     motion, world = _motion(settings), scene.world_from_medium
     trajectory = hand_sweep(settings.length_mm, duration, face_mm, motion, start, world, rng)
-    sensors = TrackerModel(), OrientationModel()
-    mounted = settings.preset != "crossed" or not settings.uncalibrated
+    sensors = _tracker(settings), OrientationModel()
     name = f"{settings.preset}-{settings.seed}" + ("-crossing" if number else "")
-    return _scanned(scene, trajectory, times, duration, sensors, others, mounted, name)
+    return _scanned(scene, trajectory, times, duration, sensors, others, not settings.uncalibrated, name)
 
 
-def _plane(scene: _Scene, seed: np.random.SeedSequence) -> SimulatedSweep:
-    """Scan of a water bath's floor, its sensors uncalibrated."""
+def _tracker(settings: SimulationSettings) -> TrackerModel:
+    if settings.mounting == "published":
+        return TrackerModel(mounting_rad=_MOUNTING_RAD, mounting_mm=_MOUNTING_MM)
+    return TrackerModel()
+
+
+def _in_water(settings: SimulationSettings, entropy: int) -> Medium:
+    return water_bath(entropy, settings.reflector) if settings.preset == "plane" else crossed_threads(entropy)
+
+
+def _calibration_scan(scene: _Scene, seed: np.random.SeedSequence) -> SimulatedSweep:
+    """Scan of what stands in a water bath, its sensors uncalibrated."""
     settings, duration = scene.settings, scene.settings.duration_s
     motion_seed, clock_seed, *others = seed.spawn(5)
-    frames = settings.frames or _PLANE_FRAMES
+    frames = settings.frames or _PHANTOM_FRAMES
     times = frame_times(frames, frames / duration, np.random.default_rng(clock_seed))
     rng = np.random.default_rng(motion_seed)
-    scan = scan_floor(settings, scene.image.width_mm, scene.world_from_medium, rng)
-    tracker = TrackerModel(mounting_rad=_MOUNTING_RAD, mounting_mm=_MOUNTING_MM)
+    scan_of = scan_floor if settings.preset == "plane" else scan_point
+    scan = scan_of(settings, scene.image.width_mm, scene.world_from_medium, rng)
     noise = settings.sensor_noise
-    sensors = with_noise(tracker, noise), with_noise(OrientationModel(), noise)
-    name = f"plane-{settings.reflector}-{settings.seed}"
+    sensors = with_noise(_tracker(settings), noise), with_noise(OrientationModel(), noise)
+    what = f"plane-{settings.reflector}" if settings.preset == "plane" else settings.preset
+    name = f"{what}-{settings.seed}"
     return _scanned(scene, scan, times, duration, sensors, others, False, name)
 
 

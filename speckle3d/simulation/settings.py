@@ -12,7 +12,8 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.simulation.bath import Reflector
 
 Signal = Literal["rf", "iq", "bmode"]
-Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "stepped", "plane"]
+Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "stepped", "plane", "wires"]
+Mounting = Literal["bench", "published"]
 
 
 class SimulationSettings(BaseModel):
@@ -23,11 +24,13 @@ class SimulationSettings(BaseModel):
     preset : str
         phantom: speckle with inclusions, one way. tissue: layers, one way. reversal: tissue, forward and
         back. rotation: phantom with a deliberate turn. crossed: tissue, two sweeps at a right angle; for
-        calibration they must fan, and their tracker must not know its mounting (`fan_deg`, `uncalibrated`).
+        calibration they must fan, and their sensors must not know their mounting (`fan_deg`, `uncalibrated`).
         stepped: uniform speckle in exact elevational steps, for decorrelation curves. plane: a water bath's
-        floor from all sides, for calibration; its sensors are not calibrated to the image.
+        floor from all sides, for calibration. wires: two crossing wires in a water bath, likewise. The
+        sensors of both are not calibrated to the image.
     frames : int, optional
-        Frames of a hand-held sweep; by default eight per mm, twice that when it comes back. Of `plane`: 150.
+        Frames of a hand-held sweep; by default eight per mm, twice that when it comes back. Of `plane` and
+        `wires`: 150.
     steps, step_mm, blocks : int, float, int
         Of `stepped`: frames per block, their distance, and how many independent blocks.
     turn_deg : float
@@ -36,8 +39,11 @@ class SimulationSettings(BaseModel):
         Of `rotation`: sweep forward, then back, turning on.
     crossing_deg, fan_deg : float
         Of `crossed`: the angle between the sweeps, and how far the probe tilts in each, half either way.
+    mounting : {"bench", "published"}
+        How the tracker sits on the probe. bench: the same in every preset, so that a calibration made from
+        one simulated scan serves every simulated sweep. published: as in table 3 of Prager et al. (1997).
     uncalibrated : bool
-        Of `crossed`: leave it to a calibration to find how the sensors sit on the probe.
+        Leave it to a calibration to find how the sensors sit on the probe.
     drift_mm : float
         Of hand-held sweeps: slow lateral and axial wander, standard deviation.
     wobble_mm, wobble_hz : float
@@ -49,15 +55,15 @@ class SimulationSettings(BaseModel):
     reflector : str
         Of `plane`. wall: the floor. bar: the Cambridge phantom's, in the middle of the beam alone.
     duration_s : float
-        Of `plane`: how long the scan takes, whatever `frame_rate_hz` says.
+        Of `plane` and `wires`: how long the scan takes, whatever `frame_rate_hz` says.
     tilt_range_deg, roll_range_deg, yaw_range_deg : float
-        Of `plane`: how far the probe turns either way.
+        Of `plane` and `wires`: how far the probe turns either way.
     depth_range_mm : tuple of float
-        Of `plane`: nearest and farthest depth of the floor in the image's middle vector.
+        Of `plane` and `wires`: nearest and farthest depth of the floor, or of the crossing, in the image.
     floor_slope_deg : float
         Of `plane`: angle of the floor with the horizontal, in a random direction.
     sensor_noise : float
-        Of `plane`: factor on the noise of both sensors; 0 for exact ones.
+        Of `plane` and `wires`: factor on the noise of both sensors; 0 for exact ones.
     signal : {"rf", "iq", "bmode"}
         What the scanner stores: echoes as they come, their I/Q, or 8-bit grey levels.
     demodulation_frequency_hz : float, optional
@@ -86,6 +92,7 @@ class SimulationSettings(BaseModel):
     reverse: bool = False
     crossing_deg: float = Field(90.0, gt=0, lt=180)
     fan_deg: float = Field(0.0, ge=0, le=90)
+    mounting: Mounting = "bench"
     uncalibrated: bool = False
     drift_mm: float = Field(0.5, ge=0, le=20)
     wobble_mm: float = Field(0.0, ge=0, le=5)

@@ -24,9 +24,9 @@ def simulated(**settings):
 
 @pytest.mark.slow
 def test_from_unboxing_to_a_volume(run, project, tmp_path, monkeypatch):
-    text = (project / "docs" / "handheld.md").read_text(encoding="utf-8")
+    text = (project / "docs" / "howto" / "handheld.md").read_text(encoding="utf-8")
     (commands, _), tables = (
-        re.findall(r"```sh\n(.*?)```", text, re.S),
+        [shown.replace("$ ", "") for shown in re.findall(r"```console\n(.*?)```", text, re.S)],
         re.findall(r"```toml\n(.*?)```", text, re.S),
     )
     assert len(commands.splitlines()) == 10

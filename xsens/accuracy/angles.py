@@ -62,7 +62,7 @@ class PairErrors:
 
 @dataclass(frozen=True)
 class AccuracyTable:
-    """Errors of each experiment over all pairs and calibrations, as in table 2 of [1]_.
+    """Errors of each experiment over all pairs and calibrations, as in table 2 of Housden et al. (2008).
 
     Attributes
     ----------

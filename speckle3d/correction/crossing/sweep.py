@@ -14,46 +14,65 @@ from speckle3d.correction.crossing.stack import ImageStack
 
 
 class CrossingSettings(BaseModel):
-    """How two crossing sweeps are brought to agree, and when they are refused.
-
-    Parameters
-    ----------
-    blurs_mm : tuple of float
-        Standard deviations of the Gaussian that the images are compared under, coarse to fine.
-    samples : int
-        Points of each sweep that are looked for in the other, about.
-    effective_samples : float
-        How many independent comparisons these are worth against the priors.
-    tissue_sigma : float
-        Relative standard deviation of what the scale of one sweep differs by from the other's, with the
-        tissue, and changes by along it.
-    nearest_mm : float
-        Depth above which nothing is looked at: the pulse and the probe's own echoes go with the probe. With
-        them tilts of simulated sweeps were up to 3 degrees wrong, without them 0.4.
-    depth_shift_mm : float
-        How much deeper one sweep may see the tissue than the other: the skin is pressed in.
-    least_angle_deg, least_overlap_mm, least_similarity : float
-        Below these a pair is refused: angle between the sweeps, length along either that the other sees,
-        and correlation of the images.
-    least_margin : float
-        Logarithm by which the best way of laying the sweeps together must be likelier than any other.
-    largest_sigma : float
-        Relative standard deviation of the length above which a pair is refused.
-    """
+    """How two crossing sweeps are brought to agree, and when they are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    blurs_mm: tuple[float, ...] = Field((2.0, 0.9, 0.45), min_length=1)
-    samples: int = Field(12_000, ge=1_000, le=200_000)
-    effective_samples: float = Field(500.0, gt=0)
-    tissue_sigma: float = Field(0.03, gt=0, le=0.5)
-    nearest_mm: float = Field(3.0, ge=0, le=20)
-    depth_shift_mm: float = Field(6.0, ge=0, le=30)
-    least_angle_deg: float = Field(30.0, ge=10, le=90)
-    least_overlap_mm: float = Field(18.0, gt=0)
-    least_similarity: float = Field(0.5, ge=0, le=1)
-    least_margin: float = Field(10.0, ge=0)
-    largest_sigma: float = Field(0.02, gt=0)
+    blurs_mm: tuple[float, ...] = Field(
+        (2.0, 0.9, 0.45),
+        min_length=1,
+        description="Standard deviations of the Gaussian that the images are compared under, coarse to fine.",
+    )
+    samples: int = Field(
+        12_000,
+        ge=1_000,
+        le=200_000,
+        description="Points of each sweep that are looked for in the other, about.",
+    )
+    effective_samples: float = Field(
+        500.0, gt=0, description="How many independent comparisons these are worth against the priors."
+    )
+    tissue_sigma: float = Field(
+        0.03,
+        gt=0,
+        le=0.5,
+        description="Relative standard deviation of what the scale of one sweep differs by from the other's, "
+        "with the tissue, and changes by along it.",
+    )
+    # With the probe's own echoes tilts of simulated sweeps were up to 3 degrees wrong, without them 0.4.
+    nearest_mm: float = Field(
+        3.0,
+        ge=0,
+        le=20,
+        description="Depth above which nothing is looked at: the pulse and the probe's own echoes go with "
+        "the probe.",
+    )
+    depth_shift_mm: float = Field(
+        6.0,
+        ge=0,
+        le=30,
+        description="How much deeper one sweep may see the tissue than the other: the skin is pressed in.",
+    )
+    least_angle_deg: float = Field(
+        30.0, ge=10, le=90, description="Angle between the sweeps below which a pair is refused."
+    )
+    least_overlap_mm: float = Field(
+        18.0,
+        gt=0,
+        description="Length along either sweep that the other sees, below which a pair is refused.",
+    )
+    least_similarity: float = Field(
+        0.5, ge=0, le=1, description="Correlation of the images below which a pair is refused."
+    )
+    least_margin: float = Field(
+        10.0,
+        ge=0,
+        description="Logarithm by which the best way of laying the sweeps together must be likelier than any "
+        "other.",
+    )
+    largest_sigma: float = Field(
+        0.02, gt=0, description="Relative standard deviation of the length above which a pair is refused."
+    )
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from speckle3d.io.load import companion_files, load_sweep
 
 @pytest.fixture(scope="module")
 def page(project):
-    return (project / "docs" / "formats.md").read_text(encoding="utf-8")
+    return (project / "docs" / "howto" / "formats.md").read_text(encoding="utf-8")
 
 
 def blocks(page, language):

@@ -1,0 +1,175 @@
+"""Pages that the code itself knows: settings, commands and the API, written before each build."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shutil
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+from sphinx.application import Sphinx
+from sphinx.util import logging
+
+from speckle3d.core.units import unit_of
+
+LOG = logging.getLogger(__name__)
+
+PUBLIC = ("speckle3d", "xsens")
+
+
+def settings_page(title: str, groups: dict[str, type[BaseModel]], when: dict[str, dict[str, str]]) -> str:
+    """Table of every setting: name, default, unit, what it is, when to change it."""
+    lines = [f"# {title}", ""]
+    for group, model in groups.items():
+        lines += [
+            f"## `{group}`" if group else "",
+            "",
+            "| setting | default | what it is | change it |",
+            "|---|---|---|---|",
+        ]
+        for name, field in model.model_fields.items():
+            told = when.get(group, {}).get(name)
+            where = f"{group}.{name}"
+            if not field.description:
+                LOG.warning("%s: has no description", where)
+            if told is None:
+                LOG.warning("%s: reference/when.toml does not say when to change it", where)
+            default = (
+                "asked for" if field.default in (PydanticUndefined, None) else f"`{_shown(field.default)}`"
+            )
+            unit = unit_of(name)
+            lines.append(
+                f"| `{name}` | {default}{f' {unit}' if unit else ''} | {_cell(field.description)} | {_cell(told)} |"
+            )
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(list(value) if isinstance(value, tuple) else value)
+
+
+def _cell(text: str | None) -> str:
+    return " ".join((text or "").split()).replace("|", "\\|")
+
+
+def command_pages() -> dict[str, str]:
+    """One page for each command and group of commands, by name."""
+    import typer.main
+
+    from speckle3d.cli import app
+
+    pages: dict[str, str] = {}
+    root = typer.main.get_command(app)
+    for name, command in sorted(root.commands.items()):  # type: ignore[attr-defined]
+        parts = [f"# `speckle3d {name}`", ""]
+        if hasattr(command, "commands"):
+            parts += [_text(command.help), ""]
+            for inner, each in sorted(command.commands.items()):
+                parts += [f"## `speckle3d {name} {inner}`", "", *_command(each)]
+        else:
+            parts += _command(command)
+        pages[name] = "\n".join(parts)
+    return pages
+
+
+def _command(command: Any) -> list[str]:
+    if hasattr(command, "describe"):
+        command.describe()
+    lines = [_text(command.help), ""]
+    rows = [_option(each) for each in command.params if not getattr(each, "hidden", False)]
+    panels: dict[str, list[str]] = {}
+    for panel, row in rows:
+        panels.setdefault(panel, []).append(row)
+    for panel, held in panels.items():
+        lines += [f"{panel}:", "", "| | |", "|---|---|", *held, ""]
+    return lines
+
+
+def _option(parameter: Any) -> tuple[str, str]:
+    argument = parameter.param_type_name == "argument"
+    panel = "Arguments" if argument else (getattr(parameter, "rich_help_panel", None) or "Options")
+    names = ", ".join([*parameter.opts, *parameter.secondary_opts])
+    if argument:
+        names = str(parameter.metavar or parameter.name).strip("{}").upper()
+    help_text = _cell(getattr(parameter, "help", "") or "")
+    if not help_text:
+        LOG.warning("%s: has no help", names)
+    return panel, f"| `{names}` | {_escaped(help_text)} |"
+
+
+def _text(text: str | None) -> str:
+    """Paragraphs of a docstring, as Markdown."""
+    paragraphs = re.split(r"\n\s*\n", (text or "").strip())
+    return "\n\n".join(_escaped(" ".join(p.split())) for p in paragraphs)
+
+
+def _escaped(text: str) -> str:
+    return text.replace("<", "&lt;").replace("*", "\\*")
+
+
+def api_pages() -> dict[str, str]:
+    """One page for each public name, `package.name`."""
+    pages: dict[str, str] = {}
+    for package in PUBLIC:
+        module = importlib.import_module(package)
+        for name in sorted(n for n in dir(module) if not n.startswith("_")):
+            public = getattr(module, name)
+            if isinstance(public, type(module)):
+                continue
+            kind = (
+                "autoclass"
+                if isinstance(public, type)
+                else "autofunction"
+                if callable(public)
+                else "autodata"
+            )
+            more = (
+                "\n   :members:"
+                if kind == "autoclass" and not issubclass(public, (BaseModel, Exception))
+                else ""
+            )
+            pages[f"{package}.{name}"] = (
+                f"# `{package}.{name}`\n\n```{{eval-rst}}\n.. {kind}:: {package}.{name}{more}\n```\n"
+            )
+    return pages
+
+
+def write(app: Sphinx) -> None:
+    """Write all pages below `reference/generated`."""
+    from speckle3d.config import Config
+    from speckle3d.io.import_settings import ImportSettings
+
+    here = Path(app.srcdir) / "reference" / "generated"
+    shutil.rmtree(here, ignore_errors=True)
+    when = tomllib.loads((here.parent / "when.toml").read_text())
+    groups = {name: type(field.default) for name, field in Config.model_fields.items()}
+    pages = {
+        "settings": settings_page("Settings", groups, when),
+        "import-settings": settings_page("What a recording does not say", {"import": ImportSettings}, when),
+    }
+    commands, api = command_pages(), api_pages()
+    pages |= {f"commands/{name}": text for name, text in commands.items()}
+    pages |= {f"api/{name}": text for name, text in api.items()}
+    pages["commands/index"] = _index("Commands", "`speckle3d COMMAND --help` says the same.", commands)
+    pages["api/index"] = _index("Python", "Public names of `speckle3d` and `xsens`.", api)
+    for name, text in pages.items():
+        path = here / f"{name}.md"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text.rstrip() + "\n")
+
+
+def _index(title: str, text: str, names: dict[str, str]) -> str:
+    return "\n".join([f"# {title}", "", text, "", "```{toctree}", ":maxdepth: 1", "", *names, "```", ""])
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the pages' making before sources are read."""
+    app.connect("builder-inited", write)
+    return {"parallel_read_safe": True}
