@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1]
 _FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 _TIMEOUT_S = 500
+_LEFT_OUT = ("pip ", "python -m pytest")
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def shown_commands(page: Path) -> list[str]:
 
 
 def run_page(page: Path, folder: Path) -> str:
-    """Run a page's sh and python blocks in order, in a folder that holds nothing but `data`; return what they print.
+    """Run a page's sh and python blocks in order, in a folder with `data` alone; return what they print.
 
     Installing is left out, as the tests run installed; so is the command that runs the tests.
     """
@@ -73,9 +74,8 @@ def run_page(page: Path, folder: Path) -> str:
         done = subprocess.run(
             arguments, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S
         )
-        assert done.returncode == 0, (
-            f"{page.name}, line {block.line}:\n{block.text}\n{done.stdout}{done.stderr}"
-        )
+        where = f"{page.name}, line {block.line}"
+        assert done.returncode == 0, f"{where}:\n{block.text}\n{done.stdout}{done.stderr}"
         printed += done.stdout
     return printed
 
@@ -92,8 +92,6 @@ def _after(before: list[str], text: str) -> str:
 def _without_installing(text: str) -> str:
     kept = []
     for line in text.splitlines():
-        parts = [
-            part for part in line.split(" && ") if not part.lstrip().startswith(("pip ", "python -m pytest"))
-        ]
+        parts = [part for part in line.split(" && ") if not part.lstrip().startswith(_LEFT_OUT)]
         kept.append(" && ".join(parts))
     return "\n".join(kept)

@@ -42,9 +42,8 @@ def settings_page(title: str, groups: dict[str, type[BaseModel]], when: dict[str
                 "asked for" if field.default in (PydanticUndefined, None) else f"`{_shown(field.default)}`"
             )
             unit = unit_of(name)
-            lines.append(
-                f"| `{name}` | {default}{f' {unit}' if unit else ''} | {_cell(field.description)} | {_cell(told)} |"
-            )
+            cells = (f"`{name}`", f"{default} {unit}".strip(), _cell(field.description), _cell(told))
+            lines.append(f"| {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)
 
