@@ -217,7 +217,7 @@ def write_outcome(
 
 
 def _timed(recording: Recording, settings: ScanSettings) -> tuple[Recording, JobSettings]:
-    given, outlier_sigma = settings.time_offset, settings.outlier_sigma
+    given, outlier_sigma = settings.time_offset_s, settings.outlier_sigma
     if given is None:
         return recording, JobSettings(outlier_sigma=outlier_sigma)
     if given == "estimate":

@@ -39,7 +39,7 @@ class ScanSettings(BaseModel):
     pixel_mm: tuple[float, float] | None = Field(
         None, description="Distance between columns and rows, mm, if the recording does not say."
     )
-    time_offset: float | Literal["estimate"] | None = Field(
+    time_offset_s: float | Literal["estimate"] | None = Field(
         None, description="Seconds to add to the sensor's clock; by default the recording's own."
     )
     outlier_sigma: float = Field(
@@ -156,9 +156,9 @@ def offset_of(text: str | None) -> float | Literal["estimate"] | None:
     if text == "estimate":
         return "estimate"
     try:
-        (seconds,) = numbers(text, 1, "--time-offset")
+        (seconds,) = numbers(text, 1, "--time-offset-s")
     except InvalidInputError:
-        raise InvalidInputError(f"--time-offset: expected seconds or `estimate`, got {text!r}") from None
+        raise InvalidInputError(f"--time-offset-s: expected seconds or `estimate`, got {text!r}") from None
     return seconds
 
 

@@ -92,7 +92,7 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 
 def _run(heard: list[int]) -> None:
     try:
-        code = app(standalone_mode=False)
+        code = app(standalone_mode=False, prog_name="speckle3d")
     except Speckle3DError as error:
         _fail(str(error), 1 if isinstance(error, NoSpaceError) else 2)
     except (KeyboardInterrupt, typer.Abort):

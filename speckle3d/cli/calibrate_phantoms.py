@@ -75,7 +75,7 @@ def calibrate_plane(
         list[float] | None, typer.Option(help="Thickness of the beam for that prediction; may be repeated.")
     ] = None,
     region: Region = None,
-    time_offset: TimeOffset = None,
+    time_offset_s: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
     validation: Validation = None,
     columns: Columns = None,
@@ -90,7 +90,7 @@ def calibrate_plane(
     """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
     from speckle3d.calibrating.settings import PlaneSettings
 
-    given = {**locals(), **_parsed(region, time_offset, leave_out)}
+    given = {**locals(), **_parsed(region, time_offset_s, leave_out)}
     _calibrate(images, from_options(PlaneSettings, given), out, validation, as_json=as_json)
 
 
@@ -112,7 +112,7 @@ def calibrate_orientation(
         typer.Option(help="orientation, or tracker: use only what a tracker says of orientation."),
     ] = "orientation",
     region: Region = None,
-    time_offset: TimeOffset = None,
+    time_offset_s: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
     validation: Validation = None,
     columns: Columns = None,
@@ -127,7 +127,7 @@ def calibrate_orientation(
     """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
     from speckle3d.calibrating.settings import OrientationSettings
 
-    given = {**locals(), **_parsed(region, time_offset, leave_out)}
+    given = {**locals(), **_parsed(region, time_offset_s, leave_out)}
     _calibrate(images, from_options(OrientationSettings, given), out, validation, as_json=as_json)
 
 
@@ -151,7 +151,7 @@ def calibrate_wires(
         ),
     ] = "auto",
     region: Region = None,
-    time_offset: TimeOffset = None,
+    time_offset_s: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
     validation: Validation = None,
     validation_points: Annotated[
@@ -165,17 +165,17 @@ def calibrate_wires(
 
     if validation is None and validation_points is not None:
         raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
-    given = {**locals(), **_parsed(region, time_offset, leave_out)}
+    given = {**locals(), **_parsed(region, time_offset_s, leave_out)}
     others = (points, validation_points, Path(phantom))
     _calibrate(images, from_options(WireSettings, given), out, validation, validation_points, others, as_json)
 
 
-def _parsed(region: str | None, time_offset: str | None, leave_out: str | None) -> dict[str, Any]:
+def _parsed(region: str | None, time_offset_s: str | None, leave_out: str | None) -> dict[str, Any]:
     from speckle3d.calibrating.settings import frames_of, offset_of, region_of
 
     return {
         "region": region_of(region),
-        "time_offset": offset_of(time_offset),
+        "time_offset_s": offset_of(time_offset_s),
         "leave_out": frames_of(leave_out),
     }
 

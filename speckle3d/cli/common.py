@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from speckle3d.cli.helping import App
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 
@@ -21,14 +22,32 @@ if TYPE_CHECKING:
 
     Model = TypeVar("Model", bound=BaseModel)
 
-app = typer.Typer(
+app = App(
     name="speckle3d",
     help="Freehand 2-D ultrasound sweeps to measured 3-D.",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-calibrate = typer.Typer(help="Calibrate what a reconstruction needs.", no_args_is_help=True)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from speckle3d import __version__
+
+        emit(f"speckle3d {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Freehand 2-D ultrasound sweeps to measured 3-D."""
+
+
+calibrate = App(help="Calibrate what a reconstruction needs.")
 app.add_typer(calibrate, name="calibrate")
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable results on stdout.")]

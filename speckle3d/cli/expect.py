@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 from speckle3d.cli.common import Json, app, emit, emit_json, from_options
+from speckle3d.cli.helping import App
 
-expect = typer.Typer(no_args_is_help=True, help="What error to expect, before anyone scans.")
+expect = App(help="What error to expect, before anyone scans.")
 app.add_typer(expect, name="expect")
 
 

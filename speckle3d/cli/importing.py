@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperOption
+from typer.core import TyperOption
 
 from speckle3d.cli.common import from_options
+from speckle3d.cli.helping import Command
 
 if TYPE_CHECKING:
     from speckle3d.io.import_settings import ImportSettings
@@ -20,7 +21,7 @@ ReferenceTransform = Annotated[str | None, typer.Option(metavar="NAME")]
 _PANEL = "What the recording does not say"
 
 
-class Importing(TyperCommand):
+class Importing(Command):
     """A command with options of `ImportSettings`, whose help texts are those of its fields."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

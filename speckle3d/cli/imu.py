@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import Json, app, emit_json, emit_rows, note
+from speckle3d.cli.helping import App
 from speckle3d.cli.imu_logs import Log, RateHz, WorldOption, read, tell
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from xsens.fusion.orient import Orientation
     from xsens.logs.samples import ImuLog
 
-imu = typer.Typer(help="The orientation sensor: logs, live data, orientation.", no_args_is_help=True)
+imu = App(help="The orientation sensor: logs, live data, orientation.")
 app.add_typer(imu, name="imu")
 
 
@@ -130,6 +131,8 @@ def imu_orient(
     require_finite_offset(time_offset_s or 0.0)
     if out is not None:
         require_own_place(out, "log", log_file, into, calibration)
+    if into is not None and not replace_stream:
+        _require_no_stream(into)
     held = ridden_along(log_file)
     log = read(log_file, rate_hz, world) if held is None else log_of(held, log_file.name)
     with naming(str(log_file)):
@@ -256,6 +259,15 @@ def _attach(
     note(f"orientation of {len(rotations)} samples in {sweep_file}{covered}")
 
 
+def _require_no_stream(sweep_file: Path) -> None:
+    from speckle3d.io.load import load_sweep
+
+    if load_sweep(sweep_file).orientation is not None:
+        raise InvalidInputError(
+            f"{sweep_file}: expected no orientation sensor's stream, got one: --replace replaces it"
+        )
+
+
 def _cover(sweep_file: Path, sensor: OrientationSensor, replace_stream: bool) -> str:
     """Tell how many frames the stream covers; refuse one that covers none, or replaces one unasked."""
     from speckle3d.io.load import load_sweep
@@ -266,10 +278,6 @@ def _cover(sweep_file: Path, sensor: OrientationSensor, replace_stream: bool) ->
         if replace_stream:
             return ""
         raise
-    if sweep.orientation is not None and not replace_stream:
-        raise InvalidInputError(
-            f"{sweep_file}: expected no orientation sensor's stream, got one: --replace replaces it"
-        )
     times_s = sweep.frame_time_s
     frames = int(sensor.covers(times_s).sum())
     covered = f"covers {frames} of {times_s.size} frames"

@@ -42,7 +42,8 @@ def reconstruct(
     drift: Annotated[
         list[str] | None,
         typer.Option(
-            help="Correction mode: orientation, pose, fused, inertial, crossed or image+subset; repeatable."
+            help="Correction mode: orientation, pose, fused, inertial, crossed or consistent-subset; may be "
+            "repeated."
         ),
     ] = None,
     crossing_file: Annotated[

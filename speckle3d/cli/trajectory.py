@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from speckle3d.cli.common import Json, ReconstructionFile, app, emit, note
+from speckle3d.cli.helping import App
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.io.tum import LengthUnit
 
-trajectory = typer.Typer(help="Trajectories as TUM text, and scores of them.", no_args_is_help=True)
+trajectory = App(help="Trajectories as TUM text, and scores of them.")
 app.add_typer(trajectory, name="trajectory")
 
 Unit = Annotated[str, typer.Option("--length-unit", help="Unit of lengths in TUM text: m or mm.")]

@@ -12,7 +12,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 
-MODES = ("image", "image+subset", "orientation", "pose", "crossed", "inertial", "fused")
+MODES = ("image", "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused")
 """Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""
 
 

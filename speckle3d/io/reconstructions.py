@@ -238,9 +238,16 @@ def _read_provenance(file: h5py.File) -> Provenance:
     )
 
 
+_EARLIER = {"consistent-subset": "image+subset"}
+"""Names of modes in older files."""
+
+
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
     group = require_group(file, "poses")
-    return {mode: read_transforms(group, mode, frames) for mode in MODES if has_member(group, mode)}
+    names = {mode: mode if has_member(group, mode) else _EARLIER.get(mode, mode) for mode in MODES}
+    return {
+        mode: read_transforms(group, name, frames) for mode, name in names.items() if has_member(group, name)
+    }
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:

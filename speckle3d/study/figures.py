@@ -27,13 +27,13 @@ DOTS_PER_INCH = 150
 CURVE_LABELS = ("length / mm", "tilt / °", "yaw / °", "roll / °")
 
 _MODES = {
-    "image": ("image-based", "#D55E00"),
-    "image+subset": ("image-based, consistent subset", "#E69F00"),
-    "orientation": ("orientation correction", "#0072B2"),
-    "pose": ("six DOF correction", "#009E73"),
+    "image": ("images alone", "#D55E00"),
+    "consistent-subset": ("images, consistent subset", "#E69F00"),
+    "orientation": ("orientation sensor", "#0072B2"),
+    "pose": ("position sensor", "#009E73"),
     "crossed": ("crossing sweep", "#CC79A7"),
-    "inertial": ("inertial scale", "#56B4E9"),
-    "fused": ("all that is known, fused", "#882255"),
+    "inertial": ("accelerometer", "#56B4E9"),
+    "fused": ("all sensors, fused", "#882255"),
 }
 """Label and colour of each mode, from Okabe and Ito's and Tol's palettes, told apart with any vision."""
 

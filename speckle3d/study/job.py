@@ -36,10 +36,11 @@ from speckle3d.study.crossed import Companion
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.folder import BlockFiles
-from speckle3d.study.images import Strip, cut_frames, middle_planes
+from speckle3d.study.images import PIXEL_MM, Strip, cut_frames, middle_planes
 from speckle3d.study.request import SUBSET, Request, require_possible
 from speckle3d.study.reslices.cut_geometry import anchors_of
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
+from speckle3d.study.reslices.enlarged import save_enlarged
 from speckle3d.study.reslices.places import view_of
 from speckle3d.study.reslices.reslice_figures import save_reslices
 from speckle3d.study.results import Summary, is_study, summary_text, write_summary
@@ -73,7 +74,10 @@ class JobResult:
     curves: DecorrelationCurves | None = None
 
 
-RESULTS = FileSet("reconstruction.h5", ("summary.json", "table.txt", "table.csv", "drift.png", "reslice.png"))
+RESULTS = FileSet(
+    "reconstruction.h5",
+    ("summary.json", "table.txt", "table.csv", "drift.png", "reslice.png", "enlarged.png"),
+)
 """What a job writes."""
 
 
@@ -91,9 +95,9 @@ def run_job(
 ) -> JobResult:
     """Reconstruct a sweep and put everything that belongs to it into `directory`.
 
-    Written: ``reconstruction.h5``, ``summary.json``, ``table.txt``, ``table.csv``, ``drift.png`` and
-    ``reslice.png``. A new folder appears whole; in one that is there, all six take the place of earlier
-    results together, and other files stay.
+    Written: ``reconstruction.h5``, ``summary.json``, ``table.txt``, ``table.csv``, ``drift.png``,
+    ``reslice.png`` and ``enlarged.png``. A new folder appears whole; in one that is there, all of them take the
+    place of earlier results together, and other files stay.
 
     Parameters
     ----------
@@ -104,7 +108,7 @@ def run_job(
     directory : path
         Made if need be.
     drift : sequence of str
-        Modes beside `image`: "image+subset", "orientation", "pose", "crossed", "inertial", "fused".
+        Modes beside `image`: "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused".
     reference : {"tracker", "truth"}, optional
         What to compare with; by default the truth if stored, else the tracker, else nothing.
     config : Config, optional
@@ -201,6 +205,7 @@ def write_results(
     files = [path, *write_summary(directory, summary)]
     files += [save_figure(figure_drift(moved, _title(summary)), directory / "drift.png")]
     files += [_draw_reslices(directory / "reslice.png", sweep.name, poses, compared, strip)]
+    files += [_draw_enlarged(directory / "enlarged.png", sweep, poses, strip)]
     table, seconds = summary_text(summary), time.perf_counter() - began
     curves = None if side is None or crossed is None else side.curves(tracked, crossed)
     return JobResult(directory, summary, table, tuple(files), seconds, curves)
@@ -301,6 +306,20 @@ def _errors(
         return [ModeError.of_estimate(m, len(sweep), float(c[0, -1])) for m, c in moved.modes.items()]
     true, ends = reference.world_from_image, 1 if reference.name == "truth" else END_FRAMES
     return compare_modes(poses, true, sweep.grid.centre_mm, reference.covered, ends)
+
+
+def _draw_enlarged(path: Path, sweep: Sweep, poses: dict[str, RigidTransform], strip: Strip) -> Path:
+    """Part of the cut along the sweep: by the tracker alone, if it covers all frames, and in every mode."""
+    left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
+    shown = {}
+    tracker = sweep.tracker
+    if tracker is not None and tracker.sensor_from_image is not None:
+        if tracker.covers(sweep.frame_time_s).all():
+            shown["tracker"] = tracker.world_from_image(sweep.frame_time_s) * left
+    shown |= {mode: each * left for mode, each in poses.items()}
+    planes = middle_planes(shown, strip.grid)
+    cuts = {mode: cut_frames(strip, strip.grid, each, planes[mode]) for mode, each in shown.items()}
+    return save_enlarged(cuts, PIXEL_MM, sweep.name, path)
 
 
 def _draw_reslices(

@@ -20,7 +20,7 @@ from speckle3d.io.load import recording_sha256
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.scoring.references import Reference, find_reference
 
-SUBSET = "image+subset"
+SUBSET = "consistent-subset"
 """Mode of the images alone with the patches that contradict the sensed orientation left out."""
 
 

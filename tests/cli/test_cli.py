@@ -14,7 +14,15 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volumes import read_volume
 
-RESULTS = {"reconstruction.h5", "summary.json", "table.txt", "table.csv", "drift.png", "reslice.png"}
+RESULTS = {
+    "reconstruction.h5",
+    "summary.json",
+    "table.txt",
+    "table.csv",
+    "drift.png",
+    "reslice.png",
+    "enlarged.png",
+}
 PNG = b"\x89PNG\r\n\x1a\n"
 
 

@@ -114,12 +114,12 @@ def test_a_clock_that_is_off_is_found(run, scans, tmp_path):
         file["tracker"].attrs["time_offset_s"] = true + 0.11
 
     shifted = changed(scans / "bar.h5", tmp_path / "shifted.h5", shift)
-    code, table, err = run("calibrate", "plane", shifted, "-o", out, "--time-offset", "estimate")
+    code, table, err = run("calibrate", "plane", shifted, "-o", out, "--time-offset-s", "estimate")
     assert code == 0, err
     # The hand moves by 10 mm/s here and the lines are exact to 0.02 mm: two milliseconds.
     assert read_calibration(out).time_offset_s == pytest.approx(true, abs=0.004)
     assert "estimated" in table
-    code, _, _ = run("calibrate", "plane", shifted, "-o", out, "--time-offset", true)
+    code, _, _ = run("calibrate", "plane", shifted, "-o", out, "--time-offset-s", true)
     assert code == 0
     assert error_of(out, scans / "bar.h5")[1] < 0.3
 
@@ -132,7 +132,7 @@ def test_a_clock_offset_that_is_given_is_kept_even_if_zero(run, scans, tmp_path)
         file["tracker"].attrs["time_offset_s"] = 0.0
 
     exact = changed(scans / "bar.h5", tmp_path / "exact.h5", by_the_images_clock)
-    for options, expected in (((), None), (("--time-offset", "0"), 0.0)):
+    for options, expected in (((), None), (("--time-offset-s", "0"), 0.0)):
         assert run("calibrate", "plane", exact, "-o", out, *options)[0] == 0
         assert read_calibration(out).time_offset_s == expected
 
@@ -194,10 +194,10 @@ def test_a_missing_motion_is_refused_and_nothing_written(refused, scans, tmp_pat
         (("--region", "500,1 600,1 600,9"), "region_px"),
         (("--columns", "2"), "--columns: "),
         (("--place", "middle"), "--place: "),
-        (("--time-offset", "soon"), "--time-offset"),
-        (("--time-offset", "nan"), "--time-offset"),
+        (("--time-offset-s", "soon"), "--time-offset-s"),
+        (("--time-offset-s", "nan"), "--time-offset-s"),
         (("--beam-mm", "nan"), "width_mm"),
-        (("--time-offset", "100"), "sensor readings"),
+        (("--time-offset-s", "100"), "sensor readings"),
         (("--pixel-mm", "0", "1"), "--pixel-mm"),
     ],
 )

@@ -14,7 +14,15 @@ from speckle3d.io.reconstructions import read_reconstruction
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
 
-RESULTS = {"reconstruction.h5", "summary.json", "table.txt", "table.csv", "drift.png", "reslice.png"}
+RESULTS = {
+    "reconstruction.h5",
+    "summary.json",
+    "table.txt",
+    "table.csv",
+    "drift.png",
+    "reslice.png",
+    "enlarged.png",
+}
 STOPS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.filterwarnings(
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
 )
 
-MODES = ["image", "image+subset", "orientation", "pose", "fused"]
+MODES = ["image", "consistent-subset", "orientation", "pose", "fused"]
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ class Options:
             each.value = getattr(given, name)
         self._offset = pn.widgets.TextInput(
             name="clock offset: empty (the recording's own), `estimate`, or seconds",
-            value="" if given.time_offset is None else str(given.time_offset),
+            value="" if given.time_offset_s is None else str(given.time_offset_s),
             width=285,
         )
         for each in (*self._widgets.values(), self._offset):
@@ -54,7 +54,7 @@ class Options:
             If the clock offset is none.
         """
         values = {name: each.value for name, each in self._widgets.items()}
-        return values | {"time_offset": offset_of((self._offset.value or "").strip() or None)}
+        return values | {"time_offset_s": offset_of((self._offset.value or "").strip() or None)}
 
     def view(self) -> Viewable:
         """The widgets, folded away."""

@@ -41,7 +41,10 @@ def _device(element: Element) -> str:
 def _lag_rows(_: Path, root: Element) -> list[Row]:
     """Rows of a delay, whose sign PLUS has the other way round: a tracker that lags is there negative."""
     (lag_s,) = vector(root, "TrackerLagSec", 1)
-    return [("time offset of the tracker", f"{-lag_s:+.4f}", "s"), ("for", "--time-offset of calibrate", "")]
+    return [
+        ("time offset of the tracker", f"{-lag_s:+.4f}", "s"),
+        ("for", "--time-offset-s of calibrate", ""),
+    ]
 
 
 def _line_rows(_: Path, root: Element) -> list[Row]:

@@ -26,7 +26,7 @@ from speckle3d.io.load import kind_of, load_sweep
         (
             '<TemporalCalibrationResults TrackerLagSec="-0.0648266"/>',
             {"content": "a tracker's delay", "time offset of the tracker": "+0.0648"},
-            "--time-offset",
+            "--time-offset-s",
         ),
         (
             '<LineSegmentationResults><Frame SegmentationStatus="OK"/><Frame/></LineSegmentationResults>',
