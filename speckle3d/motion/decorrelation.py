@@ -199,7 +199,7 @@ def _misfit(coefficients: FloatArray, design: FloatArray, rho: FloatArray, weigh
 
 
 def _bin_means(distance: FloatArray, rho: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means over bins of equal distance: at exact repeats for a stepped phantom, else 0.05 mm wide."""
+    """Means over bins of distance 0.05 mm wide: exact repeats of a phantom in such steps share one."""
     width = 0.05
     _, label = np.unique(np.round(distance / width), return_inverse=True)
     count = np.bincount(label)

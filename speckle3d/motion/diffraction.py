@@ -4,9 +4,9 @@ The echo of fully developed speckle, moved by d along the elevational axis, keep
 
     rho(d) = |sum_f S(f) gamma_f(d)|^2,   gamma_f(d) = int B_f(z) B_f*(z - d) dz / int |B_f(z)|^2 dz,
 
-where B_f is the two-way field over elevation z at one depth and frequency, the square of the one-way field of
-the lens, and S the echo's own power spectrum at that depth, which attenuation pulls down. Off the focus it is
-the wavefront's curvature in B_f that makes gamma fall.
+where B_f is the two-way field over elevation z at one depth and frequency, the product of the lens's one-way
+fields on transmit and on receive, and S the echo's own power spectrum at that depth, which attenuation pulls
+down. Off the focus it is the wavefront's curvature in B_f that makes gamma fall.
 
 The field is that of a line source seen along straight paths, without the Fresnel approximation, which fails
 in front of a 5 mm aperture at 5 mm. What lies across the image enters through the path alone: elements beside

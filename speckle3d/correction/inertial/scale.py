@@ -42,8 +42,8 @@ _CLOCK_RANGE = 2.0
 """Clock offsets are tried up to so many times their standard deviation."""
 _CERTAIN = 25.0
 """Squared deviations by which the accelerometer's sign must be the better one: five sigma."""
-_MOST_TURNED = 0.3
-"""Share of the steps that may go the other way than the images have them."""
+_LEAST_ALIKE = 0.3
+"""Share of the path over which accelerometer and images must go the same way, at least."""
 _SIGN_ROUNDS, _NOISE_ROUNDS = 3, 4
 _BLIND_MM = 1e3
 """Deviation of image steps that say nothing."""
@@ -226,7 +226,7 @@ def _signs(blind: InertialProblem, nearby: Solution | None, s: InertialSettings)
     if signs.certainty < _CERTAIN:
         return replace(signs, turned=np.zeros(steps.size, dtype=bool), clock_s=0.0, log_scale=0.0)
     share = float(np.abs(steps[signs.turned]).sum() / np.abs(steps).sum())
-    if share > 1.0 - _MOST_TURNED:
+    if share > 1.0 - _LEAST_ALIKE:
         raise MismatchError(
             f"inertial scale: expected the probe to move as the images go, got an accelerometer that has it "
             f"the other way for {share:.0%} of the path; check sensors.direction, its clock and mounting"
@@ -324,7 +324,7 @@ def _poses(
     turned = _orientation(image, sensor, time_s)
     moved = relative_poses(image).apply(centre) - centre
     moved[:, 2] = np.diff(found.travel_mm)
-    # A step is seen from the frame before; half of the turn to the next makes it symmetric.
+    # A step is seen from the frame before.
     along = turned[:-1].apply(moved)
     centres = np.concatenate([np.zeros((1, 3)), np.cumsum(along, axis=0)])
     origins = centres - turned.apply(centre)

@@ -1,0 +1,71 @@
+"""The pages of methods name what is there: settings with their defaults, modules, limits and sources."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from speckle3d.config import Config
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs" / "methods").glob("*.md"))
+SETTINGS = Config().model_dump()
+
+named_page = pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+
+
+def settings_in(text: str) -> list[tuple[str, str, str]]:
+    """Group and name of each setting in a page, and the number in parentheses behind it, if any."""
+    found = re.findall(
+        r"([a-z]+)\.([a-z_]+)\b(?:`|\})(?:\s(?:\(|\| )([-\d.]+)(?=[\s),;]))?", text.replace("\\_", "_")
+    )
+    return [
+        (group, name, value) for group, name, value in found if group in SETTINGS and name not in ("md", "py")
+    ]
+
+
+@named_page
+def test_settings_of_a_page_exist_with_the_defaults_it_gives(page: Path) -> None:
+    for group, name, value in settings_in(page.read_text()):
+        assert name in SETTINGS[group], f"{page.name}: {group}.{name}"
+        default = SETTINGS[group][name]
+        if value and isinstance(default, (int, float)):
+            shown = pytest.approx(float(value))
+            assert shown in (default, 100 * default), f"{page.name}: {group}.{name}"
+
+
+def test_settings_of_a_page_are_found() -> None:
+    found = settings_in("`inplane.search_mm` (3 mm) and $\\texttt{planes.support\\_sigma}$, but no `page.md`")
+    assert found == [("inplane", "search_mm", "3"), ("planes", "support_sigma", "")]
+
+
+@named_page
+def test_modules_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text()
+    for path in re.findall(r"`((?:speckle3d|calibration|xsens)/[\w/]+(?:\.py)?)`", text):
+        assert (ROOT / path).exists(), f"{page.name}: {path}"
+    for folder, names in re.findall(
+        r"`((?:speckle3d|calibration|xsens)/[\w/]+)` \((`\w+`(?:, `\w+`)*)\)", text
+    ):
+        for name in re.findall(r"`(\w+)`", names):
+            there = ROOT / folder / name
+            assert there.is_dir() or there.with_suffix(".py").exists(), f"{page.name}: {folder}/{name}"
+
+
+@named_page
+def test_a_page_ends_with_limits_and_sources(page: Path) -> None:
+    headings = re.findall(r"^## (.+)$", page.read_text(), re.MULTILINE)
+    assert page.stem == "index" or headings[-2:] == ["Limits", "Sources"]
+
+
+def test_the_index_leads_to_every_page() -> None:
+    index = (ROOT / "docs" / "methods" / "index.md").read_text()
+    assert {f"{page.stem}.md" for page in PAGES} - {"index.md"} == set(re.findall(r"\((\S+\.md)\)", index))
+
+
+@named_page
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((\S+?\.md)\)", page.read_text()):
+        assert (page.parent / target).exists(), f"{page.name}: {target}"
