@@ -21,6 +21,7 @@ from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.blocks import (
     Block,
@@ -58,6 +59,7 @@ STRAIGHTENING = "curves"
 """Name of a stage in `StageTimes`."""
 
 
+@shown
 @dataclass(frozen=True)
 class Tracked:
     """What the image-based stages found.
@@ -122,6 +124,21 @@ class Tracked:
         """What `covariance` has all frames have wrong together."""
         scale = scale_sigma(self.coherence)
         return SharedErrors(scale, self.curves_sigma, self.slopes.deviation_per_mm)
+
+    def facts(self) -> list[tuple[str, object]]:
+        """What the tracked sweep shows of itself."""
+        z = self.image.translation[:, 2]
+        flagged = int(np.count_nonzero(self.flags))
+        subset = "none" if self.subset is None else f"{1 - self.rejected_share:.0%} of patches agree"
+        return [
+            ("frames", f"{len(self.image)}, {flagged} of them flagged"),
+            ("travel", f"{np.abs(np.diff(z)).sum():.2f} mm along the image's normal, in mode image"),
+            ("length error", f"{100 * self.scale_sigma:.1f} % claimed (standard deviation)"),
+            ("direction", f"{self.direction:+d}, from {self.direction_from}"),
+            ("subset", subset),
+            ("pairs", f"{self.pairs} of frames"),
+            ("doubts", "; ".join(f"{each.about}: {each.suspect}" for each in self.doubts) or "none"),
+        ]
 
     @property
     def pairs(self) -> int:

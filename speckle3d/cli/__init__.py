@@ -41,7 +41,7 @@ from speckle3d.cli import (  # noqa: F401
     view,
     volumes,
 )
-from speckle3d.cli.common import app, note
+from speckle3d.cli.common import app, emit, note
 from speckle3d.core.errors import NoSpaceError, Speckle3DError
 
 __all__ = ["app", "main"]
@@ -105,8 +105,9 @@ def _run(heard: list[int]) -> None:
         # Typer's own usage errors carry an exit code; anything else is a bug and shows its traceback.
         if not hasattr(error, "format_message"):
             raise
-        # Called with no command at all, it has shown its help and has nothing to say.
-        if not error.format_message().strip():
+        # Called with no command at all: its message is the help.
+        if type(error).__name__ == "NoArgsIsHelpError":
+            emit(error.format_message())
             sys.exit(2)
         _fail(error.format_message())
     # Typer turns Ctrl-C into this exit code without a word; a recording ends with it and is whole.

@@ -21,8 +21,17 @@ OUTPUTS: dict[str, Sequence[str]] = {
 _REFERENCES = ("tracker", "truth")
 
 
-def require_before_work(command: str, values: Mapping[str, Any]) -> None:
+def require_before_work(command: str, values: Mapping[str, Any], options: Mapping[str, str]) -> None:
     """Refuse a command's files and choices that cannot be right, in no time.
+
+    Parameters
+    ----------
+    command : str
+        Its own name, without its group's.
+    values : mapping of str to object
+        By parameter.
+    options : mapping of str to str
+        Parameters that are options, as they are typed.
 
     Raises
     ------
@@ -39,11 +48,17 @@ def require_before_work(command: str, values: Mapping[str, Any]) -> None:
             if name in outputs:
                 _require_writable(path)
             elif not path.exists():
-                raise FileError(f"{path}: expected a file, got none")
-    for option, name, known in _CHOICES:
-        for value in _listed(values.get(name)):
-            if value not in known:
-                raise InvalidInputError(f"{option}: expected one of {', '.join(known)}, got {value!r}")
+                raise FileError(f"{_typed(name, options)}{path}: expected a file, got none")
+    if command in _CORRECTING:
+        for name, known in _CHOICES.items():
+            for value in _listed(values.get(name)):
+                if value not in known:
+                    where = _typed(name, options)
+                    raise InvalidInputError(f"{where}expected one of {', '.join(known)}, got {value!r}")
+
+
+def _typed(name: str, options: Mapping[str, str]) -> str:
+    return f"{options[name]}: " if name in options else ""
 
 
 def _listed(value: Any) -> list[Any]:
@@ -69,4 +84,5 @@ def _require_writable(path: Path) -> None:
 
 
 _MODES = ("orientation", "pose", "crossed", "inertial", "fused", "consistent-subset")
-_CHOICES = (("--drift", "drift", _MODES), ("--reference", "reference", _REFERENCES))
+_CHOICES = {"drift": _MODES, "reference": _REFERENCES}
+_CORRECTING = ("reconstruct", "compare")

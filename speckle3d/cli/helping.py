@@ -80,7 +80,8 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command, once its files and choices can be right."""
-        require_before_work(self.name or "", ctx.params)
+        options = {each.name: max(each.opts, key=len) for each in self.params if each.opts[0][:1] == "-"}
+        require_before_work(self.name or "", ctx.params, options)
         return super().invoke(ctx)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:

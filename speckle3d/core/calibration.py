@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid, Sweep
 
 SENSORS = ("tracker", "orientation")
@@ -75,6 +76,7 @@ class Source:
     settings_json: str = ""
 
 
+@shown
 @dataclass(frozen=True)
 class Calibration:
     """Where the image is relative to a sensor.
@@ -120,6 +122,27 @@ class Calibration:
     time_offset_s: float | None = None
     verdict: str = ""
     source: Source = field(default_factory=Source)
+
+    def facts(self) -> list[tuple[str, object]]:
+        """What the calibration shows of itself."""
+        place = self.rotation if self.translation_mm is None else self.sensor_from_image
+        kept, given = len(self.frames.used), self.frames.given
+        offset = "not estimated" if self.time_offset_s is None else f"{self.time_offset_s:+.4f} s"
+        return [
+            ("of", f"the {self.sensor}, by {self.method}"),
+            ("sensor_from_image", place),
+            (
+                "pixels",
+                None
+                if self.pixel_mm is None
+                else " x ".join(f"{each:.4g}" for each in self.pixel_mm) + " mm",
+            ),
+            ("residual", f"{self.rms:.3g} {self.rms_unit} RMS"),
+            ("condition number", f"{self.condition_number:.3g}"),
+            ("clock offset", offset),
+            ("frames", f"{kept} of {given} used"),
+            ("verdict", self.verdict),
+        ]
 
     def __post_init__(self) -> None:
         if self.sensor not in SENSORS:

@@ -9,6 +9,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import BModeSettings, RFSettings
 
 PATCH_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
@@ -150,6 +151,7 @@ class NominalProbe:
             raise InvalidInputError(f"low_hz: expected 0 < low < high, got {self.low_hz} and {self.high_hz}")
 
 
+@shown
 @dataclass(frozen=True)
 class DecorrelationCurves:
     """Correlation of fully developed speckle against elevational distance, by depth.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.shown import shown
 from speckle3d.core.volume import Volume
 
 LABEL_TYPES = ("uint8", "uint16")
@@ -57,6 +58,7 @@ STATE_SEGMENTS = (
 """Of voxels by how they came to their value."""
 
 
+@shown
 @dataclass(frozen=True)
 class LabelMap(Volume):
     """Labels on a regular grid, uint8 or uint16.

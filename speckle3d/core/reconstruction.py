@@ -10,12 +10,14 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid
 
 MODES = ("image", "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused")
 """Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""
 
 
+@shown
 @dataclass(frozen=True)
 class FramePairs:
     """Relative poses measured between frame pairs, with the distances they were fitted to.
@@ -121,6 +123,7 @@ class SharedErrors:
     turn_sigma_per_mm: FloatArray
 
 
+@shown
 @dataclass(frozen=True)
 class ModeErrors:
     """What a corrected mode claims of its poses' errors.
@@ -137,6 +140,7 @@ class ModeErrors:
     length_sigma: float
 
 
+@shown
 @dataclass(frozen=True)
 class Trust:
     """Uncertainty and flags of the poses of mode `image`.
@@ -160,6 +164,7 @@ class Trust:
     modes: dict[str, ModeErrors] = field(default_factory=dict)
 
 
+@shown
 @dataclass(frozen=True)
 class Reconstruction:
     """Poses of the frames of one sweep.
@@ -189,6 +194,19 @@ class Reconstruction:
     config_toml: str = ""
     pairs: FramePairs | None = field(default=None, repr=False)
     trust: Trust | None = field(default=None, repr=False)
+
+    def facts(self) -> list[tuple[str, object]]:
+        """What the reconstruction shows of itself."""
+        flagged = 0 if self.trust is None else int(np.count_nonzero(self.trust.flags))
+        return [
+            ("frames", f"{self.frame_time_s.size}, {flagged} of them flagged"),
+            ("modes", ", ".join(self.poses)),
+            ("image", f"{self.grid.width_mm:.4g} x {self.grid.depth_mm:.4g} mm"),
+            ("input", self.provenance.input_path),
+            ("made by", f"speckle3d {self.provenance.package_version}"),
+            ("pairs", "not read" if self.pairs is None else len(self.pairs)),
+            ("errors", "none" if self.trust is None else "covariance of every frame's pose"),
+        ]
 
     def __post_init__(self) -> None:
         if "image" not in self.poses:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import components, require_increasing
+from speckle3d.core.shown import shown
 
 DEFAULT_MAX_GAP_S = 0.2
 """Longest pause between two samples that interpolation bridges: five frames at 25 frames/s, about the time
@@ -38,6 +39,11 @@ class TimedSamples(Generic[Samples]):
             )
         if samples == 0:
             raise InvalidInputError("expected at least one sensor sample, got none")
+
+    def facts(self) -> list[tuple[str, object]]:
+        """What the stream shows of itself."""
+        span = f"{self.time_s[0]:.3f} to {self.time_s[-1]:.3f} s" if len(self) else "none"
+        return [("samples", len(self)), ("time", span), ("longest gap bridged", f"{self.max_gap_s:g} s")]
 
     def __len__(self) -> int:
         return int(self.time_s.size)
@@ -100,6 +106,7 @@ class TimedSamples(Generic[Samples]):
         return Slerp(self.time_s, samples.rotation if isinstance(samples, RigidTransform) else samples)
 
 
+@shown
 @dataclass(frozen=True)
 class TimedRotations(TimedSamples[Rotation]):
     """Orientation samples of one sensor.
@@ -120,6 +127,7 @@ class TimedRotations(TimedSamples[Rotation]):
     """
 
 
+@shown
 @dataclass(frozen=True)
 class TimedPoses(TimedSamples[RigidTransform]):
     """Position and orientation samples of one sensor.

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import require_increasing
+from speckle3d.core.shown import shown
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
 
 INERTIAL = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
@@ -261,6 +262,7 @@ class _Sensor(Generic[Samples]):
         return world_from_sensor * self.sensor_from_image
 
 
+@shown
 @dataclass(frozen=True)
 class OrientationSensor(_Sensor[Rotation]):
     """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
@@ -273,6 +275,7 @@ class OrientationSensor(_Sensor[Rotation]):
     magnetometer_au: FloatArray | None = None
 
 
+@shown
 @dataclass(frozen=True)
 class Tracker(_Sensor[RigidTransform]):
     """A 6-DOF sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`.
@@ -294,6 +297,7 @@ class Tracker(_Sensor[RigidTransform]):
         require_skew(self.image_skew_rad, "image_skew_rad")
 
 
+@shown
 @dataclass(frozen=True)
 class Sweep:
     """Frames of one freehand sweep with everything recorded beside them.
@@ -348,6 +352,25 @@ class Sweep:
     def __len__(self) -> int:
         return int(self.frames.shape[0])
 
+    def facts(self) -> list[tuple[str, object]]:
+        """What the sweep shows of itself."""
+        n, vectors, samples = self.frames.shape
+        time_s, grid = self.frame_time_s, self.grid
+        kind = "B-mode"
+        if isinstance(self.signal, RFSettings):
+            kind = "I/Q" if self.signal.are_complex else "RF"
+        rate = f", {(n - 1) / (time_s[-1] - time_s[0]):.4g} frames/s" if n > 1 else ""
+        return [
+            ("name", self.name),
+            ("frames", f"{n} of {vectors} vectors x {samples} samples, {kind}, {self.frames.dtype}"),
+            ("time", f"{time_s[0]:.3f} to {time_s[-1]:.3f} s{rate}"),
+            ("image", f"{grid.width_mm:.4g} x {grid.depth_mm:.4g} mm"),
+            ("orientation", self.orientation and _stream(self.orientation)),
+            ("tracker", self.tracker and _stream(self.tracker)),
+            ("truth", None if self.truth is None else f"{n} poses"),
+            ("probe", self.probe or "not named"),
+        ]
+
     def part(self, first: int, stop: int) -> Sweep:
         """The frames from `first` to before `stop` as a sweep of their own, with all sensors' readings.
 
@@ -371,6 +394,13 @@ class Sweep:
     def orientation_source(self) -> OrientationSensor | Tracker | None:
         """The orientation sensor, or the tracker where there is none."""
         return self.orientation or self.tracker
+
+
+def _stream(sensor: OrientationSensor | Tracker) -> str:
+    mounted = "calibrated" if sensor.sensor_from_image is not None else "not calibrated to the image"
+    time_s = sensor.readings.time_s
+    span = f", {time_s[0]:.3f} to {time_s[-1]:.3f} s" if time_s.size else ""
+    return f"{time_s.size} readings{span}, {mounted}"
 
 
 def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.ArrayLike) -> Rotation:

@@ -13,11 +13,13 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.shown import shown
 
 VOXEL_TYPES = ("uint8", "int16", "uint16", "float32")
 """Types that voxels may have."""
 
 
+@shown
 @dataclass(frozen=True)
 class Volume:
     """Voxels indexed ``[i, j, k]`` along the grid's own x, y and z axes.

@@ -17,6 +17,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt, skew
 from speckle3d.core.leastsquares import Fit, levenberg_marquardt
+from speckle3d.core.shown import shown
 from speckle3d.correction.curves import (
     AXES,
     COEFFICIENTS,
@@ -61,6 +62,7 @@ class DriftSettings(BaseModel):
     )
 
 
+@shown
 @dataclass(frozen=True)
 class DriftCorrection:
     """A corrected reconstruction and how it was corrected.

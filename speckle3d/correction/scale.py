@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
+from speckle3d.core.shown import shown
 
 TERMS = ("log_scale", "tilt_per_mm", "yaw_per_mm")
 """What `ScaleEvidence.values` are: the logarithm of true elevational distance over the images', and the
@@ -34,6 +35,7 @@ class ScaleEvidence:
     information: FloatArray
 
 
+@shown
 @dataclass(frozen=True)
 class ScaledPoses:
     """Poses whose length another source than the images has set.
@@ -66,6 +68,7 @@ class ScaledPoses:
         return float(np.exp(self.log_scale))
 
 
+@shown
 @dataclass(frozen=True)
 class FusedPoses(ScaledPoses):
     """Poses from all that is known of a sweep.

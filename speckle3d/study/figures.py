@@ -37,6 +37,7 @@ _MODES = {
 }
 """Label and colour of each mode, from Okabe and Ito's and Tol's palettes, told apart with any vision."""
 
+_INTERVAL = ("95 % interval of the image-based length", *["95 % interval of the image-based angle"] * 3)
 _SPARE_COLOURS = ("#F0E442", "#999999", "#44AA99")
 _REFERENCE_COLOUR = "#000000"
 UNSEEN = "#33415c"
@@ -159,7 +160,7 @@ def curve_panels(
             series.append(Series(curves.reference_name, _REFERENCE_COLOUR, level, "reference"))
         if curves.half_width is not None:
             middle, half = curves.modes["image"][q] - zero, curves.half_width[q]
-            name = f"95 % of {label_of('image')}"
+            name = _INTERVAL[q]
             band = over_frames(middle + half)
             series.append(Series(name, colour_of("image"), band, "band", (middle - half)[at]))
         for i, (mode, values) in enumerate(curves.modes.items()):

@@ -17,6 +17,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.modes import PUBLISHED
@@ -46,6 +47,7 @@ from speckle3d.study.reslices.reslice_figures import save_reslices
 from speckle3d.study.results import Summary, is_study, summary_text, write_summary
 
 
+@shown
 @dataclass(frozen=True)
 class JobResult:
     """What a job found, and where it is.
@@ -96,8 +98,8 @@ def run_job(
     """Reconstruct a sweep and put everything that belongs to it into `directory`.
 
     Written: ``reconstruction.h5``, ``summary.json``, ``table.txt``, ``table.csv``, ``drift.png``,
-    ``reslice.png`` and ``enlarged.png``. A new folder appears whole; in one that is there, all of them take the
-    place of earlier results together, and other files stay.
+    ``reslice.png`` and ``enlarged.png``. A new folder appears whole; in one that is there, all of them take
+    the place of earlier results together, and other files stay.
 
     Parameters
     ----------
@@ -311,11 +313,10 @@ def _errors(
 def _draw_enlarged(path: Path, sweep: Sweep, poses: dict[str, RigidTransform], strip: Strip) -> Path:
     """Part of the cut along the sweep: by the tracker alone, if it covers all frames, and in every mode."""
     left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
-    shown = {}
-    tracker = sweep.tracker
-    if tracker is not None and tracker.sensor_from_image is not None:
-        if tracker.covers(sweep.frame_time_s).all():
-            shown["tracker"] = tracker.world_from_image(sweep.frame_time_s) * left
+    shown, tracker = {}, sweep.tracker
+    mounted = tracker is not None and tracker.sensor_from_image is not None
+    if tracker is not None and mounted and tracker.covers(sweep.frame_time_s).all():
+        shown["tracker"] = tracker.world_from_image(sweep.frame_time_s) * left
     shown |= {mode: each * left for mode, each in poses.items()}
     planes = middle_planes(shown, strip.grid)
     cuts = {mode: cut_frames(strip, strip.grid, each, planes[mode]) for mode, each in shown.items()}

@@ -74,8 +74,11 @@ def test_a_clock_offset_is_seconds_or_to_be_estimated():
         WireSettings(phantom="three", points=Path("a b.csv"), registration="held", fixed_pixels=True),
     ],
 )  # fmt: skip
-def test_the_command_that_is_told_takes_the_same_settings(monkeypatch, given):
+def test_the_command_that_is_told_takes_the_same_settings(monkeypatch, given, tmp_path):
     taken = []
+    monkeypatch.chdir(tmp_path)
+    for name in ("the images.mha", "its poses.mha", "a b.csv"):
+        (tmp_path / name).touch()
     monkeypatch.setattr(
         calibrate_phantoms,
         "_calibrate",

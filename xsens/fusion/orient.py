@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.methods import DEFAULT_METHOD, Method, method_of
 from xsens.fusion.readings import PAUSE_S, UNKNOWN_HEADING_RAD, usable_samples
@@ -24,6 +25,7 @@ _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
 
 
+@shown
 @dataclass(frozen=True)
 class Orientation:
     """Orientation of every sample that has a gyroscope reading.

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_increasing
+from speckle3d.core.shown import shown
 from speckle3d.core.streams import DEFAULT_MAX_GAP_S
 from speckle3d.core.streams import TimedRotations as TimedRotations
 
@@ -43,6 +44,7 @@ class Gap:
     duration_s: float
 
 
+@shown
 @dataclass(frozen=True)
 class ImuLog:
     """Samples of one sensor on its own clock.

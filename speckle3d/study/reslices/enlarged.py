@@ -1,4 +1,4 @@
-"""Cuts along the sweep enlarged, the tracker's alone beside the corrected ones, as in figures 7 and 8 of [1]_.
+"""Cuts along the sweep enlarged, the tracker's alone beside the modes', as in figures 7 and 8 of [1]_.
 
 References
 ----------
@@ -15,14 +15,23 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from speckle3d.core.arrays import Float32Array
-from speckle3d.study.figures import colour_of, label_of, name_figure, new_figure, save_figure, show_grey
+from speckle3d.study.figures import (
+    UNSEEN,
+    colour_of,
+    label_of,
+    name_figure,
+    new_figure,
+    save_figure,
+    show_grey,
+)
 
 DEEP_MM = 12.0
 """Depth that is shown: about as much as a short sweep is long."""
 
 LONGEST_MM = 16.0
 
-_PANEL_IN = 3.0
+_PANEL_IN, _NARROWEST_IN = 3.4, 1.6
+"""Height of a panel, and its least width, for its title."""
 _RANGE_DB = 45.0
 _BRIGHTEST_PERCENTILE = 99.7
 
@@ -52,9 +61,10 @@ def save_enlarged(cuts: Mapping[str, Float32Array], pixel_mm: float, name: str, 
     shown = {mode: image[rows, columns] for mode, image in cuts.items()}
     levels = np.concatenate([each.ravel() for each in shown.values()])
     brightest = float(np.nanpercentile(levels, _BRIGHTEST_PERCENTILE))
-    figure = new_figure(0.6 + len(shown) * (_PANEL_IN + 0.2), _PANEL_IN + 1.2, None)
-    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     high, wide = next(iter(shown.values())).shape
+    panel_in = (max(_PANEL_IN * wide / high, _NARROWEST_IN), _PANEL_IN)
+    figure = new_figure(0.9 + len(shown) * (panel_in[0] + 0.25), panel_in[1] + 1.3, None)
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
     extent = (0.0, wide * pixel_mm, (top + high) * pixel_mm, top * pixel_mm)
     for panel, (mode, image) in zip(axes, shown.items(), strict=True):
         show_grey(panel, image, extent, (brightest - _RANGE_DB, brightest))
@@ -63,13 +73,17 @@ def save_enlarged(cuts: Mapping[str, Float32Array], pixel_mm: float, name: str, 
         panel.set_title("tracker alone" if alone else label_of(mode), color=colour, parse_math=False)
         panel.set_xlabel("along the sweep / mm")
     axes[0].set_ylabel("depth / mm")
-    figure.subplots_adjust(left=0.75 / figure.get_figwidth(), right=0.99, bottom=0.16, top=0.84, wspace=0.08)
+    width, height = figure.get_figwidth(), figure.get_figheight()
+    borders = 0.75 / width, 0.55 / height, 1.0 - 0.15 / width, 1.0 - 0.75 / height
+    figure.subplots_adjust(*borders, wspace=0.25 / panel_in[0])
+    corner = 1.0 - 0.1 / width, 0.06 / height
+    figure.text(*corner, "blue-grey: no frame", ha="right", fontsize="x-small", color=UNSEEN)
     name_figure(figure, f"{name}: part of the cut along the sweep, enlarged")
     return save_figure(figure, path)
 
 
 def busiest_rows(image: Float32Array, count: int) -> int:
-    """First of the `count` rows in which structures that reach along the sweep stand out most from speckle."""
+    """First of `count` rows in which structures along the sweep stand out most from speckle."""
     smooth = uniform_filter1d(np.nan_to_num(image, nan=float(np.nanmedian(image))), 15, axis=1)
     spread = smooth.var(axis=1)
     # Near the face the probe's own echo would win.

@@ -224,6 +224,7 @@ def _explain_overlays(axes: Axes, reference: str, width_in: float) -> None:
     axes.set_axis_off()
     words = (
         ("grey: both", "0.5"),
+        ("blue-grey: no frame", UNSEEN),
         ("magenta: the mode alone", "#C000C0"),
         (f"green: {reference} alone", "#008000"),
     )
