@@ -56,7 +56,7 @@ MEANINGS: dict[str, dict[str, tuple[str, str]]] = {
         ),
         "pose_covariance/*": (
             "mm and rad",
-            "of x, y, z, tilt, yaw, roll of each frame, about the image's centre",
+            "of each frame's x, y, z, tilt, yaw, roll about the image's centre",
         ),
         "pairs/first": ("1", "index of the earlier frame of each pair, from 0"),
         "pairs/second": ("1", "index of the later frame of each pair, from 0"),
