@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -19,10 +20,12 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.geometry import mirrored
+from speckle3d.core.handover.plots import plot_poses
+from speckle3d.core.handover.tables import poses_array, poses_table
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -48,6 +51,9 @@ from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.signs import SignedPairs
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance, with_common_scale
 from speckle3d.stages import PLANES, matcher_for, measured, rows_of, sound_pairs, straightened_by
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
@@ -100,6 +106,10 @@ class Tracked:
         Seconds spent in each stage.
     doubts : tuple of Doubt
         What of the recording contradicts the images or itself; what rests on refuted parts was not used.
+    grid : ImageGrid or None
+        Of the sweep.
+    frame_time_s : ndarray, shape (n,), or None
+        Of the sweep.
     """
 
     image: RigidTransform
@@ -118,12 +128,33 @@ class Tracked:
     slopes: SlopeEvidence
     times: StageTimes
     doubts: tuple[Doubt, ...] = ()
+    grid: ImageGrid | None = None
+    frame_time_s: FloatArray | None = None
 
     @property
     def shared(self) -> SharedErrors:
         """What `covariance` has all frames have wrong together."""
         scale = scale_sigma(self.coherence)
         return SharedErrors(scale, self.curves_sigma, self.slopes.deviation_per_mm)
+
+    def plot(self) -> Figure:
+        """Draw length, tilt, yaw and roll against the frame, with their 95 % intervals."""
+        poses = {"image": self.image}
+        if self.subset is not None:
+            poses["consistent-subset"] = self.subset
+        return plot_poses(poses, self._centre_mm, self.covariance)
+
+    def to_dataframe(self) -> Any:
+        """Poses in mode `image` as a `pandas.DataFrame`, a row for each frame; see `poses_table`."""
+        return poses_table(self.image, self._centre_mm, self.frame_time_s, self.covariance, self.flags)
+
+    def to_xarray(self) -> Any:
+        """Poses in mode `image` as an `xarray.DataArray` of rigid matrices, mm."""
+        return poses_array(self.image, self.frame_time_s)
+
+    @property
+    def _centre_mm(self) -> FloatArray:
+        return np.zeros(3) if self.grid is None else self.grid.centre_mm
 
     def facts(self) -> list[tuple[str, object]]:
         """What the tracked sweep shows of itself."""
@@ -301,6 +332,8 @@ def track(
         slopes=slopes,
         times=times,
         doubts=(*doubts, *sensors.doubts),
+        grid=sweep.grid,
+        frame_time_s=sweep.frame_time_s,
     )
 
 

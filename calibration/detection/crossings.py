@@ -22,12 +22,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft, ndimage
-from skimage.feature import peak_local_max
 
 from calibration.chain import Seen
 from calibration.detection.everyframe import in_every_frame, require_image
 from calibration.detection.region import checked_pixel, region_mask
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
 
@@ -229,7 +229,8 @@ def _maxima(
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels of the maxima, between samples by parabolas, and their values."""
     near = max(1, int(s.apart_mm / 2.0 / float((step_px * pixel_mm).max())))
-    peaks = peak_local_max(response, min_distance=near, num_peaks=_PEAKS, exclude_border=False)
+    features = extra_module("skimage.feature", "calibrate", "finding crossings")
+    peaks = features.peak_local_max(response, min_distance=near, num_peaks=_PEAKS, exclude_border=False)
     score = response[tuple(peaks.T)].astype(float)
     offset = np.zeros(peaks.shape)
     padded = np.pad(response, 1, mode="edge")

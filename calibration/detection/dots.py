@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import ndimage
-from skimage.feature import peak_local_max
 
 from calibration.detection.everyframe import in_every_frame, require_image
 from calibration.detection.region import checked_pixel, region_mask
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import Frames
@@ -186,7 +186,8 @@ def _maxima(
     """Columns and rows of maxima that are `apart_mm` apart, shape (n, 2), strongest first."""
     size = 2 * np.maximum(np.rint(s.apart_mm / 2 / pixel_mm), 1).astype(int) + 1
     around = np.ones(size, dtype=bool)
-    peaks = peak_local_max(contrast, footprint=around, threshold_abs=limit, exclude_border=False)
+    features = extra_module("skimage.feature", "calibrate", "finding dots of wires")
+    peaks = features.peak_local_max(contrast, footprint=around, threshold_abs=limit, exclude_border=False)
     if inside is not None:
         peaks = peaks[inside[tuple(peaks.T)]]
     return _far_apart(peaks[:_MOST_MAXIMA], s.apart_mm / pixel_mm)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.extras import extra_module
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
@@ -249,11 +250,10 @@ def read_stack(
 
 def block_means(image: Float32Array, by: tuple[int, int]) -> Float32Array:
     """Means over whole blocks of `by` pixels, those left over at the far edges dropped; NaN where any is."""
-    from skimage.transform import downscale_local_mean
-
+    transform = extra_module("skimage.transform", "calibrate", "a calibration from images")
     across, down = by
     whole = image[: image.shape[0] // across * across, : image.shape[1] // down * down]
-    return np.asarray(downscale_local_mean(whole, by), dtype=np.float32)
+    return np.asarray(transform.downscale_local_mean(whole, by), dtype=np.float32)
 
 
 def mean_rotations(poses: RigidTransform, weights: FloatArray) -> Rotation:

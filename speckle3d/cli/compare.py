@@ -20,6 +20,7 @@ from speckle3d.cli.common import (
     note,
 )
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.extras import require_extra
 
 if TYPE_CHECKING:
     from speckle3d.study.compare import StudyProgress
@@ -63,6 +64,7 @@ def compare(
 
     A sweep that fails is a row that says why; the exit code is 2 only if all do.
     """
+    require_extra("report", "compare", "plotly")
     from speckle3d.report.page import write_report
     from speckle3d.study.compare import compare_sweeps
     from speckle3d.study.paper import paper_study

@@ -6,7 +6,6 @@ import signal
 import sys
 import time
 from contextlib import ExitStack
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +14,7 @@ import typer
 from speckle3d.cli.common import CalibrationFiles, ConfigFile, app, emit, load_settings, note, progress_bar
 from speckle3d.cli.importing import Importing, Number
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import require_extra
 from speckle3d.core.printable import printable
 
 if TYPE_CHECKING:
@@ -96,8 +96,7 @@ def live(
     IMAGE, Volume_Reference; words of --check a STRING and a STATUS, SweepAdvice. Ctrl-C ends the sweep, which
     is then reconstructed as `speckle3d reconstruct` does it.
     """
-    if find_spec("pyigtl") is None or find_spec("fastcrc") is None:
-        raise InvalidInputError("live: expected pyigtl to be installed: pip install 'speckle3d[live]'")
+    require_extra("live", "live", "pyigtl", "fastcrc")
     from speckle3d.cli.common import from_options
     from speckle3d.io.curves import read_curves
     from speckle3d.io.igtl.connection import Connection

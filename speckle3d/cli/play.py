@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from enum import StrEnum
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from speckle3d.cli.common import Images, app, note
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import require_extra
 
 if TYPE_CHECKING:
     from speckle3d.core.sweep import Frames, ImageGrid, Sweep
@@ -55,8 +55,7 @@ def play(
     zero. RF is sent with the samples of a vector along the columns, as PLUS sends it; the readings of a
     tracker or an orientation sensor are TRANSFORM messages.
     """
-    if find_spec("pyigtl") is None or find_spec("fastcrc") is None:
-        raise InvalidInputError("play: expected pyigtl to be installed: pip install 'speckle3d[live]'")
+    require_extra("live", "play", "pyigtl", "fastcrc")
     from speckle3d.io.igtl.played import Names, clock_shift_s, played
     from speckle3d.io.igtl.server import Server
     from speckle3d.io.load import load_sweep

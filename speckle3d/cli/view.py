@@ -5,7 +5,6 @@ from __future__ import annotations
 import webbrowser
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,6 +12,7 @@ import typer
 
 from speckle3d.cli.common import PixelMm, Poses, SweepFile, Transform, app, from_options, note
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import require_extra
 
 if TYPE_CHECKING:
     from speckle3d.app.page import Page
@@ -65,8 +65,7 @@ def view(
     ] = True,
 ) -> None:
     """Look at a file in the browser, on this machine alone; ends ten minutes after the last viewer left."""
-    if find_spec("panel") is None:
-        raise InvalidInputError("view: expected Panel to be installed: pip install 'speckle3d[app]'")
+    require_extra("app", "view", "panel")
     from speckle3d.app.opened import opened
     from speckle3d.app.server import AppServer
 

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
 
 
@@ -46,6 +47,5 @@ def polygon_mask(shape: tuple[int, ...], corners: FloatArray) -> BoolArray:
     -------
     ndarray of bool, shape (columns, rows)
     """
-    from skimage.draw import polygon2mask
-
-    return np.asarray(polygon2mask(shape, corners), dtype=bool)
+    draw = extra_module("skimage.draw", "calibrate", "a region")
+    return np.asarray(draw.polygon2mask(shape, corners), dtype=bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,8 +11,14 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.handover.plots import plot_poses
+from speckle3d.core.handover.tables import poses_array, poses_table
+from speckle3d.core.handover.viewers import frames_for_pyvista
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MODES = ("image", "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused")
 """Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""
@@ -194,6 +201,34 @@ class Reconstruction:
     config_toml: str = ""
     pairs: FramePairs | None = field(default=None, repr=False)
     trust: Trust | None = field(default=None, repr=False)
+
+    def plot(self) -> Figure:
+        """Draw length, tilt, yaw and roll of every mode against the frame, with the images' 95 % interval."""
+        covariance = None if self.trust is None else self.trust.covariance
+        return plot_poses(self.poses, self.grid.centre_mm, covariance)
+
+    def to_dataframe(self, mode: str = "image") -> Any:
+        """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `poses_table`."""
+        trust = self.trust
+        held = None if trust is None else trust.modes.get(mode)
+        covariance = held.covariance if held is not None else None
+        if mode == "image" and trust is not None:
+            covariance = trust.covariance
+        flags = None if trust is None else trust.flags
+        return poses_table(self._of(mode), self.grid.centre_mm, self.frame_time_s, covariance, flags)
+
+    def to_xarray(self, mode: str = "image") -> Any:
+        """Poses of a mode as an `xarray.DataArray` of rigid matrices, mm."""
+        return poses_array(self._of(mode), self.frame_time_s)
+
+    def to_pyvista(self, mode: str = "image") -> Any:
+        """Outlines of the frames at the poses of a mode as a `pyvista.PolyData`, mm (extra ``pyvista``)."""
+        return frames_for_pyvista(self._of(mode), self.grid)
+
+    def _of(self, mode: str) -> RigidTransform:
+        if mode not in self.poses:
+            raise InvalidInputError(f"mode: expected one of {', '.join(self.poses)}, got {mode!r}")
+        return self.poses[mode]
 
     def facts(self) -> list[tuple[str, object]]:
         """What the reconstruction shows of itself."""

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import require_increasing
+from speckle3d.core.handover.tables import frames_array
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
 
@@ -370,6 +371,10 @@ class Sweep:
             ("truth", None if self.truth is None else f"{n} poses"),
             ("probe", self.probe or "not named"),
         ]
+
+    def to_xarray(self) -> Any:
+        """All frames as an `xarray.DataArray` over frame, lateral_mm and depth_mm; read into memory."""
+        return frames_array(self)
 
     def part(self, first: int, stop: int) -> Sweep:
         """The frames from `first` to before `stop` as a sweep of their own, with all sensors' readings.

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.handover.viewers import volume_for_napari, volume_for_pyvista
 from speckle3d.core.shown import shown
 
 VOXEL_TYPES = ("uint8", "int16", "uint16", "float32")
@@ -59,6 +60,14 @@ class Volume:
         """Number of voxels along i, j and k."""
         n_i, n_j, n_k = self.voxels.shape
         return n_i, n_j, n_k
+
+    def to_pyvista(self) -> Any:
+        """Voxels as a `pyvista.ImageData` at their place in the world, mm (extra ``pyvista``)."""
+        return volume_for_pyvista(self)
+
+    def to_napari(self, viewer: Any = None) -> tuple[Any, dict[str, Any], str]:
+        """Voxels as layer data of napari, added to a viewer if one is given (extra ``napari``)."""
+        return volume_for_napari(self, viewer)
 
     @property
     def world_from_index(self) -> FloatArray:

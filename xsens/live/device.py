@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.extras import extra_module
 from xsens.messages.control import BASE_RATE_HZ, Configuration, MessageId, error_of
 from xsens.messages.framing import Framer, Message, encode
 from xsens.messages.mtdata import OutputMode, OutputSettings
@@ -181,10 +182,7 @@ def connect(port_name: str, baud: int | None = None) -> Device:
 
 def _opened(port_name: str, baud: int) -> Serial:
     """Open a serial port for this process alone: 8 data bits, no parity, 2 stop bits."""
-    try:
-        import serial
-    except ImportError as error:
-        raise FileError("a live sensor needs pyserial: pip install 'speckle3d[live]'") from error
+    serial = extra_module("serial", "live", "a live sensor")
     stop = serial.STOPBITS_TWO
     try:
         return serial.Serial(

@@ -11,6 +11,7 @@ from scipy.sparse import coo_array, diags_array
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.extras import extra_module
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.surface import Surface
 from speckle3d.core.sweep import ImageGrid
@@ -229,8 +230,7 @@ def _sigma(vertices: FloatArray, gradient: FloatArray, errors: PosedErrors, grid
 
 def _marched(volume: Volume, values: FloatArray, level: float, inside: Inside, known: BoolArray) -> Surface:
     """Marching cubes over the cells whose eight voxels are known, in the world."""
-    from skimage.measure import marching_cubes
-
+    marching_cubes = extra_module("skimage.measure", "surface", "a surface").marching_cubes
     if min(volume.shape) < 2:
         raise InsufficientDataError(f"surface: expected two voxels along every axis, got {volume.shape}")
     try:

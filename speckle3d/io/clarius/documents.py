@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import extra_module
 
 _UNITS = {
     "": {"": 1.0},
@@ -135,10 +136,4 @@ def _document(yaml: Any, events: Iterator[Any], where: str) -> Any:
 
 
 def _library() -> Any:
-    try:
-        import yaml
-    except ImportError:
-        raise InvalidInputError(
-            'packages of Clarius scanners need PyYAML: pip install "speckle3d[clarius]"'
-        ) from None
-    return yaml
+    return extra_module("yaml", "clarius", "a package of a Clarius scanner")

@@ -20,6 +20,7 @@ from io import BufferedReader
 from typing import Any, TypeAlias
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.extras import extra_module
 from speckle3d.core.files import open_regular
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.hdf5 import reading
@@ -191,13 +192,7 @@ def _compare(content: bytes, sums: tuple[int, ...], flags: int, checks: _Checks,
 
 
 def _library() -> Any:
-    try:
-        import lzallright
-    except ImportError:
-        raise InvalidInputError(
-            'lzop files (.lzo) need the package lzallright: pip install "speckle3d[clarius]"'
-        ) from None
-    return lzallright
+    return extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)")
 
 
 def _read_header(member: Member, stream: BufferedReader) -> tuple[int, int]:

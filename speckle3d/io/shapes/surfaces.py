@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.extras import extra_module
 from speckle3d.core.files import PathLike
 from speckle3d.core.surface import Surface
 from speckle3d.io.hdf5 import atomic_path, one_line, reading
@@ -45,7 +46,7 @@ def write_surface(path: PathLike, surface: Surface) -> None:
     suffix = require_suffix(path)
     if not len(surface):
         raise InvalidInputError(f"{path}: expected a surface of at least one triangle, got none")
-    import meshio
+    meshio = extra_module("meshio", "surface", "a surface's file")
 
     points, triangles = surface.vertices_mm.astype(np.float32), surface.triangles.astype(np.int32)
     mesh = meshio.Mesh(points, [("triangle", triangles)])
@@ -93,7 +94,7 @@ def read_surface(path: PathLike) -> Surface:
 
 
 def _read(path: Path, suffix: str) -> Any:
-    import meshio
+    meshio = extra_module("meshio", "surface", "a surface's file")
 
     if suffix == ".ply":
         with _Lines(io.FileIO(path)) as stream:

@@ -117,7 +117,8 @@ class TestDevice:
     def test_without_pyserial_it_says_what_to_install(self, python):
         code = (
             "import sys; sys.modules['serial'] = None\n"
+            "from speckle3d.core.errors import InvalidInputError\n"
             "from xsens.live.device import connect\n"
-            "try: connect('none')\nexcept OSError as error: print(error)"
+            "try: connect('none')\nexcept InvalidInputError as error: print(error)"
         )
-        assert "pip install 'speckle3d[live]'" in python(code)
+        assert 'pip install "speckle3d[live]"' in python(code)

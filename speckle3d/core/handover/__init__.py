@@ -1,0 +1,1 @@
+"""Results handed over to pandas, xarray, matplotlib, pyvista and napari."""

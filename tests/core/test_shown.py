@@ -1,0 +1,112 @@
+"""Results show themselves in ten lines, in notebooks as a table, and are handed over to other libraries."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+import speckle3d as s3
+from speckle3d.core.shown import brief
+from speckle3d.core.volume import Volume
+from xsens.logs.samples import ImuLog
+
+
+@pytest.fixture(scope="module")
+def things(sweep, curves, tracked):
+    corrected = s3.correct(tracked, sweep, ["pose", "orientation", "fused"])
+    volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
+    log = ImuLog(np.arange(500) / 100, gyroscope_rad_s=np.zeros((500, 3)))
+    return [
+        sweep,
+        sweep.tracker,
+        sweep.orientation,
+        sweep.tracker.readings,
+        curves,
+        tracked,
+        volume,
+        log,
+        *corrected.values(),
+    ]
+
+
+def test_a_repr_fits_in_ten_lines(things):
+    for thing in things:
+        lines = repr(thing).splitlines()
+        assert lines[0].startswith(type(thing).__name__), lines[0]
+        assert 2 <= len(lines) <= 10, (type(thing).__name__, len(lines))
+        assert max(map(len, lines)) <= 100, type(thing).__name__
+
+
+def test_a_notebook_shows_the_same_as_a_table(things):
+    for thing in things:
+        table = thing._repr_html_()
+        assert table.startswith("<table>")
+        assert table.count("<tr>") == len(repr(thing).splitlines()) - 1
+
+
+def test_names_from_outside_are_escaped_in_the_table(sweep):
+    from dataclasses import replace
+
+    assert "<script>" not in replace(sweep, name="<script>")._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (None, "none"),
+        (np.zeros((90, 3)), "float64 (90, 3)"),
+        (1 / 3, "0.3333"),
+        (RigidTransform.identity(4), "4 rigid transforms"),
+        ((1, 2), "1, 2"),
+        (list(range(99)), "99"),
+    ],
+)
+def test_values_are_told_in_a_few_words(value, expected):
+    assert brief(value) == expected
+
+
+def test_a_table_has_a_row_for_each_frame(tracked, sweep):
+    pytest.importorskip("pandas")
+    table = tracked.to_dataframe()
+    assert len(table) == len(sweep)
+    assert table["length_mm"].iloc[-1] == pytest.approx(table["length_mm"].max(), abs=0.1)
+    truth = np.abs(np.diff(sweep.truth.apply(sweep.grid.centre_mm), axis=0)).sum()
+    assert table["length_mm"].iloc[-1] < truth
+    assert (table["sigma_z_mm"].iloc[1:] > 0).all()
+    np.testing.assert_allclose(table["time_s"], sweep.frame_time_s)
+
+
+def test_frames_become_a_labelled_array(sweep):
+    pytest.importorskip("xarray")
+    array = sweep.part(0, 3).to_xarray()
+    assert array.dims == ("frame", "lateral_mm", "depth_mm")
+    np.testing.assert_array_equal(array.sel(frame=2), sweep.frames[2])
+    assert array.depth_mm.attrs["units"] == "mm"
+
+
+def test_poses_are_drawn_with_names_and_units(tracked):
+    figure = tracked.plot()
+    assert [each.get_ylabel() for each in figure.axes] == [
+        "length / mm", "tilt / degrees", "yaw / degrees", "roll / degrees",
+    ]  # fmt: skip
+    named = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert named[0] == "mode image"
+    assert "95 % interval of mode image" in named
+
+
+def test_a_volume_lies_in_napari_where_it_lies_in_the_world():
+    turned = RigidTransform.from_components([1.0, 2.0, 3.0], RigidTransform.identity().rotation)
+    volume = Volume(np.arange(24, dtype=np.uint8).reshape(4, 3, 2), (0.5, 0.5, 1.0), turned)
+    voxels, known, kind = volume.to_napari()
+    assert kind == "image"
+    assert voxels is volume.voxels
+    np.testing.assert_allclose(known["affine"] @ [2, 1, 1, 1], [2.0, 2.5, 4.0, 1.0])
+
+
+def test_a_volume_lies_in_pyvista_where_it_lies_in_the_world():
+    pytest.importorskip("pyvista")
+    volume = Volume(
+        np.arange(24, dtype=np.uint8).reshape(4, 3, 2), (0.5, 0.5, 1.0), RigidTransform.identity()
+    )
+    grid = volume.to_pyvista()
+    index = grid.find_closest_point([1.0, 0.5, 1.0])
+    assert grid.point_data["levels"][index] == volume.voxels[2, 1, 1]
