@@ -25,6 +25,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite, roll_yaw_tilt, rotation_from_fixed_angles
 from speckle3d.core.leastsquares import Fit
+from speckle3d.core.shown import shown
 from speckle3d.kernels.chain import chain_derivatives
 
 SeenAs = Literal["line", "direction", "dot"]
@@ -40,6 +41,7 @@ TARGET = ("x_c", "y_c", "z_c", "alpha_c", "beta_c", "gamma_c")
 CHAIN = (*PROBE, *TARGET)
 
 
+@shown
 @dataclass(frozen=True)
 class ImagePoints:
     """Points of a phantom in the images, and where the sensor was.
@@ -267,6 +269,7 @@ class Rival:
     evidence: float
 
 
+@shown
 @dataclass(frozen=True)
 class ChainSolution:
     """A calibration as the solver leaves it: the chain, its certainty, and the frames it is made from.

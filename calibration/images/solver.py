@@ -33,6 +33,7 @@ from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, 
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.shown import shown
 from speckle3d.core.threads import on_one_thread
 
 FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
@@ -90,6 +91,7 @@ class Improvement:
     after: float
 
 
+@shown
 @dataclass(frozen=True)
 class ImageCalibration:
     """Where the image is on the sensor, found from two crossing sweeps.

@@ -91,7 +91,7 @@ class Command(TyperCommand):
             record = param.get_help_record(ctx)
             if record is not None:
                 panels.setdefault(self.panel_of(param), []).append(record)
-        for panel in sorted(panels, key=lambda name: name == ADVANCED):
+        for panel in sorted(panels, key=lambda name: (name != "Arguments", name == ADVANCED)):
             with formatter.section(panel):
                 formatter.write_dl(panels[panel])
 

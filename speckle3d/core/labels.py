@@ -59,6 +59,7 @@ STATE_SEGMENTS = (
 
 
 @shown
+@shown
 @dataclass(frozen=True)
 class LabelMap(Volume):
     """Labels on a regular grid, uint8 or uint16.

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.shown import shown
 
 COMPONENTS = 6
 
@@ -78,6 +79,7 @@ class Belonging:
         return Belonging(self.frames[rows], self.weights[rows], self.gap_mm[rows])
 
 
+@shown
 @dataclass(frozen=True)
 class PosedErrors:
     """Errors of poses together with the poses: what points of the world move by.

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.geometry import mirrored
+from speckle3d.core.shown import shown
 
 MIRROR = np.diag([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
 """What a mirror in the first image's plane does to (x, y, z, tilt, yaw, roll)."""
@@ -24,6 +25,7 @@ SCALE_CHANGE_MM, TURN_CHANGE_MM = 2.0, 15.0
 """Travel over which the error of the scale changes, with the tissue, and a hand's tilt and yaw wander."""
 
 
+@shown
 @dataclass(frozen=True)
 class RelativePoses:
     """Edges of the graph: the second frame's pose in the first, about the image's centre.

@@ -12,8 +12,10 @@ from scipy.sparse.csgraph import connected_components
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.shown import shown
 
 
+@shown
 @dataclass(frozen=True)
 class Surface:
     """Triangles whose corners, seen from outside, go round against the clock.

@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.shown import shown
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
 from speckle3d.kernels.statistics import PatchCurves
@@ -68,6 +69,7 @@ class CoherenceSettings(BaseModel):
     )
 
 
+@shown
 @dataclass(frozen=True)
 class Coherence:
     """How the echoes of every patch depart from fully developed speckle, by frame.

@@ -22,7 +22,7 @@ from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
 from speckle3d.report import tables
 from speckle3d.report.data import Cuts, Record, StudyData, SweepView, cut_modes, load_view, read_study
-from speckle3d.study.figures import curve_panels, figure_panels
+from speckle3d.study.figures import curve_panels, figure_panels, name_figure
 from speckle3d.study.folder import only_run
 from speckle3d.study.overall import counted
 from speckle3d.study.results import copy_lines
@@ -182,7 +182,8 @@ def _overview(study: StudyData, directory: Path) -> PageFigure | None:
         "magnitude over the mode's sweeps."
     )
     plot = draw.plot_panels({"": panels}, 2, 140 + 50 * len(modes))
-    drawn = figure_panels(panels, 2, (9.0, 1.3 + 0.5 * len(modes)))
+    drawn = figure_panels(panels, 2, (9.0, 1.8 + 0.5 * len(modes)))
+    name_figure(drawn, "a point: a part of a sweep; a bar: the mean magnitude over sweeps, either way")
     return _filed(directory, "overview", drawn, caption, plot)
 
 

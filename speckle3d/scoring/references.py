@@ -14,12 +14,14 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
 
 REFERENCES = ("tracker", "truth")
 
 
+@shown
 @dataclass(frozen=True)
 class Reference:
     """Poses that modes are compared with.
@@ -38,6 +40,7 @@ class Reference:
     covered: BoolArray
 
 
+@shown
 @dataclass(frozen=True)
 class SweepCurves:
     """Accumulated length (mm), tilt, yaw and roll (degrees) over the frames.

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.simulation.bath import Reflector
 
@@ -120,6 +121,7 @@ class SimulationSettings(BaseModel):
         return value
 
 
+@shown
 @dataclass(frozen=True)
 class SimulatedSweep:
     """A sweep whose frames are computed as they are read, and the settings that determine it.

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
@@ -33,6 +34,7 @@ USUAL_RANGE_DB = 60.0
 _RANGE = "dynamic_range_db"
 
 
+@shown
 @dataclass(frozen=True)
 class PosedSweep:
     """A sweep, and where its frames are.

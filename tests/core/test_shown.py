@@ -1,10 +1,14 @@
 """Results show themselves in ten lines, in notebooks as a table, and are handed over to other libraries."""
 
+import re
+from dataclasses import fields, is_dataclass
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
+import xsens
 from speckle3d.core.shown import brief
 from speckle3d.core.volume import Volume
 from xsens.logs.samples import ImuLog
@@ -47,6 +51,18 @@ def test_names_from_outside_are_escaped_in_the_table(sweep):
     from dataclasses import replace
 
     assert "<script>" not in replace(sweep, name="<script>")._repr_html_()
+
+
+@pytest.mark.parametrize("package", [s3, xsens])
+def test_public_results_show_themselves_so(package):
+    public = [getattr(package, name) for name in dir(package)]
+    held = [each for each in public if isinstance(each, type) and is_dataclass(each)]
+    arrays = re.compile(r"Array|Rigid|Rotation")
+    with_arrays = [each for each in held if any(arrays.search(str(f.type)) for f in fields(each))]
+    assert with_arrays
+    assert {each.__name__ for each in with_arrays if not hasattr(each, "_repr_html_")} <= {
+        "MechanismSettings"
+    }
 
 
 @pytest.mark.parametrize(

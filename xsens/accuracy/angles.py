@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.tables import text_table
 
@@ -37,6 +38,7 @@ _MOUNTING_LIMIT = np.deg2rad(2.0)
 half a degree leaves an error of a quarter of a radian at this limit."""
 
 
+@shown
 @dataclass(frozen=True)
 class PairErrors:
     """Angles between the frames of every pair by the reference, and the errors of the sensor's angles.
@@ -60,6 +62,7 @@ class PairErrors:
         return self.error_rad.size // 3
 
 
+@shown
 @dataclass(frozen=True)
 class AccuracyTable:
     """Errors of each experiment over all pairs and calibrations, as in table 2 of Housden et al. (2008).

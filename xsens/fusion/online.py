@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.shown import shown
 from speckle3d.kernels.orientation.inclination import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank
@@ -26,6 +27,7 @@ _FOLLOWS = 0.05
 """How fast the usual step between samples follows theirs, as a fraction of a sample."""
 
 
+@shown
 @dataclass(frozen=True)
 class OnlineState:
     """Estimate of the filter after the last sample.

@@ -185,9 +185,10 @@ def _opened(port_name: str, baud: int) -> Serial:
     serial = extra_module("serial", "live", "a live sensor")
     stop = serial.STOPBITS_TWO
     try:
-        return serial.Serial(
+        opened: Serial = serial.Serial(
             port_name, baud, stopbits=stop, timeout=_POLL_S, write_timeout=ANSWER_S, exclusive=True
         )
+        return opened
     except (OSError, ValueError) as error:
         reason = _first_line(error)
         raise DeviceError(f"{port_name}: cannot be opened as a serial port: {reason}") from error

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.shown import shown
 from xsens.fusion.field import ROUGH
 from xsens.live.device import DeviceInfo
 from xsens.logs.parts import Hints
@@ -35,6 +36,7 @@ _NAN = float("nan")
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
 
+@shown
 @dataclass(frozen=True)
 class LiveState:
     """Present state of a sensor being recorded.

@@ -10,6 +10,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.shown import shown
 from speckle3d.correction.crossing.certainty import angle_deg, bend_slice, covariance, overlap_mm, terms_of
 from speckle3d.correction.crossing.moved import Parts, rms_mm
 from speckle3d.correction.crossing.path import BENDS, StraightSweep, straightened
@@ -38,6 +39,7 @@ _FOLLOWED = 0.45
 and 1.0 mm for 0.62, and lengths came out wrong by up to 8 %. Of 0.3 mm at most 0.41 were made."""
 
 
+@shown
 @dataclass(frozen=True)
 class CrossedPair:
     """Two sweeps after their images have been made to agree.

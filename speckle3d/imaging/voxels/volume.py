@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, ByteArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import Images, PosedImages
@@ -29,6 +30,7 @@ MAX_MEMORY_GB = 4.0
 """Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
 
 
+@shown
 @dataclass(frozen=True)
 class CompoundedVolume(Volume):
     """A volume and where its voxels are from.

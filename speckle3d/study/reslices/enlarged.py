@@ -54,7 +54,7 @@ def save_enlarged(cuts: Mapping[str, Float32Array], pixel_mm: float, name: str, 
     FileError
         If the file cannot be written.
     """
-    reference = next(reversed(cuts.values()))
+    reference = list(cuts.values())[-1]
     top = busiest_rows(reference, round(DEEP_MM / pixel_mm))
     rows = slice(top, top + round(DEEP_MM / pixel_mm))
     columns = slice(0, min(min(each.shape[1] for each in cuts.values()), round(LONGEST_MM / pixel_mm)))
