@@ -291,8 +291,9 @@ class ChainSolution:
         Of all points, mm (sines of angles for directions).
     sigma : float
         Robust standard deviation of the residuals of the points used.
-    condition_number : float
-        Of the scaled Jacobian in the sensor's and the world's own frames, as published (TR 303, Table 2).
+    published_condition_number : float
+        Of the scaled Jacobian in the sensor's and the world's own frames, as published (TR 303, Table 2);
+        large where a mounting is near a singularity of its angles, however sufficient the motion.
     prior : PixelPrior, optional
         That the solution takes into account.
     rival : Rival, optional
@@ -308,9 +309,14 @@ class ChainSolution:
     used: BoolArray
     residuals: FloatArray
     sigma: float
-    condition_number: float
+    published_condition_number: float
     prior: PixelPrior | None = None
     rival: Rival | None = None
+
+    @property
+    def condition_number(self) -> float:
+        """Of the scaled Jacobian in frames on the image and the phantom: by this motions are judged."""
+        return self.fit.condition_number
 
     @property
     def angular(self) -> bool:

@@ -137,7 +137,7 @@ def judge(solution: ChainSolution) -> Adequacy:
     )
     error = errors.angle_rad if angular else errors.corner_mm
     excess = errors.of_limit(REFUSED_MM, REFUSED_RAD)
-    condition = solution.fit.condition_number
+    condition = solution.condition_number
     share = (MISFIT_RAD if angular else MISFIT_MM) / solution.rms if solution.rms > 0 else np.inf
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.

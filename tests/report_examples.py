@@ -41,11 +41,13 @@ def small_study(folder, sweeps):
         "doubts": [{"sweep": "forward", "about": "tracker", "suspect": "units <in> metres",
                     "evidence": "expected 3 mm, got 0.003", "refuted": True}],
         "rows": rows,
-        "drift": [{"sweep": "forward", "mode": "image", "FDR": 0.1234, "GPE_mm": 0.5, "EA_deg": None}],
+        "drift": [
+            {"sweep": "forward", "mode": "image", "FDR_percent": 12.34, "GPE_mm": 0.5, "EA_deg": None}],
         "intervals": [{"mode": "pose", "quantity": "length_error_percent", "sweeps": 2, "mean": 0.987,
                        "low": 0.5, "high": 1.5}],
-        "paired": [{"mode": "image", "against": "pose", "quantity": "FDR", "sweeps": 2, "difference": 0.111,
-                    "low": 0.021, "high": 0.2, "wilcoxon_p": 0.01, "holm_p": 0.03, "better": "pose"}],
+        "paired": [{"mode": "image", "against": "pose", "quantity": "FDR_percent", "sweeps": 2,
+                    "difference": 11.1, "low": 2.1, "high": 20.0, "wilcoxon_p": 0.01, "holm_p": 0.03,
+                    "better": "pose"}],
     }  # fmt: skip
     (folder / "study.json").write_text(json.dumps(study), encoding="utf-8")
     return folder

@@ -21,8 +21,8 @@ app.add_typer(trajectory, name="trajectory")
 Unit = Annotated[str, typer.Option("--length-unit", help="Unit of lengths in TUM text: m or mm.")]
 
 _LABELS = (
-    ("FDR", "final drift rate (FDR)", "{:.2%}"),
-    ("ADR", "average drift rate (ADR)", "{:.2%}"),
+    ("FDR_percent", "final drift rate (FDR)", "{:.2f} %"),
+    ("ADR_percent", "average drift rate (ADR)", "{:.2f} %"),
     ("MD_mm", "maximum drift (MD)", "{:.4f} mm"),
     ("SD_mm", "sum of drift (SD)", "{:.3f} mm"),
     ("HD_mm", "Hausdorff distance (HD)", "{:.4f} mm"),
@@ -151,7 +151,11 @@ def _require_meaning(
 def _table(found: dict[str, Any]) -> str:
     from speckle3d.core.tables import text_table
 
-    rows = [("poses", str(found["poses"]))]
+    rows = [
+        ("poses", str(found["poses"])),
+        ("matched", found["association"]),
+        ("aligned", found["alignment"]),
+    ]
     for name, words in (("APE", "absolute pose error (APE)"), ("RPE", "relative pose error (RPE)")):
         each = found[name]
         rows += [

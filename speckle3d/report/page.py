@@ -117,7 +117,7 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     found = tables.scored_means(study.single, study.modes)
     lead = tables.summary_lines(found, len(study.done), len(study.broken), study.paired, study.references)
     keys = ("name", "path", "sha256", "key", "seconds")
-    best = tables.best_of(found.means, "length_percent") if found.together else None
+    best = tables.clearly_best(found.means, study.paired) if found.together else None
     scripts = [get_plotlyjs(), files("speckle3d.report").joinpath("script.js").read_text(encoding="utf-8")]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("speckle3d", "report"),

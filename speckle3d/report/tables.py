@@ -260,6 +260,15 @@ def best_of(means: Sequence[Record], key: str) -> str | None:
     return str(min(valued, key=lambda row: row[key])["mode"]) if valued else None
 
 
+def clearly_best(means: Sequence[Record], paired: Sequence[Record]) -> str | None:
+    """Mode whose length is best and told apart from every other mode's; None if no mode is."""
+    best = best_of(means, "length_percent")
+    others = [str(row["mode"]) for row in means if row["mode"] != best]
+    if best is None or not others:
+        return None
+    return best if all(beats(paired, "length_error_percent", best, other) for other in others) else None
+
+
 def _length_line(scored: Scored, best: str) -> str:
     means = scored.means
     mine = next(row for row in means if row["mode"] == best)

@@ -9,9 +9,9 @@ over i = 1 to n - 1: the first frame is right by construction.
 ======  ================================================================================================
 FDR     final drift rate: ``d_(n-1) / L_(n-1)``, with the drift ``d_i = |T^_i c - T_i c|`` of the image
         centre c and the length of the reference's path ``L_i = sum_(k <= i) |T_k c - T_(k-1) c|``, straight
-        from frame to frame; a share, without unit. A jittery reference has a longer path than the probe.
-ADR     average drift rate: mean over frames of ``d_i / L_i``; frames before the reference moves are left
-        out
+        from frame to frame; %. A jittery reference has a longer path than the probe.
+ADR     average drift rate: mean over frames of ``d_i / L_i``, %; frames before the reference moves are
+        left out
 MD      maximum drift: largest ``d_i``, mm
 SD      sum of drift: sum of ``d_i`` over the frames, mm; it grows with the number of frames
 HD      symmetric Hausdorff distance of the two sets of centres ``{T^_i c}`` and ``{T_i c}``, mm: the
@@ -106,8 +106,8 @@ def drift_rates(
     Returns
     -------
     dict
-        ``FDR`` and ``ADR`` (shares), ``MD_mm``, ``SD_mm``, ``HD_mm`` and ``EA_deg``, as the module's table
-        defines them.
+        ``FDR_percent`` and ``ADR_percent``, ``MD_mm``, ``SD_mm``, ``HD_mm`` and ``EA_deg``, as the module's
+        table defines them.
 
     Raises
     ------
@@ -125,8 +125,8 @@ def drift_rates(
     moved = travelled > 0
     angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * found.rotation).magnitude())[1:])
     return {
-        "FDR": float(drift[-1] / travelled[-1]),
-        "ADR": float(np.mean(drift[moved] / travelled[moved])),
+        "FDR_percent": float(100.0 * drift[-1] / travelled[-1]),
+        "ADR_percent": float(100.0 * np.mean(drift[moved] / travelled[moved])),
         "MD_mm": float(drift.max()),
         "SD_mm": float(drift.sum()),
         "HD_mm": max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),

@@ -177,7 +177,8 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     Returns
     -------
     dict
-        ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, ``same_sweep``
+        ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, how they were matched
+        (``association``) and laid on each other (``alignment``), ``same_sweep``
         (whether both are of the same bytes, None where a file does not say), ``APE`` and ``RPE`` as
         `PoseError`, what `speckle3d.scoring.displacements.score_row` gives, and the TUS-REC ``score``, None
         without landmarks.
@@ -206,6 +207,8 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
         "reference": reference.name,
         "poses": len(found),
         "left_out": len(shared) - common,
+        "association": "the reference interpolated at the estimate's times",
+        "alignment": "first poses on each other, lengths as they are",
         "same_sweep": of[0] == of[1] if all(of) else None,
         "APE": absolute_pose_error(found, true),
         "RPE": relative_pose_error(found, true),

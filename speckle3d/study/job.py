@@ -9,6 +9,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
@@ -31,6 +32,7 @@ from speckle3d.io.load import import_record, kind_of, recording_sha256
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Progress, Tracked, after, track
+from speckle3d.scoring.jitter import jitter_percent
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
 from speckle3d.study.crossed import Companion
@@ -203,6 +205,7 @@ def write_results(
         doubted_modes(sweep, doubts, poses),
         left_out,
         claims_of(tracked, sweep.grid.centre_mm, corrections),
+        _jitter(sweep),
     )
     files = [path, *write_summary(directory, summary)]
     files += [save_figure(figure_drift(moved, _title(summary)), directory / "drift.png")]
@@ -308,6 +311,15 @@ def _errors(
         return [ModeError.of_estimate(m, len(sweep), float(c[0, -1])) for m, c in moved.modes.items()]
     true, ends = reference.world_from_image, 1 if reference.name == "truth" else END_FRAMES
     return compare_modes(poses, true, sweep.grid.centre_mm, reference.covered, ends)
+
+
+def _jitter(sweep: Sweep) -> float:
+    """Per cent of the length that a tracker's jitter alone may be; 0 without one over all frames."""
+    tracker = sweep.tracker
+    if tracker is None or tracker.sensor_from_image is None or not tracker.covers(sweep.frame_time_s).all():
+        return 0.0
+    found = jitter_percent(tracker.world_from_image(sweep.frame_time_s), sweep.grid.centre_mm)
+    return found if np.isfinite(found) else 0.0
 
 
 def _draw_enlarged(path: Path, sweep: Sweep, poses: dict[str, RigidTransform], strip: Strip) -> Path:

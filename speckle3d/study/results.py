@@ -43,13 +43,15 @@ _COLUMNS = (
     ("reference", "reference", "{}"),
     ("reference_mm", "reference mm", "{:.2f}"),
     ("estimate_mm", "estimate mm", "{:.2f}"),
-    ("length_error_mm", "error mm", "{:+.2f}"),
-    ("length_error_percent", "error %", "{:+.1f}"),
-    ("tilt_error_deg", "tilt deg", "{:+.2f}"),
-    ("yaw_error_deg", "yaw deg", "{:+.2f}"),
-    ("roll_error_deg", "roll deg", "{:+.2f}"),
+    ("length_error_mm", "length error mm", "{:+.2f}"),
+    ("length_error_percent", "length error %", "{:+.1f}"),
+    ("tilt_error_deg", "tilt error deg", "{:+.2f}"),
+    ("yaw_error_deg", "yaw error deg", "{:+.2f}"),
+    ("roll_error_deg", "roll error deg", "{:+.2f}"),
     ("remark", "remark", "{}"),
 )
+TOLD_JITTER_PERCENT = 1.0
+"""From here on a length that rests on the tracker says what its jitter does."""
 _TO_THE_LEFT = (0, 1, 2, 3, 11)
 
 
@@ -72,6 +74,8 @@ class Summary:
         Modes that were asked for and refused, and why.
     claims : mapping of str to float
         Relative standard deviation of the length that a mode claims, where it claims one.
+    jitter_percent : float
+        What the tracker's jitter alone leaves of error in a length that rests on it; 0 without a tracker.
     details : dict
         Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
     """
@@ -86,6 +90,7 @@ class Summary:
     doubted: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     claims: Mapping[str, float] = field(default_factory=dict)
+    jitter_percent: float = 0.0
 
     @property
     def doubt_lines(self) -> list[str]:
@@ -239,6 +244,9 @@ def remark_on(summary: Summary, row: ModeError) -> str:
     words = []
     if row.mode in summary.claims:
         words.append(f"length +- {100 * summary.claims[row.mode]:.1f} %")
+    rests_on_tracker = row.mode in FITTED_TO_TRACKER or summary.reference == "tracker"
+    if rests_on_tracker and summary.jitter_percent >= TOLD_JITTER_PERCENT:
+        words.append(f"tracker's jitter alone +- {summary.jitter_percent:.1f} %")
     if row.mode in FITTED_TO_TRACKER and summary.reference == "tracker":
         words.append("fitted to this tracker")
     if row.mode in summary.doubted:

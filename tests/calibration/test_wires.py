@@ -255,7 +255,7 @@ def test_any_mounting_and_any_place_of_three_wires_is_found(seed):
     turned = (mounting.inv() * solution.chain.sensor_from_image).rotation.magnitude()
     assert turned < np.deg2rad(0.4)
     # In frames on image and phantom every mounting is as good as another: 7.8 to 9.9.
-    assert solution.fit.condition_number < 15
+    assert solution.condition_number < 15
 
 
 @pytest.mark.parametrize("fit_pixels", [True, False])

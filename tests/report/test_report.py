@@ -312,17 +312,17 @@ def test_the_lead_names_the_modes_that_are_not_told_apart_from_the_best():
 def test_means_and_differences_over_sweeps_are_tables(page):
     words = " ".join(page.words)
     assert "1.0 [0.5, 1.5]" in words
-    assert "+11.1% [+2.1%, +20.0%]" in words
+    assert "+11.1 [+2.1, +20.0]" in words
     assert f"{label_of('image')} − {label_of('pose')}" in words
-    ((_, line),) = paired_table(pairs("FDR", ("image", "pose"))).lines
+    ((_, line),) = paired_table(pairs("FDR_percent", ("image", "pose"))).lines
     assert [cell.is_bold for cell in line] == [False, False, True, False]
-    assert line[1].text.splitlines() == ["+100.0%", "[−50.0%, +250.0%]"]
+    assert line[1].text.splitlines() == ["+1.0", "[−0.5, +2.5]"]
     assert intervals_table([]) is None
     # Means of fewer sweeps say so.
-    held = {"quantity": "FDR", "low": None, "high": None, "mean": 0.5}
+    held = {"quantity": "FDR_percent", "low": None, "high": None, "mean": 0.5}
     rows = [held | {"mode": mode, "sweeps": sweeps} for mode, sweeps in (("image", 4), ("pose", 1))]
     ((_, line),) = intervals_table(rows).lines
-    assert [cell.text for cell in line] == ["FDR", "50.0%", "50.0% (1)"]
+    assert [cell.text for cell in line] == ["FDR %", "0.5", "0.5 (1)"]
 
 
 @pytest.mark.parametrize(

@@ -83,8 +83,8 @@ def test_rates_are_of_the_path_travelled_not_of_the_way_gained():
 
     # There and back: the path is 1, then 2 mm long; drifts are 0.1 and 0.3 mm.
     rates = drift_rates(at(0.0, 1.1, 0.3), at(0.0, 1.0, 0.0), CENTRE_MM)
-    assert rates["FDR"] == pytest.approx(0.3 / 2)
-    assert rates["ADR"] == pytest.approx((0.1 / 1 + 0.3 / 2) / 2)
+    assert rates["FDR_percent"] == pytest.approx(100 * 0.3 / 2)
+    assert rates["ADR_percent"] == pytest.approx(100 * (0.1 / 1 + 0.3 / 2) / 2)
     assert (rates["MD_mm"], rates["SD_mm"]) == pytest.approx((0.3, 0.4))
 
 
@@ -118,7 +118,7 @@ def test_neither_world_matters():
 def test_a_rest_at_the_start_is_left_out_of_the_average_rate():
     still = RigidTransform.concatenate([sliding(100.0)[:1], sliding(100.0)])
     stretched = RigidTransform.concatenate([sliding(105.0)[:1], sliding(105.0)])
-    assert drift_rates(stretched, still, CENTRE_MM)["ADR"] == pytest.approx(0.05)
+    assert drift_rates(stretched, still, CENTRE_MM)["ADR_percent"] == pytest.approx(5.0)
 
 
 def test_a_reference_at_rest_or_of_another_length_is_refused():
@@ -133,7 +133,14 @@ def test_drift_of_a_uniform_stretch():
     reference = Reference("truth", sliding(20.0, 41), np.ones(41, dtype=bool))
     (row,) = drift_rows(ImageGrid(26, 1000, 0.3, 0.0193), {"image": sliding(21.0, 41)}, reference)
     # Mean of 0.05 z over frames 1 to 40 is 0.05 x 20 x 41 / 80; steps differ by 0.05 x 0.5 mm.
-    expected = {"FDR": 0.05, "ADR": 0.05, "MD_mm": 1.0, "SD_mm": 20.5, "HD_mm": 1.0, "EA_deg": 0.0}
+    expected = {
+        "FDR_percent": 0.05,
+        "ADR_percent": 0.05,
+        "MD_mm": 1.0,
+        "SD_mm": 20.5,
+        "HD_mm": 1.0,
+        "EA_deg": 0.0,
+    }
     expected |= {"GPE_mm": 0.5125, "LPE_mm": 0.025}
     assert {name: row[name] for name in expected} == pytest.approx(expected, abs=1e-9)
 
@@ -165,7 +172,7 @@ def test_drift_of_the_origin_is_the_absolute_pose_error(trajectories):
     path = texts[0].distances
     assert ours["MD_mm"] == pytest.approx(shift.max(), abs=1e-9)
     assert ours["SD_mm"] == pytest.approx(shift.sum(), abs=1e-9)
-    assert ours["FDR"] == pytest.approx(shift[-1] / path[-1], abs=1e-9)
+    assert ours["FDR_percent"] == pytest.approx(100 * shift[-1] / path[-1], abs=1e-7)
     assert ours["EA_deg"] == pytest.approx(angle[1:].mean(), abs=1e-9)
 
 

@@ -71,7 +71,7 @@ def test_pose_errors_by_hand():
 def test_text_without_images_is_scored_at_its_origin(texts, pair):
     found = compare_trajectories(load_estimate(texts[0]), load_reference(texts[1]))
     rates = drift_rates(*pair, np.zeros(3))
-    assert (found["FDR"], found["HD_mm"]) == pytest.approx((rates["FDR"], rates["HD_mm"]))
+    assert (found["FDR_percent"], found["HD_mm"]) == pytest.approx((rates["FDR_percent"], rates["HD_mm"]))
     assert (found["poses"], found["left_out"], found["GPE_mm"], found["score"]) == (40, 0, None, None)
 
 

@@ -79,9 +79,11 @@ def test_every_mode_that_has_sensors_and_the_broken_sweep_as_a_row(study):
 
 def test_means_over_sweeps_are_in_the_study_and_in_the_table(study):
     found = held(study.directory)
-    (mean,) = [r for r in found["intervals"] if (r["quantity"], r["mode"]) == ("FDR", "pose")]
+    (mean,) = [r for r in found["intervals"] if (r["quantity"], r["mode"]) == ("FDR_percent", "pose")]
     assert mean["sweeps"] == 2
-    assert mean["mean"] == pytest.approx(np.mean([r["FDR"] for r in found["drift"] if r["mode"] == "pose"]))
+    assert mean["mean"] == pytest.approx(
+        np.mean([r["FDR_percent"] for r in found["drift"] if r["mode"] == "pose"])
+    )
     pairs = [(r["mode"], r["against"]) for r in found["paired"] if r["quantity"] == "length_error_percent"]
     assert len(pairs) == len(set(pairs)) == 10
     # Two sweeps cannot tell modes apart.

@@ -38,7 +38,9 @@ def study(sweeps, gain=3.0, seed=3):
                      "tilt_error_deg": float("nan"), "yaw_error_deg": 0.0,
                      "roll_error_deg": 0.0}
                 )  # fmt: skip
-            drift.append({"sweep": f"s{i}", "mode": mode, "FDR": 0.01 * error, "GPE_mm": 0.1, "GLE_mm": None})
+            drift.append(
+                {"sweep": f"s{i}", "mode": mode, "FDR_percent": error, "GPE_mm": 0.1, "GLE_mm": None}
+            )
     return rows, drift
 
 
@@ -66,7 +68,7 @@ def test_one_number_per_sweep_is_the_mean_magnitude_of_its_parts():
         11, pytest.approx(expected.mean), expected.low, expected.high,
     )  # fmt: skip
     assert expected.low < expected.mean < expected.high
-    assert of(intervals, "FDR", "image")["mean"] == pytest.approx(0.01 * expected.mean)
+    assert of(intervals, "FDR_percent", "image")["mean"] == pytest.approx(expected.mean)
     # Quantities without a value are left out, those without scatter have no interval.
     assert {r["quantity"] for r in intervals} & {"tilt_error_deg", "GLE_mm", "MD_mm"} == set()
     assert of(intervals, "GPE_mm", "pose")["low"] is None
@@ -81,9 +83,9 @@ def test_modes_that_differ_in_every_sweep_are_beats_and_like_ones_not():
     assert found["wilcoxon_p"] == pytest.approx(2 / 2**11)
     assert found["holm_p"] >= 2 * found["wilcoxon_p"]
     assert of(paired, "length_error_percent", "image", "twin")["better"] is None
-    assert beats(paired, "FDR", "pose", "image")
-    assert not beats(paired, "FDR", "image", "pose")
-    assert not beats(paired, "FDR", "twin", "image")
+    assert beats(paired, "FDR_percent", "pose", "image")
+    assert not beats(paired, "FDR_percent", "image", "pose")
+    assert not beats(paired, "FDR_percent", "twin", "image")
 
 
 def test_few_sweeps_tell_nothing_apart_though_all_agree():
@@ -96,11 +98,11 @@ def test_the_text_is_compact_and_says_who_is_better():
     intervals, paired = over_sweeps(*study(11))
     lines = overall_text(intervals, paired).splitlines()
     assert lines[0].split() == ["mean", "of", "11", "sweeps", "image", "twin", "pose"]
-    (fdr,) = [line for line in lines if line.startswith("FDR")]
-    found = of(intervals, "FDR", "pose")
-    assert f"{found['mean']:.1%} [{found['low']:.1%}, {found['high']:.1%}]" in fdr
+    (fdr,) = [line for line in lines if line.startswith("FDR %")]
+    found = of(intervals, "FDR_percent", "pose")
+    assert f"{found['mean']:.1f} [{found['low']:.1f}, {found['high']:.1f}]" in fdr
     (apart,) = [line for line in lines if line.startswith("less ")]
-    assert apart == "less length error %, FDR: pose than image, twin"
+    assert apart == "less length error %, FDR %: pose than image, twin"
     assert max(len(line) for line in lines) <= 110
     assert overall_text([], []) == ""
 
