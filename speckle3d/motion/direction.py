@@ -10,6 +10,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import Sweep, image_orientation
 
+_LEAST_CORRELATION, _LEAST_DEVIATIONS = 0.5, 2.5
+"""Correlation of turns that tells the direction, in itself and over what chance gives."""
+_SAME_CORRELATION, _ALIKE_SIZE = 0.95, 1.5
+"""Correlation, and ratio of sizes, at which turns are one motion's, however few of them there are."""
+
 
 class SensorSettings(BaseModel):
     """How sensor streams are used."""
@@ -104,12 +109,44 @@ def _turn_agreement(sweep: Sweep, image: RigidTransform) -> int | None:
     measured = sensor.world_from_image(sweep.frame_time_s[covered])
     sensed = (measured[0].inv() * measured).as_rotvec()[:, :2]
     seen = (image.rotation[covered[0]].inv() * image.rotation[covered]).as_rotvec()[:, :2]
-    t = np.linspace(-1, 1, covered.size)
-    trend = np.vander(t, 3)
-    left = [v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensed, seen)]
-    power = float(np.sum(left[0] ** 2) * np.sum(left[1] ** 2))
-    if power == 0:
+    return same_turns(sensed, seen)
+
+
+def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
+    """Whether two records of turns go the same way (1) or opposite ways (-1); None if chance may tell so.
+
+    Told are a correlation that chance does not give records as slow as these, and one near one between turns
+    of one size, as the same motion gives.
+
+    Parameters
+    ----------
+    sensed, seen : ndarray, shape (n, 2)
+        Tilt and yaw of each frame, rad.
+
+    References
+    ----------
+    .. [1] M. S. Bartlett, "Some aspects of the time-correlation problem in regard to tests of significance",
+       Journal of the Royal Statistical Society 98, 1935: the variance of a correlation of series that change
+       slowly.
+    """
+    trend = np.vander(np.linspace(-1, 1, len(sensed)), 3)
+    ours, theirs = (v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensed, seen))
+    powers = float(np.sum(ours**2)), float(np.sum(theirs**2))
+    if not min(powers) > 0:
         return None
-    correlation = float(np.sum(left[0] * left[1])) / power**0.5
-    # Slow turns have some ten independent values in a sweep: 0.5 is about two standard deviations.
-    return None if abs(correlation) < 0.5 else int(np.sign(correlation))
+    product = float(np.sum(ours * theirs))
+    correlation = product / np.sqrt(powers[0] * powers[1])
+    by_chance = float(np.sqrt(max(_chance_variance(ours, theirs), 0.0)))
+    of_one_size = _ALIKE_SIZE**-2 <= powers[0] / powers[1] <= _ALIKE_SIZE**2
+    told = abs(correlation) >= _LEAST_CORRELATION and abs(product) >= _LEAST_DEVIATIONS * by_chance
+    the_same = abs(correlation) >= _SAME_CORRELATION and of_one_size
+    return int(np.sign(correlation)) if told or the_same else None
+
+
+def _chance_variance(ours: FloatArray, theirs: FloatArray) -> float:
+    """Variance of the sum of products of independent series with these autocovariances (Bartlett)."""
+    n = len(ours)
+    weights = 1.0 - np.abs(np.arange(1 - n, n)) / n
+    columns = zip(ours.T, theirs.T, strict=True)
+    own = (np.correlate(a, a, "full") * np.correlate(b, b, "full") for a, b in columns)
+    return float(sum(np.sum(weights * each) for each in own)) / n

@@ -20,6 +20,9 @@ from speckle3d.motion.uncertainty import changing_variance, common_factors
 
 KNOTS = 40
 """Frames between which errors are interpolated: with six new variables each, some 10 MB for 300 frames."""
+ROUNDING = 1e-6
+"""Share of the largest error below which a component's own is rounding: errors carried into it would be
+divided by next to nothing."""
 _LEAST = 1e-12
 """Share of a variance below which a direction is as good as certain."""
 
@@ -84,7 +87,7 @@ def chain_factors(covariance: FloatArray, centres_mm: FloatArray) -> FloatArray:
         Along the axes of `covariance`.
     """
     n = len(covariance)
-    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2).max(axis=0), 1e-24))
+    size = _sizes(covariance, centres_mm)
     target = _positive(covariance / np.outer(size, size))
     knots = knot_frames(n)
     reached = target[0] * np.outer(size, size)
@@ -103,6 +106,17 @@ def chain_factors(covariance: FloatArray, centres_mm: FloatArray) -> FloatArray:
         carry = carried(centres_mm - centres_mm[frame])
         factors[number] = share[number, None, :, None] * np.einsum("iab,bm->mia", carry, root)
     return np.asarray(_with_covariance(factors.reshape(-1, n, 6) / size, target) * size)
+
+
+def _sizes(covariance: FloatArray, centres_mm: FloatArray) -> FloatArray:
+    """Largest standard deviation of each component, none less than `ROUNDING` of the largest, shape (6,).
+
+    Angles are compared with displacements by what they displace over the whole sweep.
+    """
+    own = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2).max(axis=0), 1e-24))
+    lever_mm = 1.0 + float(np.linalg.norm(centres_mm - centres_mm[0], axis=1).max())
+    arm = np.array([1.0, 1.0, 1.0, lever_mm, lever_mm, lever_mm])
+    return np.asarray(np.maximum(own, ROUNDING * float((own * arm).max()) / arm))
 
 
 def turn_factors(

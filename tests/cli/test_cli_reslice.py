@@ -167,7 +167,7 @@ def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp
     assert "0 to 23, got 24" in told("--frame", "24")
     assert "--frame" in told("--angle-deg", "30")
     assert "--right" in told("--origin", "0", "0", "0")
-    assert "--curve" in told("--on", out)
+    assert "--curve" in told("--on", curve)
     assert "100000000" in told("--pixel-mm", "0.0001")
     assert "curved" in told("--curve", curve, to=tmp_path / "r.nrrd")
     assert "none.png" in told("--curve", curve, "--on", curve.parent / "none.png")

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.reconstruction import SharedErrors
-from speckle3d.motion.joint_errors import carried, joint_errors, turn_factors
+from speckle3d.motion.joint_errors import carried, chain_factors, joint_errors, turn_factors
 from speckle3d.motion.uncertainty import changing_variance, common_factors, shared_covariance
 
 CENTRE_MM = np.array([7.0, 22.0, 0.0])
@@ -109,3 +109,21 @@ def test_a_sensor_that_wanders_turns_frames_and_bends_the_path():
     # At knots the difference of two independent turns.
     np.testing.assert_allclose(deviation[-1, 3:], np.sqrt(2) * np.array([0.002, 0.003, 0.004]), rtol=1e-6)
     assert (deviation[-1, :2] > 0.0).all()
+
+
+@pytest.mark.parametrize("least_mm", [1e-4, 1e-8, 1e-12, 0.0])
+def test_a_component_without_an_error_of_its_own_leaves_the_others_theirs(least_mm):
+    """Tilt and yaw carry errors into a place whose own was told to be rounding, or was split off."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        frames, own = 60, np.array([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3])
+        own[which := rng.integers(0, 3)] = least_mm
+        mixed = rng.normal(size=(6, 6))
+        covariance = (mixed @ mixed.T * np.outer(own, own)) * np.linspace(0, 1, frames)[:, None, None]
+        factors = chain_factors(covariance, np.outer(np.linspace(0, 20, frames), [0.2, 0.0, 1.0]))
+        got = np.einsum("mia,mia->ia", factors, factors)[1:]
+        wanted = np.diagonal(covariance, axis1=1, axis2=2)[1:]
+        others = np.arange(6) != which
+        # The floor under rounding is a millionth of the largest error; divided by nothing it was 1e58.
+        np.testing.assert_allclose(got[:, others], wanted[:, others], rtol=1e-3)
+        assert (got[:, which] <= wanted[:, which] + 1e-9).all()

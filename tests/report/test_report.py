@@ -140,7 +140,7 @@ def test_every_row_is_in_the_table_and_the_broken_sweep_with_its_reason(page, re
         assert f"{row['tilt_error_deg']:+.2f}" in words
     assert printable(REASON) in words
     assert "GPE / mm" in words
-    assert "0.123" in words
+    assert "12.3" in words
     assert "sensors" in words[words.index("Every setting") :]
 
 
