@@ -61,7 +61,8 @@ def convert(
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="OUT", help="Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .mhd, .nrrd), to write."
+            metavar="OUT",
+            help="Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .mhd, .nrrd), to write; or -o OUT.",
         ),
     ],
     sampling_rate_hz: Number = None,

@@ -78,6 +78,12 @@ class Command(TyperCommand):
         self.format_help_text(ctx, formatter)
         self.format_options(ctx, formatter)
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take `-o FILE` where the output is an argument, as it is everywhere else."""
+        if any(each.name == "out" and each.param_type_name == "argument" for each in self.params):
+            args = _output_last(args)
+        return list(super().parse_args(ctx, args))
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command, once its files and choices can be right."""
         options = {each.name: max(each.opts, key=len) for each in self.params if each.opts[0][:1] == "-"}
@@ -130,6 +136,13 @@ class App(typer.Typer):
     def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
         """Register a command; see `typer.Typer.command`."""
         return super().command(name, **{"cls": Command, **options})
+
+
+def _output_last(args: list[str]) -> list[str]:
+    for i, each in enumerate(args[:-1]):
+        if each in ("-o", "--output"):
+            return [*args[:i], *args[i + 2 :], args[i + 1]]
+    return args
 
 
 def _first_sentence(text: str | None) -> str:

@@ -83,7 +83,7 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, world: WorldOption = None, a
 @imu.command("convert")
 def imu_convert(
     log_file: Log,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="CSV to write.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="CSV to write; or -o OUT.")],
     rate_hz: RateHz = None,
     world: WorldOption = None,
 ) -> None:
@@ -154,7 +154,7 @@ def imu_orient(
 @imu.command("record")
 def imu_record(
     port: Annotated[str, typer.Argument(help="Serial port of the sensor, as /dev/ttyUSB0 or COM3.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="File for the sensor's bytes.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File for the sensor's bytes; or -o OUT.")],
     content: Annotated[str, typer.Option(help="orientation, calibrated, raw, or `as set`.")] = "orientation",
     rate_hz: Annotated[float | None, typer.Option(help="Samples per second; by default as set.")] = None,
     baud: Annotated[

@@ -26,7 +26,7 @@ _PRESETS = (
 
 @app.command()
 def simulate(
-    out: Annotated[Path, typer.Argument(help="Sweep file to write.")],
+    out: Annotated[Path, typer.Argument(help="Sweep file to write; or -o OUT.")],
     preset: Annotated[str, typer.Option(help=_PRESETS)] = "phantom",
     seed: Annotated[int, typer.Option(help="Same seed and settings, same sweep.")] = 0,
     length_mm: Annotated[float | None, typer.Option(help="Length of the sweep, mm (20).")] = None,

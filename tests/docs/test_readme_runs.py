@@ -11,7 +11,7 @@ def test_the_readme_runs_as_written(tmp_path):
     printed = run_page(ROOT / "README.md", folder)
     assert (folder / "volume.nrrd").exists()
     # From the calibrations made on the way to a sweep that knew none: the tracker's length is right.
-    rows = [line.split() for line in printed.splitlines() if line.startswith("sweep ")]
+    rows = [line.split() for line in printed.splitlines() if line.startswith("sweep  f")]
     errors = {row[2]: abs(float(row[7])) for row in rows}
     assert errors["pose"] < 3.0
     assert errors["image"] < 25.0
