@@ -125,6 +125,11 @@ def calibrate_images(
         told.append(f"{said}, from images")
         sweeps = replace(one, time_offset_s=delay.seconds), replace(other, time_offset_s=delay.seconds)
         found = _solve(sweeps, found.sensor_from_image, settings)
+    if not found.converged:
+        raise InsufficientDataError(
+            f"{first.name} and {second.name}: the solution did not converge: expected a better start, or "
+            "longer sweeps with more structure; nothing is written"
+        )
     # Checked again at the answer, because the overlap of the sweeps depends on the mounting.
     enough = _angulation(sweeps, found.sensor_from_image)
     notes = notes_of(found, enough) + told

@@ -13,6 +13,7 @@ TUTORIALS = ROOT / "docs" / "tutorials"
         ("reconstruct.md", ("volume.nrrd", "along.png", "scene/scene.mrml", "out/enlarged.png")),
         ("wires.md", ("again.h5", "out/reconstruction.h5")),
         ("handheld.md", ("mounting.h5", "curves.h5", "volume.nrrd")),
+        ("without-phantom.md", ("tracker.h5", "tracker.png")),
         ("compare.md", ("study/report.html",)),
     ],
 )

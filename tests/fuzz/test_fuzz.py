@@ -25,9 +25,9 @@ def fuzz(tmp_path, *options):
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", [KINDS, OTHERS], ids=["own", "others"])
 def test_no_kind_of_file_brings_a_reader_down(tmp_path, kinds):
-    said = fuzz(tmp_path, "--kinds", *kinds, "--cases", 25, "--first", 10**6)
+    said = fuzz(tmp_path, "--kinds", *kinds, "--cases", 12, "--first", 10**6)
     for kind in kinds:
-        assert f"{kind}: seeds 1000000 to 1000024: " in said
+        assert f"{kind}: seeds 1000000 to 1000011: " in said
 
 
 @pytest.mark.slow

@@ -51,12 +51,12 @@ def test_a_delay_is_found_within_two_milliseconds(seed, kind):
 @pytest.mark.slow
 def test_claimed_errors_are_those_of_repetition():
     scores = []
-    for seed in range(40):
+    for seed in range(24):
         signal, frames, poses, _ = recorded(seed, noise_mm=0.5, seconds=8.0)
         found = delay_from_lines(signal, frames, poses)
         scores.append((found.seconds - DELAY_S) / found.standard_error_s)
-    # The standard deviation of 40 is known to 11 %; three times that.
-    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.34)
+    # The standard deviation of 24 is known to 14 %; three times that.
+    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.43)
 
 
 def test_a_periodic_motion_is_refused():
