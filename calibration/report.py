@@ -205,6 +205,8 @@ def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequ
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
     for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
         _draw_shot(axes, shot, aspect)
+    if len(shots) < panels.shape[1]:
+        _explain(panels[0, -1], calibration)
     _draw_residuals(panels[1, 0], solution)
     _draw_against_tilt(panels[1, 1], solution)
     _draw_motion(panels[1, 2], solution)
@@ -236,6 +238,17 @@ def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
     axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
 
 
+def _explain(axes: Axes, calibration: Calibration) -> None:
+    """Say in a panel without an image what the colours of the others mean, and what was found."""
+    told = [
+        "blue: found in the image, and used",
+        "red: left out, or another candidate",
+        "",
+        *(f"{p.name}: {p.value:.3f} +- {p.standard_error:.3f} {p.unit}" for p in calibration.parameters),
+    ]
+    axes.text(0.0, 1.0, "\n".join(told), va="top", fontsize=8, transform=axes.transAxes, parse_math=False)
+
+
 def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     values, unit = _shown(solution)
     used = solution.used
@@ -244,7 +257,7 @@ def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     if used.any():
         reach = 8.0 * float(np.abs(values[used]).std() + 1e-12)
         axes.set_ylim(-reach, reach)
-    axes.set(xlabel="frame", ylabel=f"residual / {unit}")
+    axes.set(xlabel="frame", ylabel=f"residual / {unit}", title="what is left over, by frame")
 
 
 def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
@@ -253,14 +266,14 @@ def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
     turns = _turns_deg(solution)
     used = solution.used
     axes.plot(turns[used, 0], values[used], ".", color=USED, ms=3)
-    axes.set(xlabel="tilt / deg", ylabel=f"residual / {unit}")
+    axes.set(xlabel="tilt / deg", ylabel=f"residual / {unit}", title="and by tilt")
 
 
 def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
     turns = _turns_deg(solution)[solution.used]
     drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
-    axes.set(xlabel="tilt / deg", ylabel="roll / deg")
+    axes.set(xlabel="tilt / deg", ylabel="roll / deg", title="how the probe was turned")
 
 
 def _shown(solution: ChainSolution) -> tuple[FloatArray, str]:

@@ -24,7 +24,7 @@ from speckle3d.study.overall import (
 _UNITS = {"_percent": " / %", "_mm": " / mm", "_deg": " / °", "_s": " / s"}
 _ERRORS = ("length_error_mm", "length_error_percent", "tilt_error_deg", "yaw_error_deg", "roll_error_deg")
 _PART_COLUMNS = ("sweep", "part", "mode", "reference", "frames", "reference_mm", "estimate_mm", *_ERRORS)
-_LONG_LETTERS = 40
+_LONG_LETTERS = 24
 """Letters of a cell that may be broken into lines."""
 
 
@@ -237,13 +237,13 @@ def summary_lines(
         lines.append(_length_line(scored, best) + _doubt(means, paired, "length_error_percent", best))
         if straightest is not None:
             known = [row for row in means if row["tilt_deg"] is not None]
-            tilts = ", ".join(f"{label_of(row['mode'])} {row['tilt_deg']:.2f}°" for row in known)
-            tilt_line = f"In tilt {label_of(straightest)} is closest. Mean tilt error: {tilts}."
+            tilts = ", ".join(f"{_named(row['mode'])} {row['tilt_deg']:.2f}°" for row in known)
+            tilt_line = f"In tilt {_named(straightest)} is closest. Mean tilt error: {tilts}."
             lines.append(tilt_line + _doubt(means, paired, "tilt_error_deg", straightest))
     if words := reference_words(references or {}):
         lines.append(f"{words[0].upper()}{words[1:]}.")
     if fitted_to_reference({row["mode"] for row in means}, references or {}):
-        fitted = [label_of(row["mode"]) for row in means if row["mode"] in FITTED_TO_TRACKER]
+        fitted = [_named(row["mode"]) for row in means if row["mode"] in FITTED_TO_TRACKER]
         named, (were, are) = " and ".join(fitted), (("was", "it is"), ("were", "they are"))[len(fitted) > 1]
         lines.append(
             f"{named[0].upper()}{named[1:]} {were} fitted to the tracker that {are} compared with: the "
@@ -269,18 +269,23 @@ def clearly_best(means: Sequence[Record], paired: Sequence[Record]) -> str | Non
     return best if all(beats(paired, "length_error_percent", best, other) for other in others) else None
 
 
+def _named(mode: str) -> str:
+    """A mode within a sentence."""
+    return f"“{label_of(mode)}”"
+
+
 def _length_line(scored: Scored, best: str) -> str:
     means = scored.means
     mine = next(row for row in means if row["mode"] == best)
     others = [
-        f"{row['length_percent']:.1f} % with {label_of(row['mode'])}"
+        f"{row['length_percent']:.1f} % for {_named(row['mode'])}"
         for row in means
         if row["mode"] != best and row["length_percent"] is not None
     ]
     against = f", against {', '.join(others)}" if others else ""
     which = f" that {'has' if mine['sweeps'] == 1 else 'have'} every mode" if scored.left_out else ""
     return (
-        f"Over {counted(mine['sweeps'], 'sweep')}{which} ({counted(scored.parts, 'part')}), {label_of(best)} "
+        f"Over {counted(mine['sweeps'], 'sweep')}{which} ({counted(scored.parts, 'part')}), {_named(best)} "
         f"has the smallest error of length: {mine['length_percent']:.1f} % on average over sweeps "
         f"({mine['length_mm']:.2f} mm){against}."
     )
@@ -296,6 +301,6 @@ def _doubt(means: Sequence[Record], paired: Sequence[Record], quantity: str, bes
         apart = "it apart from every other mode" if len(others) > 1 else "them apart"
         return f" The sweeps tell {apart}."
     if len(alike) == len(others):
-        others_named = "the other modes" if len(others) > 1 else label_of(others[0])
+        others_named = "the other modes" if len(others) > 1 else _named(others[0])
         return f" It is not told apart from {others_named} by these sweeps: the difference may be chance."
-    return f" It is not told apart from {' and '.join(map(label_of, alike))}: that difference may be chance."
+    return f" It is not told apart from {' and '.join(map(_named, alike))}: that difference may be chance."

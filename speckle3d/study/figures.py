@@ -28,11 +28,11 @@ CURVE_LABELS = ("length / mm", "tilt / °", "yaw / °", "roll / °")
 
 _MODES = {
     "image": ("images alone", "#D55E00"),
-    "consistent-subset": ("images, consistent subset", "#E69F00"),
-    "orientation": ("corrected by orientation sensor", "#0072B2"),
-    "pose": ("corrected by position sensor", "#009E73"),
-    "crossed": ("corrected by crossing sweep", "#CC79A7"),
-    "inertial": ("corrected by accelerometer", "#56B4E9"),
+    "consistent-subset": ("consistent subset", "#E69F00"),
+    "orientation": ("with orientation sensor", "#0072B2"),
+    "pose": ("with position sensor", "#009E73"),
+    "crossed": ("with crossing sweep", "#CC79A7"),
+    "inertial": ("with accelerometer", "#56B4E9"),
     "fused": ("all sensors, fused", "#882255"),
 }
 """Label and colour of each mode, from Okabe and Ito's and Tol's palettes, told apart with any vision."""
