@@ -111,6 +111,15 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
 def load_config(path: Path) -> Config:
     """Read a configuration from a TOML file; settings that it does not give keep their defaults.
 
+    Parameters
+    ----------
+    path : path
+        TOML file; settings that it does not give keep their defaults.
+
+    Returns
+    -------
+    Config
+
     Raises
     ------
     FileError

@@ -14,6 +14,7 @@ from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, MismatchError, naming
+from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import elevational_steps
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
@@ -29,7 +30,7 @@ Correction = DriftCorrection | ScaledPoses | FusedPoses
 def correct(
     tracked: Tracked,
     sweep: Sweep,
-    modes: Sequence[str],
+    modes: Sequence[str] | str,
     config: Config | None = None,
     crossed: CrossedPair | None = None,
 ) -> dict[str, Correction]:
@@ -40,9 +41,9 @@ def correct(
     tracked : Tracked
     sweep : Sweep
         From which `tracked` was made.
-    modes : sequence of str
-        Among ``"orientation"`` (three curves) and ``"pose"`` (six), which are as published, ``"crossed"``,
-        ``"inertial"`` and ``"fused"``.
+    modes : sequence of str, or str
+        One or several among ``"orientation"`` (three curves) and ``"pose"`` (six), which are as published,
+        ``"crossed"``, ``"inertial"`` and ``"fused"``.
     config : Config, optional
     crossed : CrossedPair, optional
         Of this sweep and another, in either order, from `cross_sweeps`.
@@ -75,7 +76,9 @@ def correct(
     >>> [len(corrected[mode].poses) for mode in ("orientation", "pose")]
     [32, 32]
     """
-    settings = config or Config()
+    require_kind(tracked, Tracked, "tracked", "track(sweep, curves)")
+    require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
+    settings, modes = config or Config(), [modes] if isinstance(modes, str) else modes
     require_modes(sweep, modes, crossed is not None)
     for mode in modes:
         if mode != "fused":

@@ -42,6 +42,11 @@ def cross_sweeps(
     progress : callable, optional
         Called with frames done and frames in all, of both.
 
+    Returns
+    -------
+    CrossedPair
+        Both sweeps and how their lengths differ from the images'.
+
     Raises
     ------
     MismatchError, InsufficientDataError

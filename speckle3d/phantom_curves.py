@@ -33,6 +33,10 @@ def calibrate_curves(
     progress : callable, optional
         Called with frames done and frames in all.
 
+    Returns
+    -------
+    DecorrelationCurves
+
     Raises
     ------
     InsufficientDataError

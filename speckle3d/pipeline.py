@@ -19,6 +19,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.handover.plots import plot_poses
 from speckle3d.core.handover.tables import poses_array, poses_table
@@ -228,6 +229,8 @@ def track(
     >>> len(tracked.image), tracked.direction_from, bool(tracked.flags.any())
     (32, 'tracker', False)
     """
+    require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
+    require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
     settings, times = config or Config(), StageTimes()
     matcher = _matcher_for(sweep, curves, settings)
     doubts = unrefuted(

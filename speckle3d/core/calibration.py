@@ -100,12 +100,18 @@ class Calibration:
         All that was estimated, the phantom's own included.
     rms : float
         Root mean square residual, in `rms_unit`.
+    rms_unit : str
+        "mm", or "deg" where only directions are known.
     condition_number : float
         Of the Jacobian with scaled columns.
     time_offset_s : float, optional
         The sensor's clock offset that was used or found; None where it was neither.
     verdict : str
         One sentence: whether the motion was sufficient.
+    frames : FramesUsed
+        Which frames were used, and why others were dropped.
+    source : Source
+        What it was made from.
     """
 
     method: str
@@ -183,6 +189,17 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     """Put a calibration on a sweep's sensor, in place of what the sweep says of it.
 
     The sensor's clock offset is replaced if the calibration knows one; the image grid stays as it is.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    calibration : Calibration
+        Of one of its sensors.
+
+    Returns
+    -------
+    Sweep
+        With this mounting, and this clock offset if the calibration has one.
 
     Raises
     ------

@@ -176,6 +176,10 @@ class DecorrelationCurves:
     origin : {"phantom", "tracked", "data sheet", "crossing"}
     nominal : NominalProbe or None
         Of curves from a data sheet.
+    key : CurveKey
+        Signal, vector pitch and patches that the curves are for.
+    pairs_used : int
+        Frame pairs that were measured.
     """
 
     key: CurveKey

@@ -68,6 +68,10 @@ class LabelMap(Volume):
     ----------
     segments : tuple of Segment
         What labels mean; one that has no segment means nothing.
+    voxels : ndarray of uint8 or uint16, shape (n_i, n_j, n_k)
+        Label of each voxel.
+    spacing_mm, world_from_grid, fields
+        As of a `Volume`.
 
     Raises
     ------

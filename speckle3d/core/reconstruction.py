@@ -184,6 +184,14 @@ class Reconstruction:
         The effective configuration.
     trust : Trust or None
         None in older files, which hold none.
+    frame_time_s : ndarray, shape (n,)
+        The image clock.
+    grid : ImageGrid
+        Of the images.
+    provenance : Provenance
+        What it was made from.
+    pairs : FramePairs or None
+        Every frame pair; None if they were not read.
 
     Examples
     --------

@@ -315,6 +315,12 @@ class Sweep:
         ``world_from_image`` of every frame; simulations only.
     probe : str, optional
         Name of probe and preset: everything that shapes the beam.
+    orientation : OrientationSensor, optional
+        Readings of an orientation sensor.
+    tracker : Tracker, optional
+        Readings of a position sensor.
+    name : str
+        For messages and files.
 
     Examples
     --------

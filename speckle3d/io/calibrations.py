@@ -51,6 +51,12 @@ _SOURCE = dict.fromkeys(("input_path", "input_sha256", "package_version", "setti
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
     """Write a calibration; the file appears whole or not at all.
 
+    Parameters
+    ----------
+    path : path
+        HDF5 file to write.
+    calibration : Calibration
+
     Raises
     ------
     FileError
@@ -80,6 +86,15 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
 
 def read_calibration(path: PathLike) -> Calibration:
     """Read a calibration, and check it.
+
+    Parameters
+    ----------
+    path : path
+        HDF5 file of `speckle3d calibrate`.
+
+    Returns
+    -------
+    Calibration
 
     Raises
     ------

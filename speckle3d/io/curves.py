@@ -41,6 +41,12 @@ FORMAT = "speckle3d.curves"
 def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     """Write decorrelation curves; the file appears whole or not at all.
 
+    Parameters
+    ----------
+    path : path
+        HDF5 file to write.
+    curves : DecorrelationCurves
+
     Raises
     ------
     FileError
@@ -63,6 +69,15 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
 
 def read_curves(path: PathLike) -> DecorrelationCurves:
     """Read decorrelation curves, and check them.
+
+    Parameters
+    ----------
+    path : path
+        HDF5 file of `speckle3d calibrate curves`.
+
+    Returns
+    -------
+    DecorrelationCurves
 
     Raises
     ------

@@ -162,6 +162,12 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
     ----------
     with_pairs : bool
         Whether to read the frame pairs, by far the larger part.
+    path : path
+        ``reconstruction.h5`` of a results folder.
+
+    Returns
+    -------
+    Reconstruction
 
     Raises
     ------

@@ -216,6 +216,11 @@ def write_sweep(
         Called with the number of frames written and their total.
     simulation : mapping, optional
         How the sweep was simulated, for ``/simulation``.
+    path : path
+        HDF5 file to write.
+    sweep : Sweep
+    compression : {"gzip", "lzf", None}
+        As of `SweepWriter`.
 
     Raises
     ------

@@ -60,6 +60,19 @@ class ModeError:
 
     Errors are estimate minus reference; that of length is positive where the estimate is too long,
     whichever way the probe moved, and its percentage is of the reference's length in that part.
+
+    Attributes
+    ----------
+    part : str
+        "f" forward, "r" back, numbered where there are several; "all" without a reference.
+    mode : str
+    frames : int
+        Of the part.
+    reference_mm, estimate_mm : float
+        Length by the reference and by this mode.
+    length_error_mm, length_error_percent : float
+    tilt_error_deg, yaw_error_deg, roll_error_deg : float
+        Of the turn over the part, about the image's x, y and z.
     """
 
     part: str

@@ -126,3 +126,27 @@ def test_a_volume_lies_in_pyvista_where_it_lies_in_the_world():
     grid = volume.to_pyvista()
     index = grid.find_closest_point([1.0, 0.5, 1.0])
     assert grid.point_data["levels"][index] == volume.voxels[2, 1, 1]
+
+
+def test_one_mode_may_be_asked_for_by_its_name(tracked, sweep):
+    assert set(s3.correct(tracked, sweep, "pose")) == {"pose"}
+
+
+@pytest.mark.parametrize(
+    ("call", "expected"),
+    [
+        (
+            lambda t, s: s3.track("data/phantom.h5", t.curves),
+            r"sweep: expected a Sweep, as load_sweep\(path\)",
+        ),
+        (
+            lambda t, s: s3.track(s, "curves.h5"),
+            r"curves: expected a DecorrelationCurves.*got str 'curves.h5'",
+        ),
+        (lambda t, s: s3.correct(s, t, ["pose"]), r"tracked: expected a Tracked, as track"),
+        (lambda t, s: s3.correct(t, s, ["nonsense"]), r"expected a drift mode among.*got 'nonsense'"),
+    ],
+)
+def test_what_was_passed_by_mistake_is_told(tracked, sweep, call, expected):
+    with pytest.raises(s3.Speckle3DError, match=expected):
+        call(tracked, sweep)

@@ -133,6 +133,11 @@ def pair_errors(
     sensor_from_image : Rotation, single or length k
         Calibrations of the sensor.
 
+    Returns
+    -------
+    PairErrors
+        Degrees, by calibration and pair.
+
     Raises
     ------
     MismatchError
@@ -219,6 +224,11 @@ def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
         ``world_from_image`` by the sensor, with one calibration.
     reference : Rotation, length n
         ``world_from_target`` by the reference; ``reference * mounting`` is then the image's.
+
+    Returns
+    -------
+    Rotation
+        ``reference_from_image``.
 
     Raises
     ------

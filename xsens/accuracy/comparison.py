@@ -49,6 +49,11 @@ def compare_orientations(
     one, other : TimedRotations or Orientation
         In worlds whose z is up; `other` is interpolated at the samples of `one`.
 
+    Returns
+    -------
+    Comparison
+        What sets the two apart, degrees.
+
     Raises
     ------
     InsufficientDataError

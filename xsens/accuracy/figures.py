@@ -79,6 +79,12 @@ def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figu
     ----------
     experiments : mapping of str to PairErrors
         Errors by name; examples are chosen from all experiments and calibrations by their largest error.
+    title : str
+        Over the figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
 
     Raises
     ------

@@ -62,6 +62,11 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
         The mechanism's axes from its base to the probe: each turn carries the axes after it. The default
         is the convention of the fixed angles, R = Rz(roll) Ry(yaw) Rx(tilt).
 
+    Returns
+    -------
+    MechanismSettings
+        Settings by line, angles in radians.
+
     Raises
     ------
     FileError
@@ -87,6 +92,18 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
 
 def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation:
     """Reading of the sensor for each setting, averaged over the time the mechanism stood still.
+
+    Parameters
+    ----------
+    sensor : TimedRotations
+        Readings of the sensor.
+    settings : MechanismSettings
+        When the mechanism stood at which angles.
+
+    Returns
+    -------
+    Rotation
+        Rotations at these settings.
 
     Raises
     ------

@@ -85,6 +85,11 @@ def orient(
         smoother, or vqf: use the readings after each sample as well as those before; filter, or vqf-online:
         as live.
 
+    Returns
+    -------
+    Orientation
+        Of every sample that has a gyroscope reading.
+
     Raises
     ------
     InsufficientDataError

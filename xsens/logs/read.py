@@ -153,6 +153,10 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
     source : str
         Name of the bytes in errors.
 
+    Returns
+    -------
+    ImuLog
+
     Raises
     ------
     InvalidInputError

@@ -58,6 +58,15 @@ class Message:
 def encode(message: Message) -> bytes:
     """Bytes of `message`, with preamble, length and checksum.
 
+    Parameters
+    ----------
+    message : Message
+
+    Returns
+    -------
+    bytes
+        From preamble to check sum.
+
     Examples
     --------
     >>> from xsens import Message, encode
@@ -72,6 +81,15 @@ def encode(message: Message) -> bytes:
 
 def decode(data: bytes) -> list[Message]:
     """Messages in `data`, in order; bytes that belong to none are left out (see `find_frames`).
+
+    Parameters
+    ----------
+    data : bytes
+        Any run of bytes.
+
+    Returns
+    -------
+    list of Message
 
     Examples
     --------

@@ -49,6 +49,11 @@ def surface_of(
     smooth : int
         Passes of smoothing; see `smoothed`.
 
+    Returns
+    -------
+    Surface
+        Vertices in the world, mm.
+
     Raises
     ------
     InvalidInputError

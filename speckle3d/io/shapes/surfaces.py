@@ -27,6 +27,13 @@ def write_surface(path: PathLike, surface: Surface) -> None:
     Coordinates are the world's, mm, as float32; STL has no vertices in common between triangles. VTK is the
     legacy format, version 4.2, which older readers know, too.
 
+    Parameters
+    ----------
+    path : path
+        Ends in .stl, .ply or .vtk.
+    surface : Surface
+        At least one triangle; mm.
+
     Raises
     ------
     InvalidInputError
@@ -66,6 +73,15 @@ def write_surface(path: PathLike, surface: Surface) -> None:
 
 def read_surface(path: PathLike) -> Surface:
     """Read a surface of triangles.
+
+    Parameters
+    ----------
+    path : path
+        STL, PLY or VTK.
+
+    Returns
+    -------
+    Surface
 
     Raises
     ------

@@ -42,6 +42,14 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
 
     As `VolumeWriter` does it, with what the labels of a `LabelMap` mean.
 
+    Parameters
+    ----------
+    path : path
+        Ends in .nrrd, .mha, .nii.gz or .nii.
+    volume : Volume
+    compress : bool
+        Whether voxels are packed, where the format can.
+
     Raises
     ------
     InvalidInputError
@@ -150,6 +158,15 @@ def read_volume(path: PathLike) -> Volume:
 
     Files that say that they are of labels give a `LabelMap`. A left-handed grid is turned into a right-handed
     one by counting k from its other end.
+
+    Parameters
+    ----------
+    path : path
+        NRRD, MetaImage or NIfTI.
+
+    Returns
+    -------
+    Volume
 
     Raises
     ------
