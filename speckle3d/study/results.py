@@ -314,7 +314,8 @@ def _read_summary(folder: Path, name: str) -> Summary:
     rows: list[list[Any]] = [[math.nan if row[n] is None else row[n] for n in names] for row in held["rows"]]
     summary = held["reference"], held["frames"], held["coverage"]
     doubts = [Doubt(**each) for each in held.get("doubts", ())]
-    told = {key: held.get(key, {}) for key in ("doubted", "left_out", "claims")}
+    told: dict[str, Any] = {key: held.get(key, {}) for key in ("doubted", "left_out", "claims")}
+    told["jitter_percent"] = held.get("jitter_percent") or 0.0
     return Summary(name, *summary, [ModeError(*values) for values in rows], doubts=doubts, **told)
 
 
