@@ -19,29 +19,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import typer
 
 # Importing a module of commands registers them.
-from speckle3d.cli import (  # noqa: F401
-    calibrate_clock,
-    calibrate_curves,
-    calibrate_images,
-    calibrate_phantoms,
-    compare,
-    expect,
-    files,
-    imu,
-    imu_accuracy,
-    live,
-    measure,
-    play,
-    reconstruction,
-    reslices,
-    scenes,
-    simulate,
-    surfaces,
-    trajectory,
-    view,
-    volumes,
-)
+from speckle3d.cli import compare, expect, files, reconstruction, simulate, trajectory  # noqa: F401
+from speckle3d.cli.calibrate import clock, curves, images, phantoms  # noqa: F401
 from speckle3d.cli.common import app, emit, note
+from speckle3d.cli.look import measure, reslices, scenes, surfaces, view, volumes  # noqa: F401
+from speckle3d.cli.sensors import imu, imu_accuracy  # noqa: F401
+from speckle3d.cli.stream import live, play  # noqa: F401
 from speckle3d.core.errors import NoSpaceError, Speckle3DError
 
 __all__ = ["app", "main"]

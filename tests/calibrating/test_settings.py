@@ -21,7 +21,7 @@ from speckle3d.calibrating.settings import (
     region_text,
     with_values,
 )
-from speckle3d.cli import calibrate_phantoms
+from speckle3d.cli.calibrate import phantoms as calibrate_phantoms
 from speckle3d.core.errors import InvalidInputError
 
 number = st.floats(-1e4, 1e4, allow_nan=False)

@@ -13,7 +13,7 @@ from commands import command
 
 import speckle3d as s3
 from speckle3d.cli import _run
-from speckle3d.cli.live import _require_possible, _trouble
+from speckle3d.cli.stream.live import _require_possible, _trouble
 from speckle3d.io.igtl.link import LinkState
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweeps import unfinished_note

@@ -203,7 +203,10 @@ def test_a_python_without_vqf_is_told(monkeypatch):
 
 
 def test_vqf_is_loaded_when_asked_for():
-    code = "import sys, xsens, speckle3d.cli.imu; xsens.orient, xsens.Method; assert 'vqf' not in sys.modules"
+    code = (
+        "import sys, xsens, speckle3d.cli.sensors.imu; xsens.orient, xsens.Method; "
+        "assert 'vqf' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

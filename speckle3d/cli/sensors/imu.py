@@ -12,8 +12,8 @@ import typer
 
 from speckle3d.cli.common import Json, app, emit_json, emit_rows, note
 from speckle3d.cli.helping import App
-from speckle3d.cli.imu_logs import Log, RateHz, WorldOption, read, tell
 from speckle3d.cli.outputs import require_own_place
+from speckle3d.cli.sensors.imu_logs import Log, RateHz, WorldOption, read, tell
 from speckle3d.core.errors import InvalidInputError, naming
 from xsens.fusion.methods import DEFAULT_METHOD, Method
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import Json, emit, emit_rows, note
-from speckle3d.cli.imu import (
+from speckle3d.cli.sensors.imu import (
     DEFAULT_SOURCE,
     Magnetometer,
     MethodOption,
@@ -16,7 +16,7 @@ from speckle3d.cli.imu import (
     orientation_of,
     require_finite_offset,
 )
-from speckle3d.cli.imu_logs import Log, RateHz, WorldOption, read, tell
+from speckle3d.cli.sensors.imu_logs import Log, RateHz, WorldOption, read, tell
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:

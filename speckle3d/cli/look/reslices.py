@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from speckle3d.cli.common import CalibrationFiles, PosedFile, SweepFile, Transform, app, note, progress_bar
-from speckle3d.cli.compounding import LevelRange, said_of
 from speckle3d.cli.importing import (
     Importing,
     Number,
@@ -18,6 +17,7 @@ from speckle3d.cli.importing import (
     ReferenceTransform,
     files_of,
 )
+from speckle3d.cli.look.compounding import LevelRange, said_of
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 

@@ -21,7 +21,14 @@ from speckle3d.cli.common import (
     note,
     progress_bar,
 )
-from speckle3d.cli.compounding import (
+from speckle3d.cli.importing import (
+    Importing,
+    Number,
+    PlusConfig,
+    ReferenceTransform,
+    files_of,
+)
+from speckle3d.cli.look.compounding import (
     FillRadius,
     LevelRange,
     Rule,
@@ -29,13 +36,6 @@ from speckle3d.cli.compounding import (
     VoxelMm,
     compounding_settings,
     open_sweep_at,
-)
-from speckle3d.cli.importing import (
-    Importing,
-    Number,
-    PlusConfig,
-    ReferenceTransform,
-    files_of,
 )
 from speckle3d.cli.outputs import require_own_places
 from speckle3d.core.errors import InvalidInputError

@@ -1,0 +1,1 @@
+"""Commands that calibrate: curves, and where sensors sit on the probe."""

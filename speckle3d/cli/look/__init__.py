@@ -1,0 +1,1 @@
+"""Commands that look at results: voxels, cuts, surfaces, measures, scenes, the browser."""

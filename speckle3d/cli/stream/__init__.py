@@ -1,0 +1,1 @@
+"""Commands of sweeps that are being made, over OpenIGTLink."""
