@@ -60,7 +60,8 @@ def save_enlarged(cuts: Mapping[str, Float32Array], pixel_mm: float, name: str, 
     columns = slice(0, min(min(each.shape[1] for each in cuts.values()), round(LONGEST_MM / pixel_mm)))
     shown = {mode: image[rows, columns] for mode, image in cuts.items()}
     levels = np.concatenate([each.ravel() for each in shown.values()])
-    brightest = float(np.nanpercentile(levels, _BRIGHTEST_PERCENTILE))
+    seen = levels[np.isfinite(levels)]
+    brightest = float(np.percentile(seen, _BRIGHTEST_PERCENTILE)) if seen.size else 0.0
     high, wide = next(iter(shown.values())).shape
     panel_in = (max(_PANEL_IN * wide / high, _NARROWEST_IN), _PANEL_IN)
     figure = new_figure(0.9 + len(shown) * (panel_in[0] + 0.25), panel_in[1] + 1.3, None)
@@ -84,7 +85,10 @@ def save_enlarged(cuts: Mapping[str, Float32Array], pixel_mm: float, name: str, 
 
 def busiest_rows(image: Float32Array, count: int) -> int:
     """First of `count` rows in which structures along the sweep stand out most from speckle."""
-    smooth = uniform_filter1d(np.nan_to_num(image, nan=float(np.nanmedian(image))), 15, axis=1)
+    seen = image[np.isfinite(image)]
+    if not seen.size:
+        return 0
+    smooth = uniform_filter1d(np.nan_to_num(image, nan=float(np.median(seen))), 15, axis=1)
     spread = smooth.var(axis=1)
     # Near the face the probe's own echo would win.
     first = min(count // 3, max(len(spread) - count, 0))
