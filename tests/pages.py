@@ -95,3 +95,10 @@ def _without_installing(text: str) -> str:
         parts = [part for part in line.split(" && ") if not part.lstrip().startswith(_LEFT_OUT)]
         kept.append(" && ".join(parts))
     return "\n".join(kept)
+
+
+def run_tutorial(name: str, tmp_path: Path) -> tuple[Path, str]:
+    """Run a tutorial in an empty folder; return the folder and what it printed."""
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    return folder, run_page(ROOT / "docs" / "tutorials" / name, folder)
