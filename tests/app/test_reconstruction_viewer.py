@@ -11,6 +11,7 @@ from browsers import needs_browser, opened, viewing
 from matplotlib.image import imread
 
 from speckle3d import cli
+from speckle3d.study.figures import label_of
 
 pytestmark = needs_browser
 
@@ -93,7 +94,7 @@ def test_a_dragged_plane_is_cut_where_it_is(page, results, handle):
     assert page.evaluate(TITLE, "cut-free") != before[1]
 
 
-@pytest.mark.parametrize("other", [None, "six DOF correction"])
+@pytest.mark.parametrize("other", [None, label_of("pose")])
 def test_the_saved_picture_is_what_the_command_makes(page, results, other):
     if other:
         page.get_by_text("cuts", exact=True).first.click()
