@@ -27,7 +27,7 @@ def look_up(
     """Fill ``values`` with the grey level at each point and ``slopes`` with its change with the point.
 
     Between two neighbouring planes a point's coordinates in them, and the grey levels, are interpolated
-    linearly. Where the point lies outside, or beside a NaN, the value is NaN.
+    linearly. Where the point lies outside, or beside a NaN, the value and its slopes are NaN.
 
     Parameters
     ----------
@@ -51,6 +51,8 @@ def look_up(
         p0, p1, p2 = points[i, 0], points[i, 1], points[i, 2]
         values[i] = math.nan
         place[i] = math.nan
+        if with_slopes:
+            slopes[i] = math.nan
         at = min(max(at, 0), many - 2)
         d = _local(planes[at], p0, p1, p2, 2)
         # The planes are in order along the path; neighbouring points lie near each other.
