@@ -159,13 +159,13 @@ class BeamTable:
         return np.asarray(power * cell_mm2 * self.probe.signal.sample_spacing_mm)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def tabulate_beam(
     probe: Probe | None = None, grid: BeamGrid | None = None, attenuation_db_cm_mhz: float = 0.0
 ) -> BeamTable:
     """Compute the two-way field of `probe` by Rayleigh-Sommerfeld sums over elements and lens strips.
 
-    The last two tables are kept: the two sweeps of a pair, say, share one.
+    The last four tables, 5 MB each, are kept: the two sweeps of a pair share one, and each kind of medium has its own.
 
     Parameters
     ----------

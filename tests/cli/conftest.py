@@ -1,12 +1,11 @@
 """Commands run in this process, and what a small sweep of 24 frames gives."""
 
 import shutil
-import subprocess
 import sys
 
 import h5py
 import pytest
-from commands import SMALL, command
+from commands import SMALL, run_command
 from made_once import made_once
 
 from speckle3d import cli
@@ -49,7 +48,7 @@ def refused(run, tmp_path):
 
 @pytest.fixture(scope="session")
 def bench(tmp_path_factory):
-    """A folder with a small sweep and the curves for it, made by the command in a process of its own."""
+    """A folder with a small sweep and the curves for it, made by the command."""
     steps = ("--preset", "stepped", "--steps", "15", "--step-mm", "0.06", "--blocks", "2")
 
     def make(folder):
@@ -58,8 +57,7 @@ def bench(tmp_path_factory):
             ("simulate", folder / "stepped.h5", *SMALL, *steps),
             ("calibrate", "curves", folder / "stepped.h5", "-o", folder / "curves.h5"),
         ):
-            done = subprocess.run(command(*arguments), capture_output=True, text=True, timeout=120)
-            assert done.returncode == 0, done.stderr
+            run_command(*arguments)
 
     return made_once(tmp_path_factory, "bench", make)
 
@@ -70,14 +68,7 @@ def reconstructed(bench, tmp_path_factory):
     modes = ("--drift", "orientation", "--drift", "pose")
 
     def make(folder):
-        done = subprocess.run(
-            command("reconstruct", bench / "sweep.h5", "-o", folder, *modes),
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        assert done.returncode == 0, done.stderr
-        rows = done.stdout.splitlines()[2:]
+        rows = run_command("reconstruct", bench / "sweep.h5", "-o", folder, *modes).splitlines()[2:]
         assert [line.split()[2] for line in rows] == ["image", "orientation", "pose"]
 
     return made_once(tmp_path_factory, "bench-out", make)

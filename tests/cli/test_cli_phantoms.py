@@ -25,8 +25,8 @@ def scans(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scans")
     bar = (*SCAN, "--reflector", "bar")
     run_command("simulate", folder / "bar.h5", *bar, "--sensor-noise", "0")
-    run_command("simulate", folder / "noisy.h5", *bar)
-    still = ("--tilt-range-deg", "0", "--frames", "30")
+    run_command("simulate", folder / "noisy.h5", *bar, "--frames", "40")
+    still = ("--tilt-range-deg", "0", "--frames", "20")
     run_command("simulate", folder / "untilted.h5", *bar, *still)
     return folder
 

@@ -277,7 +277,7 @@ def matrices_of(x):
     return [np.eye(4), *(pose_of(*p).as_matrix() for p in x.reshape(-1, 6))]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_poses_are_the_least_squares_ones(seed, monkeypatch):
     pairs, truth = random_graph(seed)
     start = truth[0].inv() * truth[1:]

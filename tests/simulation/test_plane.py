@@ -91,8 +91,7 @@ def test_the_bars_echo_lies_in_the_plane_that_the_truth_says():
         assert abs(slope) * sweep.grid.width_mm < 0.04
 
 
-@pytest.mark.parametrize("depth_mm", [10.0, 20.0, 28.0])
-@pytest.mark.parametrize("tilt_deg", [-30.0, 30.0])
+@pytest.mark.parametrize(("depth_mm", "tilt_deg"), [(10.0, -30.0), (20.0, 30.0), (28.0, -30.0)])
 def test_the_walls_first_echo_is_shallower_by_half_the_beams_thickness_times_the_slope(
     beam, depth_mm, tilt_deg
 ):

@@ -1,5 +1,7 @@
 """A scan of two crossing threads, and the one mounting of all presets."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.signal import hilbert
@@ -12,7 +14,9 @@ CROSSING_MM = (320.0, -150.0, -240.0)
 MOUNTED = ("phantom", "tissue", "reversal", "rotation", "crossed")
 
 
+@cache
 def made(**settings):
+    """The sweep of some settings, made once for all tests; nothing may change it."""
     return simulate(SimulationSettings(**{"vectors": 16, "samples": 600, "frames": 4, **settings}))[0]
 
 
@@ -31,7 +35,7 @@ def test_a_calibration_scan_has_the_mounting_of_every_sweep(scan, preset):
 
 @pytest.mark.parametrize("preset", MOUNTED)
 def test_any_sweep_can_be_left_uncalibrated(preset):
-    told, bare = made(preset=preset), made(preset=preset, uncalibrated=True)
+    told, bare = made(preset=preset, seed=5), made(preset=preset, seed=5, uncalibrated=True)
     assert bare.sweep.tracker.sensor_from_image is None
     assert bare.sweep.orientation.sensor_from_image is None
     np.testing.assert_array_equal(
