@@ -189,6 +189,10 @@ class Phantom(Protocol):
         """What the points are: the two ends of a line, the direction of one, or a dot."""
 
     @property
+    def kept_in_plane(self) -> bool:
+        """Whether a hand must keep it in the image, and misses it by an error that wanders."""
+
+    @property
     def determined(self) -> tuple[str, ...]:
         """Those of `TARGET` that images of the phantom determine."""
 

@@ -25,7 +25,7 @@ from calibration.plane import PIXEL_ERROR, Stages, calibrate_plane
 from calibration.registration import Choice, calibrate_registered
 from calibration.report import Shot, as_calibration
 from calibration.solver import OUTLIER_SIGMA
-from calibration.wires import Registration, calibrate_cross_wire, calibrate_wires
+from calibration.wires import BESIDE_MM, Registration, calibrate_cross_wire, calibrate_wires
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -222,10 +222,12 @@ def wires_job(
     phantom: WirePhantom | None,
     fit_pixels: bool = True,
     registration: Registration | Literal["auto"] = "auto",
+    beside_mm: float = BESIDE_MM,
 ) -> Outcome:
     """Calibrate a 6-DOF sensor with three orthogonal wires or N-shapes; without a phantom, two that cross.
 
-    With `registration` "auto", frames left out choose how much to believe of the phantom's stated place.
+    With `registration` "auto", frames left out choose how much to believe of the stated place. A hand
+    misses a crossing by `beside_mm`, out of plane.
     """
     _require_poses(recording)
     known = recording.pixel_mm, fit_pixels
@@ -236,7 +238,7 @@ def wires_job(
 
     def calibrate(points: ImagePoints) -> ChainSolution:
         if phantom is None:
-            return calibrate_cross_wire(points, *known, job.outlier_sigma)
+            return calibrate_cross_wire(points, *known, job.outlier_sigma, beside_mm)
         return calibrate_wires(points, phantom, *known, fixed, job.outlier_sigma)
 
     def choose(points: ImagePoints) -> ChainSolution:

@@ -64,6 +64,7 @@ class Plane:
 
     determined: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
     seen_as: SeenAs = "line"
+    kept_in_plane: bool = False
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Height above the plane."""
@@ -88,6 +89,7 @@ class LineDirections:
     pixel_mm: FloatArray
     level: bool = False
     seen_as: SeenAs = "direction"
+    kept_in_plane: bool = False
 
     @property
     def determined(self) -> tuple[str, ...]:

@@ -32,6 +32,10 @@ _PROPORTIONS_MM = (0.5, 2.0, 8.0)
 """Errors of position over errors of rotation that are tried, mm per degree: trackers are specified at 0.25 mm
 with 0.5 degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
 
+_LATERAL = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+"""Where a wire runs nearly in the image, its echo is drawn out along it, which is sideways more often than
+not, and the crossing is found there less well."""
+
 
 def settle(
     points: ImagePoints,
@@ -114,8 +118,22 @@ def sensor_error(points: ImagePoints, phantom: Phantom, chain: Chain) -> SensorE
         turned = np.cross(along[:, None], in_world)
         return SensorError(turned.reshape(-1, 3)[:, :2], (np.ones(2),))
     arm = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.apply(flat))
-    both = np.concatenate([np.cross(arm[:, None], in_world), in_world], axis=2)
-    return SensorError(both.reshape(-1, 6), [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in _PROPORTIONS_MM])
+    shifted = in_world @ shift_axes(points, phantom, chain)
+    both = np.concatenate([np.cross(arm[:, None], in_world), shifted], axis=2)
+    proportions = [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in _PROPORTIONS_MM]
+    return SensorError(
+        both.reshape(-1, 6), [*proportions, _LATERAL] if phantom.kept_in_plane else proportions
+    )
+
+
+def shift_axes(points: ImagePoints, phantom: Phantom, chain: Chain) -> FloatArray:
+    """Directions, in the world, of the sensor's shifts: columns, shape (n, 3, 3) or (3, 3).
+
+    The world's own; but the image's where a hand keeps the target in it.
+    """
+    if not phantom.kept_in_plane:
+        return np.eye(3)
+    return np.asarray(points.turns @ chain.sensor_from_image.as_matrix()[:3, :3])
 
 
 def _corrected(
@@ -135,7 +153,8 @@ def _corrected(
     error[:, : sensor.shape[1]] = sensor[::several]
     moved = points.world_from_sensor.as_matrix()
     moved[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
-    moved[:, :3, 3] -= error[:, 3:]
+    axes = shift_axes(points, phantom, chain)
+    moved[:, :3, 3] -= np.squeeze(axes @ error[:, 3:, None], axis=2)
     poses = RigidTransform(moved, normalize=False)
     in_world = (rows.reshape(-1, 3) @ chain.target_from_world.as_matrix()[:3, :3]).reshape(rows.shape)
     in_image = in_world @ points.turns @ chain.sensor_from_image.as_matrix()[:3, :2]

@@ -13,12 +13,14 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import toeplitz
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.alternatives import best_solution
-from calibration.chain import TARGET, Chain, ChainSolution, ImagePoints, SeenAs, residuals_and_jacobian
+from calibration.chain import POSE, TARGET, Chain, ChainSolution, ImagePoints, SeenAs, residuals_and_jacobian
 from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
 from calibration.identifiability import require_adequate
+from calibration.near import near_jacobian
 from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
 from calibration.starts import rotations_all_over, wire_start
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -28,8 +30,12 @@ from speckle3d.core.wires import WirePhantom
 Registration = Literal["held", "turned", "free"]
 
 _ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "free": TARGET}
+BESIDE_MM = 0.1
+"""A crossing is bright within tenths of a millimetre of the middle of the beam, where a hand keeps it."""
+
 _FEWEST_FRAMES = 6
 _STARTS = 6
+_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,7 @@ class CrossWire:
 
     determined: tuple[str, ...] = TARGET[:3]
     seen_as: SeenAs = "dot"
+    kept_in_plane: bool = True
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the crossing."""
@@ -59,6 +66,7 @@ class Wires:
     geometry: WirePhantom
     determined: tuple[str, ...] = TARGET
     seen_as: SeenAs = "dot"
+    kept_in_plane: bool = False
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the wire, along two directions across it."""
@@ -72,6 +80,7 @@ def calibrate_cross_wire(
     pixel_mm: FloatArray | None = None,
     fit_pixels: bool = True,
     outlier_sigma: float = OUTLIER_SIGMA,
+    beside_mm: float = BESIDE_MM,
 ) -> ChainSolution:
     """Calibrate a 6-DOF sensor from images of two crossing wires, or of a bead.
 
@@ -84,6 +93,9 @@ def calibrate_cross_wire(
         Column pitch and row spacing; needed unless they are fitted.
     fit_pixels : bool
         Eleven parameters, else nine.
+    beside_mm : float
+        Root mean square distance by which the hand misses the crossing, out of plane; claimed errors allow
+        for it.
 
     Raises
     ------
@@ -105,7 +117,25 @@ def calibrate_cross_wire(
     nearest, away = nearest_candidates(points, *_image_and_point(first.chain))
     near, chosen = away <= GATES_MM[-1], points[nearest]
     solution = best_solution(chosen[near], CrossWire(), [first.chain], probe, outlier_sigma)
+    solution = _beside(solution, beside_mm)
     return require_adequate(_with_contradicting(solution, chosen, near))
+
+
+def _beside(solution: ChainSolution, beside_mm: float) -> ChainSolution:
+    """Allow for a hand that misses the point by `beside_mm`, at the pace at which it turns the probe.
+
+    So slow an error the fit takes for tilt and yaw, and residuals tell nothing of it: its size is assumed,
+    its autocorrelation is that of the motions that it is taken for.
+    """
+    points, phantom, chain, free = solution.points_used, solution.phantom, solution.chain, solution.free
+    _, jacobian = near_jacobian(points, phantom, chain, free)
+    out_of_plane = chain.target_from_image(points).rotation.as_matrix()[:, :, 2]
+    pull = np.einsum("nip,ni->pn", jacobian.reshape(len(points), 3, -1), out_of_plane)
+    moved = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True) @ pull
+    posed = moved[[free.index(name) for name in POSE]]
+    alike = sum(np.correlate(row, row, "full")[len(row) - 1 :] / max(row @ row, _TINY) for row in posed)
+    covariance = beside_mm**2 * moved @ toeplitz(alike / max(alike[0], _TINY)) @ moved.T
+    return replace(solution, noise=replace(solution.noise, covariance=solution.covariance + covariance))
 
 
 def _image_and_point(chain: Chain) -> tuple[FloatArray, FloatArray]:

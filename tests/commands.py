@@ -21,7 +21,8 @@ def run_command(*arguments):
         with contextlib.redirect_stdout(told):
             cli.main()
     except SystemExit as leave:
-        assert not leave.code, " ".join(sys.argv)
+        if leave.code:
+            raise RuntimeError(f"exit code {leave.code}: {' '.join(sys.argv)}") from None
     finally:
         sys.argv = before
     return told.getvalue()

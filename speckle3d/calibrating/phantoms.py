@@ -151,7 +151,9 @@ def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
         return orientation_job(recording, seen, job, settings.level, settings.viewed_from)
     assert isinstance(settings, WireSettings)
     phantom = Wired.of(settings.phantom).phantom
-    return wires_job(recording, seen, job, phantom, not settings.fixed_pixels, settings.registration)
+    return wires_job(
+        recording, seen, job, phantom, not settings.fixed_pixels, settings.registration, settings.beside_mm
+    )
 
 
 def remarks(outcome: Outcome) -> list[str]:

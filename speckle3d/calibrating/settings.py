@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from calibration.detection.lines import LineSettings
 from calibration.plane import PIXEL_ERROR
 from calibration.solver import OUTLIER_SIGMA
+from calibration.wires import BESIDE_MM
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.text import numbers
@@ -105,6 +106,12 @@ class WireSettings(ScanSettings):
     fixed_pixels: bool = Field(False, description="Keep the pixel size instead of estimating it.")
     registration: Literal["auto", "held", "turned", "free"] = Field(
         "auto", description="How much to believe of the place that a configuration says."
+    )
+    beside_mm: float = Field(
+        BESIDE_MM,
+        ge=0,
+        allow_inf_nan=False,
+        description="How far out of plane a hand misses a crossing, RMS, mm.",
     )
 
 

@@ -165,7 +165,8 @@ def tabulate_beam(
 ) -> BeamTable:
     """Compute the two-way field of `probe` by Rayleigh-Sommerfeld sums over elements and lens strips.
 
-    The last four tables, 5 MB each, are kept: the two sweeps of a pair share one, and each kind of medium has its own.
+    The last four tables, 5 MB each, are kept: the two sweeps of a pair share one, each kind of medium has
+    its own.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ def of_crossing(seed=0, count=80, noise_mm=0.3):
     shift, turn = readings.as_components()
     shift = shift + 0.5 * rng.standard_normal(shift.shape)
     return calibrate_cross_wire(
-        ImagePoints(pixels, np.arange(count), RigidTransform.from_components(shift, turn))
+        ImagePoints(pixels, np.arange(count), RigidTransform.from_components(shift, turn)), beside_mm=0.0
     )
 
 

@@ -15,7 +15,7 @@ from speckle3d.calibrating.settings import ScanSettings, offset_of
 _SHOWN = {
     "plane": ("reflector", "stages", "pixel_error", "fixed_pixels"),
     "orientation": ("viewed_from", "level"),
-    "wires": ("registration", "fixed_pixels"),
+    "wires": ("registration", "fixed_pixels", "beside_mm"),
 }
 
 

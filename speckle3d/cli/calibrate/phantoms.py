@@ -150,6 +150,10 @@ def calibrate_wires(
             "explains frames best that were left out."
         ),
     ] = "auto",
+    beside_mm: Annotated[
+        float,
+        typer.Option(help="How far the hand misses a crossing, out of plane, RMS, mm: claims allow for it."),
+    ] = 0.1,
     region: Region = None,
     time_offset_s: TimeOffset = None,
     outlier_sigma: OutlierSigma = 4.0,
