@@ -213,7 +213,16 @@ def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequ
     for axes in panels[1]:
         axes.grid(alpha=0.3)
     figure.suptitle(calibration.verdict, fontsize=10)
+    figure.supxlabel(_colours(shots), fontsize=8)
     return figure
+
+
+def _colours(shots: Sequence[Shot]) -> str:
+    """What the colours and marks of the page mean."""
+    told = ["blue: found in the image, and used", "red: left out (x in the residuals)"]
+    if any(len(shot.candidates_px) for shot in shots):
+        told.append("red +: other places where lines may cross")
+    return "; ".join(told)
 
 
 def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
@@ -239,13 +248,8 @@ def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
 
 
 def _explain(axes: Axes, calibration: Calibration) -> None:
-    """Say in a panel without an image what the colours of the others mean, and what was found."""
-    told = [
-        "blue: found in the image, and used",
-        "red: left out, or another candidate",
-        "",
-        *(f"{p.name}: {p.value:.3f} +- {p.standard_error:.3f} {p.unit}" for p in calibration.parameters),
-    ]
+    """Say in a panel without an image what was found."""
+    told = [f"{name}: {value} {unit}" for name, value, unit in (p.row() for p in calibration.parameters)]
     axes.text(0.0, 1.0, "\n".join(told), va="top", fontsize=8, transform=axes.transAxes, parse_math=False)
 
 
@@ -255,9 +259,12 @@ def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     axes.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
     axes.plot(solution.points.frame[~used], values[~used], "x", color=DROPPED, ms=4)
     if used.any():
-        reach = 8.0 * float(np.abs(values[used]).std() + 1e-12)
+        size = float(np.abs(values[used]).std() + 1e-12)
+        reach = np.clip(1.1 * float(np.abs(values).max()), 8.0 * size, 30.0 * size)
         axes.set_ylim(-reach, reach)
-    axes.set(xlabel="frame", ylabel=f"residual / {unit}", title="what is left over, by frame")
+    axes.set(
+        xlabel="frame", ylabel=f"largest residual of a point / {unit}", title="what is left over, by frame"
+    )
 
 
 def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
@@ -266,7 +273,7 @@ def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
     turns = _turns_deg(solution)
     used = solution.used
     axes.plot(turns[used, 0], values[used], ".", color=USED, ms=3)
-    axes.set(xlabel="tilt / deg", ylabel=f"residual / {unit}", title="and by tilt")
+    axes.set(xlabel="tilt / deg", ylabel=f"largest residual / {unit}", title="and by tilt")
 
 
 def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
