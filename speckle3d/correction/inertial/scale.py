@@ -357,11 +357,22 @@ def _covariance(
     out[:, 2, :] = out[:, :, 2] = 0.0
     out[:, 3:, :] = out[:, :, 3:] = 0.0
     out[:, 2, 2] = left + (sigma * z) ** 2
-    known = 2.0 * (1.0 - np.exp(-(time_s - time_s[0]) / s.wander_s))
-    inclination, heading = np.deg2rad([s.orientation_sigma_deg, s.heading_sigma_deg])
-    for axis, wander in ((3, inclination), (4, heading), (5, inclination)):
-        out[:, axis, axis] = wander**2 * known + 1e-8
+    wandered = 2.0 * (1.0 - np.exp(-(time_s - time_s[0]) / s.wander_s))
+    out[:, 3:, 3:] = wandered[:, None, None] * turn_covariance(poses[0].rotation, s) + 1e-8 * np.eye(3)
     return out
+
+
+def turn_covariance(world_from_first: Rotation, settings: InertialSettings) -> FloatArray:
+    """Covariance of the sensor's slow errors of tilt, yaw and roll, rad^2, shape (3, 3).
+
+    Parameters
+    ----------
+    world_from_first : Rotation
+        How the first image is turned in the sensor's world, whose z points up: heading is about that.
+    """
+    inclination, heading = np.deg2rad([settings.orientation_sigma_deg, settings.heading_sigma_deg])
+    up = world_from_first.inv().apply([0.0, 0.0, 1.0])
+    return np.asarray(inclination**2 * np.eye(3) + (heading**2 - inclination**2) * np.outer(up, up))
 
 
 def _details(

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from benchmarks.length.inertial_cases import CENTRE_MM, WOBBLE, Setup, along, drawn
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.correction.inertial.expected import InertialPlan, expected_scale_error
-from speckle3d.correction.inertial.scale import correct_inertial
+from speckle3d.correction.inertial.scale import correct_inertial, turn_covariance
+from speckle3d.correction.inertial.settings import InertialSettings
 
 CURVES_SIGMA = 0.1
 
@@ -95,6 +97,20 @@ def test_images_that_go_the_other_way_are_contradicted(wobbled):
     image = type(wobbled.image).from_matrix(flip @ wobbled.image.as_matrix() @ flip)
     with pytest.raises(MismatchError, match="the other way for"):
         corrected(replace(wobbled, image=image))
+
+
+@pytest.mark.parametrize(
+    ("held", "heading"),
+    # Beam down; beam level with the array level; beam level with the array upright.
+    [([-90, 0, 0], 1), ([0, 0, 0], 2), ([90, 90, 0], 0)],
+)
+def test_heading_is_the_angle_about_the_vertical_however_the_probe_is_held(held, heading):
+    settings = InertialSettings()
+    world_from_image = Rotation.from_euler("xyz", held, degrees=True)
+    found = np.rad2deg(np.sqrt(np.diag(turn_covariance(world_from_image, settings))))
+    expected = np.full(3, settings.orientation_sigma_deg)
+    expected[heading] = settings.heading_sigma_deg
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 @pytest.mark.slow
