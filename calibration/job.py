@@ -29,11 +29,10 @@ from calibration.wires import BESIDE_MM, Registration, calibrate_cross_wire, cal
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import Frames
 from speckle3d.core.wires import WirePhantom
-
-Progress = Callable[[int, int], None]
 
 SEARCH_S = 0.4
 """Clock offsets tried to either side of the recording's own: usual latencies of trackers and frame grabbers

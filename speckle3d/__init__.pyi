@@ -6,6 +6,7 @@ from .core.calibration import calibrated as calibrated
 from .core.curves import DecorrelationCurves as DecorrelationCurves
 from .core.errors import Speckle3DError as Speckle3DError
 from .core.labels import LabelMap as LabelMap
+from .core.progress import progress_bar as progress_bar
 from .core.reconstruction import Reconstruction as Reconstruction
 from .core.sweep import Sweep as Sweep
 from .corrections import correct as correct

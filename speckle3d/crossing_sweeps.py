@@ -9,6 +9,7 @@ import numpy as np
 from speckle3d.config import Config
 from speckle3d.core.curves import BAND_ADVICE, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.correction.crossing.stack import ImageStack
@@ -17,7 +18,7 @@ from speckle3d.correction.trust import believed
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.motion.corrected_curves import corrected_curves
 from speckle3d.motion.direction import sensed_orientation
-from speckle3d.pipeline import Progress, Tracked, after, track
+from speckle3d.pipeline import Tracked, track
 
 
 def cross_sweeps(

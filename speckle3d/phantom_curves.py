@@ -11,13 +11,13 @@ from dataclasses import replace
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.chosen import match_in_order
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.texture import speckle_size
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
-from speckle3d.pipeline import Progress, after
 
 
 def calibrate_curves(

@@ -23,6 +23,7 @@ from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.handover.plots import plot_poses
 from speckle3d.core.handover.tables import poses_array, poses_table
+from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
@@ -56,7 +57,6 @@ from speckle3d.stages import PLANES, matcher_for, measured, rows_of, sound_pairs
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Progress = Callable[[int, int], None]
 """Called with frames done and frames in all."""
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
@@ -200,7 +200,7 @@ def track(
         Of the sweep's probe and settings.
     config : Config, optional
     progress : callable, optional
-        Called with frames done and frames in all.
+        Called with frames done and frames in all; `speckle3d.progress_bar` makes one.
     sink : callable, optional
         Called with the frame pairs, some at a time.
     images : callable, optional
@@ -414,8 +414,3 @@ def _rejected_share(pairs: SignedPairs, used: BoolArray) -> float:
 
 def _seen_from(direction: int, poses: RigidTransform) -> RigidTransform:
     return poses if direction > 0 else mirrored(poses)
-
-
-def after(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Progress of one of several sweeps, `before` frames of `total` being done when it begins."""
-    return None if progress is None else lambda done, _: progress(before + done, total)

@@ -17,10 +17,11 @@ from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import robust_sigma
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
 from speckle3d.motion.corrected_curves import corrected_curves
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.pipeline import Progress, Tracked, track
+from speckle3d.pipeline import Tracked, track
 
 LENGTH_SIGMA = 0.005
 """Of a tracker's millimetres and of how well its mounting is known, beside its jitter."""

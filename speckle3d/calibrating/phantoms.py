@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,11 +36,10 @@ from speckle3d.calibrating.written import Written, write_with_report
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import readable
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
+from speckle3d.core.progress import Progress
 from speckle3d.core.wires import WirePhantom, three_wires
 from speckle3d.io.plus_config import read_wire_phantom
 from speckle3d.io.points import PickedPoints, read_points, write_points
-
-Progress = Callable[[int, int], None]
 
 BY_HAND = "left out by hand"
 """Why frames are dropped that the settings leave out."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -106,32 +106,6 @@ Modes = Annotated[list[str] | None, typer.Option("--mode", help=f"{_MODE_HELP} M
 SweepFile = Annotated[
     Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
 ]
-
-
-@contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on stderr; yields a function of frames done and frames in all."""
-    from rich.progress import MofNCompleteColumn, TimeRemainingColumn
-
-    with bar_on_stderr(what, MofNCompleteColumn(), TimeRemainingColumn()) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-@contextmanager
-def bar_on_stderr(what: str, *columns: Any) -> Iterator[Any]:
-    """Show rich's progress under a description on stderr, with more columns behind the bar."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    console = Console(stderr=True)
-    # In a log a bar is noise, and an error must stay one line.
-    hidden = not console.is_terminal
-    # The name of a file is neither markup nor a template.
-    name = printable(what).replace("{", "{{").replace("}", "}}")
-    shown = (TextColumn(name, markup=False), BarColumn(), *columns)
-    with Progress(*shown, console=console, transient=True, disable=hidden) as bar:
-        yield bar
 
 
 def note(text: str) -> None:

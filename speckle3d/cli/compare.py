@@ -9,18 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import (
-    CalibrationFiles,
-    ConfigFile,
-    Json,
-    app,
-    bar_on_stderr,
-    emit,
-    load_settings,
-    note,
-)
+from speckle3d.cli.common import CalibrationFiles, ConfigFile, Json, app, emit, load_settings, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import require_extra
+from speckle3d.core.progress import bar_on_stderr
 
 if TYPE_CHECKING:
     from speckle3d.study.compare import StudyProgress

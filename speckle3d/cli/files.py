@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from speckle3d.cli.calibrations import mount
-from speckle3d.cli.common import (
-    CalibrationFiles,
-    Json,
-    SweepFile,
-    Transform,
-    app,
-    emit,
-    emit_rows,
-    note,
-    progress_bar,
-)
+from speckle3d.cli.common import CalibrationFiles, Json, SweepFile, Transform, app, emit, emit_rows, note
 from speckle3d.cli.importing import (
     Importing,
     Number,
@@ -29,6 +19,7 @@ from speckle3d.cli.importing import (
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     pass

@@ -8,18 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.calibrations import mount
-from speckle3d.cli.common import (
-    CalibrationFiles,
-    ConfigFile,
-    Json,
-    app,
-    emit,
-    load_settings,
-    note,
-    progress_bar,
-)
+from speckle3d.cli.common import CalibrationFiles, ConfigFile, Json, app, emit, load_settings, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import app, from_options, progress_bar
+from speckle3d.cli.common import app, from_options
 from speckle3d.cli.outputs import require_own_place
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.simulation.settings import SimulatedSweep

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -16,6 +16,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing
 from speckle3d.core.parts import DiskFile
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import (
     INERTIAL,
     BModeSettings,
@@ -44,7 +45,6 @@ Compression = Literal["gzip", "lzf"] | None
 COMPRESSIONS: dict[str, Compression] = {"gzip": "gzip", "lzf": "lzf", "none": None}
 """By their names on the command line."""
 
-Progress = Callable[[int, int], None]
 
 _GZIP_LEVEL = 1
 """Told to readers; what packs is `speckle3d.io.deflate`."""

@@ -7,6 +7,7 @@ import threading
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.correction.crossing.pair import CrossingSoFar, crossing_so_far
@@ -16,7 +17,7 @@ from speckle3d.crossing_sweeps import crossing_side, stack_for
 from speckle3d.live.checks import GOOD
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.live.volume import GrowingVolume
-from speckle3d.pipeline import Progress, track
+from speckle3d.pipeline import track
 
 NOT_YET = "not overlapping with the first sweep yet: go on"
 NO_PLACE = "not overlapping with the first sweep"

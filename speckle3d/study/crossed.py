@@ -6,11 +6,12 @@ from speckle3d.config import Config
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.crossing_sweeps import crossing_side, curves_from, require_pair, stack_for
 from speckle3d.matching.blocks import ImageSink
-from speckle3d.pipeline import Progress, Tracked, after, track
+from speckle3d.pipeline import Tracked, track
 
 
 class Companion:

@@ -17,6 +17,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
+from speckle3d.core.progress import Progress, after
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
@@ -31,7 +32,7 @@ from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.load import import_record, kind_of, recording_sha256
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.pipeline import Progress, Tracked, after, track
+from speckle3d.pipeline import Tracked, track
 from speckle3d.scoring.jitter import jitter_percent
 from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves

@@ -28,7 +28,7 @@ from speckle3d.app.phantom.options import Options
 from speckle3d.app.phantom.picture import DROPPED, FOUND, USED, Picture
 from speckle3d.app.phantom.region import Region
 from speckle3d.app.phantom.run import RunPane, Solved, labelled
-from speckle3d.app.phantom.work import Progress, in_turn
+from speckle3d.app.phantom.work import in_turn
 from speckle3d.calibrating.phantoms import found
 from speckle3d.calibrating.settings import (
     OrientationSettings,
@@ -37,6 +37,7 @@ from speckle3d.calibrating.settings import (
     with_values,
 )
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import Progress
 
 _WIDTH, _HEIGHT = 590, 400
 _STEEPEST = 300.0

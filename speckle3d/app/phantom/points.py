@@ -23,11 +23,12 @@ from speckle3d.app.phantom.picks import Picks
 from speckle3d.app.phantom.picture import DROPPED, FOUND, USED, Picture
 from speckle3d.app.phantom.region import Region
 from speckle3d.app.phantom.run import RunPane, Solved, labelled
-from speckle3d.app.phantom.work import Progress, Work, in_turn
+from speckle3d.app.phantom.work import Work, in_turn
 from speckle3d.calibrating.phantoms import Wired, found, picked
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Speckle3DError
+from speckle3d.core.progress import Progress
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
 _WIDTH, _HEIGHT = 590, 410

@@ -18,11 +18,12 @@ from calibration.job import Outcome, Recording
 from calibration.report import text_report
 from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.picture import DROPPED, USED
-from speckle3d.app.phantom.work import Progress, Work, in_turn
+from speckle3d.app.phantom.work import Work, in_turn
 from speckle3d.calibrating.phantoms import remarks, solved, write_outcome
 from speckle3d.calibrating.settings import ScanSettings
 from speckle3d.calibrating.written import BESIDE
 from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.progress import Progress
 
 _LACKING = "#9a6700"
 """Dark amber: a result that more motion would improve."""

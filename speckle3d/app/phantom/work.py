@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 import panel as pn
 from bokeh.document import Document
 
+from speckle3d.core.progress import Progress
+
 Result = TypeVar("Result")
-Progress = Callable[[int, int], None]
 
 _POLL_S = 0.1
 

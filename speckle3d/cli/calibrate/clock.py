@@ -9,19 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from speckle3d.cli.calibrations import require_free
-from speckle3d.cli.common import (
-    Images,
-    Json,
-    PixelMm,
-    Poses,
-    Region,
-    Transform,
-    calibrate,
-    emit,
-    note,
-    progress_bar,
-)
+from speckle3d.cli.common import Images, Json, PixelMm, Poses, Region, Transform, calibrate, emit, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.core.calibration import Calibration

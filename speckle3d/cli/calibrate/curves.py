@@ -7,18 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import (
-    ConfigFile,
-    Json,
-    calibrate,
-    emit,
-    emit_json,
-    load_settings,
-    note,
-    progress_bar,
-)
+from speckle3d.cli.common import ConfigFile, Json, calibrate, emit, emit_json, load_settings, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.config import Config

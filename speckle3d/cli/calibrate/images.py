@@ -10,17 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from speckle3d.cli.calibrations import report_written, require_free
-from speckle3d.cli.common import (
-    CalibrationOut,
-    Json,
-    PixelMm,
-    Transform,
-    calibrate,
-    naming_options,
-    note,
-    progress_bar,
-)
+from speckle3d.cli.common import CalibrationOut, Json, PixelMm, Transform, calibrate, naming_options, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform

@@ -22,9 +22,9 @@ from speckle3d.cli.common import (
     emit_json,
     from_options,
     note,
-    progress_bar,
 )
 from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.calibrating.settings import ScanSettings

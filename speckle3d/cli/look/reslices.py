@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import CalibrationFiles, PosedFile, SweepFile, Transform, app, note, progress_bar
+from speckle3d.cli.common import CalibrationFiles, PosedFile, SweepFile, Transform, app, note
 from speckle3d.cli.importing import (
     Importing,
     Number,
@@ -20,6 +20,7 @@ from speckle3d.cli.importing import (
 from speckle3d.cli.look.compounding import LevelRange, said_of
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.core.arrays import ByteArray, FloatArray

@@ -16,7 +16,6 @@ from speckle3d.cli.common import (
     Transform,
     app,
     note,
-    progress_bar,
 )
 from speckle3d.cli.importing import (
     Importing,
@@ -34,6 +33,7 @@ from speckle3d.cli.look.compounding import (
     compounding_settings,
     open_sweep_at,
 )
+from speckle3d.core.progress import progress_bar
 
 
 @app.command(cls=Importing)

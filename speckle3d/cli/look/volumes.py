@@ -19,7 +19,6 @@ from speckle3d.cli.common import (
     app,
     emit_json,
     note,
-    progress_bar,
 )
 from speckle3d.cli.importing import (
     Importing,
@@ -39,6 +38,7 @@ from speckle3d.cli.look.compounding import (
 )
 from speckle3d.cli.outputs import require_own_places
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import progress_bar
 
 Three = tuple[float, float, float]
 

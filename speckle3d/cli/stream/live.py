@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import CalibrationFiles, ConfigFile, app, emit, load_settings, note, progress_bar
+from speckle3d.cli.common import CalibrationFiles, ConfigFile, app, emit, load_settings, note
 from speckle3d.cli.importing import Importing, Number
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 from speckle3d.core.printable import printable
+from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,7 +10,7 @@ References
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,6 +22,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike
 from speckle3d.core.parts import cannot_write
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
@@ -30,8 +31,6 @@ from speckle3d.io.headers import NRRD_NAMES, read_header
 from speckle3d.io.pixels import meta_type, nrrd_type, type_of_word
 from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.rows import Rows, number_of, rows_of, rows_without_images
-
-Progress = Callable[[int, int], None]
 
 SUFFIXES = (".mha", ".mhd", ".nrrd")
 """Of the files that `write_sequence` writes, as .igs.mha."""

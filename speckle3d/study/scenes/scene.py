@@ -11,6 +11,7 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import STATE_SEGMENTS
+from speckle3d.core.progress import Progress
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
@@ -23,7 +24,6 @@ from speckle3d.study.scenes.sequences import PosedSequence
 from speckle3d.study.scenes.voxels import (
     BEST_FIRST,
     GridRequest,
-    Progress,
     VolumeReport,
     VolumeRequest,
     write_voxels,

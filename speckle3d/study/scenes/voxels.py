@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -17,6 +17,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, Segment
 from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.images import PosedImages
@@ -35,7 +36,6 @@ BEST_FIRST = ("fused", "crossed", "pose", "inertial", "orientation", "image")
 """Modes in the order in which a volume takes its poses: those that set the length first."""
 
 Axes = Literal["sweep", "world", "principal"]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
