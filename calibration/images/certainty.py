@@ -228,15 +228,22 @@ def require_one_answer(
 
 
 def _scatter(refined: Refined, restarted: Comparison, unit: float, share: bool) -> FloatArray:
-    """Covariance of where fits end that start beside the answer on all sides, shape (6, 6)."""
+    """Mean square of how far fits that start beside the answer end from one that starts at it, shape (6, 6).
+
+    Not about their own mean: fits that all end in the same other place are in doubt, too. Nor about the
+    answer, for at `RESTARTED` images are blurred, which moves all ends alike.
+    """
     beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * unit], 3)
-    ends = []
-    for side in np.concatenate([_SIDES, -_SIDES]):
+
+    def end(side: FloatArray) -> RigidTransform:
         start = refined.estimate.stepped(np.append(side * beside, [0.0, 0.0]), refined.pivot_mm)
-        end = refine(restarted, start, max_steps=_RESTART_STEPS, share=share).estimate
-        away = refined.estimate.sensor_from_image.inv() * end.sensor_from_image
-        ends.append(np.append(away.rotation.as_rotvec(), away.translation))
-    return np.cov(ends, rowvar=False)
+        found = refine(restarted, start, max_steps=_RESTART_STEPS, share=share).estimate
+        return found.sensor_from_image
+
+    back = end(np.zeros(6)).inv()
+    away = [back * end(side) for side in np.concatenate([_SIDES, -_SIDES])]
+    ends = np.array([np.append(one.rotation.as_rotvec(), one.translation) for one in away])
+    return np.asarray(ends.T @ ends / (len(ends) - 1))
 
 
 def _steps(angulation: Angulation, wide_mm: float, unit: float) -> FloatArray:

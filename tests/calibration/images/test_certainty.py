@@ -8,6 +8,7 @@ import pytest
 from crossing_scenes import crossing_sweeps, displaced, tissue
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.images import certainty
 from calibration.images.angulation import Angulation, point_motion
 from calibration.images.certainty import (
     DEEP_MM,
@@ -111,6 +112,23 @@ def test_fits_started_beside_return_in_tissue_and_scatter_over_layers(scene, lay
         assert spread[[0, 2]].max() > 0.4
     else:
         assert spread.max() < 0.1
+
+
+@pytest.mark.slow
+def test_fits_that_all_end_in_the_same_other_place_are_in_doubt(scene, crossing, monkeypatch):
+    answer = refine(crossing.level(FINE[-1], scene[2]), Estimate(scene[2], np.ones(2)))
+    beside = crossing.level(RESTARTED, answer.estimate.sensor_from_image)
+    aside = Estimate(scene[2] * RigidTransform.from_translation([0.0, 0.0, 0.8]), np.ones(2))
+
+    def ending_aside(comparison, start, **_):
+        away = start.sensor_from_image.inv() * answer.estimate.sensor_from_image
+        at_answer = np.linalg.norm(away.translation) < 1e-6 and away.rotation.magnitude() < 1e-6
+        return dataclasses.replace(answer, estimate=answer.estimate if at_answer else aside)
+
+    monkeypatch.setattr(certainty, "refine", ending_aside)
+    scatter = _scatter(answer, beside, crossing.unit, None)
+    away = answer.estimate.sensor_from_image.inv() * aside.sensor_from_image
+    assert np.sqrt(scatter[5, 5]) >= abs(away.translation[2]) > 0.5
 
 
 @pytest.mark.slow
