@@ -107,26 +107,32 @@ def _stoppable() -> Iterator[list[int]]:
     Python can only drop what is raised (finalisers, functions called from C) is sent once more.
     """
     heard: list[int] = []
-    first_s, show_dropped = 0.0, sys.unraisablehook
+    first_s, sending, show_dropped = 0.0, False, sys.unraisablehook
 
     def stop(number: int, _frame: FrameType | None) -> None:
         nonlocal first_s
         if not heard:
             first_s = time.monotonic()
             heard.append(number)
-        elif time.monotonic() - first_s < _CLEANING_S:
+        elif sending or time.monotonic() - first_s < _CLEANING_S:
             return
         raise _ToldToStopError
 
+    def send_again() -> None:
+        time.sleep(_AGAIN_S)
+        while sending:
+            time.sleep(_AGAIN_S)
+        os.kill(os.getpid(), heard[0])
+
     def dropped(what: sys.UnraisableHookArgs) -> None:
-        nonlocal first_s
+        nonlocal first_s, sending
         if not heard:
             show_dropped(what)
         elif isinstance(what.exc_value, _ToldToStopError):
-            first_s = -_CLEANING_S
-            again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), heard[0]))
-            again.daemon = True
-            again.start()
+            # Starting a thread takes long on a busy machine; what is raised in here would be dropped, too.
+            sending, first_s = True, -_CLEANING_S
+            threading.Thread(target=send_again, daemon=True).start()
+            sending = False
 
     before = {}
     if threading.current_thread() is threading.main_thread():  # only the main thread may set handlers

@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
 import time
 
 import pytest
@@ -73,7 +74,15 @@ def test_a_second_signal_does_not_disturb_the_cleaning_and_a_later_one_is_heard(
     assert len(cleaned) == 3
 
 
-def test_a_signal_that_python_drops_is_sent_again(run, monkeypatch):
+@pytest.mark.parametrize("pause_s", [0.0, 0.3])
+def test_a_signal_that_python_drops_is_sent_again_however_slowly_threads_start(run, monkeypatch, pause_s):
+    class Slow(threading.Thread):
+        def start(self):
+            super().start()
+            deadline = time.monotonic() + pause_s
+            while time.monotonic() < deadline:
+                time.sleep(0.01)
+
     class Finalised:
         def __del__(self):
             os.kill(os.getpid(), signal.SIGTERM)
@@ -83,6 +92,7 @@ def test_a_signal_that_python_drops_is_sent_again(run, monkeypatch):
         time.sleep(10)
 
     monkeypatch.setattr(cli, "app", told)
+    monkeypatch.setattr(threading, "Thread", Slow)
     assert run() == (143, "", "speckle3d: stopped\n")
 
 
