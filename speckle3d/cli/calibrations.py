@@ -78,7 +78,9 @@ def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> Non
 
     # A calibration counts the pixels of images; RF has more samples than they.
     grid, pixel_mm = IntensityExtractor.for_sweep(sweep).grid, calibration.pixel_mm
-    if pixel_mm is not None and pixel_difference(grid, calibration) > NOTED_SIZE:
+    # Two sweeps' own pixels, say, were not found but taken as they are.
+    found = any(parameter.name in ("s_x", "s_y") for parameter in calibration.parameters)
+    if pixel_mm is not None and found and pixel_difference(grid, calibration) > NOTED_SIZE:
         note(
             f"{path}: found pixels of {pixel_mm[0]:.4g} x {pixel_mm[1]:.4g} mm, "
             f"those of the sweep's images are {grid.vector_pitch_mm:.4g} x {grid.sample_spacing_mm:.4g} mm"

@@ -22,6 +22,7 @@ from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import GreyImages
 
+FOUND = made().parameters
 MODES = ("--drift", "orientation", "--drift", "pose")
 
 
@@ -165,9 +166,10 @@ def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_
     assert np.rad2deg(((plain * about_z).inv() * first).magnitude()) < 2.0
 
 
-def test_pixels_that_differ_are_said(run, sweep, bench, saved, tmp_path):
-    for share, said in ((1.02, True), (1.005, False)):
-        path = saved(of_sweep(sweep, "tracker", pixel_mm=pixels_of(sweep) * [1.0, share]))
+def test_pixels_that_were_found_and_differ_are_said(run, sweep, bench, saved, tmp_path):
+    for share, parameters, said in ((1.02, FOUND, True), (1.005, FOUND, False), (1.02, (), False)):
+        pixel_mm = pixels_of(sweep) * [1.0, share]
+        path = saved(of_sweep(sweep, "tracker", pixel_mm=pixel_mm, parameters=parameters))
         code, _, err = run("convert", bench / "sweep.h5", tmp_path / "out.h5", "--calibration", path)
         assert code == 0
         assert ("found pixels of" in err) == said
