@@ -12,6 +12,7 @@ import pytest
 from calibration_files import made
 
 from speckle3d.cli import common
+from speckle3d.core.progress import bar_on_stderr
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.study.folder import named
 
@@ -63,7 +64,7 @@ def test_a_sweep_of_any_name_is_reconstructed(run, tmp_path, small_sweeps):
 def test_a_bar_names_a_file_without_markup_or_template():
     from rich.console import Console
 
-    with common.bar_on_stderr(f"reconstructing {HOSTILE}") as bar:
+    with bar_on_stderr(f"reconstructing {HOSTILE}") as bar:
         bar.add_task("", total=1)
         out = io.StringIO()
         Console(file=out, width=200, color_system=None).print(bar.get_renderable())
