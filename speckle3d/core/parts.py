@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import io
 import os
 import re
 import secrets
@@ -81,6 +82,22 @@ def locks() -> Any:
         return None
 
 
+class _Nowhere(io.RawIOBase):
+    """File that takes everything and holds nothing."""
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        return 0 if whence == os.SEEK_END else offset
+
+    def readinto(self, buffer: Any, /) -> int:
+        return 0
+
+    def write(self, data: Any, /) -> int:
+        return memoryview(data).nbytes
+
+    def truncate(self, size: int | None = None, /) -> int:
+        return size or 0
+
+
 class DiskFile:
     """File for HDF5 to write into, by which a full disk is an ordinary error.
 
@@ -89,7 +106,8 @@ class DiskFile:
     the system's error. To be called after every piece of a file that may become large.
 
     HDF5 also swallows what is raised while it calls the methods below. So a signal that arrives there, as
-    Ctrl-C does, waits for `check` or for the end of the block.
+    Ctrl-C does, waits for `check` or for the end of the block. What HDF5 still writes behind a block that
+    ended by an error goes nowhere.
 
     Parameters
     ----------
@@ -98,7 +116,8 @@ class DiskFile:
     """
 
     def __init__(self, path: Path, keep: bool = False) -> None:
-        self._file = open(path, "r+b" if keep else "w+b", buffering=0)  # noqa: SIM115 - closed with the block
+        # Closed with the block.
+        self._file: io.RawIOBase = open(path, "r+b" if keep else "w+b", buffering=0)  # noqa: SIM115
         self._at = 0
         self._failure: OSError | None = None
         self._kept: list[tuple[int, bytes]] = []
@@ -123,6 +142,9 @@ class DiskFile:
         finally:
             if kind is None:
                 self.check()
+            else:
+                # HDF5 closes its side when the last object of the file goes, which a traceback may hold.
+                self._file = _Nowhere()
 
     def check(self) -> None:
         """Handle signals that wait, and raise the `OSError` of the first write that the system refused."""

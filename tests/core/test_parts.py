@@ -1,5 +1,6 @@
 """Temporary files, and files on a disk that is full."""
 
+import gc
 import os
 import signal
 
@@ -75,6 +76,22 @@ def test_a_signal_that_arrives_while_hdf5_calls_waits_for_the_next_check(tmp_pat
         disk.write(memoryview(b"again"))
     with pytest.raises(KeyboardInterrupt), DiskFile(tmp_path / "a"):
         os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_hdf5_closes_behind_a_block_that_a_signal_ended(tmp_path, keep, capfd):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["x"] = 1
+    held = []
+    with pytest.raises(KeyboardInterrupt), DiskFile(tmp_path / "a.h5", keep) as disk:  # noqa: PT012
+        held.append(h5py.File(disk, "r+" if keep else "w"))
+        held[0].create_dataset("y", data=np.arange(5000), chunks=(100,), compression="gzip")
+        raise KeyboardInterrupt
+    held.clear()
+    gc.collect()
+    assert capfd.readouterr() == ("", "")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["x"] = 1
 
 
 @pytest.mark.parametrize("room", [0, 700, 3000, 9000])
