@@ -30,6 +30,8 @@ from speckle3d.imaging.images import ChosenImages
 
 PIXEL_MM = 0.15
 _COLOURS = ("#0072B2", "#D55E00", "#009E73")
+_UNSEEN = "#33415c"
+"""Where the other sweep has no frame: blue-grey, as in cuts."""
 _REACH_MM = 1.5
 
 IMAGES, SIGMA_MM = 10, 1.0
@@ -129,7 +131,7 @@ def figure_of(
         _draw_map(axes, pair, offset, similarities(comparison, about, pair, offset))
     for axes in panels[2:].flat:
         axes.grid(alpha=0.3)
-    figure.suptitle(_verdict(result, angulation), fontsize=10)
+    figure.suptitle(f"verdict: {_verdict(result, angulation)}", fontsize=10)
     return figure
 
 
@@ -179,14 +181,16 @@ def _draw_images(
     low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
     extent = (0.0, grid.width_mm, grid.depth_mm - grid.first_sample_depth_mm, 0.0)
     drawn = {f"{shown.name}, frame {frame}": own} | {
-        f"the other sweep there, {when}": cut_of(shown, other, frame, pose)
+        f"the other sweep there, {when} (blue-grey: no frame)": cut_of(shown, other, frame, pose)
         for when, pose in (("before", result.start), ("after", result.sensor_from_image))
     }
     for axes, (title, image) in zip(row, drawn.items(), strict=True):
-        axes.set_facecolor("#22303c")
+        axes.set_facecolor(_UNSEEN)
         axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="bilinear")
         axes.set_title(title, fontsize=8)
+        axes.set_xlabel("lateral / mm", fontsize=8)
         axes.tick_params(labelsize=7)
+    row[0].set_ylabel("depth / mm", fontsize=8)
 
 
 def _reach_mm(poses: RigidTransform) -> float:
@@ -199,6 +203,7 @@ def _draw_map(axes: Axes, names: tuple[str, str], offset: FloatArray, similarity
     drawn = axes.contourf(offset, offset, similarity.T, 16, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="mean correlation")
     axes.plot(0.0, 0.0, "+", color="white")
+    axes.set_title("about the answer (cross)", fontsize=8)
     across, up = (f"{name} / {_unit_of(name)}" for name in names)
     axes.set(xlabel=across, ylabel=up)
 
@@ -212,8 +217,9 @@ def _draw_strength(axes: Axes, angulation: Angulation) -> None:
     place = np.arange(len(PARAMETERS))
     axes.bar(place - 0.2, angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
     axes.bar(place + 0.2, angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")
-    axes.set_xticks(place, [f"{name}\n/ {'°' if k < 3 else 'mm'}" for k, name in enumerate(PARAMETERS)])
-    axes.set(xlabel="error", ylabel="disagreement / mm")
+    axes.set_xticks(place, [f"{name}\n{'1°' if k < 3 else '1 mm'}" for k, name in enumerate(PARAMETERS)])
+    axes.tick_params("x", labelsize=8)
+    axes.set(xlabel="error of the calibration", ylabel="disagreement of the sweeps / mm")
     axes.legend(fontsize=8)
 
 
