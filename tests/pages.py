@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 _FENCE = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
-_TIMEOUT_S = 500
+_TIMEOUT_S = 1800
 _LEFT_OUT = ("pip ", "python -m pytest")
 
 

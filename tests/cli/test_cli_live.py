@@ -77,7 +77,7 @@ def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player,
     waited_for(out / "sweep.h5", 96)
     time.sleep(1.0)
     running.send_signal(signal.SIGINT)
-    _, told = running.communicate(timeout=90)
+    _, told = running.communicate(timeout=300)
     assert running.returncode == 0, told
     placed = re.search(r"96 frames in .*, (\d+) placed as they came", told)
     assert int(placed[1]) > 0

@@ -15,7 +15,7 @@ from speckle3d.io.igtl.connection import Connection
 from speckle3d.io.igtl.messages import ImageReceived, Limits, packed_image, packed_transform
 from speckle3d.io.igtl.server import Server
 
-WAIT_S = 10.0
+WAIT_S = 60.0
 
 
 def until(is_so, timeout_s=WAIT_S):
