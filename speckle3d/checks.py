@@ -18,8 +18,8 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import SpeckleSizes, speckle_size
-from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.curve_doubts import DepthFactors, doubt_curves, doubt_speed
+from speckle3d.motion.coherence import RowScales
+from speckle3d.motion.curve_doubts import doubt_curves, doubt_speed
 from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.plausibility import far_apart, folded, severed, standing, undetermined
 from speckle3d.motion.signs import SignedPairs
@@ -31,15 +31,14 @@ def doubts_of_curves(
     matcher: FrameMatcher,
     sizes: SpeckleSizes,
     reader: PairReader,
-    factors: DepthFactors,
+    rows: RowScales | None,
     flags: IntArray,
     pairs: SignedPairs,
-    coherence: Coherence | None,
     path: FloatArray,
 ) -> tuple[Doubt, ...]:
     """What a sweep's own speckle says against the curves; raises if it refutes them."""
     size = speckle_size(sweep, matcher, np.flatnonzero(flags == 0), sizes)
-    found = doubt_curves(size, factors, reader.sum_ratios(pairs), curves, matcher.patches, coherence)
+    found = doubt_curves(size, rows, reader.sum_ratios(pairs), curves, matcher.patches)
     return unrefuted([*doubt_speed(path, sweep.frame_time_s), *found], sweep.name, MismatchError)
 
 

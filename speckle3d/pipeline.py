@@ -43,16 +43,15 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import SpeckleSizes, doubt_images
-from speckle3d.motion.coherence import Coherence, scale_sigma
+from speckle3d.motion.coherence import Coherence, RowScales, scale_sigma
 from speckle3d.motion.curve_doubts import doubt_depths
-from speckle3d.motion.curve_prior import RowsSeen
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.signs import SignedPairs
 from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance, with_common_scale
-from speckle3d.stages import PLANES, matcher_for, measured, rows_of, sound_pairs, straightened_by
+from speckle3d.stages import PLANES, matcher_for, measured
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,9 +97,9 @@ class Tracked:
     coherence : Coherence or None
         How the patches' echoes depart from a phantom's; None if not adapted to.
     curves : DecorrelationCurves
-        With which the images were read: those given, straightened by what depths disagree on.
-    rows : RowsSeen
-        Distances that rows of patches still want, over those of all.
+        With which the images were read.
+    rows : RowScales or None
+        Scales that rows of patches ask for, over that of all; None if not adapted to.
     slopes : SlopeEvidence
         What the images' own yaw and tilt are worth.
     times : StageTimes
@@ -125,7 +124,7 @@ class Tracked:
     direction_from: str
     coherence: Coherence | None
     curves: DecorrelationCurves
-    rows: RowsSeen
+    rows: RowScales | None
     slopes: SlopeEvidence
     times: StageTimes
     doubts: tuple[Doubt, ...] = ()
@@ -250,27 +249,14 @@ def track(
     flags = _flagged(sweep, found, settings)
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
-    pairs, coherence, path = measured(found.table, flags, reader, settings, times)
+    pairs, coherence, path, rows = measured(found.table, flags, reader, settings, times)
     with times.of("checks of the images"):
-        sound = sound_pairs(found.table, flags)
         flags = _with_unjoined(flags, reader, pairs)
         _require_placed(sweep, flags)
         # What stands still would be blamed on the curves.
         doubts += doubts_of_standing(sweep, matcher, curves, path, flags)
-        factors = reader.depth_factors(found.table, path, sound, settings.coherence)
-        doubts += doubts_of_curves(
-            sweep, curves, matcher, sizes, reader, factors, flags, pairs, coherence, path
-        )
-
-    # -> curves of the lens that the depths of the images agree on, and everything read with them
-    given = curves
-    with times.of(STRAIGHTENING):
-        curves, mismatch = straightened_by(factors, curves, coherence, matcher.patches, settings)
-    if curves is not given:
-        reader = reader.with_curves(curves)
-        pairs, coherence, path = measured(found.table, flags, reader, settings, times, path)
-        with times.of(STRAIGHTENING):
-            factors = reader.depth_factors(found.table, path, sound, settings.coherence)
+        doubts += doubts_of_curves(sweep, curves, matcher, sizes, reader, rows, flags, pairs, path)
+    mismatch = curves.mismatch(settings.curves.same_probe)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
@@ -331,7 +317,7 @@ def track(
         direction_from=source,
         coherence=coherence,
         curves=curves,
-        rows=rows_of(factors, coherence, matcher.patches),
+        rows=rows,
         slopes=slopes,
         times=times,
         doubts=(*doubts, *sensors.doubts),

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.curves import TISSUE_SIGMA, DecorrelationCurves
+from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import unrefuted
 from speckle3d.core.errors import MismatchError, naming
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.blocks import StageTimes
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.curve_doubts import DepthFactors, doubt_widths
-from speckle3d.motion.curve_prior import RowsSeen, rows_seen, straightened
+from speckle3d.motion.coherence import SCALE_ROUNDS, Coherence, RowScales
+from speckle3d.motion.curve_doubts import doubt_widths
 from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.signs import SignedPairs
 
@@ -46,10 +46,11 @@ def measured(
     config: Config,
     times: StageTimes,
     known: FloatArray | None = None,
-) -> tuple[SignedPairs, Coherence | None, FloatArray]:
+) -> tuple[SignedPairs, Coherence | None, FloatArray, RowScales | None]:
     """Signed planes of all usable pairs, the coherence they were read with, and the path they give.
 
-    Coherence is estimated from distances, and distances are read with coherence: each twice, in turn.
+    Coherence and scale are estimated from the path's distances, and distances are read with coherence, in turn.
+    Planes give the path its shape; its scale is at last the one that all patches ask for.
     """
     sound = sound_pairs(table, flags)
     path = known
@@ -59,14 +60,17 @@ def measured(
     if not config.coherence.adapt:
         with times.of(PLANES):
             pairs = reader.measure(table, path, sound, None)
-        return pairs, None, reader.path(table, pairs, None)
-    for known_scale in (False, True):
-        with times.of("coherence"):
-            coherence, path = reader.coherence(table, path, sound, config.coherence, known_scale)
+        return pairs, None, reader.path(table, pairs, None), None
+    with times.of("coherence"):
+        coherence, scale, rows = reader.coherence(table, path, sound)
+    for _ in range(SCALE_ROUNDS):
         with times.of(PLANES):
-            pairs = reader.measure(table, path, sound, coherence)
+            pairs = reader.measure(table, path * scale, sound, coherence)
             path = reader.path(table, pairs, coherence)
-    return pairs, coherence, path
+        with times.of("coherence"):
+            coherence, scale, rows = reader.coherence(table, path, sound)
+    pairs = replace(pairs, planes=pairs.planes.scaled(scale))
+    return pairs, coherence, reader.path(table, pairs, coherence), rows
 
 
 def sound_pairs(table: CorrelationTable, flags: IntArray) -> BoolArray:
@@ -74,27 +78,3 @@ def sound_pairs(table: CorrelationTable, flags: IntArray) -> BoolArray:
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
     sound: BoolArray = ~bad[table.first] & ~bad[table.second]
     return sound
-
-
-def straightened_by(
-    factors: DepthFactors,
-    curves: DecorrelationCurves,
-    coherence: Coherence | None,
-    patches: PatchGrid,
-    config: Config,
-) -> tuple[DecorrelationCurves, float]:
-    """Curves of the lens that the depths of the images agree on, and what is left of their mismatch.
-
-    The curves given, and all of it, if they are to stay as they are.
-    """
-    mismatch = curves.mismatch(config.curves.same_probe)
-    if config.curves.straighten and mismatch > TISSUE_SIGMA and curves.origin in ("phantom", "data sheet"):
-        return straightened(curves, rows_of(factors, coherence, patches), mismatch)
-    return curves, mismatch
-
-
-def rows_of(factors: DepthFactors, coherence: Coherence | None, patches: PatchGrid) -> RowsSeen:
-    """What rows of patches say of the curves."""
-    if coherence is None:
-        return rows_seen(factors)
-    return rows_seen(factors, patches.rows_of(coherence.share.mean(axis=0)).mean(axis=-1))

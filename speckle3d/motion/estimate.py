@@ -18,12 +18,13 @@ from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import (
     Coherence,
-    CoherenceSettings,
     PairEchoes,
+    PatchCorrelations,
+    RowScales,
     estimate_coherence,
     scale_sigma,
 )
-from speckle3d.motion.curve_doubts import FLAT, DepthFactors, depth_factors, sum_ratios
+from speckle3d.motion.curve_doubts import FLAT, sum_ratios
 from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, PatchDistances
 from speckle3d.motion.planes import PairPlanes, PlaneFitter, PlaneSettings, consistent_subset
 from speckle3d.motion.signs import (
@@ -143,7 +144,7 @@ class PairReader:
                 f"{patches} patches: is the image wide enough, and do the curves fit it?"
             )
         error = PLAIN_ERROR if coherence is None else ADAPTED_ERROR
-        return self.signed(table, pairs, sound, path[:known], error)[0]
+        return self.signed(table, pairs, sound, path[:known, :2], error)[0]
 
     def unsigned(
         self, table: CorrelationTable, path: FloatArray, sound: BoolArray, coherence: Coherence | None
@@ -152,25 +153,17 @@ class PairReader:
         chosen = self._choose(table, path[:, 0], sound)
         first, second = table.first[chosen], table.second[chosen]
         apart = path[second, 0] - path[first, 0]
-        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2, apart)
+        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2)
         planes = self.fitter.fit(
             table.correlation[chosen], table.inplane[chosen, :2], echoes, start_mm=np.abs(apart)
         )
         return SignedPairs(chosen, first, second, echoes, planes, np.ones(chosen.size))[planes.determined]
 
-    def roughly(
-        self, table: CorrelationTable, coherence: Coherence | None, apart_mm: FloatArray
-    ) -> SignedPairs:
-        """Planes of frames' pairs with earlier frames that they resemble, wherever they are; all signs +1.
-
-        Parameters
-        ----------
-        apart_mm : ndarray, shape (e,)
-            About how far apart the frames of each pair are, for structure that fades.
-        """
+    def roughly(self, table: CorrelationTable, coherence: Coherence | None) -> SignedPairs:
+        """Planes of frames' pairs with earlier frames that they resemble, wherever they are; all signs +1."""
         rows = self._alike(table)
         first, second = table.first[rows], table.second[rows]
-        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2, apart_mm[rows])
+        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2)
         planes = self.fitter.fit(table.correlation[rows], table.inplane[rows, :2], echoes)
         return SignedPairs(rows, first, second, echoes, planes, np.ones(rows.size))[planes.determined]
 
@@ -199,32 +192,19 @@ class PairReader:
         return pairs.with_signs(pair_signs(settled, *signless)), settled
 
     def coherence(
-        self,
-        table: CorrelationTable,
-        path: FloatArray,
-        sound: BoolArray,
-        settings: CoherenceSettings,
-        known_scale: bool,
-    ) -> tuple[Coherence, FloatArray]:
-        """Fit what stays of the patches' echoes and rescale the path; see `estimate_coherence`."""
-        return estimate_coherence(
+        self, table: CorrelationTable, path: FloatArray, sound: BoolArray
+    ) -> tuple[Coherence, float, RowScales]:
+        """Fit what stays of the patches' echoes, and the scale of the path; see `estimate_coherence`."""
+        correlations = PatchCorrelations(
             table.first[sound],
             table.second[sound],
             table.correlation[sound],
             path,
             self._curves,
             self._patches,
-            self._patches.centre_mm[:, 0] - self._centre[0],
-            settings,
-            known_scale,
+            self.fitter.levers,
         )
-
-    def depth_factors(
-        self, table: CorrelationTable, path: FloatArray, sound: BoolArray, settings: CoherenceSettings
-    ) -> DepthFactors:
-        """Distances read at each depth over those of all depths; see `speckle3d.motion.curve_doubts`."""
-        lateral = self._patches.centre_mm[:, 0] - self._centre[0]
-        return depth_factors(table, sound, path, self._curves, self._patches, lateral, settings)
+        return estimate_coherence(correlations)
 
     def sum_ratios(self, pairs: SignedPairs) -> FloatArray:
         """Sums of two distances over the one that spans both; see `speckle3d.motion.curve_doubts`."""
@@ -263,8 +243,8 @@ class PairReader:
         return RigidTransform.concatenate([known, (known[0] * self.solve(edges).poses)[len(known) :]])
 
     def path_of(self, poses: RigidTransform) -> FloatArray:
-        """Elevational position of the image's centre and slope along x of every pose, shape (n, 2)."""
-        return np.column_stack([poses.apply(self._centre)[:, 2], poses.rotation.as_matrix()[:, 2, 0]])
+        """Elevational position of the image's centre and slopes along x and y of every pose, shape (n, 3)."""
+        return np.column_stack([poses.apply(self._centre)[:, 2], poses.rotation.as_matrix()[:, 2, :2]])
 
     def unjoined(self, second: IntArray) -> BoolArray:
         """Frames after the first that are the second of no pair, shape (n,)."""
@@ -274,7 +254,7 @@ class PairReader:
         return lone
 
     def path(self, table: CorrelationTable, pairs: SignedPairs, coherence: Coherence | None) -> FloatArray:
-        """Elevational position of the image's centre and slope along x of every frame, shape (n, 2)."""
+        """Elevational position of the image's centre and slopes along x and y of every frame, shape (n, 3)."""
         slopes = self.slopes(pairs, coherence)
         return self.path_of(self.solve(self.edges(table, pairs, slopes.applied(pairs.planes))).poses)
 

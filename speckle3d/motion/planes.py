@@ -13,7 +13,7 @@ with depth as y does. The fit keeps what is seen; `speckle3d.motion.uncertainty`
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -127,6 +127,16 @@ class PairPlanes:
         """Offset a of each pair, shape (e,)."""
         return self.coefficients[:, 0]
 
+    def scaled(self, factor: float) -> PairPlanes:
+        """Return the same planes with all distances multiplied by a factor."""
+        return replace(
+            self,
+            coefficients=self.coefficients * factor,
+            covariance=self.covariance * factor**2,
+            excess_mm=self.excess_mm * np.float32(factor),
+            sigma_mm=self.sigma_mm * np.float32(factor),
+        )
+
     def where(self, mask: BoolArray, others: PairPlanes) -> PairPlanes:
         """These planes where the mask of pairs says so, and those of `others` elsewhere."""
         chosen = []
@@ -158,7 +168,7 @@ class PlaneFitter:
         tilt = estimator.tilt
         # Where the curves know nothing of tilt, it is taken to turn about the focus, and the focus to be at
         # the image's centre: all depths then see the centre's distance.
-        self._levers = Levers(
+        self.levers = Levers(
             np.ascontiguousarray(at_mm[:, 0]),
             zero if tilt is None else at_mm[:, 1] - tilt.pivot_mm,
             zero if tilt is None else np.ascontiguousarray(tilt.spread_mm),
@@ -167,7 +177,7 @@ class PlaneFitter:
 
     def design(self) -> FloatArray:
         """What a, b and c are multiplied by for each patch, without in-plane motion, shape (p, 3)."""
-        lateral, lever, _ = self._levers
+        lateral, lever, _ = self.levers
         return np.column_stack([np.ones(len(lateral)), lateral, lever])
 
     def raised(self, moved_mm: FloatArray, slopes: FloatArray) -> FloatArray:
@@ -267,7 +277,7 @@ class PlaneFitter:
                 problem.used[some],
                 lost[some],
                 problem.model[some].for_kernels(),
-                self._levers,
+                self.levers,
                 self._curves,
                 problem.middle_mm[some],
                 told[some],
@@ -277,7 +287,7 @@ class PlaneFitter:
             )
 
         in_parallel(work, pairs, GRAIN)
-        return self._concluded(fitted, problem.used, problem.model, turned=not rules.sensed)
+        return self._concluded(fitted, problem.used, turned=not rules.sensed)
 
     def _rules(self, sensed: bool) -> FitRules:
         return FitRules(
@@ -291,7 +301,7 @@ class PlaneFitter:
             ROUNDS,
         )
 
-    def _concluded(self, fitted: FittedPlanes, used: BoolArray, model: EchoModel, turned: bool) -> PairPlanes:
+    def _concluded(self, fitted: FittedPlanes, used: BoolArray, turned: bool) -> PairPlanes:
         """Planes with their covariances; those with a < 0 turned over if `turned`."""
         coefficients, information, cost, *residuals = fitted
         patches = used.sum(axis=1)
@@ -299,7 +309,7 @@ class PlaneFitter:
         covariance = np.linalg.inv(information) * scatter[:, None, None]
         covariance[:, 0, 0] += self.settings.bias_mm**2
         # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
-        reach = self._estimator.reach_mm * np.maximum(1.0, np.median(model.stretch, axis=1))
+        reach = self._estimator.reach_mm
         determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
         if turned:
             coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
@@ -311,7 +321,7 @@ class PlaneFitter:
         end = self._estimator.end_amplitude
         if not end.any():
             return np.ones(correlation.shape, dtype=bool)
-        least = model.gain * (model.staying + model.moving * end) ** 2
+        least = model.gain * (model.share + (1 - model.share) * end) ** 2
         return np.asarray((end == 0.0) | (correlation > least))
 
     def _middle(self, correlation: Float32Array, used: BoolArray, model: EchoModel) -> FloatArray:
@@ -320,7 +330,7 @@ class PlaneFitter:
         count = np.maximum(used.sum(axis=1), 1)
         pair = np.arange(len(known))
         median = (known[pair, (count - 1) // 2].astype(float) + known[pair, count // 2]) / 2
-        share = model.staying.mean(axis=1)
+        share = model.share.mean(axis=1)
         left = (np.sqrt(np.maximum(np.where(np.isfinite(median), median, 0.0), 0.0)) - share) / np.maximum(
             1.0 - share, 0.1
         )

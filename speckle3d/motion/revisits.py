@@ -139,7 +139,7 @@ def _read(
     echoes = None
     if coherence is not None:
         # Structure is what the earlier visit saw of it.
-        echoes = PairEchoes(coherence, first.astype(float), position_mm[second] - position_mm[first])
+        echoes = PairEchoes(coherence, first.astype(float))
     planes = fitter.fit(table.correlation[rows], table.inplane[rows, :2], echoes)
     return SignedPairs(rows, first, second, echoes, planes, np.ones(rows.size))[planes.determined]
 
