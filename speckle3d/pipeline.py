@@ -47,6 +47,7 @@ from speckle3d.motion.coherence import Coherence, RowScales, scale_sigma
 from speckle3d.motion.curve_doubts import doubt_depths
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import PairReader
+from speckle3d.motion.lens import with_fitted_lens
 from speckle3d.motion.plausibility import interleaved
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.signs import SignedPairs
@@ -61,8 +62,6 @@ PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
 MOST_LOST = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
-STRAIGHTENING = "curves"
-"""Name of a stage in `StageTimes`."""
 
 
 @shown
@@ -256,6 +255,12 @@ def track(
         # What stands still would be blamed on the curves.
         doubts += doubts_of_standing(sweep, matcher, curves, path, flags)
         doubts += doubts_of_curves(sweep, curves, matcher, sizes, reader, rows, flags, pairs, path)
+
+    # -> a data sheet's lens fitted to what depths disagree on, and everything read with it
+    if curves.origin == "data sheet" and rows is not None:
+        curves = with_fitted_lens(curves, rows)
+        reader = reader.with_curves(curves)
+        pairs, coherence, path, rows = measured(found.table, flags, reader, settings, times, path)
     mismatch = curves.mismatch(settings.curves.same_probe)
 
     # -> pairs of frames from different visits of the same tissue, which the path shows
@@ -302,8 +307,8 @@ def track(
         subset, used = _consistent(sensors.trusted, table, pairs, direction, reader, settings)
 
     if sink:
-        for rows in reader.rows(table, pairs, edges, used, direction, sigma):
-            sink(rows)
+        for some in reader.rows(table, pairs, edges, used, direction, sigma):
+            sink(some)
     return Tracked(
         image=_seen_from(direction, trajectory.poses),
         covariance=whole if direction > 0 else MIRROR @ whole @ MIRROR,

@@ -49,8 +49,8 @@ def measured(
 ) -> tuple[SignedPairs, Coherence | None, FloatArray, RowScales | None]:
     """Signed planes of all usable pairs, the coherence they were read with, and the path they give.
 
-    Coherence and scale are estimated from the path's distances, and distances are read with coherence, in turn.
-    Planes give the path its shape; its scale is at last the one that all patches ask for.
+    Coherence and scale are estimated from the path's distances, and distances are read with coherence, in
+    turn. Planes give the path its shape; its scale is at last the one that all patches ask for.
     """
     sound = sound_pairs(table, flags)
     path = known

@@ -65,7 +65,7 @@ def place_latest(
 
     path = window.path
     path[-1] = 2 * path[-2] - path[-3] if len(path) > 2 else path[-2]
-    rough = reader.roughly(table, coherence, path[table.second, 0] - path[table.first, 0])
+    rough = reader.roughly(table, coherence)
     path[-1] = signed(_planes_of(rough, window))[1][-1]
     found = _planes_of(reader.unsigned(table, path, sound, coherence), window)
     pairs, _ = signed(found)

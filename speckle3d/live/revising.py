@@ -20,7 +20,7 @@ from speckle3d.matching.quality import FrameFlag
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.estimate import PairReader
 from speckle3d.motion.signs import SignedPairs
-from speckle3d.stages import measured, sound_pairs, straightened_by
+from speckle3d.stages import measured, sound_pairs
 
 LATEST = 150
 """Frames over which coherence is learnt anew while a sweep is longer: five times `CoherenceSettings`' block.
@@ -87,19 +87,13 @@ class Reviser:
     """
 
     def __init__(self, matcher: FrameMatcher, curves: DecorrelationCurves, config: Config) -> None:
-        self._curves, self._config, self._patches = curves, config, matcher.patches
+        self._config = config
         self.reader = PairReader(
             curves, matcher.patches, matcher.centre_mm, 1, config.planes, config.trajectory
         )
 
-    def whole(self, sweep: Growing, known: Known | None = None) -> Revision:
+    def whole(self, sweep: Growing) -> Revision:
         """Estimate everything from all frames, as `track` does of a recording, but for returns.
-
-        Parameters
-        ----------
-        known : Known, optional
-            With whose curves images are read; without it, those given are straightened by what is seen, which
-            may take half a second.
 
         Raises
         ------
@@ -107,15 +101,9 @@ class Reviser:
             If the images do not determine a plane yet.
         """
         table, config = CorrelationTable.joined(sweep.tables), self._config
-        reader, times = (known or self).reader.of_frames(len(sweep)), StageTimes()
+        reader, times = self.reader.of_frames(len(sweep)), StageTimes()
         _require_any(sound_pairs(table, sweep.flags))
-        pairs, coherence, path = measured(table, sweep.flags, reader, config, times)
-        if known is None:
-            factors = reader.depth_factors(table, path, sound_pairs(table, sweep.flags), config.coherence)
-            curves, _ = straightened_by(factors, self._curves, coherence, self._patches, config)
-            if curves is not self._curves:
-                reader = reader.with_curves(curves)
-                pairs, coherence, path = measured(table, sweep.flags, reader, config, times, path)
+        pairs, coherence, *_ = measured(table, sweep.flags, reader, config, times)
         slopes = reader.slopes(pairs, coherence)
         poses = reader.solve(reader.edges(table, pairs, slopes.applied(pairs.planes))).poses
         held = _by_frame(pairs, 0, [len(each) for each in sweep.tables])
@@ -137,9 +125,8 @@ class Reviser:
         reader, coherence = known.reader.of_frames(window.frames.size), known.coherence
         path = window.path
         if coherence is not None:
-            coherence, path = reader.coherence(
-                window.table, window.path, window.sound, self._config.coherence, known_scale=True
-            )
+            coherence, scale, _ = reader.coherence(window.table, path, window.sound)
+            path = path * scale
         pairs = reader.unsigned(window.table, path, window.sound, coherence)
         pairs, _ = reader.signed(window.table, pairs, window.sound, window.path[: window.fixed])
         poses = window.placed(pairs, known.slopes, reader)[window.fixed :]

@@ -131,7 +131,6 @@ class LiveTracker:
         self._poses = RigidTransform.identity(0)
         self._known: Known | None = None
         self._given = Known(self._reviser.reader, None, SlopeEvidence(np.ones(2), np.zeros(2)))
-        self._last_straightened = 0
         self._revision, self._last_whole, self._looked_at = 0, 0, 0
         self._lock, self._grown = threading.Lock(), threading.Condition()
         self._ended = False
@@ -256,7 +255,7 @@ class LiveTracker:
         known = self._known
         try:
             if known is None or len(sweep) <= LATEST or len(sweep) >= GROWTH * self._last_whole:
-                revision = self._reviser.whole(sweep, self._curves_for(len(sweep)))
+                revision = self._reviser.whole(sweep)
                 self._last_whole = len(sweep)
             else:
                 revision = self._reviser.latest(sweep, known)
@@ -264,15 +263,6 @@ class LiveTracker:
             # Frames that come later may tell.
             return
         self._take(revision)
-
-    def _curves_for(self, frames: int) -> Known | None:
-        """With whose curves to read: None if it is time to straighten them by what is seen now."""
-        if self._known is None or frames <= ANEW:
-            return self._given
-        if frames >= GROWTH * self._last_straightened:
-            self._last_straightened = frames
-            return None
-        return self._known
 
     def _take(self, revision: Revision) -> None:
         """Put a revision's poses in place of earlier ones; later frames go along with its last."""

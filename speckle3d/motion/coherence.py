@@ -7,11 +7,11 @@ whose echo is speckle and a share c of structure has
     rho(d) = gain ((1 - c) r(s d) + c r(s d)^a)^2,    0 <= c < 1, 0 <= a < 1,
 
 where the gain is what electronic noise leaves, a = 0 stands for structure that does not change and a near 1
-for structure hardly longer than speckle, and s is what the distances of the path are still to be multiplied by.
-Each patch is fitted over the whole sweep, and s is the median over all patches: no patch is judged to
-hold structure or not. Its standard deviation comes from the scatter of the rows of patches, since
-structure lies in layers. Near d = 0 only s^2 (1 - c (1 - a)) is observable, and structure and scale part by the
-shape where r < 0.5 alone: over tissue some 2 % of the scale stay open.
+for structure hardly longer than speckle, and s is what the distances of the path are still to be multiplied
+by. Each patch is fitted over the whole sweep, and s is the median over all patches: no patch is judged to
+hold structure or not. Its standard deviation comes from the scatter of the rows of patches, since structure
+lies in layers. Near d = 0 only s^2 (1 - c (1 - a)) is observable, and structure and scale part by the shape
+where r < 0.5 alone: over tissue some 2 % of the scale stay open.
 """
 
 from __future__ import annotations
@@ -40,6 +40,9 @@ SCALE_ROUNDS = 2
 """Rounds in which shares and scale, and the path that they are read from, are estimated in turn."""
 HALF_NORMAL = float(np.sqrt(2.0 / np.pi))
 """Mean over root mean square of half-normal shares, the distribution of largest entropy."""
+NOISY_GAIN = 0.9
+"""Part of the correlation that noise leaves, below which a row is noisy: speckle looks finer, structure
+unsure."""
 LEAST_SHARE = 1e-4
 """Root mean square share that stands for none."""
 NO_STRUCTURE = 0.005
@@ -178,7 +181,9 @@ class PatchCorrelations:
         moved = np.zeros((self._first.size, 3))
         moved[:, : path.shape[1]] = path[self._second] - path[self._first]
         z, yaw, tilt = moved.T[:, :, None]
-        distance = np.hypot(z + yaw * self._levers.lateral_mm + tilt * self._levers.lever_mm, tilt * self._levers.spread_mm)
+        distance = np.hypot(
+            z + yaw * self._levers.lateral_mm + tilt * self._levers.lever_mm, tilt * self._levers.spread_mm
+        )
         usable = np.isfinite(self._correlation) & (distance <= self._reach_mm)
         bins = _BIN_EDGES_MM.size - 1
         at = np.minimum(np.searchsorted(_BIN_EDGES_MM, distance, side="right") - 1, bins - 1)
@@ -206,7 +211,7 @@ class PatchCorrelations:
         return np.maximum(value, 1e-6), np.where(inside, (high - low) * position, 0.0)
 
     def fit_scales(self, structure: bool = True) -> FloatArray:
-        """ln s, gain, c and a of every patch of every piece, shape (q, 4); without structure, c = a = 0."""
+        """Ln s, gain, c and a of every patch of every piece, shape (q, 4); without structure, c = a = 0."""
 
         def misfit(v: FloatArray) -> tuple[FloatArray, FloatArray]:
             r, slope = self._speckle(np.exp(v[:, :1]))
@@ -236,7 +241,9 @@ class PatchCorrelations:
             rho = r**2 + 2 * HALF_NORMAL * share * (r - r**2) + (share * (1 - r)) ** 2
             by_r = 2 * r + 2 * HALF_NORMAL * share * (1 - 2 * r) - 2 * share**2 * (1 - r)
             by_share = 2 * HALF_NORMAL * (r - r**2) + 2 * share * (1 - r) ** 2
-            jacobian = np.stack([gain * by_r * slope, rho, gain * by_share], axis=-1) * self._weight[..., None]
+            jacobian = (
+                np.stack([gain * by_r * slope, rho, gain * by_share], axis=-1) * self._weight[..., None]
+            )
             return self._weight * (gain * rho - self._mean), jacobian
 
         start = np.tile([0.0, 0.95, 0.1], (self._patch.size, 1))

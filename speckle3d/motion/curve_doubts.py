@@ -18,7 +18,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import PatchGrid
-from speckle3d.motion.coherence import RowScales
+from speckle3d.motion.coherence import NOISY_GAIN, RowScales
 
 FASTEST_MM_S = 300.0
 """Mean speed above which no hand sweeps a probe: scans take 1 to 50 mm/s, a fast one some 100."""
@@ -35,8 +35,6 @@ to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong by 10 mm; axial
 by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of two 0.69."""
 LEAST_ROWS, ENOUGH_ROWS = 3, 4
 """Rows of patches from which doubts arise, and from which sizes refute."""
-NOISY_GAIN = 0.9
-"""Part of the correlation that noise leaves, below which it makes speckle look finer."""
 UNSEEN_NOISE, REFUTED_NOISE = 1.8, 2.5
 """Correlation of neighbouring vectors over what the noise taken from distances would leave of it. Simulated:
 up to 1.1 in nearly all of 64 good sweeps, 1.5 in the worst."""
@@ -150,7 +148,11 @@ def bend(rows: RowScales) -> float:
         return 0.0
     depth, logarithm = rows.depth_mm[clear], rows.logarithm[clear]
     design = np.vander((depth - depth.mean()) / np.ptp(depth), 3)
-    fit = least_squares(lambda v: design @ v - logarithm, np.zeros(3), loss="soft_l1", f_scale=_ROW_ERROR)
+
+    def misfit(values: FloatArray) -> FloatArray:
+        return np.asarray(design @ values - logarithm)
+
+    fit = least_squares(misfit, np.zeros(3), loss="soft_l1", f_scale=_ROW_ERROR)
     return float(np.std(design @ fit.x))
 
 

@@ -146,7 +146,10 @@ class DistanceEstimator:
         rho, slope = ((1 - part) * t.take(at) + part * t.take(at + 1) for t in (self._rho, self._slope))
         g = np.sqrt(rho)
         echo = share + (1 - share) * g
-        noise = correlation_variance(np.minimum(gain * echo**2, 0.999), self.cells, self.of_echo) + INTERPOLATION**2
+        noise = (
+            correlation_variance(np.minimum(gain * echo**2, 0.999), self.cells, self.of_echo)
+            + INTERPOLATION**2
+        )
         misfit = SHARE_ERROR * share * (1 - g) * 2 * echo * gain
         sigma_rho = np.sqrt(noise + misfit**2) * g / np.maximum(gain * echo * (1 - share), 1e-6)
         direct = sigma_rho / np.maximum(slope, 1e-9)

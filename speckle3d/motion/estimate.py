@@ -254,7 +254,7 @@ class PairReader:
         return lone
 
     def path(self, table: CorrelationTable, pairs: SignedPairs, coherence: Coherence | None) -> FloatArray:
-        """Elevational position of the image's centre and slopes along x and y of every frame, shape (n, 3)."""
+        """Elevational position and slopes along x and y of every frame, shape (n, 3)."""
         slopes = self.slopes(pairs, coherence)
         return self.path_of(self.solve(self.edges(table, pairs, slopes.applied(pairs.planes))).poses)
 
