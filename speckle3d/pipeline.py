@@ -60,6 +60,8 @@ if TYPE_CHECKING:
 """Called with frames done and frames in all."""
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
+LENS_ROUNDS = 4
+"""Fits of a data sheet's lens: a path read with a wrong lens bends the rows otherwise than the right one."""
 MOST_LOST = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
@@ -257,7 +259,7 @@ def track(
         doubts += doubts_of_curves(sweep, curves, matcher, sizes, reader, rows, flags, pairs, path)
 
     # -> a data sheet's lens fitted to what depths disagree on, and everything read with it
-    if curves.origin == "data sheet" and rows is not None:
+    for _ in range(LENS_ROUNDS if curves.origin == "data sheet" and rows is not None else 0):
         curves = with_fitted_lens(curves, rows)
         reader = reader.with_curves(curves)
         pairs, coherence, path, rows = measured(found.table, flags, reader, settings, times, path)

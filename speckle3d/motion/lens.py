@@ -21,8 +21,6 @@ ROW_SIGMA = 0.04
 """Scatter of rows' scales that structure in tissue makes: 4 to 9 % over simulated tissue, 1 % over
 phantoms."""
 LEAST_ROWS = 4
-GOOD_FIT = 0.5
-"""Share of the rows' mean square deviation that a lens must explain to be believed."""
 
 
 def stretched(curves: DecorrelationCurves, log_factor: FloatArray) -> DecorrelationCurves:
@@ -56,13 +54,14 @@ def with_fitted_lens(curves: DecorrelationCurves, rows: RowScales) -> Decorrelat
     Returns
     -------
     DecorrelationCurves
-        As given where no lens explains the rows; else stretched, with what is left of `scale_sigma`.
+        Of the lens found, and with the `scale_sigma` given: rows of one sweep share errors of structure.
     """
     assert curves.nominal is not None
     clear = rows.gain >= NOISY_GAIN
     if clear.sum() < LEAST_ROWS:
         return curves
-    sheet, depth, logarithm = curves.nominal, rows.depth_mm[clear], rows.logarithm[clear]
+    # A row that reads long asks for narrower curves.
+    sheet, depth, logarithm = curves.nominal, rows.depth_mm[clear], -rows.logarithm[clear]
     lens = Lens(sheet.aperture_mm, sheet.focus_mm, sheet.transmit_mm)
     nominal = Nominal(lens, (sheet.low_hz, sheet.high_hz), sheet.attenuation_db_cm_mhz)
     width = nominal.log_width(depth)
@@ -79,16 +78,10 @@ def with_fitted_lens(curves: DecorrelationCurves, rows: RowScales) -> Decorrelat
     fit = least_squares(
         misfit, start, loss="soft_l1", diff_step=[0.03, 0.03], x_scale=[0.1, 0.1], max_nfev=20
     )
-    left = logarithm - fit.x[1] - wider(float(fit.x[0]), depth, width)
-    if np.mean(left**2) > GOOD_FIT * np.var(logarithm):
-        return curves
     at = np.clip(curves.depth_mm, depth[0], depth[-1])
     factor = wider(float(fit.x[0]), at, nominal.log_width(at))
-    covariance = np.linalg.inv(np.asarray(fit.jac).T @ np.asarray(fit.jac))
-    per_focus = (wider(0.05, depth, width) - wider(-0.05, depth, width)).mean() / 0.1
-    known = per_focus**2 * (FOCUS_SIGMA**2 - covariance[0, 0])
-    sigma = float(np.sqrt(max(curves.scale_sigma**2 - known, ATTENUATION_SIGMA**2)))
-    return replace(stretched(curves, factor), scale_sigma=sigma)
+    fitted = replace(sheet, focus_mm=sheet.focus_mm * float(np.exp(fit.x[0])))
+    return replace(stretched(curves, factor), nominal=fitted)
 
 
 @dataclass(frozen=True)
