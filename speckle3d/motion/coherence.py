@@ -38,20 +38,21 @@ PIECE_MM = 10.0
 tissue fitted in halves read 1 % longer), more would outlast the tissue's layers."""
 SCALE_ROUNDS = 2
 """Rounds in which shares and scale, and the path that they are read from, are estimated in turn."""
-HALF_NORMAL = float(np.sqrt(2.0 / np.pi))
-"""Mean over root mean square of half-normal shares, the distribution of largest entropy."""
 NOISY_GAIN = 0.9
 """Part of the correlation that noise leaves, below which a row is noisy: speckle looks finer, structure
 unsure."""
 LEAST_SHARE = 1e-4
 """Root mean square share that stands for none."""
-NO_STRUCTURE = 0.005
-"""Root mean square share below which the median row of patches holds fully developed speckle alone: phantoms
-show 0.000, tissue 0.01 to 0.16."""
+ROW_SIGMA, PRIOR_ROWS = 0.06, 10
+"""Scatter of the scales that rows of patches ask for over tissue, and how many rows of the sweep's own it
+counts: simulated tissue of two physics has 0.04 to 0.09, the scatter of 13 rows is known to a third."""
+NO_STRUCTURE = 0.02
+"""Mean share, over rows of patches, below which all speckle is taken as fully developed: simulated phantoms
+have 0.000 to 0.006, tissue 0.05 to 0.14."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
-_LOWEST, _HIGHEST = np.array([-1.0, 0.05, 0.0, 0.0]), np.array([1.0, 1.2, 0.95, 0.9])
-"""Bounds of ln s, gain, c and a."""
+MOST_SHARE, MOST_POWER = 0.95, 0.9
+"""Bounds of c and a: at one, structure is all there is, or speckle itself."""
 
 
 class CoherenceSettings(BaseModel):
@@ -166,7 +167,7 @@ class PatchCorrelations:
         self._floor = np.where(end > WELL_FALLEN, 0.0, end)
         self._amplitude = np.sqrt(np.clip((at.correlation.T - self._floor) / (1 - self._floor), 0.0, 1.0)).T
         self._step_mm = float(curves.distance_mm[1])
-        self._cells, self._of_echo = at.cells, curves.key.correlation_of == "echo"
+        self._cells, self.of_echo = at.cells, curves.key.correlation_of == "echo"
         self._reach_mm = float(curves.distance_mm[-1]) if end.max() > WELL_FALLEN else np.inf
         travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path[:, 0])))])
         count = max(1, int(travel[-1] / PIECE_MM))
@@ -196,7 +197,7 @@ class PatchCorrelations:
         count = np.maximum(sums[0], 1)
         self._distance, mean = sums[1] / count, sums[2] / count
         floor, cells = self._floor[self._patch, None], self._cells[self._patch, None]
-        variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, self._of_echo) + INTERPOLATION**2
+        variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, self.of_echo) + INTERPOLATION**2
         self._mean = (mean - floor) / (1 - floor)
         self._weight = (1 - floor) * np.sqrt(sums[0] / variance)
 
@@ -210,60 +211,42 @@ class PatchCorrelations:
         value = np.where(inside, low + (position - cell) * (high - low), high)
         return np.maximum(value, 1e-6), np.where(inside, (high - low) * position, 0.0)
 
-    def fit_scales(self, structure: bool = True) -> FloatArray:
-        """Ln s, gain, c and a of every patch of every piece, shape (q, 4); without structure, c = a = 0."""
+    def fit(
+        self,
+        log_scale: float | None = None,
+        most_share: float = MOST_SHARE,
+        most_power: float = 0.0,
+        share_sigma: float = np.inf,
+    ) -> FloatArray:
+        """Fit ln s, gain, c and a of every patch of every piece, shape (q, 4).
+
+        Parameters
+        ----------
+        log_scale : float, optional
+            To which ln s is held; by default each patch tells its own.
+        most_share, most_power : float
+            Upper bounds of c and a.
+        share_sigma : float
+            Standard deviation of a normal prior of c about zero.
+        """
+        lowest = np.array([-1.0 if log_scale is None else log_scale, 0.05, 0.0, 0.0])
+        highest = np.array([1.0 if log_scale is None else log_scale, 1.2, most_share, most_power])
 
         def misfit(v: FloatArray) -> tuple[FloatArray, FloatArray]:
             r, slope = self._speckle(np.exp(v[:, :1]))
             gain, share, power = v[:, 1:2], v[:, 2:3], v[:, 3:4]
             long = r**power
             echo = (1 - share) * r + share * long
-            by_echo = 2 * gain * echo * self._weight
+            by_echo = 2 * gain * echo
             by_scale = by_echo * (1 - share + share * power * long / r) * slope
             by_share, by_power = by_echo * (long - r), by_echo * share * long * np.log(r)
-            jacobian = np.stack([by_scale, echo**2 * self._weight, by_share, by_power], axis=-1)
-            return self._weight * (gain * echo**2 - self._mean), jacobian
+            jacobian = np.stack([by_scale, echo**2, by_share, by_power], axis=-1) * self._weight[..., None]
+            left = self._weight * (gain * echo**2 - self._mean)
+            prior = np.broadcast_to(np.array([0.0, 0.0, 1 / share_sigma, 0.0]), (len(v), 1, 4))
+            return np.append(left, share / share_sigma, axis=1), np.concatenate([jacobian, prior], axis=1)
 
-        highest = _HIGHEST if structure else np.array([*_HIGHEST[:2], 0.0, 0.0])
-        start = np.minimum([0.0, 0.95, 0.05, 0.1], highest)
-        return bounded_least_squares(misfit, np.tile(start, (self._patch.size, 1)), _LOWEST, highest)
-
-    def root_mean_square_share(self) -> float:
-        """Median over the rows of patches of the root mean square share of structure that does not change.
-
-        With half-normal shares of mean square m2 a patch has on average
-        rho = gain (r^2 + 2 m1 (r - r^2) + m2 (1 - r)^2), m1 = sqrt(2 m2 / pi).
-        """
-
-        def misfit(v: FloatArray) -> tuple[FloatArray, FloatArray]:
-            r, slope = self._speckle(np.exp(v[:, :1]))
-            gain, share = v[:, 1:2], v[:, 2:3]
-            rho = r**2 + 2 * HALF_NORMAL * share * (r - r**2) + (share * (1 - r)) ** 2
-            by_r = 2 * r + 2 * HALF_NORMAL * share * (1 - 2 * r) - 2 * share**2 * (1 - r)
-            by_share = 2 * HALF_NORMAL * (r - r**2) + 2 * share * (1 - r) ** 2
-            jacobian = (
-                np.stack([gain * by_r * slope, rho, gain * by_share], axis=-1) * self._weight[..., None]
-            )
-            return self._weight * (gain * rho - self._mean), jacobian
-
-        start = np.tile([0.0, 0.95, 0.1], (self._patch.size, 1))
-        share = bounded_least_squares(misfit, start, _LOWEST[:3], _HIGHEST[:3])[:, 2]
-        return float(np.median(self.row_medians(share)))
-
-    def fit_shares(self, scale: float, typical: float) -> FloatArray:
-        """Share and gain of every patch, shape (q, 2), the share with a normal prior of width `typical`."""
-        r, _ = self._speckle(np.full((1, 1), scale))
-
-        def misfit(v: FloatArray) -> tuple[FloatArray, FloatArray]:
-            share, gain = v[:, :1], v[:, 1:]
-            echo = share + (1 - share) * r
-            jacobian = np.stack([2 * gain * echo * (1 - r), echo**2], axis=-1) * self._weight[..., None]
-            prior = np.broadcast_to(np.array([1 / typical, 0.0]), (len(v), 1, 2))
-            left = np.concatenate([self._weight * (gain * echo**2 - self._mean), share / typical], axis=1)
-            return left, np.concatenate([jacobian, prior], axis=1)
-
-        start = np.tile([min(0.05, typical), 0.95], (self._patch.size, 1))
-        return bounded_least_squares(misfit, start, _LOWEST[[2, 1]], _HIGHEST[[2, 1]])
+        start = np.clip([0.0, 0.95, 0.05, 0.1], lowest, highest)
+        return bounded_least_squares(misfit, np.tile(start, (self._patch.size, 1)), lowest, highest)
 
     @property
     def row_depth_mm(self) -> FloatArray:
@@ -332,6 +315,10 @@ def scale_sigma(coherence: Coherence | None) -> float:
 def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, float, RowScales]:
     """Estimate shares of structure, gains, and the factor that distances along the path are still to get.
 
+    Structure of an echo turns its phase, so that it decays with some power of speckle's coherence; of
+    intensity, which has no phase, shapes with and without decay fit alike: the mean of both scales is taken,
+    and what lies between them is claimed.
+
     Returns
     -------
     Coherence
@@ -339,20 +326,34 @@ def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, floa
         True distances over those of the path, median over the patches.
     RowScales
     """
-    typical = correlations.root_mean_square_share()
-    fits = correlations.fit_scales(structure=typical >= NO_STRUCTURE)
-    scale = float(np.exp(np.median(fits[:, 0])))
-    share, gain = correlations.fit_shares(scale, max(typical, LEAST_SHARE)).T
-    pieces = correlations.centres.size
+    frozen = correlations.fit()
+    typical = float(np.mean(correlations.row_medians(frozen[:, 2])))
+    if typical < NO_STRUCTURE:
+        fits = [correlations.fit(most_share=0.0)]
+    elif correlations.of_echo:
+        fits = [correlations.fit(most_power=MOST_POWER)]
+    else:
+        fits = [frozen, correlations.fit(most_power=MOST_POWER)]
+    medians = [float(np.median(fit[:, 0])) for fit in fits]
+    log_scale, pieces = float(np.mean(medians)), correlations.centres.size
+    share_gain = correlations.fit(log_scale, share_sigma=max(typical, LEAST_SHARE))[:, [2, 1]]
+    share, gain = share_gain.T
     rows = RowScales(
         correlations.row_depth_mm,
-        correlations.row_medians(fits[:, 0]) - np.log(scale),
+        correlations.row_medians(np.mean(fits, axis=0)[:, 0]) - log_scale,
         correlations.row_medians(gain),
         correlations.row_medians(share),
     )
     # Standard error of a median of rows, by their median absolute deviation from a line: tilt makes one.
     line = theilslopes(rows.logarithm, rows.depth_mm)
     spread = 1.4826 * float(np.median(np.abs(rows.logarithm - line.intercept - line.slope * rows.depth_mm)))
-    sigma = float(np.hypot(1.2533 * spread / np.sqrt(rows.logarithm.size), CURVES_SIGMA))
-    coherence = Coherence(correlations.centres, share.reshape(pieces, -1), gain.reshape(pieces, -1), sigma)
-    return coherence, scale, rows
+    if typical >= NO_STRUCTURE:
+        count = rows.logarithm.size
+        spread = np.sqrt((count * spread**2 + PRIOR_ROWS * ROW_SIGMA**2) / (count + PRIOR_ROWS))
+    errors = 1.2533 * spread / np.sqrt(rows.logarithm.size), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
+    sigma = float(np.linalg.norm(errors))
+    return (
+        Coherence(correlations.centres, share.reshape(pieces, -1), gain.reshape(pieces, -1), sigma),
+        float(np.exp(log_scale)),
+        rows,
+    )

@@ -12,14 +12,11 @@ from scipy.optimize import least_squares
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import ATTENUATION_SIGMA, DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.motion.coherence import NOISY_GAIN, RowScales
+from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
 from speckle3d.motion.diffraction import Lens, Nominal, half_distance
 
 FOCUS_SIGMA = 0.15 / np.sqrt(3.0)
 """Standard deviation of the logarithm of the focal length about its data sheet's: 15 % either way."""
-ROW_SIGMA = 0.04
-"""Scatter of rows' scales that structure in tissue makes: 4 to 9 % over simulated tissue, 1 % over
-phantoms."""
 LEAST_ROWS = 4
 
 
