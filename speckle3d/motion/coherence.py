@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.stats import theilslopes
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.shown import shown
 from speckle3d.kernels.plane_misfit import Levers
@@ -36,8 +36,6 @@ CURVES_SIGMA = 0.002
 PIECE_MM = 10.0
 """Travel over which a patch's echo is taken as alike: less does not part structure from scale (12 mm of
 tissue fitted in halves read 1 % longer), more would outlast the tissue's layers."""
-SCALE_ROUNDS = 2
-"""Rounds in which shares and scale, and the path that they are read from, are estimated in turn."""
 NOISY_GAIN = 0.9
 """Part of the correlation that noise leaves, below which a row is noisy: speckle looks finer, structure
 unsure."""
@@ -82,41 +80,17 @@ class Coherence:
     gain: FloatArray
     scale_sigma: float
 
-    def models(self, frame: FloatArray) -> EchoModel:
+    def models(self, frame: FloatArray | IntArray) -> EchoModel:
         """Echo models of pairs about frames of shape (e,)."""
-        at = np.clip(frame, self.frame[0], self.frame[-1])
+        at = np.clip(np.asarray(frame, dtype=float), self.frame[0], self.frame[-1])
         before = np.clip(np.searchsorted(self.frame, at, side="right") - 1, 0, max(self.frame.size - 2, 0))
         after = np.minimum(before + 1, self.frame.size - 1)
         width = np.maximum(self.frame[after] - self.frame[before], 1.0)
         part = ((at - self.frame[before]) / width)[:, None]
-        share, gain = ((1 - part) * v[before] + part * v[after] for v in (self.share, self.gain))
+        share, gain = (
+            np.asarray((1 - part) * v[before] + part * v[after], dtype=float) for v in (self.share, self.gain)
+        )
         return EchoModel(share, gain)
-
-
-@dataclass(frozen=True)
-class PairEchoes:
-    """Echo models of frame pairs, made when they are asked for: for all pairs of a long sweep they are large.
-
-    Attributes
-    ----------
-    frame : ndarray, shape (e,)
-        About which the echoes of each pair are taken.
-    """
-
-    coherence: Coherence
-    frame: FloatArray
-
-    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> PairEchoes:
-        """Those of some of the pairs."""
-        return PairEchoes(self.coherence, self.frame[pairs])
-
-    def followed_by(self, others: PairEchoes) -> PairEchoes:
-        """Those of these pairs and of others, by one coherence."""
-        return PairEchoes(self.coherence, np.concatenate([self.frame, others.frame]))
-
-    def models(self) -> EchoModel:
-        """Models of all of these pairs."""
-        return self.coherence.models(self.frame)
 
 
 @dataclass(frozen=True)

@@ -12,19 +12,19 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.sweep import RFSettings
-from speckle3d.matching.intensity import two_way_wavenumber
+from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.errors import MismatchError
+from speckle3d.core.sweep import Sweep
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
+from speckle3d.matching.texture import SpeckleSizes, speckle_size
 from speckle3d.motion.coherence import NOISY_GAIN, RowScales
+from speckle3d.motion.estimate import Motion
 
 FASTEST_MM_S = 300.0
 """Mean speed above which no hand sweeps a probe: scans take 1 to 50 mm/s, a fast one some 100."""
-WIDEST_MM = 8.0
-"""Distance over which no beam keeps half of its correlation: that of an unfocused element 25 mm high, which
-keeps (1 - d / 25)^2 of the echo's. Probes' elements are 2 to 15 mm high, and focused."""
 BENT, REFUTED_BEND = 0.12, 0.25
 """Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.06 in phantom,
 tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too high 0.20, reversed 0.53."""
@@ -45,10 +45,29 @@ it in images of few patches: alone, it refutes nothing."""
 LEAST_TRIPLES = 12
 FLAT = 0.3
 """Part of the distance that halves the correlation, below which it is too flat for distances to be summed."""
-TILT_FACTOR = 1.4
-"""Of tilt's spread over that of the curves' width, from which it is calculated when curves are measured."""
 _ROW_ERROR = 0.03
 """Of a row's factor, from the curves and tissue."""
+
+
+def examine_curves(
+    sweep: Sweep, matcher: FrameMatcher, sizes: SpeckleSizes, motion: Motion, usable: BoolArray
+) -> tuple[Doubt, ...]:
+    """Hold the curves against a sweep's own speckle and steps.
+
+    Raises
+    ------
+    MismatchError
+        If they are refuted.
+    """
+    size, problem, pairs = (
+        speckle_size(sweep, matcher, np.flatnonzero(usable), sizes),
+        motion.problem,
+        motion.pairs,
+    )
+    least = FLAT * float(problem.fitter.estimator.typical_distance(np.sqrt(0.5)))
+    ratios = sum_ratios(pairs.first, pairs.second, pairs.sign * pairs.planes.offset_mm, least)
+    doubts = doubt_curves(size, motion.rows, ratios, problem.curves, problem.patches)
+    return unrefuted([*doubt_speed(motion.path, sweep.frame_time_s), *doubts], sweep.name, MismatchError)
 
 
 def doubt_curves(
@@ -68,51 +87,6 @@ def doubt_curves(
     if sum(map(bool, kinds)) > 1:
         found = tuple(replace(doubt, refuted=True) for doubt in found)
     return (*found, *doubt_noise(seen, curves, patches, gain))
-
-
-def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:
-    """Tell that patches were left out because the curves did not measure their depths."""
-    rows, kept = laid.row_depth_mm, used.row_depth_mm
-    if rows.size == kept.size:
-        return ()
-    return (
-        Doubt(
-            "curves",
-            "depths",
-            f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to "
-            f"{curves.depth_mm[-1]:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm: "
-            f"{rows.size - kept.size} of {rows.size} rows left out",
-            refuted=False,
-        ),
-    )
-
-
-def doubt_widths(curves: DecorrelationCurves) -> tuple[Doubt, ...]:
-    """Doubt curves that no beam has."""
-    half = np.array([np.interp(-0.5, -row, curves.distance_mm) for row in curves.correlation])
-    found = []
-    if curves.tilt is not None and isinstance(curves.key.signal, RFSettings):
-        width = np.array([np.interp(0.5, -np.log(row), curves.distance_mm) for row in curves.correlation])
-        ratio = float(np.median(curves.tilt.spread_mm / (two_way_wavenumber(curves.key.signal) * width**2)))
-        if abs(np.log(ratio)) > np.log(TILT_FACTOR):
-            found.append(
-                Doubt(
-                    "curves",
-                    "distances changed after the curves were measured",
-                    f"expected tilt to spread echoes as the curves' width has it, got {ratio:.2f} times that",
-                    refuted=True,
-                )
-            )
-    if np.median(half) > WIDEST_MM:
-        found.append(
-            Doubt(
-                "curves",
-                "units",
-                f"expected correlation to halve within {WIDEST_MM:g} mm, got {np.median(half):.3g} mm",
-                refuted=True,
-            )
-        )
-    return tuple(found)
 
 
 def doubt_speed(path: FloatArray, time_s: FloatArray) -> tuple[Doubt, ...]:
