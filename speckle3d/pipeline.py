@@ -231,6 +231,8 @@ def track(
     """
     require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
     require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
+    if len(sweep) < 2:
+        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
     settings, times = config or Config(), StageTimes()
     matcher = matcher_for(sweep, curves, settings)
     doubts = examine_recording(sweep, matcher, curves)
@@ -314,7 +316,7 @@ def match_ahead(
 
     Raises
     ------
-    MismatchError, InsufficientDataError
+    MismatchError
         As `track`, before any work is done: the curves are not used otherwise.
     """
     settings, times = config or Config(), StageTimes()
@@ -330,11 +332,7 @@ def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> Fr
     ------
     MismatchError
         If the curves belong to another probe, frequency, sampling, patch size or depth.
-    InsufficientDataError
-        If the sweep has a single frame.
     """
-    if len(sweep) < 2:
-        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
     matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
     curves.key.require_same(matcher.key)
     with naming(sweep.name):

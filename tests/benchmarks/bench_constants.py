@@ -2,9 +2,9 @@
 
 Run: ``python tests/benchmarks/bench_constants.py SWEEP... --curves CURVES``, with sweeps that have a truth.
 
-Every module constant of `speckle3d.motion` that is a number or a tuple of numbers, and every numeric setting of
-the stages there, is halved and doubled in turn; printed are those that move a length by more than `--least` per
-cent, with the largest change and its sweep. Constants of kernels are compiled in and stay.
+Every module constant of `speckle3d.motion` that is a number or a tuple of numbers, and every numeric setting
+of the stages there, is halved and doubled in turn; printed are those that move a length by more than
+`--least` per cent, with the largest change and its sweep. Constants of kernels are compiled in and stay.
 """
 
 import argparse
@@ -24,7 +24,15 @@ from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import track
 
 STAGES = ("coherence", "planes", "trajectory")
-NOT_OF_THE_PATH = ("data_sheet", "decorrelation", "diffraction", "lens", "phantom", "curve_doubts", "plausibility")
+NOT_OF_THE_PATH = (
+    "data_sheet",
+    "decorrelation",
+    "diffraction",
+    "lens",
+    "phantom",
+    "curve_doubts",
+    "plausibility",
+)
 """Modules of curves, and of findings, which change no estimate."""
 
 
@@ -70,7 +78,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sweeps", nargs="+", type=Path)
     parser.add_argument("--curves", type=Path, required=True)
-    parser.add_argument("--least", type=float, default=0.3, help="per cent of length below which nothing is said")
+    parser.add_argument(
+        "--least", type=float, default=0.3, help="per cent below which nothing is said"
+    )
     chosen = parser.parse_args()
     sweeps, curves = [load_sweep(path) for path in chosen.sweeps], read_curves(chosen.curves)
 
@@ -100,8 +110,13 @@ def main() -> None:
             except ValueError:
                 continue
             moved[f"[{stage}] {name} x {factor:g}"] = lengths(config)
-    print(f"{len(moved)} changes over {len(sweeps)} sweeps; those that move a length by {chosen.least:g} % or more:")
-    for what, length in sorted(moved.items(), key=lambda item: -np.nan_to_num(np.abs(item[1] / usual - 1), nan=9).max()):
+    print(
+        f"{len(moved)} changes over {len(sweeps)} sweeps; those that move a length by {chosen.least:g} % or
+        more:"
+    )
+    for what, length in sorted(
+        moved.items(), key=lambda item: -np.nan_to_num(np.abs(item[1] / usual - 1), nan=9).max()
+    ):
         change = 100 * (length / usual - 1)
         if np.isnan(change).any() or np.abs(change).max() >= chosen.least:
             print(f"  {what:50s}" + "".join(f"{value:+8.2f}" for value in change))
