@@ -78,9 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sweeps", nargs="+", type=Path)
     parser.add_argument("--curves", type=Path, required=True)
-    parser.add_argument(
-        "--least", type=float, default=0.3, help="per cent below which nothing is said"
-    )
+    parser.add_argument("--least", type=float, default=0.3, help="per cent below which nothing is said")
     chosen = parser.parse_args()
     sweeps, curves = [load_sweep(path) for path in chosen.sweeps], read_curves(chosen.curves)
 
@@ -110,16 +108,12 @@ def main() -> None:
             except ValueError:
                 continue
             moved[f"[{stage}] {name} x {factor:g}"] = lengths(config)
-    print(
-        f"{len(moved)} changes over {len(sweeps)} sweeps; those that move a length by {chosen.least:g} % or
-        more:"
-    )
-    for what, length in sorted(
-        moved.items(), key=lambda item: -np.nan_to_num(np.abs(item[1] / usual - 1), nan=9).max()
-    ):
-        change = 100 * (length / usual - 1)
-        if np.isnan(change).any() or np.abs(change).max() >= chosen.least:
-            print(f"  {what:50s}" + "".join(f"{value:+8.2f}" for value in change))
+    print(f"{len(moved)} changes; those that move a length by {chosen.least:g} % or more, in per cent:")
+    changes = {what: 100 * (length / usual - 1) for what, length in moved.items()}
+    largest = {what: np.nan_to_num(np.abs(change), nan=np.inf).max() for what, change in changes.items()}
+    for what in sorted(largest, key=lambda name: -largest[name]):
+        if largest[what] >= chosen.least:
+            print(f"  {what:50s}" + "".join(f"{value:+8.2f}" for value in changes[what]))
 
 
 if __name__ == "__main__":
