@@ -3,6 +3,7 @@
 What is measured stands in ``accuracy/table.toml``, which ``benchmarks/bench_accuracy_set.py`` writes anew.
 """
 
+import os
 import tomllib
 from dataclasses import dataclass, replace
 from functools import cache
@@ -12,6 +13,8 @@ import numpy as np
 from crossing_tissue import GRID, PairCase, made_pair
 
 from speckle3d.config import Config
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.correction.crossing.pair import crossed
 from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
@@ -27,6 +30,8 @@ from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.receiver import received_as_bmode
 
 TABLE = Path(__file__).parent / "accuracy" / "table.toml"
+KEPT = os.environ.get("SPECKLE3D_ACCURACY_SWEEPS")
+"""Folder that `simulate_set` has filled, for those who run the tests again and again."""
 INDEPENDENT = Path(__file__).resolve().parents[2] / "shared" / "independent"
 SHORT_FRAMES = 28
 """Of 3.5 mm."""
@@ -108,6 +113,26 @@ def short(sweep):
     return sweep.part(0, SHORT_FRAMES)
 
 
+def backwards(sweep):
+    """The sweep's start as a probe that goes the other way would have recorded it."""
+    sweep = short(sweep)
+    span_s = sweep.frame_time_s[0] + sweep.frame_time_s[-1]
+
+    def reversed_stream(kind, of, sensor):
+        readings = sensor.readings
+        stream = of(span_s - readings.time_s[::-1], readings.world_from_sensor[::-1])
+        return kind(stream, sensor.sensor_from_image, -sensor.time_offset_s)
+
+    return replace(
+        sweep,
+        frames=np.stack([sweep.frames[i] for i in range(len(sweep))])[::-1],
+        frame_time_s=span_s - sweep.frame_time_s[::-1],
+        truth=sweep.truth[::-1],
+        orientation=reversed_stream(OrientationSensor, TimedRotations, sweep.orientation),
+        tracker=reversed_stream(Tracker, TimedPoses, sweep.tracker),
+    )
+
+
 def grey(sweep):
     return received_as_bmode(sweep, 60.0)
 
@@ -119,6 +144,7 @@ def untracked(sweep):
 CASES = {
     "phantom": ("phantom",),
     "phantom, 3.5 mm": ("phantom", short),
+    "phantom, backwards": ("phantom", backwards),
     "phantom, turned": ("rotation",),
     "phantom, data sheet": ("phantom", None, "sheet"),
     "phantom, data sheet of 17 mm": ("phantom", None, "wrong sheet"),

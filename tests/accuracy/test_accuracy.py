@@ -1,7 +1,9 @@
 """Every mode, on small sweeps of every kind, is as accurate as `table.toml` has it and claims the same."""
 
+from pathlib import Path
+
 import pytest
-from accuracy_set import INDEPENDENT, MOST_CLAIMS, AccuracySet, read_table, simulate_set
+from accuracy_set import INDEPENDENT, KEPT, MOST_CLAIMS, AccuracySet, read_table, simulate_set
 from made_once import made_once
 
 ROOM = 1.5
@@ -17,6 +19,8 @@ every_claim = pytest.mark.parametrize("row", CLAIMED)
 
 @pytest.fixture(scope="session")
 def accuracy_set(tmp_path_factory, shipped):
+    if KEPT:
+        return AccuracySet(Path(KEPT), shipped)
     folder = made_once(tmp_path_factory, "accuracy", lambda folder: simulate_set(folder, shipped))
     return AccuracySet(folder, shipped)
 
