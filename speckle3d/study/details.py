@@ -20,7 +20,6 @@ from speckle3d.correction.trust import name_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
-from speckle3d.scoring.references import SweepCurves
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
@@ -60,13 +59,11 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
 
 
 def details_of(
-    tracked: Tracked, corrections: Mapping[str, Correction], moved: SweepCurves, provenance: Provenance
+    tracked: Tracked, corrections: Mapping[str, Correction], provenance: Provenance
 ) -> dict[str, Any]:
     """Everything worth keeping of a reconstruction beside its errors, by name."""
-    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
     return {
         "provenance": provenance,
-        "estimates": {m: dict(zip(names, c[:, -1].tolist(), strict=True)) for m, c in moved.modes.items()},
         "pairs": tracked.pairs,
         "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
@@ -118,17 +115,13 @@ def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:
 
 
 def _correction_details(correction: Correction) -> dict[str, Any]:
-    if isinstance(correction, DriftCorrection):
-        return _fit_details(correction)
-    return {
-        "length_over_images": correction.scale,
-        "relative_sigma": correction.log_scale_sigma,
-        "rests_on": [each.source for each in correction.evidence],
-        **correction.details,
-    }
-
-
-def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
+    if isinstance(correction, ScaledPoses):
+        return {
+            "length_over_images": correction.scale,
+            "relative_sigma": correction.log_scale_sigma,
+            "rests_on": [each.source for each in correction.evidence],
+            **correction.details,
+        }
     fit = correction.fit
     return {
         "curves": correction.settings.curves,
