@@ -31,17 +31,8 @@ from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.examine.curves import examine_curves
 from speckle3d.examine.images import examine_path, examine_standing, interleaved
 from speckle3d.examine.recording import examine_recording
-from speckle3d.matching.blocks import (
-    Block,
-    BlockSource,
-    ImageSink,
-    MatchedBlock,
-    MatchedSweep,
-    StageTimes,
-    match_block,
-    match_sweep,
-)
 from speckle3d.matching.chosen import match_again
+from speckle3d.matching.frames import ImageSink, MatchedSweep, StageTimes, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames, sound_pairs
 from speckle3d.matching.table import CorrelationTable
@@ -185,7 +176,6 @@ def track(
     progress: Progress | None = None,
     sink: PairSink | None = None,
     images: ImageSink | None = None,
-    matched: BlockSource | None = None,
 ) -> Tracked:
     """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
 
@@ -204,9 +194,7 @@ def track(
     sink : callable, optional
         Called with the frame pairs, some at a time.
     images : callable, optional
-        Called with every intensity image, but not with those of blocks that `matched` returns.
-    matched : callable, optional
-        Asked for each block of frames before it is matched here.
+        Called with every intensity image.
 
     Returns
     -------
@@ -216,10 +204,10 @@ def track(
     ------
     MismatchError
         If the curves belong to another probe, frequency, sampling, patch size or depth, by what the files say
-        or by what the images do; see `speckle3d.motion.curve_doubts`.
+        or by what the images do; see `speckle3d.examine`.
     InsufficientDataError
         If too many frames have no speckle in common with others, if the images do not determine the length,
-        or if they cannot be those of one probe that moves (`speckle3d.motion.plausibility`).
+        or if they cannot be those of one probe that moves (`speckle3d.examine.images`).
 
     Examples
     --------
@@ -238,9 +226,7 @@ def track(
     doubts = examine_recording(sweep, matcher, curves)
 
     sizes = SpeckleSizes(sweep, matcher, images)
-    matches = match_sweep(
-        sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep, matched
-    )
+    matches = match_sweep(sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep)
     table, flags = matches.table, frame_flags(sweep, matches, settings)
 
     with times.of(MOTION):
@@ -303,26 +289,6 @@ def track(
         grid=sweep.grid,
         frame_time_s=sweep.frame_time_s,
     )
-
-
-def match_ahead(
-    sweep: Sweep,
-    curves: DecorrelationCurves,
-    block: Block,
-    config: Config | None = None,
-    images: ImageSink | None = None,
-) -> MatchedBlock:
-    """Match one block of a sweep, for `track` to take; any process may do so, and in any order.
-
-    Raises
-    ------
-    MismatchError
-        As `track`, before any work is done: the curves are not used otherwise.
-    """
-    settings, times = config or Config(), StageTimes()
-    matcher = matcher_for(sweep, curves, settings)
-    frames = list(match_block(sweep, matcher, settings.trajectory, settings.quality, block, images, times))
-    return MatchedBlock(frames, times.seconds)
 
 
 def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:

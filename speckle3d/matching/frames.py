@@ -1,18 +1,12 @@
-"""Frames of a sweep matched with earlier ones, in blocks that can be matched independently of each other.
-
-What two frames have in common does not depend on where other frames lie, so that a long sweep is matched in
-blocks: each is a function of the sweep, the settings and the block's frame numbers alone. Blocks may run one
-after another or in any order, in any process, with the same result to the last bit.
-"""
+"""Frames of a sweep matched, one after the other, with the earlier ones that the schedule wants."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy.typing as npt
@@ -65,40 +59,6 @@ class StageTimes:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + took
             self.processor_seconds[stage] = self.processor_seconds.get(stage, 0.0) + sum(spent)
 
-    def include(self, seconds: Mapping[str, float]) -> None:
-        """Add what was spent elsewhere."""
-        for stage, spent in seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
-
-
-@dataclass(frozen=True)
-class Block:
-    """Frames `first` to `stop`, `stop` excluded."""
-
-    first: int
-    stop: int
-
-
-@dataclass(frozen=True)
-class MatchedFrame:
-    """A frame's features and its pairs, by the earlier frame, latest first."""
-
-    frame: int
-    features: FrameFeatures
-    pairs: Mapping[int, MatchedPair]
-
-
-@dataclass(frozen=True)
-class MatchedBlock:
-    """A block's frames in order, and the seconds spent in each stage."""
-
-    frames: Sequence[MatchedFrame]
-    seconds: Mapping[str, float]
-
-
-BlockSource = Callable[[Block], MatchedBlock | None]
-"""Returns a block that has been matched already, None for one that has not."""
-
 
 @dataclass(frozen=True)
 class MatchedSweep:
@@ -106,13 +66,6 @@ class MatchedSweep:
 
     table: CorrelationTable
     features: Sequence[FrameFeatures]
-
-
-def blocks_of(frames: int, block_frames: int) -> list[Block]:
-    """Split a sweep into the fewest near-equal blocks of at most `block_frames`."""
-    count = -(-frames // block_frames)
-    bounds = [frames * k // count for k in range(count + 1)]
-    return [Block(first, stop) for first, stop in pairwise(bounds)]
 
 
 def match_sweep(
@@ -123,7 +76,6 @@ def match_sweep(
     times: StageTimes,
     progress: Callable[[int, int], None] | None = None,
     images: ImageSink | None = None,
-    given: BlockSource | None = None,
 ) -> MatchedSweep:
     """Match every frame of a sweep with the earlier ones that the schedule wants.
 
@@ -134,42 +86,30 @@ def match_sweep(
     progress : callable, optional
         Called with frames done and frames in all.
     images : callable, optional
-        Called with every intensity image, but not with those of blocks that `given` returns.
-    given : callable, optional
-        Asked for each block before it is matched here.
+        Called with every intensity image.
     """
     features: list[FrameFeatures] = []
+    maker, matched = (
+        FrameMaker(sweep.signal, matcher, quality, times),
+        FrameByFrame(matcher, trajectory, times),
+    )
+
+    def make(index: int) -> MadeReady:
+        with times.of("reading"):
+            frame = read_frame(sweep.frames, index)
+        return maker.make(index, frame)
 
     def pairs() -> Iterator[tuple[int, int, MatchedPair]]:
-        for block in blocks_of(len(sweep), trajectory.block_frames):
-            held = given(block) if given else None
-            if held:
-                times.include(held.seconds)
-            matched = (
-                held.frames
-                if held
-                else match_block(sweep, matcher, trajectory, quality, block, images, times)
-            )
-            for each in matched:
-                features.append(each.features)
-                yield from ((first, each.frame, each.pairs[first]) for first in sorted(each.pairs))
-                if progress:
-                    progress(each.frame + 1, len(sweep))
+        for made in ahead(make, range(len(sweep)), AHEAD):
+            if images:
+                images(made.number, made.intensity)
+            features.append(made.features)
+            found = matched.advance(made.number, made.ready)
+            yield from ((first, made.number, found[first]) for first in sorted(found))
+            if progress:
+                progress(made.number + 1, len(sweep))
 
     return MatchedSweep(CorrelationTable.of(pairs(), len(matcher.patches)), features)
-
-
-def match_block(
-    sweep: Sweep,
-    matcher: FrameMatcher,
-    trajectory: TrajectorySettings,
-    quality: QualitySettings,
-    block: Block,
-    images: ImageSink | None = None,
-    times: StageTimes | None = None,
-) -> Iterator[MatchedFrame]:
-    """Match each frame of a block with the earlier ones that the schedule wants, those before it included."""
-    return _BlockMatcher(sweep, matcher, trajectory, quality, times or StageTimes()).run(block, images)
 
 
 @dataclass(frozen=True)
@@ -218,35 +158,6 @@ class FrameByFrame:
             self._motion = {k: v for k, v in self._motion.items() if k in keep}
         return pairs
 
-    def lead_in(self, first: int, back: Iterable[tuple[int, ReadyFrame]]) -> None:
-        """Find the key frames before a frame to begin with.
-
-        Key frames are so far apart in travel, not in time: after a pause at the border, only frames from
-        before the pause tell on which side the next ones are.
-
-        Parameters
-        ----------
-        back : iterable of (int, ReadyFrame)
-            Frames before `first`, latest first, taken as far as is needed.
-        """
-        s = self._settings
-        most = s.key_frames + s.far_key_frames
-        recent, keys, sound = range(max(0, first - s.recent), first), [first - 1], None
-        self._motion = {first - 1: InPlaneMotion()}
-        for frame, ready in back:
-            with self._times.of(MATCHING):
-                self._ready[frame] = ready
-                if frame < first - 1:
-                    median = self._lead(keys[-1], frame)
-                    if sound is None and median >= s.least_correlation:
-                        sound = keys[-1]
-                    if median < s.key_correlation:
-                        keys.append(frame)
-                self._ready = {k: v for k, v in self._ready.items() if k in keys or k in recent}
-            if len(keys) >= most and frame <= recent.start:
-                break
-        self._schedule.begin(sorted(keys[:most]), first - 1 if sound is None else sound)
-
     def _pairs(self, frame: int) -> dict[int, MatchedPair]:
         """Match a frame with its references, from a start found against the first that it resembles."""
         references = self._schedule.references(frame)
@@ -276,15 +187,6 @@ class FrameByFrame:
                 self._motion[frame] = compose(self._motion[before], pairs[before].motion)
         return pairs
 
-    def _lead(self, key: int, frame: int) -> float:
-        """Match a frame with a key frame after it; its motion is the key frame's if they are not alike."""
-        fixed, moving = self._ready[key], self._ready[frame]
-        found = self._matcher.match(fixed, moving, self._matcher.search(fixed, moving))
-        median = MatchedPair.of(found).median
-        alike = median >= self._settings.least_correlation
-        self._motion[frame] = compose(self._motion[key], found.motion) if alike else self._motion[key]
-        return median
-
 
 class FrameMaker:
     """Makes frames of one sweep ready to be matched, each by itself and on any thread."""
@@ -305,45 +207,3 @@ class FrameMaker:
             echo = self._matcher.echo(frame)
             features = self._inspector.inspect(frame, echo.intensity)
             return MadeReady(number, echo.intensity, self._matcher.prepare(echo), features)
-
-
-class _BlockMatcher:
-    """Matches the frames of a block."""
-
-    def __init__(
-        self,
-        sweep: Sweep,
-        matcher: FrameMatcher,
-        trajectory: TrajectorySettings,
-        quality: QualitySettings,
-        times: StageTimes,
-    ) -> None:
-        self._sweep, self._settings, self._times = sweep, trajectory, times
-        self._maker = FrameMaker(sweep.signal, matcher, quality, times)
-        self._matched = FrameByFrame(matcher, trajectory, times)
-
-    def run(self, block: Block, images: ImageSink | None) -> Iterator[MatchedFrame]:
-        if block.first:
-            self._lead_in(block.first)
-        for made in self._made_ready(range(block.first, block.stop), images):
-            yield MatchedFrame(made.number, made.features, self._matched.advance(made.number, made.ready))
-
-    def _lead_in(self, first: int) -> None:
-        """Find the key frames before a block, going back from it no farther than a block is long."""
-        farthest = max(self._settings.block_frames, self._settings.recent)
-        back = range(first - 1, max(-1, first - 1 - farthest), -1)
-        with closing(self._made_ready(back)) as earlier:
-            self._matched.lead_in(first, ((made.number, made.ready) for made in earlier))
-
-    def _made_ready(self, numbers: range, images: ImageSink | None = None) -> Generator[MadeReady]:
-        """Yield frames in order, made ready a few ahead of use; images go to their sink in order, too."""
-
-        def make(index: int) -> MadeReady:
-            with self._times.of("reading"):
-                frame = read_frame(self._sweep.frames, index)
-            return self._maker.make(index, frame)
-
-        for made in ahead(make, numbers, AHEAD):
-            if images:
-                images(made.number, made.intensity)
-            yield made
