@@ -41,8 +41,10 @@ from speckle3d.matching.blocks import (
 from speckle3d.matching.chosen import match_again
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.spectra import row_spectra
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import SpeckleSizes, doubt_images
+from speckle3d.motion.attenuation import estimate_attenuation
 from speckle3d.motion.coherence import Coherence, scale_sigma
 from speckle3d.motion.curve_doubts import doubt_depths
 from speckle3d.motion.curve_prior import RowsSeen
@@ -248,6 +250,12 @@ def track(
         sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep, matched
     )
     flags = _flagged(sweep, found, settings)
+
+    # -> curves of the tissue's attenuation
+    attenuation = estimate_attenuation(curves, row_spectra(sweep, matcher, np.flatnonzero(flags == 0)))
+    doubts += attenuation.doubts
+    curves = attenuation.applied(curves)
+    reader = reader.with_curves(curves)
 
     # -> |distance| and its sigma -> plane per frame pair, with its sign
     pairs, coherence, path = measured(found.table, flags, reader, settings, times)
