@@ -51,6 +51,8 @@ NOISE_WEIGHT = 0.03
 """Power over the largest at which a frequency has half its weight, -15 dB; 0 to 0.3 make no difference."""
 LARGEST = 1.5
 """Largest difference that is looked for, dB/cm/MHz."""
+LEAST_STEP = 0.05
+"""Difference, dB/cm/MHz, for which widening is calculated at least; it is straight below."""
 OTHER_BAND = 0.9
 """Of n near the skin, of either sign, from which another transmit band or filter is assumed: tissue has 0.1
 to 0.4 there, a band lower or higher by 0.5 MHz 1.5."""
@@ -122,12 +124,11 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     if abs(left) > OTHER_BAND:
         return replace(unknown, doubts=(_other_band(left, middle),))
     lens = nominal_probe(curves).lens
-    wide = [
-        _log_width(lens, spectra.depth_mm, frequency_mhz, phantom, each) for each in (0.0, beta, beta + 0.1)
-    ]
+    step = float(np.copysign(max(abs(beta), LEAST_STEP), beta))
+    before, after = (_log_width(lens, spectra.depth_mm, frequency_mhz, phantom, each) for each in (0.0, step))
+    by_unit = (after - before) / step
     error = float(np.hypot(error, MODEL_SIGMA))
-    per_difference = float((wide[2] - wide[1]).mean()) / 0.1
-    return Attenuation(beta, error, spectra.depth_mm, wide[1] - wide[0], abs(per_difference) * error)
+    return Attenuation(beta, error, spectra.depth_mm, beta * by_unit, abs(float(by_unit.mean())) * error)
 
 
 def _loss(depth_mm: FloatArray) -> FloatArray:
