@@ -35,8 +35,10 @@ from speckle3d.matching.chosen import match_again
 from speckle3d.matching.frames import ImageSink, MatchedSweep, StageTimes, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames, sound_pairs
+from speckle3d.matching.spectra import row_spectra
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import SpeckleSizes
+from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
 from speckle3d.motion.coherence import Coherence, RowScales, scale_sigma
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import Motion, MotionProblem, edges_of, estimate_motion, frame_pairs
@@ -86,6 +88,8 @@ class Tracked:
         Sign of the elevational motion, +1 or -1.
     direction_from : str
         What settled the sign.
+    attenuation : Attenuation
+        Of the tissue over the curves' phantom, by the echoes' spectrum.
     coherence : Coherence or None
         How the patches' echoes depart from a phantom's; None if not adapted to.
     curves : DecorrelationCurves
@@ -114,6 +118,7 @@ class Tracked:
     curves_sigma: float
     direction: int
     direction_from: str
+    attenuation: Attenuation
     coherence: Coherence | None
     curves: DecorrelationCurves
     rows: RowScales | None
@@ -230,8 +235,10 @@ def track(
     table, flags = matches.table, frame_flags(sweep, matches, settings)
 
     with times.of(MOTION):
-        problem = motion_problem(curves, matcher, len(sweep), settings)
+        attenuation = estimate_attenuation(curves, row_spectra(sweep, matcher, np.flatnonzero(flags == 0)))
+        problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)
         motion = estimate_motion(problem, table, sound_pairs(table, flags))
+    doubts += attenuation.doubts
     flags = with_unplaced(sweep, flags, motion.pairs)
     with times.of("checks of the images"):
         doubts += examine_standing(sweep, matcher, curves, motion.path[:, 0], flags == 0)
@@ -240,7 +247,8 @@ def track(
     with times.of("revisits"):
         table, motion = tied_to_returns(sweep, matcher, table, motion, flags)
     with times.of("trajectory"):
-        slopes, mismatch = motion.slopes, motion.problem.curves.mismatch(settings.curves.same_probe)
+        slopes = motion.slopes
+        mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
         edges = edges_of(table, motion.pairs, slopes.applied(motion.pairs.planes))
         trajectory = solve_trajectory(edges, len(sweep), matcher.centre_mm, settings.trajectory, True)
         shared = SharedErrors(scale_sigma(motion.coherence), mismatch, slopes.deviation_per_mm)
@@ -280,6 +288,7 @@ def track(
         curves_sigma=mismatch,
         direction=direction,
         direction_from=source,
+        attenuation=attenuation,
         coherence=motion.coherence,
         curves=motion.problem.curves,
         rows=motion.rows,

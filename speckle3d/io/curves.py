@@ -1,4 +1,4 @@
-"""Decorrelation curves on disk (format ``speckle3d.curves``, version 1)."""
+"""Decorrelation curves on disk (format ``speckle3d.curves``, version 1; 2 with a spectrum)."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from speckle3d.core.curves import (
     PROBE_SIGMA,
     CurveKey,
     DecorrelationCurves,
+    EchoSpectra,
     NominalProbe,
     Origin,
     SpeckleSize,
@@ -52,10 +53,14 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     FileError
         If the file cannot be written.
     """
-    with atomic_hdf5(path, FORMAT) as file:
+    with atomic_hdf5(path, FORMAT, version=1 if curves.spectrum is None else 2) as file:
         for name in ("depth_mm", "distance_mm", "correlation", "cells"):
             file[name] = getattr(curves, name)
-        for group, part in (("tilt", curves.tilt), ("speckle", curves.speckle)):
+        for group, part in (
+            ("tilt", curves.tilt),
+            ("speckle", curves.speckle),
+            ("spectrum", curves.spectrum),
+        ):
             for name, values in vars(part).items() if part is not None else ():
                 file[f"{group}/{name}"] = values
         for name in ("pairs_used", "scale_sigma", "origin"):
@@ -94,7 +99,7 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
     >>> curves.key.correlation_of
     'echo'
     """
-    with opened(path, FORMAT) as file, naming(str(path)):
+    with opened(path, FORMAT, (1, 2)) as file, naming(str(path)):
         depth = read_checked(file, "depth_mm", ("r",))
         require_finite(depth, "/depth_mm")
         if not depth.size or (np.diff(depth) <= 0).any():
@@ -121,11 +126,17 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         if has_member(file, "speckle"):
             names = ("speckle/lateral_mm", "speckle/axial_mm")
             speckle = SpeckleSize(*(read_checked(file, name, (depth.size,)) for name in names))
+        spectrum = None
+        if has_member(file, "spectrum"):
+            rows = read_checked(file, "spectrum/depth_mm", ("y",))
+            frequency = read_checked(file, "spectrum/frequency_hz", ("f",))
+            power = read_checked(file, "spectrum/power", (rows.size, frequency.size))
+            spectrum = EchoSpectra(rows, frequency, power)
         nominal = None
         if (group := find_group(file, "nominal")) is not None:
             kinds = dict.fromkeys((field.name for field in fields(NominalProbe)), float)
             nominal = NominalProbe(**read_attributes(group, kinds))
-        parts = tilt, speckle, sigma, origin, nominal
+        parts = tilt, speckle, sigma, origin, nominal, spectrum
         return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, *parts)
 
 
