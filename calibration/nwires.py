@@ -19,10 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Chain, ImagePoints, Seen
 from calibration.detection.dots import Dots
 from calibration.detection.labelling import LabelSettings, label_by_calibration, label_dots
-from calibration.starts import rigid_fits, wire_start
+from calibration.plane import Chain
+from calibration.points import ImagePoints, Seen
+from calibration.wire_fits import rigid_fits
+from calibration.wires import wire_start
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import nearest_rotation

@@ -23,9 +23,9 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft, ndimage
 
-from calibration.chain import Seen
 from calibration.detection.everyframe import in_every_frame, require_image
 from calibration.detection.region import checked_pixel, region_mask
+from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite

@@ -20,9 +20,10 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from calibration.chain import Chain, Seen
 from calibration.detection.dots import Dots
-from calibration.starts import free_fits, rigid_fits
+from calibration.plane import Chain
+from calibration.points import Seen
+from calibration.wire_fits import free_fits, rigid_fits
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
