@@ -143,7 +143,8 @@ def judge(solution: Solution) -> Adequacy:
         )
         return Adequacy(error, condition, (), weakest, True, misfit)
     tied = solution.rival is not None and solution.rival.evidence < TIE
-    lacking = [motion for motion, extent in extents(solution).items() if extent < _ABSENT]
+    there = extents(solution)
+    lacking = [motion for motion, extent in there.items() if extent < _ABSENT]
     dots = solution.phantom.seen_as == "dot"
     # Dots of wires tell the image's place from a few frames; what they lack is in their errors.
     allowed = _ALLOWED_LACKING if lacking and not dots else 1.0
@@ -151,12 +152,13 @@ def judge(solution: Solution) -> Adequacy:
     unsized = solution.phantom.seen_as == "line" and solution.prior is None and "s_x" in solution.free
     unsized &= UP_AND_DOWN in lacking
     refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied or unsized)
-    missing = tuple(lacking) if weak or refused else ()
+    # If none is absent, the one that was there and not far enough.
+    missing = tuple(lacking or [min(there, key=lambda one: there[one])]) if weak or refused else ()
     state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
     if not angular and errors[1] / REFUSED_RAD > errors[0] / REFUSED_MM:
         state += f" and {_size(errors[1], True)}"
     state += f", condition number {condition:.3g}"
-    advice = "; and ".join(missing) if missing else "record more frames over a wider range"
+    advice = "; and ".join(missing)
     if tied and excess <= allowed:
         verdict = f"two answers explain the images equally well, one of them mirrored ({state}): {advice}"
     elif refused:
@@ -174,7 +176,7 @@ def weakest_of(jacobian: FloatArray, free: tuple[str, ...]) -> str:
     """What a motion determines least, in words: the last eigenvector of the scaled normal matrix."""
     scaled = jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     part = np.abs(np.linalg.eigh(scaled.T @ scaled)[1][:, 0])
-    named = [free[k] for k in np.argsort(-part) if part[k] > _TAKES_PART * part.max()][:3]
+    named = [name for name, share in zip(free, part, strict=True) if share > _TAKES_PART * part.max()]
     first, *rest = (_WORDS[name] for name in named)
     return f"{first} (with {' and '.join(rest)})" if rest else first
 

@@ -231,7 +231,7 @@ class Equations:
 
     def residuals(self, chain: Chain) -> FloatArray:
         """What does not vanish, shape (n, r)."""
-        return np.einsum("nri,ni->nr", self.rows, self._placed(chain)[1]) - self.offsets
+        return np.asarray(np.einsum("nri,ni->nr", self.rows, self._placed(chain)[1]) - self.offsets)
 
     def _placed(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """The images' axes in the phantom's frame, (n, 3, 3), and where the points are in it, (n, 3)."""

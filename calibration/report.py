@@ -86,8 +86,8 @@ def as_calibration(
 def _parameters(solution: Solution) -> tuple[Parameter, ...]:
     """The parameters estimated: places in the sensor's frame and the phantom's, angles about own axes.
 
-    An angle's error is that about the image's z, y and x axes (roll, yaw, tilt), or about the phantom's: near a
-    singularity of fixed angles it is as large as ever.
+    An angle's error is that about the image's z, y and x axes (roll, yaw, tilt), or about the phantom's:
+    near a singularity of fixed angles it is as large as ever.
     """
     values = dict(zip(CHAIN, solution.chain.parameters(), strict=True))
     turn = np.eye(len(CHAIN))

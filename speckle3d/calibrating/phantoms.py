@@ -286,9 +286,9 @@ def _seen_wires(
         )
     size, region = recording.pixel_mm, settings.region
     if wired.phantom is None:
-        return crossings_in_frames(recording.images, size, None, region, progress)
+        return crossings_in_frames(recording.images, size, region, progress)
     clip: npt.ArrayLike | None = wired.clip_px if region is None else region
-    dots = dots_in_frames(recording.images, size, None, clip, progress).without(settings.leave_out)
+    dots = dots_in_frames(recording.images, size, clip, progress).without(settings.leave_out)
     times, offset_s = recording.frame_time_s, recording.time_offset_s
     if isinstance(recording.readings, TimedPoses) and covered(recording.readings, times, offset_s).all():
         # A calibration from the frames that show all wires finds those of the other frames.

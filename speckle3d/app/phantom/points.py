@@ -194,7 +194,7 @@ class _Picker:
             return np.asarray(self._candidates.pixels[self._candidates.frame == self._frames.frame])
         if not self._wired.names:
             return np.zeros((0, 2))
-        pixels, _ = dots_in_image(image, self._recording.pixel_mm, None, self._region.corners)
+        pixels, _ = dots_in_image(image, self._recording.pixel_mm, self._region.corners)
         return pixels
 
     def _draw_points(self) -> None:
