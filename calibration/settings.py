@@ -84,7 +84,7 @@ class LineSettings(_Settings):
     smoothing_mm: float = Field(
         0.7,
         gt=0,
-        description="Standard deviation of the Gaussian down a column whose slope shows edges (sigma).",
+        description="Standard deviation of the smoothing down a column whose slope shows edges (sigma).",
     )
     threshold: float | None = Field(
         None,

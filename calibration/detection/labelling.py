@@ -251,11 +251,19 @@ def _combined(
     """Hypotheses: parallel triples at the layers' distances, shape (h, 3 layers); else what fails."""
     chosen = triples[0]
     for layer, found in zip(layers[1:], triples[1:], strict=True):
-        parallel, ratio = _side_by_side(chosen[:, :3], found, dots_mm, layers[0], layer)
-        parallel &= ~(chosen[:, None, :, None] == found[None, :, None, :]).any(axis=(2, 3))
+        cosine, ratio = _side_by_side(chosen[:, :3], found, dots_mm, layers[0], layer)
+        shared = (chosen[:, None, :, None] == found[None, :, None, :]).any(axis=(2, 3))
+        parallel = (cosine > _PARALLEL_COSINE) & ~shared
         one, other = np.nonzero(parallel & (ratio > _GAPS[0]) & (ratio < _GAPS[1]))
         if len(one) == 0:
-            return np.zeros((0, 3), np.int64), _off_by(ratio[parallel], _GAPS)
+            why = "the same row of dots would serve two layers"
+            if parallel.any():
+                why = _off_by(ratio[parallel], _GAPS)
+            elif not shared.all():
+                turn = np.rad2deg(np.arccos(cosine[~shared].max()))
+                allowed = np.rad2deg(np.arccos(_PARALLEL_COSINE))
+                why = f"the nearest are turned by {turn:.0f} degrees, {allowed:.0f} allowed"
+            return np.zeros((0, 3), np.int64), why
         chosen = np.concatenate([chosen[one], found[other]], axis=1)
         strongest = np.argsort(-score[chosen].sum(axis=1), kind="stable")
         chosen = chosen[strongest[:_MOST_HYPOTHESES]]
@@ -264,15 +272,15 @@ def _combined(
 
 def _side_by_side(
     first: IntArray, other: IntArray, dots_mm: FloatArray, layer: _Layer, below: _Layer
-) -> tuple[npt.NDArray[np.bool_], FloatArray]:
-    """Which triples of two layers, (a, 3) and (b, 3), are parallel, and their distance over the layers'."""
+) -> tuple[FloatArray, FloatArray]:
+    """Cosine between triples of two layers, (a, 3) and (b, 3), and their distance over the layers'."""
     along = [dots_mm[t[:, 2]] - dots_mm[t[:, 0]] for t in (first, other)]
     unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in along]
-    parallel = (unit[0] @ unit[1].T) * layer.turned * below.turned > _PARALLEL_COSINE
+    cosine = np.clip((unit[0] @ unit[1].T) * layer.turned * below.turned, -1.0, 1.0)
     middle = [dots_mm[t[:, [0, 2]]].mean(axis=1) for t in (first, other)]
     apart = middle[1][None] - middle[0][:, None]
     distance = np.abs(unit[0][:, None, 0] * apart[..., 1] - unit[0][:, None, 1] * apart[..., 0])
-    return np.asarray(parallel), np.asarray(distance / abs(below.height_mm - layer.height_mm))
+    return np.asarray(cosine), np.asarray(distance / abs(below.height_mm - layer.height_mm))
 
 
 def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatArray:
