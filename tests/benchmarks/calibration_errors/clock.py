@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Seen
+from calibration.points import Seen
 from calibration.job import JobSettings, Recording, plane_job
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.streams import TimedPoses

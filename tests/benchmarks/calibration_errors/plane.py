@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints
+from calibration.points import ImagePoints
 from calibration.plane import calibrate_plane
 from speckle3d.core.errors import InsufficientDataError
 

@@ -1,4 +1,4 @@
-"""How well two sweeps determine a calibration: the covariance of an answer, and what the tissue leaves open.
+"""Claimed errors of a calibration from two sweeps: the jackknife over tissue and images, and the tracker's.
 
 An answer sits on a bump of speckle, where the similarity falls more steeply than it would without speckle. So
 the curvature behind the standard errors is taken over displacements wider than speckle; from its place on the
@@ -9,16 +9,17 @@ ends elsewhere, that is part of the claim.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
-from calibration.images.fit import LEVERS_MM, Refined, about_pivot, positive, refine
+from calibration.images.fit import LEVERS_MM, Refined, about_pivot, refine
 from calibration.images.search import apart_mm
 from calibration.images.similarity import Comparison, Estimate, Level, Similarity
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
 
@@ -34,7 +35,7 @@ the similarity's bends of a higher order drown the difference."""
 _FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0, 0.2, 0.2])
 """Largest steps, rad, mm and relative sizes: of an error that hardly shows no step would be wide enough."""
 
-_LEAST_CURVATURE = 0.01
+LEAST_CURVATURE = 0.01
 """Least curvature in any direction, as a share of Gauss-Newton's. Layers have 0.01 to 0.06, other tissue 0.07
 and more: below, the standard errors are so large that the answer is refused."""
 
@@ -64,11 +65,6 @@ again: over speckle's size, and within reach of the fit. And the most steps of e
 _SIDES = np.array([[1, 1, 1, 1, 1, 1], [1, -1, 1, -1, -1, 1]])
 """Signs of turns and displacements; each side has its opposite."""
 
-LAYERED = 0.4
-"""Share of the largest stiffness against displacements of the sweeps below which a refused answer is put down
-to layers: simulated layers have 0.1 to 0.4. Of other tissue most has 0.33 and more; but seen with beams that
-are thick across, some has 0.12 and is known well, so that stiffness alone refuses nothing."""
-
 MOST_MM, MOST_DEG = 1.0, 2.5
 """Largest standard errors of the image's centre and turns: 95 % intervals of 2 mm, within which the published
 method agreed with phantoms in vivo (Wein and Khamene 2008), and 5 degrees. It agreed within 4 degrees;
@@ -83,52 +79,50 @@ RIVAL_MM, CLEAR_LEAD = 3.0, 2.0
 """Distance at which another place found by the search is another answer and not the same one unrefined; and
 the lead over it, in standard errors of their difference, that an answer must have."""
 
-NAMES = (*PARAMETERS, "lateral pixel size", "axial pixel size")
 
+def curvature_of(
+    refined: Refined, angulation: Angulation, unit: float, share: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Curvature of each patch's weighted correlation, (p, f, f), and of all, (f, f), over speckle's width.
 
-@dataclass(frozen=True)
-class Certainty:
-    """What is known of an answer.
-
-    Attributes
-    ----------
-    covariance : ndarray, shape (8, 8)
-        Of turns, displacements and relative pixel sizes at the image's origin.
-    condition_number : float
-    weakest : str
-        The parameter that makes up most of the least determined direction.
-    stiffness : ndarray, shape (3,)
-        How fast the similarity falls as the sweeps are displaced against each other across the first's image,
-        along its beam and out of its plane, as shares of the largest; negative where it rises.
+    By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full, is
+    several times too stiff.
     """
+    base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
+    wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
+    steps, columns = _steps(angulation, wide, unit), []
+    for parameter in refined.free:
+        step = np.zeros(len(LEVERS_MM))
+        step[parameter] = steps[parameter]
+        places = (refined.estimate.stepped(sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
+        seen = [refined.comparison.at(place, True, share) for place in places]
+        columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
+    bends = np.stack(columns, axis=2)
+    return bends, positive(bends.sum(axis=0), refined.system[0])
 
-    covariance: FloatArray
-    condition_number: float
-    weakest: str
-    stiffness: FloatArray
 
-
-def certainty(
+def claimed(
     refined: Refined,
+    bends: FloatArray,
+    curvature: FloatArray,
     restarted: Comparison,
-    angulation: Angulation,
     unit: float,
     tracker: tuple[float, float],
     share: bool = False,
-) -> Certainty:
-    """Covariance of an answer from the similarity's curvature, and from three kinds of errors.
+) -> FloatArray:
+    """Covariance of an answer's turns, displacements and relative pixel sizes at the image's origin, (8, 8).
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
-    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for
-    seconds displaces one sweep against the other and shows in no such change; its effect is computed. To
-    their sum comes the scatter of fits started beside the answer.
+    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for seconds
+    displaces one sweep against the other and shows in no such change; its effect is computed. To their sum
+    comes the scatter of fits started beside the answer.
 
     Parameters
     ----------
+    bends, curvature
+        See `curvature_of`.
     restarted : Comparison
         At `RESTARTED`.
-    angulation : Angulation
-        Of the sweeps at the answer, for steps that displace the sweeps alike.
     unit : float
         Size of the images relative to the usual.
     tracker : tuple of float
@@ -140,27 +134,23 @@ def certainty(
     .. [1] A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference", Journal of
        Human Resources, 2015 (the jackknife over clusters).
     """
-    chosen = np.array(refined.free)
-    base = about_pivot(refined.pivot_mm)[:, chosen]
+    base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
     slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
-    wide = unit * (WIDE_MM if len(chosen) == len(PARAMETERS) else NARROW_MM)
-    bends = _bends(refined, _steps(angulation, wide, unit), base, share)
-    pulls, stiffness = _pulls(refined, wide, base, share)
-    curvature = positive(bends.sum(axis=0), refined.system[0], _LEAST_CURVATURE)
-    norms = np.sqrt(np.diag(curvature))
-    values, vectors = np.linalg.eigh(curvature / np.outer(norms, norms))
-    condition = float(np.sqrt(values[-1] / max(values[0], 1e-300)))
-    tissue = _left_out(slopes, bends, _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit))), curvature)
-    poses = _left_out(slopes, bends, _numbered(np.column_stack(_stretches(refined))), curvature)
+    wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
+    blocks = _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit)))
+    sweep, image = refined.comparison.images.T
+    stretches = _numbered(np.column_stack([sweep, _numbered(np.column_stack([sweep, image])) // STRETCH]))
+    left_out = [_left_out(slopes, bends, one, curvature) for one in (blocks, stretches)]
+    pulls = _pulls(refined, wide, base, share)
     moved = np.linalg.inv(curvature)
     wander = moved @ _wandering(refined, pulls, np.repeat(np.square(tracker), 3)) @ moved.T
-    covariance = base @ (tissue + poses + wander) @ base.T
+    covariance = base @ (sum(left_out) + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
     covariance[:6, :6] += _scatter(refined, restarted, unit, share)
-    return Certainty(covariance, condition, NAMES[chosen[np.argmax(np.abs(vectors[:, 0]))]], stiffness)
+    return np.asarray(covariance)
 
 
-def require_known(known: Certainty, angulation: Angulation, centre_mm: FloatArray) -> None:
+def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: FloatArray) -> None:
     """Refuse an answer whose claimed errors are too large to be of use.
 
     Raises
@@ -168,7 +158,7 @@ def require_known(known: Certainty, angulation: Angulation, centre_mm: FloatArra
     InsufficientDataError
         With what would help: other motion, or other tissue.
     """
-    pose = known.covariance[:6, :6]
+    pose = covariance[:6, :6]
     moved = point_motion(centre_mm[None])[0]
     turns = np.rad2deg(np.sqrt(np.diag(pose)[:3]))
     shifts = np.sqrt(np.diag(moved @ pose @ moved.T))
@@ -176,16 +166,8 @@ def require_known(known: Certainty, angulation: Angulation, centre_mm: FloatArra
         return
     worst = int(np.argmax(np.concatenate([turns / MOST_DEG, shifts / MOST_MM])))
     got = f"{turns[worst]:.1f} degrees" if worst < 3 else f"{shifts[worst - 3]:.1f} mm"
-    if angulation.verdict != "sufficient":
-        help_by = angulation.advice
-    elif known.stiffness.min() < LAYERED:
-        ways = "across the first sweep's images", "along its beams", "along its way"
-        way = ways[known.stiffness.argmin()]
-        help_by = (
-            f"scan tissue that changes in all directions: layers alone do not tell; this hardly changes {way}"
-        )
-    else:
-        help_by = "scan tissue with more structure, or longer sweeps"
+    sufficient = angulation.verdict == "sufficient"
+    help_by = "scan tissue with more structure in all directions" if sufficient else angulation.advice
     limit = f"{MOST_DEG:g} degrees" if worst < 3 else f"{MOST_MM:g} mm"
     raise InsufficientDataError(
         f"expected sweeps that tell {PARAMETERS[worst]} to {limit} (standard error), got {got}; {help_by}"
@@ -255,48 +237,25 @@ def _steps(angulation: Angulation, wide_mm: float, unit: float) -> FloatArray:
     return np.asarray(np.minimum(wide_mm / np.maximum(shows, 1e-6), farthest))
 
 
-def _bends(refined: Refined, steps: FloatArray, base: FloatArray, share: bool) -> FloatArray:
-    """Curvature of each patch's weighted correlation, by differences of its slopes, shape (p, f, f)."""
-    columns = []
-    for parameter in refined.free:
-        step = np.zeros(len(LEVERS_MM))
-        step[parameter] = steps[parameter]
-        places = (refined.estimate.stepped(sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
-        seen = [refined.comparison.at(place, True, share) for place in places]
-        columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
-    return np.stack(columns, axis=2)
-
-
-def _pulls(refined: Refined, step_mm: float, base: FloatArray, share: bool) -> tuple[FloatArray, FloatArray]:
-    """How each patch's slopes change as the second sweep is displaced, and the stiffness against it.
-
-    Displacements are along the world's axes: shapes (p, f, 3) and (3,); the latter along the axes of the
-    first sweep's mean image.
-    """
+def _pulls(refined: Refined, step_mm: float, base: FloatArray, share: bool) -> FloatArray:
+    """How each patch's slopes change as the second sweep is displaced along the world's axes, (p, f, 3)."""
     first, second = refined.comparison.stacks
-    axes = (first.world_from_sensor * refined.estimate.sensor_from_image).rotation.mean().as_matrix()
-    columns, stiff = [], np.empty(3)
-    for k, axis in enumerate(axes.T):
+    columns = []
+    for axis in np.eye(3):
         seen = []
         for sign in (-1.0, 1.0):
             world = RigidTransform.from_translation(sign * step_mm * axis) * second.world_from_sensor
             moved = replace(refined.comparison, stacks=(first, replace(second, world_from_sensor=world)))
             seen.append(moved.at(refined.estimate, True, share))
         columns.append(_fallen(refined, seen) @ base / (2.0 * step_mm))
-        there = _throughout(refined, seen)
-        fall = refined.similarity.alike - 0.5 * (seen[0].alike + seen[1].alike)
-        stiff[k] = (refined.weight * np.where(there, fall, 0.0)).sum() / refined.weight[there].sum()
-    return np.stack(columns, axis=2) @ axes.T, stiff / stiff.max()
-
-
-def _throughout(refined: Refined, seen: list[Similarity]) -> BoolArray:
-    return refined.similarity.valid & seen[0].valid & seen[1].valid
+    return np.stack(columns, axis=2)
 
 
 def _fallen(refined: Refined, seen: list[Similarity]) -> FloatArray:
     """Difference of the weighted slopes at two places, of patches with support throughout; zero of others."""
+    there = refined.similarity.valid & seen[0].valid & seen[1].valid
     fallen = refined.weight[:, None] * (seen[0].gradient - seen[1].gradient)
-    return np.where(_throughout(refined, seen)[:, None], fallen, 0.0)
+    return np.where(there[:, None], fallen, 0.0)
 
 
 def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> FloatArray:
@@ -351,7 +310,9 @@ def _numbered(cells: FloatArray) -> IntArray:
     return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], dtype=np.int64).ravel()
 
 
-def _stretches(refined: Refined) -> tuple[IntArray, IntArray]:
-    """Sweep, and stretch of `STRETCH` images in it, of each patch."""
-    sweep, image = refined.comparison.images.T
-    return sweep, _numbered(np.column_stack([sweep, image])) // STRETCH
+def positive(found: FloatArray, normal: FloatArray, least: float = LEAST_CURVATURE) -> FloatArray:
+    """Symmetrise, and raise to at least a share of a positive matrix in every direction."""
+    firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
+    part, axes = eigh((found + found.T) / 2.0, firm)
+    back = firm @ axes
+    return np.asarray((back * np.maximum(part, least)) @ back.T)
