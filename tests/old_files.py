@@ -149,7 +149,8 @@ def fill(target, content):
     orientation, tracker = content.orientation, content.tracker
     for i in range(N):
         target.append_orientation(
-            orientation.readings.time_s[i], orientation.readings.world_from_sensor[i].as_quat(scalar_first=True)
+            orientation.readings.time_s[i],
+            orientation.readings.world_from_sensor[i].as_quat(scalar_first=True),
         )
         target.append_pose(tracker.readings.time_s[i], POSES[i].as_matrix(), valid=i != 2)
     for frame, time_s in zip(content.frames, content.frame_time_s, strict=True):
