@@ -222,9 +222,8 @@ def test_a_word_stands_for_any_length_and_integers_for_floats(tmp_path):
         file["g/x"] = np.arange(6).reshape(2, 3)
     with open_hdf5(tmp_path / "a.h5") as file:
         np.testing.assert_array_equal(read_checked(file["g"], "x", ("row", 3)), [[0.0, 1, 2], [3, 4, 5]])
-        for shape, dtype, message in (((3, 3), float, r"/g/x.*\(3, 3\).*\(2, 3\)"), ((2, 3), bool, "bool")):
-            with pytest.raises(InvalidInputError, match=message):
-                read_checked(file["g"], "x", shape, dtype)
+        with pytest.raises(InvalidInputError, match=r"/g/x.*\(3, 3\).*\(2, 3\)"):
+            read_checked(file["g"], "x", (3, 3))
 
 
 def reconstruct(path, chunks, finish=True, poses=None, trust=None):

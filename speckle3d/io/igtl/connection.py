@@ -95,9 +95,9 @@ class Connection:
 
     def _listen(self, connected: socket.socket) -> None:
         self._lost.clear()
-        link = Link(connected, self._inbox, self._outbox, self._ended)
         self._connections += 1
         self._connected.set()
+        link = Link(connected, self._inbox, self._outbox, self._ended)
         while not (self._lost.wait(_FIRST_PAUSE_S) or self._over.is_set()):
             pass
         self._connected.clear()

@@ -19,7 +19,7 @@ STALL_S = 10.0
 """Longest pause within a message."""
 
 _MOST_RECEIVED, _MOST_SENDING = 256, 64
-"""Messages not yet taken, for which the peer then waits; and not yet sent, the oldest of which are dropped."""
+"""Messages not yet taken, for which the peer then waits; and not yet sent, of which the oldest go."""
 
 
 @dataclass(frozen=True)

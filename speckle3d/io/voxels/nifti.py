@@ -21,7 +21,7 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import one_line
 
-_SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}  # type: ignore[arg-type]
+_SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes: the length of the header of NIfTI-1 and NIfTI-2."""
 _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _LABELS = "label"
@@ -51,15 +51,14 @@ def nifti_header(
     """
     header = nibabel.Nifti1Header()
     header.set_data_dtype(dtype.newbyteorder("<"))
-    try:
-        header.set_data_shape(shape)
-    except nibabel.spatialimages.HeaderDataError as error:
+    if max(shape) >= 2**15:
         raise InvalidInputError(
             f"NIfTI: expected at most 32767 voxels along an axis, got {max(shape)}: take .nrrd"
-        ) from error
+        )
+    header.set_data_shape(shape)
     header.set_xyzt_units("mm")
-    for put in (header.set_sform, header.set_qform):
-        put(_RAS_FROM_LPS @ world_from_index, 1)
+    header.set_sform(_RAS_FROM_LPS @ world_from_index, 1)
+    header.set_qform(_RAS_FROM_LPS @ world_from_index, 1)
     header.set_slope_inter(1, 0)
     if is_labels:
         header.set_intent(_LABELS)

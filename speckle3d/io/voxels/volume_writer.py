@@ -29,6 +29,7 @@ from speckle3d.core.labels import Segment, require_segments
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import VOXEL_TYPES, require_spacing
 from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.header_text import meta_start, put_packed_size
 from speckle3d.io.pixels import meta_type, nrrd_type
 from speckle3d.io.text import unescaped
 from speckle3d.io.voxels.nifti import nifti_header
@@ -182,6 +183,8 @@ class VolumeWriter:
             raise MismatchError(f"{self._path}: expected {self._shape[2]} planes, got {self._planes}")
         if self._packer is not None:
             self._file.write(self._packer.flush())
+            if self._suffix == ".mha":
+                put_packed_size(self._file, self._header, self._file.tell() - len(self._header))
 
     def _require_volume(
         self,
@@ -223,11 +226,7 @@ class VolumeWriter:
     def _meta(self, matrix: npt.NDArray[np.float64], fields: Mapping[str, str]) -> list[str]:
         spacing = np.linalg.norm(matrix[:3, :3], axis=0)
         return [
-            "ObjectType = Image",
-            "NDims = 3",
-            "BinaryData = True",
-            "BinaryDataByteOrderMSB = False",
-            f"CompressedData = {self._packs}",
+            *meta_start(3, 0 if self._packs else None),
             f"TransformMatrix = {_texts((matrix[:3, :3] / spacing).T.ravel())}",
             f"Offset = {_texts(matrix[:3, 3])}",
             "CenterOfRotation = 0 0 0",
