@@ -234,7 +234,7 @@ def find_member(group: h5py.Group, name: str) -> Any:
             # A soft link may lead to a link to another file.
             if node is None or node.file.filename != group.file.filename:
                 raise InvalidInputError(
-                    "expected a member of the file itself, got a link to nothing or out of it"
+                    "expected a member of the file itself, got a link to nothing or to another file"
                 )
     return node
 
