@@ -185,7 +185,7 @@ class _Part:
             self._start[self._axis] = i
         if self._is_plain:
             if self._node.get_chunk_info_by_coord(tuple(self._start)).byte_offset is None:
-                raise InvalidInputError("expected its samples in the file, got none: they were not written")
+                raise InvalidInputError("expected chunks of its samples in the file, got none: never written")
             self._node.read_direct_chunk(tuple(self._start), out=values.reshape(-1).view(np.uint8))
         else:
             self._on_disk.select_hyperslab(tuple(self._start), self._count)
