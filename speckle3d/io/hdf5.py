@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -36,8 +37,9 @@ _READ_FAILURES = (
     MemoryError,
     OverflowError,
     EOFError,
+    zlib.error,
 )
-"""What h5py and NumPy raise when the bytes of a file do not make sense."""
+"""What h5py, NumPy and zlib raise when the bytes of a file do not make sense."""
 
 _HAS_WRITER = ("already open for write", "unable to lock file")
 """HDF5's words for a file that is being written, or whose writer was killed."""

@@ -1,4 +1,4 @@
-"""The reconstruction file, version 1: frame pairs are written as they come, and the file is read whole."""
+"""The reconstruction file, version 1."""
 
 from __future__ import annotations
 
@@ -39,28 +39,26 @@ from speckle3d.io.hdf5 import (
     require_dataset,
     require_group,
 )
-from speckle3d.io.records import HDF5Writer, read_record
+from speckle3d.io.records import HDF5Writer, put, read_record
 
 FORMAT = "speckle3d.reconstruction"
 
-_PAIRS: dict[str, tuple[tuple[int, ...], npt.DTypeLike]] = {
-    "first": ((), np.int64),
-    "second": ((), np.int64),
-    "first_from_second": ((4, 4), np.float64),
-    "covariance": ((6, 6), np.float64),
-    "distance_mm": ((-1,), np.float32),
-    "sigma_mm": ((-1,), np.float32),
-    "used": ((-1,), np.bool_),
+_PAIR_ROWS: dict[str, tuple[int, ...]] = {
+    "first": (),
+    "second": (),
+    "first_from_second": (4, 4),
+    "covariance": (6, 6),
+    "distance_mm": (-1,),
+    "sigma_mm": (-1,),
+    "used": (-1,),
 }
-"""Shape behind the pair axis, -1 for the patches, and type of every data set of /pairs with a row a pair."""
+"""Shape of a pair's row, -1 for the patches, in every data set of /pairs but ``patch_centre_mm``."""
 
 _SHARED = ("scale_sigma", "curves_sigma", "turn_sigma_per_mm")
 """Attributes of the covariance of `image`, by the fields of `SharedErrors`."""
 
 _EARLIER = {"consistent-subset": "image+subset"}
 """Names of modes in older files."""
-
-_CHUNK_BYTES = 2**18
 
 
 class ReconstructionWriter(HDF5Writer):
@@ -81,6 +79,7 @@ class ReconstructionWriter(HDF5Writer):
         super().__init__(path, FORMAT)
         self._grid = grid
         self._times = require_increasing(frame_time_s, f"{path}: /frame_time_s")
+        self._pairs: list[FramePairs] = []
         self._is_finished = False
 
     def _begin(self) -> None:
@@ -90,6 +89,12 @@ class ReconstructionWriter(HDF5Writer):
     def _finish(self) -> None:
         if not self._is_finished:
             raise InvalidInputError(f"{self.path}: expected finish() before the end, got none")
+        if self._pairs:
+            group = self.file.create_group("pairs")
+            self.put(group, "patch_centre_mm", self._pairs[0].patch_centre_mm)
+            for name in _PAIR_ROWS:
+                rows = np.concatenate([getattr(pairs, name) for pairs in self._pairs])
+                put(group, name, rows, self.room, compression="lzf", shuffle=True)
 
     def append_pairs(self, pairs: FramePairs) -> None:
         """Append frame pairs; their patches must be those of the pairs before.
@@ -101,26 +106,9 @@ class ReconstructionWriter(HDF5Writer):
         """
         where = f"{self.path}: /pairs"
         _check_pairs(pairs, self._times.size, where)
-        group = self.file.require_group("pairs")
-        if "first" not in group:
-            self._create_pairs(group, pairs)
-        elif not np.array_equal(group["patch_centre_mm"], pairs.patch_centre_mm):
+        if self._pairs and not np.array_equal(self._pairs[0].patch_centre_mm, pairs.patch_centre_mm):
             raise InvalidInputError(f"{where}/patch_centre_mm: expected the patches of the pairs before")
-        start, rows = len(group["first"]), {name: np.asarray(getattr(pairs, name)) for name in _PAIRS}
-        self.room.require(self.file.id.get_filesize(), sum(values.nbytes for values in rows.values()))
-        for name, values in rows.items():
-            group[name].resize(start + len(pairs), axis=0)
-            group[name][start:] = values
-
-    def _create_pairs(self, group: h5py.Group, pairs: FramePairs) -> None:
-        self.put(group, "patch_centre_mm", pairs.patch_centre_mm)
-        for name, (_, dtype) in _PAIRS.items():
-            row = np.shape(getattr(pairs, name))[1:]
-            row_bytes = max(int(np.prod(row)) * np.dtype(dtype).itemsize, 1)
-            chunks = (max(_CHUNK_BYTES // row_bytes, 1), *(max(n, 1) for n in row))
-            group.create_dataset(
-                name, (0, *row), dtype, maxshape=(None, *row), chunks=chunks, compression="lzf", shuffle=True
-            )
+        self._pairs.append(pairs)
 
     def finish(
         self,
@@ -195,7 +183,7 @@ load_reconstruction = read_reconstruction
 
 def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
     patches = len(pairs.patch_centre_mm)
-    for name, (row, _) in _PAIRS.items():
+    for name, row in _PAIR_ROWS.items():
         expected = (len(pairs), *(patches if n < 0 else n for n in row))
         got = np.shape(getattr(pairs, name))
         if got != expected:

@@ -126,8 +126,8 @@ class HDF5Writer:
             label(self.file)
 
 
-def put(group: h5py.Group, name: str, value: Any, room: Room) -> None:
-    """Write a value under a name by its type.
+def put(group: h5py.Group, name: str, value: Any, room: Room, **layout: Any) -> None:
+    """Write a value under a name by its type; `layout` is of a data set, as h5py has it.
 
     Numbers, texts and tuples of numbers become attributes, arrays and rigid transforms data sets, rotations
     a data set of quaternions with ``_wxyz`` behind its name, dataclasses and mappings groups. None is not
@@ -150,7 +150,7 @@ def put(group: h5py.Group, name: str, value: Any, room: Room) -> None:
     else:
         values = np.asarray(value.as_matrix() if isinstance(value, RigidTransform) else value)
         room.require(group.file.id.get_filesize(), values.nbytes)
-        group[name] = values
+        group.create_dataset(name, data=values, **layout)
 
 
 def _unicode(text: str) -> str:

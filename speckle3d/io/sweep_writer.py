@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
-from typing import Any, Literal, Protocol, runtime_checkable
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -43,22 +43,6 @@ COMPRESSIONS: dict[str, Compression] = {"gzip": "gzip", "lzf": "lzf", "none": No
 
 _GZIP_LEVEL = 1
 """Higher ones take several times as long for echoes and save no more than 2 %."""
-
-
-@runtime_checkable
-class CarriesMore(Protocol):
-    """Frames of a recording that says more than a sweep holds."""
-
-    def write_more(self, file: h5py.File) -> None:
-        """Write that into groups of its own."""
-
-
-@runtime_checkable
-class MadeInOrder(Protocol):
-    """Frames that are computed when they are read, and fastest from the first to the last."""
-
-    def in_order(self) -> Iterator[npt.NDArray[Any]]:
-        """All frames."""
 
 
 class FrameSet:
@@ -206,26 +190,6 @@ class SweepWriter(HDF5Writer):
         self._frames.append(frame, self.room)
         self._time_s.append(float(time_s))
 
-    def write_sensor(self, sensor: OrientationSensor | Tracker) -> None:
-        """Write a sensor's stream."""
-        _write_sensor(self.file, sensor, self.room)
-
-    def write_truth(self, world_from_image: RigidTransform) -> None:
-        """Write the true pose of every frame."""
-        self.put(self.file, "truth", {"world_from_image": world_from_image})
-
-    def write_probe(self, name: str) -> None:
-        """Write the name of probe and preset."""
-        self.put(self.file, "probe", name)
-
-    def write_simulation(self, values: Mapping[str, Any]) -> None:
-        """Write how a sweep was simulated as attributes of ``/simulation``; nested values become JSON."""
-        plain = {
-            name: value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
-            for name, value in values.items()
-        }
-        self.put(self.file, "simulation", plain)
-
     def copy_unknown(self, source: PathLike) -> None:
         """Copy what another sweep file holds beyond this version of the format."""
         with reading(source), naming(str(source)), open_hdf5(source) as other:
@@ -241,9 +205,6 @@ class SweepWriter(HDF5Writer):
             times = require_increasing(np.asarray(self._time_s, dtype=float), "/frame_time_s")
             if times.size == 0:
                 raise InvalidInputError(f"/{self._frames.name}: expected at least one frame, got none")
-            truth = self.file.get("truth/world_from_image")
-            if truth is not None and len(truth) != times.size:
-                raise InvalidInputError(f"/truth: expected {times.size} poses, got {len(truth)}")
         self.put(self.file, "frame_time_s", times)
 
 
@@ -286,26 +247,23 @@ def write_sweep(
     3
     """
     frames = sweep.frames
+    # Frames that are computed when they are read may be fastest from the first to the last.
+    made = getattr(frames, "in_order", lambda: map(frames.__getitem__, range(len(sweep))))()
     with SweepWriter(path, sweep.grid, sweep.signal, stored_dtype(frames), compression) as writer:
-        made = (
-            frames.in_order()
-            if isinstance(frames, MadeInOrder)
-            else map(frames.__getitem__, range(len(sweep)))
-        )
         for i, (frame, time_s) in enumerate(zip(made, sweep.frame_time_s, strict=True)):
             writer.append(frame, time_s)
             if progress is not None:
                 progress(i + 1, len(sweep))
         for sensor in (sweep.orientation, sweep.tracker):
             if sensor is not None:
-                writer.write_sensor(sensor)
+                _write_sensor(writer.file, sensor, writer.room)
         if sweep.truth is not None:
-            writer.write_truth(sweep.truth)
-        if sweep.probe:
-            writer.write_probe(sweep.probe)
-        if simulation is not None:
-            writer.write_simulation(simulation)
-        if isinstance(frames, CarriesMore):
+            writer.put(writer.file, "truth", {"world_from_image": sweep.truth})
+        writer.put(writer.file, "probe", sweep.probe or None)
+        for name, value in (simulation or {}).items():
+            plain = value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
+            writer.put(writer.file, "simulation", {name: plain})
+        if hasattr(frames, "write_more"):
             frames.write_more(writer.file)
         if type(frames) is HDF5Frames:
             writer.copy_unknown(frames.path)

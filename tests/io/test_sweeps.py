@@ -377,11 +377,9 @@ def test_the_writer_refuses_what_the_reader_would(tmp_path, frames, times, optio
 
 
 def test_how_a_sweep_was_simulated_is_kept_and_ignored(tmp_path):
-    sweep = sweep_examples.rf_sweep()
-    with SweepWriter(tmp_path / "s.h5", sweep.grid, sweep.signal) as writer:
-        writer.append(sweep.frames[0], 0.0)
-        writer.write_simulation({"seed": 7, "preset": "tissue", "movement": {"length_mm": 40.0}})
-    assert len(read_sweep(tmp_path / "s.h5")) == 1
+    told = {"seed": 7, "preset": "tissue", "movement": {"length_mm": 40.0}}
+    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(), simulation=told)
+    assert len(read_sweep(tmp_path / "s.h5")) == 6
     with h5py.File(tmp_path / "s.h5") as file:
         assert file["simulation"].attrs["seed"] == 7
         assert json.loads(file["simulation"].attrs["movement"]) == {"length_mm": 40.0}
