@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.checks import doubts_of_curves, doubts_of_path, doubts_of_standing, examined_sensors
+from speckle3d.checks import doubts_of_curves, doubts_of_path, doubts_of_standing
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
@@ -28,6 +28,8 @@ from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.examine.disagreements import disagreements
+from speckle3d.examine.sensors import examined_sensors
 from speckle3d.matching.blocks import (
     Block,
     BlockSource,
@@ -169,7 +171,10 @@ class Tracked:
             ("direction", f"{self.direction:+d}, from {self.direction_from}"),
             ("subset", subset),
             ("pairs", f"{self.pairs} of frames"),
-            ("doubts", "; ".join(f"{each.about}: {each.suspect}" for each in self.doubts) or "none"),
+            (
+                "doubts",
+                "; ".join(f"{each.about}: {each.suspect or each.evidence}" for each in self.doubts) or "none",
+            ),
         ]
 
     @property
@@ -304,11 +309,11 @@ def track(
     whole = with_common_scale(covariance, trajectory.poses, matcher.centre_mm, mismatch)
     sigma = float(np.hypot(scale_sigma(coherence), mismatch))
 
-    # -> sensors that images and their own readings do not contradict -> sign of the motion
+    # -> sensors that do not contradict themselves -> sign of the motion
     with times.of("sensors"):
-        sensors = examined_sensors(sweep, trajectory.poses, covariance, settings)
+        sensors = examined_sensors(sweep, trajectory.poses, settings.sensors.examine)
         direction, source = settle_direction(
-            sensors.telling, trajectory.poses, settings.sensors, sensors.turn_confirmed
+            sensors.trusted, trajectory.poses, settings.sensors, sensors.turn_confirmed
         )
 
     # -> orientation-consistent subset -> its own trajectory
@@ -318,9 +323,13 @@ def track(
     if sink:
         for rows in reader.rows(table, pairs, edges, used, direction, sigma):
             sink(rows)
+    image, whole = (
+        _seen_from(direction, trajectory.poses),
+        whole if direction > 0 else MIRROR @ whole @ MIRROR,
+    )
     return Tracked(
-        image=_seen_from(direction, trajectory.poses),
-        covariance=whole if direction > 0 else MIRROR @ whole @ MIRROR,
+        image=image,
+        covariance=whole,
         subset=None if subset is None else _seen_from(direction, subset),
         rejected_share=float("nan") if subset is None else _rejected_share(pairs, used),
         flags=_with_unjoined(flags, reader, pairs),
@@ -334,7 +343,7 @@ def track(
         rows=rows_of(factors, coherence, matcher.patches),
         slopes=slopes,
         times=times,
-        doubts=(*doubts, *sensors.doubts),
+        doubts=(*doubts, *sensors.doubts, *disagreements(sensors.trusted, image, whole, sigma)),
         grid=sweep.grid,
         frame_time_s=sweep.frame_time_s,
     )

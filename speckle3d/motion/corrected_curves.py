@@ -47,7 +47,7 @@ def corrected_curves(
         The sweeps, each as `speckle3d.pipeline.track` has it.
     log_scale, log_scale_sigma : sequence of float
         Of each sweep: the logarithm of its true elevational length over the images', from a crossing sweep,
-        an inertial sensor or a tracker, and its standard deviation.
+        or a tracker, and its standard deviation.
 
     Factors by depth follow what another lens does; what all depths have in common follows the lengths known.
     Tissue whose structure reads short is corrected with it: curves learnt over tissue are right over tissue.

@@ -92,8 +92,8 @@ def compare_sweeps(
     Parameters
     ----------
     modes : sequence of str, optional
-        Beside `image`; by default all that each sweep has sensors for but "inertial". "crossed" takes
-        for the crossing sweep of ``SWEEP.h5`` the file ``SWEEP-crossing.h5`` beside it.
+        Beside `image`; by default all that each sweep has sensors for. "crossed" takes for the
+        crossing sweep of ``SWEEP.h5`` the file ``SWEEP-crossing.h5`` beside it.
     curves : path, optional
         Decorrelation curves; by default curves.h5 beside each sweep.
     progress : callable, optional

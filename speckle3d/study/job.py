@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -14,7 +14,6 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.progress import Progress, after
@@ -23,9 +22,9 @@ from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.modes import PUBLISHED
-from speckle3d.correction.scale import FusedPoses, ScaledPoses
-from speckle3d.correction.trust import believed, require_believed
 from speckle3d.corrections import Correction, correct
+from speckle3d.examine.disagreements import differing_lengths
+from speckle3d.examine.sensors import believed, require_believed
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
@@ -113,7 +112,7 @@ def run_job(
     directory : path
         Made if need be.
     drift : sequence of str
-        Modes beside `image`: "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused".
+        Modes beside `image`: "consistent-subset", "orientation", "pose", "crossed", "fused".
     reference : {"tracker", "truth"}, optional
         What to compare with; by default the truth if stored, else the tracker, else nothing.
     config : Config, optional
@@ -194,7 +193,10 @@ def write_results(
         compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
     moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)
     name, share = ("none", 0.0) if compared is None else (compared.name, float(compared.covered.mean()))
-    doubts = (*tracked.doubts, *_contradictions(corrections))
+    claims = claims_of(tracked, sweep.grid.centre_mm, corrections)
+    lengths = {m: float(np.abs(c[0, -1])) for m, c in moved.modes.items()}
+    claimed = {m: (lengths[m], lengths[m] * sigma) for m, sigma in claims.items() if m in lengths}
+    doubts = (*tracked.doubts, *differing_lengths(claimed))
     summary = Summary(
         sweep.name,
         name,
@@ -205,7 +207,7 @@ def write_results(
         doubts,
         doubted_modes(sweep, doubts, poses),
         left_out,
-        claims_of(tracked, sweep.grid.centre_mm, corrections),
+        claims,
         _jitter(sweep),
     )
     files = [path, *write_summary(directory, summary)]
@@ -273,18 +275,6 @@ def _corrected(
             where = f"{sweep.name}: drift mode {mode}"
             left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
     return corrections, left_out
-
-
-def _contradictions(corrections: Mapping[str, Correction]) -> tuple[Doubt, ...]:
-    """What correcting found of sensors and images that checks before had not."""
-    fused = [each for each in corrections.values() if isinstance(each, FusedPoses)]
-    found = [doubt for each in fused for doubt in each.contradictions]
-    inertial = corrections.get("inertial")
-    if isinstance(inertial, ScaledPoses) and float(inertial.details["turned_steps"]) > 0:
-        steps = f"{inertial.details['turned_steps']:.0f} steps"
-        words = f"expected the direction that the accelerometer feels, got {steps} that go the other way"
-        found.append(Doubt("images", "direction of a stretch", words, False))
-    return tuple(found)
 
 
 def _refusal_of_subset(sweep: Sweep, tracked: Tracked) -> str:

@@ -14,7 +14,7 @@ from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import SourceFile
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.modes import require_modes
-from speckle3d.correction.trust import cleaned_readings
+from speckle3d.examine.sensors import cleaned_readings
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.load import recording_sha256
 from speckle3d.motion.direction import sensed_orientation
@@ -88,10 +88,7 @@ def require_possible(
 
 
 def available_modes(sweep: Sweep, config: Config) -> list[str]:
-    """Modes beside `image` that need no more than the sweep's sensors, calibrated to the image.
-
-    Without `inertial`, which needs a motion made for it.
-    """
+    """Modes beside `image` that need no more than the sweep's sensors, calibrated to the image."""
     found = []
     for mode in (SUBSET, "orientation", "pose", "fused"):
         with suppress(InsufficientDataError):
