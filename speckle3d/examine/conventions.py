@@ -20,8 +20,6 @@ LEAST_TURN_DEG, SCALE_ERROR = 0.1, 0.05
 LEAST_GAIN = 4.0
 """Logarithm of the likelihood by which a convention must explain the gyroscope better: good simulated sensors
 gain up to 0.1, faulty ones from 5."""
-CONTRADICTED = 0.5
-"""Share of the variance of a gyroscope's turns that readings must lack to contradict it."""
 MOST_BIAS_DEG_S = 3.0
 """Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
 TILTED_DEG, UPRIGHT_DEG = 25.0, 10.0
@@ -75,23 +73,15 @@ class GyroscopeTurns:
             self.degrees - (turned[: -self.lag].inv() * turned[self.lag :]).as_rotvec(degrees=True)
         )
 
-    def misfit(self, turned: Rotation) -> float:
-        """Negative logarithm of the likelihood of readings, but for a bias; overlapping turns count once."""
-        variance = _spread(self.difference(turned)) ** 2 + self._noise**2
-        return float(len(self.degrees) / self.lag * np.log(variance).sum())
+    def misfit(self, difference: FloatArray) -> float:
+        """Negative logarithm of the likelihood of a difference, but for a bias; overlapping turns count once."""
+        noise = LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
+        return float(len(self.degrees) / self.lag * np.log(_spread(difference) ** 2 + noise**2).sum())
 
-    @property
-    def _noise(self) -> float:
-        return LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
-
-    def unexplained(self, turned: Rotation) -> float:
-        """Share of the variance of the gyroscope's turns that readings lack; NaN if it hardly turns."""
-        size = _spread(self.degrees)
-        tells = size > 2.0 * self._noise
-        if not tells.any():
-            return float("nan")
-        left = _spread(self.difference(turned))
-        return float((left[tells] ** 2).sum() / (size[tells] ** 2).sum())
+    def gain(self, turned: Rotation, other: Rotation | None = None) -> float:
+        """Log likelihood of `other` readings, or of a sensor that does not turn, over that of the readings."""
+        against = self.degrees if other is None else self.difference(other)
+        return self.misfit(self.difference(turned)) - self.misfit(against)
 
     def bias_deg_s(self, turned: Rotation) -> float:
         """Rate by which the gyroscope turns on the whole and the readings do not."""
@@ -108,14 +98,20 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     turns, readings = GyroscopeTurns.of(sensor), sensor.readings.world_from_sensor
     if turns is None:
         return
-    own, unexplained = turns.misfit(readings), turns.unexplained(readings)
-    gain, name = max((own - turns.misfit(other), name) for name, other in conventions(readings))
-    evidence = f"expected to turn as its own gyroscope, lacks {100 * unexplained:.0f} % of its variance"
-    if gain > LEAST_GAIN and unexplained > CONTRADICTED:
+    upright = [
+        (turns.gain(readings, other), name)
+        for name, other in conventions(readings)
+        if not _gravity_from_vertical(sensor, other) > UPRIGHT_DEG
+    ]
+    gain, name = max(upright, default=(0.0, ""))
+    still, bias = turns.gain(readings), turns.bias_deg_s(readings)
+    if gain > LEAST_GAIN:
+        evidence = f"expected to turn as its own gyroscope, fits worse than otherwise by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
-    elif unexplained > CONTRADICTED:
-        yield Doubt(sensor.label, "gyroscope on other axes or in other units", evidence, False)
-    elif (bias := turns.bias_deg_s(readings)) > MOST_BIAS_DEG_S:
+    elif still > LEAST_GAIN:
+        evidence = f"expected to turn as its own gyroscope, fits worse than no turn by {still:.0f} in log likelihood"
+        yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
+    elif bias > MOST_BIAS_DEG_S:
         evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"
         yield Doubt(sensor.label, "heading drift, or a gyroscope's bias", evidence, False)
 
@@ -123,7 +119,7 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
 def turns_confirmed(sensor: OrientationSensor) -> bool:
     """Whether the gyroscope turns enough to tell, and the readings with it."""
     turns = GyroscopeTurns.of(sensor)
-    return turns is not None and turns.unexplained(sensor.readings.world_from_sensor) < CONTRADICTED
+    return turns is not None and turns.gain(sensor.readings.world_from_sensor) < -LEAST_GAIN
 
 
 def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:
@@ -132,13 +128,14 @@ def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:
     degrees = _gravity_from_vertical(sensor, readings)
     if not degrees > TILTED_DEG:
         return
+    mended = [
+        name
+        for name, other in conventions(readings)
+        if _gravity_from_vertical(sensor, other) < UPRIGHT_DEG
+    ]
+    suspect = (mended or ["a world whose z is not vertical, or an accelerometer on other axes"])[0]
     evidence = f"expected gravity along the world's z, got it {degrees:.0f} degrees off"
-    for name, other in conventions(readings):
-        if _gravity_from_vertical(sensor, other) < UPRIGHT_DEG:
-            yield Doubt(sensor.label, name, evidence, True)
-            return
-    suspect = "a world whose z is not vertical, or an accelerometer on other axes"
-    yield Doubt(sensor.label, suspect, evidence, False)
+    yield Doubt(sensor.label, suspect, evidence, bool(mended))
 
 
 def _gravity_from_vertical(sensor: OrientationSensor, readings: Rotation) -> float:

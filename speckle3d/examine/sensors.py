@@ -73,7 +73,7 @@ def _doubts_of(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTr
     """What is odd about one sensor, most telling first."""
     found = [*_frozen(sensor, sweep, image), *_shaking(sensor)]
     if not found and isinstance(sensor, OrientationSensor):
-        found += [*doubts_of_gyroscope(sensor)] or [*doubts_of_gravity(sensor)]
+        found += [*doubts_of_gyroscope(sensor), *doubts_of_gravity(sensor)]
     return [*found, *_slips(sensor, sweep.frame_time_s)]
 
 
