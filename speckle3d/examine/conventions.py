@@ -74,12 +74,12 @@ class GyroscopeTurns:
         )
 
     def misfit(self, difference: FloatArray) -> float:
-        """Negative logarithm of the likelihood of a difference, but for a bias; overlapping turns count once."""
+        """Negative log likelihood of a difference, but for a bias; overlapping turns count once."""
         noise = LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
         return float(len(self.degrees) / self.lag * np.log(_spread(difference) ** 2 + noise**2).sum())
 
     def gain(self, turned: Rotation, other: Rotation | None = None) -> float:
-        """Log likelihood of `other` readings, or of a sensor that does not turn, over that of the readings."""
+        """Log likelihood of `other` readings, or of one that does not turn, over that of `turned`."""
         against = self.degrees if other is None else self.difference(other)
         return self.misfit(self.difference(turned)) - self.misfit(against)
 
@@ -106,10 +106,14 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     gain, name = max(upright, default=(0.0, ""))
     still, bias = turns.gain(readings), turns.bias_deg_s(readings)
     if gain > LEAST_GAIN:
-        evidence = f"expected to turn as its own gyroscope, fits worse than otherwise by {gain:.0f} in log likelihood"
+        evidence = (
+            f"expected to turn as its own gyroscope, fits worse than so by {gain:.0f} in log likelihood"
+        )
         yield Doubt(sensor.label, name, evidence, True)
     elif still > LEAST_GAIN:
-        evidence = f"expected to turn as its own gyroscope, fits worse than no turn by {still:.0f} in log likelihood"
+        evidence = (
+            f"expected to turn as its own gyroscope, no turn fits better by {still:.0f} in log likelihood"
+        )
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
     elif bias > MOST_BIAS_DEG_S:
         evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"
@@ -129,9 +133,7 @@ def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:
     if not degrees > TILTED_DEG:
         return
     mended = [
-        name
-        for name, other in conventions(readings)
-        if _gravity_from_vertical(sensor, other) < UPRIGHT_DEG
+        name for name, other in conventions(readings) if _gravity_from_vertical(sensor, other) < UPRIGHT_DEG
     ]
     suspect = (mended or ["a world whose z is not vertical, or an accelerometer on other axes"])[0]
     evidence = f"expected gravity along the world's z, got it {degrees:.0f} degrees off"

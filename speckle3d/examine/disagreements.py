@@ -22,12 +22,12 @@ UNIT_FACTOR = 1.5
 """Factor within which a path must be such a multiple: units are farther apart, paths by images nearer."""
 FEWEST_FRAMES = 10
 SMOOTH_FRAMES = 9
-"""Frames of which the running median is taken: what a sensor's jitter does to one of them is none of its path."""
+"""Frames of which the running median is taken, so that jitter is not taken for motion."""
 LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.013
 """Errors of place and roll that sensors have beside their jitter: of a mounting off by 1 mm or a third
 of a degree while the probe turns by 5 degrees, and of a heading."""
 SIDEWAYS = 0.05
-"""Motion along x or y for each mm of travel that images see where structure runs across; of simulated tissue."""
+"""Motion along x or y that images see for each mm of travel where structure runs across, in simulated tissue."""
 
 
 def disagreements(

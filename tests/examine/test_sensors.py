@@ -94,9 +94,7 @@ def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracked)
     bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
     for recorded in (bad, bare):
         examined = examined_sensors(recorded, tracked.image)
-        sign = settle_direction(
-            examined.trusted, tracked.image, Config().sensors, examined.turn_confirmed
-        )
+        sign = settle_direction(examined.trusted, tracked.image, Config().sensors, examined.turn_confirmed)
         assert sign == (1, "assumed")
 
 
