@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.checks import examined_sensors
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
@@ -29,8 +28,10 @@ from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.examine.curves import examine_curves
+from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_path, examine_standing, interleaved
 from speckle3d.examine.recording import examine_recording
+from speckle3d.examine.sensors import examined_sensors
 from speckle3d.matching.chosen import match_again
 from speckle3d.matching.frames import ImageSink, MatchedSweep, StageTimes, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
@@ -165,7 +166,10 @@ class Tracked:
             ("direction", f"{self.direction:+d}, from {self.direction_from}"),
             ("subset", subset),
             ("pairs", f"{self.pairs} of frames"),
-            ("doubts", "; ".join(f"{each.about}: {each.suspect}" for each in self.doubts) or "none"),
+            (
+                "doubts",
+                "; ".join(f"{each.about}: {each.suspect or each.evidence}" for each in self.doubts) or "none",
+            ),
         ]
 
     @property
@@ -267,9 +271,9 @@ def track(
     )
 
     with times.of("sensors"):
-        sensors = examined_sensors(sweep, trajectory.poses, covariance, settings)
+        sensors = examined_sensors(sweep, trajectory.poses, settings.sensors.examine)
         direction, source = settle_direction(
-            sensors.telling, trajectory.poses, settings.sensors, sensors.turn_confirmed
+            sensors.trusted, trajectory.poses, settings.sensors, sensors.turn_confirmed
         )
         subset, used = consistent_poses(sensors.trusted, table, motion, direction, settings)
 
@@ -277,9 +281,11 @@ def track(
     if sink:
         for some in frame_pairs(motion, table, edges, used, direction, sigma):
             sink(some)
+    image = _seen_from(direction, trajectory.poses)
+    covariance = covariance if direction > 0 else MIRROR @ covariance @ MIRROR
     return Tracked(
-        image=_seen_from(direction, trajectory.poses),
-        covariance=covariance if direction > 0 else MIRROR @ covariance @ MIRROR,
+        image=image,
+        covariance=covariance,
         subset=None if subset is None else _seen_from(direction, subset),
         rejected_share=float("nan") if subset is None else _rejected_share(motion.pairs, used),
         flags=flags,
@@ -294,7 +300,7 @@ def track(
         rows=motion.rows,
         slopes=slopes,
         times=times,
-        doubts=(*doubts, *sensors.doubts),
+        doubts=(*doubts, *sensors.doubts, *disagreements(sensors.trusted, image, covariance, sigma)),
         grid=sweep.grid,
         frame_time_s=sweep.frame_time_s,
     )

@@ -85,6 +85,20 @@ def without(sensor: Sensor, left_out: BoolArray) -> Sensor:
     return replace(sensor, readings=less, **kept)
 
 
+def jitter(sensor: OrientationSensor | Tracker) -> tuple[float, float]:
+    """Standard deviation of a step between readings but for the motion itself, mm and degrees."""
+    samples = sensor.readings.world_from_sensor
+    rotation = samples.rotation if isinstance(samples, RigidTransform) else samples
+    turns = (rotation.mean().inv() * rotation).as_rotvec(degrees=True)
+    places = samples.translation if isinstance(samples, RigidTransform) else np.zeros((len(turns), 3))
+    if len(turns) < 3:
+        return 0.0, 0.0
+    # A second difference of white noise varies six times as much, a step twice.
+    second = (np.sqrt(1.0 / 3.0) * (each[2:] - 2.0 * each[1:-1] + each[:-2]) for each in (places, turns))
+    size = [max(robust_sigma(column) for column in each.T) for each in second]
+    return size[0], size[1]
+
+
 def standstill(sensor: OrientationSensor | Tracker) -> tuple[float, float]:
     """Begin and end of the longest time over which the readings are all the same, s; empty without one."""
     samples, time_s = sensor.readings.world_from_sensor, sensor.readings.time_s
