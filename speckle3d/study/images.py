@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.config import Config, config_from_toml
+from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
@@ -197,7 +197,7 @@ def grey_images(
     """
     settings = None
     if reconstruction is not None and reconstruction.config_toml:
-        settings = config_from_toml(reconstruction.config_toml).intensity
+        settings = stored_config(reconstruction.config_toml).intensity
     if levels == "stored":
         return StoredImages(sweep, progress)
     if levels == "linear":
