@@ -160,7 +160,7 @@ class IntensityExtractor:
         if self.settings.equalise_mm == 0:
             return intensity, np.stack([analytic.real, analytic.imag])
         mean, floor = self._local_mean(intensity)
-        image, parts = np.empty(mean.shape, np.float32), borrowed((2, *mean.shape), np.float32)
+        image, parts = np.empty(mean.shape, np.float32), np.empty((2, *mean.shape), np.float32)
         equalise_echo(_in_turn(analytic), np.ascontiguousarray(intensity), mean, floor, image, parts)
         return image, parts
 
