@@ -84,7 +84,7 @@ class GyroscopeTurns:
         return self.misfit(self.difference(turned)) - self.misfit(against)
 
     def gain_reversed(self, turned: Rotation) -> float:
-        """Log likelihood of the readings if the gyroscope is of the other sign, over that of them as they are."""
+        """Log likelihood of the readings, were the gyroscope of the other sign, over that as they are."""
         difference = self.difference(turned)
         return self.misfit(difference) - self.misfit(difference - 2.0 * self.degrees)
 
