@@ -1,1 +1,1 @@
-"""What is odd about a recording, how odd, and what that rests on. Nothing here changes an estimate."""
+"""What a recording, its images, curves and sensors say against each other; changes no estimate."""

@@ -18,7 +18,6 @@ from speckle3d.correction.modes import sensor_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
-from speckle3d.scoring.references import SweepCurves
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
@@ -58,13 +57,11 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
 
 
 def details_of(
-    tracked: Tracked, corrections: Mapping[str, Correction], moved: SweepCurves, provenance: Provenance
+    tracked: Tracked, corrections: Mapping[str, Correction], provenance: Provenance
 ) -> dict[str, Any]:
     """Everything worth keeping of a reconstruction beside its errors, by name."""
-    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
     return {
         "provenance": provenance,
-        "estimates": {m: dict(zip(names, c[:, -1].tolist(), strict=True)) for m, c in moved.modes.items()},
         "pairs": tracked.pairs,
         "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
@@ -83,8 +80,6 @@ def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
     return {
         "mean_share": float(found.share.mean()),
         "mean_gain": float(found.gain.mean()),
-        "mean_stretch": float(found.stretch.mean()),
-        "length_over_phantom_reading": float(found.scale.mean()),
         "scale_sigma": found.scale_sigma,
     }
 
@@ -107,17 +102,13 @@ def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:
 
 
 def _correction_details(correction: Correction) -> dict[str, Any]:
-    if isinstance(correction, DriftCorrection):
-        return _fit_details(correction)
-    return {
-        "length_over_images": correction.scale,
-        "relative_sigma": correction.log_scale_sigma,
-        "rests_on": [each.source for each in correction.evidence],
-        **correction.details,
-    }
-
-
-def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
+    if not isinstance(correction, DriftCorrection):
+        return {
+            "length_over_images": correction.scale,
+            "relative_sigma": correction.log_scale_sigma,
+            "rests_on": [each.source for each in correction.evidence],
+            **correction.details,
+        }
     fit = correction.fit
     return {
         "curves": correction.settings.curves,
