@@ -87,7 +87,7 @@ def uncorrected_variance(error: FloatArray) -> FloatArray:
         Readings less corrected poses, in the order of frames.
     """
     white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
-    return 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
+    return np.asarray(2.0 * np.maximum(error.var(axis=0) - white, 0.0), dtype=float)
 
 
 def tracker_errors(
