@@ -19,17 +19,14 @@ EDGE_FRACTION = 0.1
 
 Origin = Literal["phantom", "tracked", "data sheet", "crossing"]
 """What curves' distances come from: exact steps, a tracker, diffraction, or a sweep that crosses another."""
-STRUCTURE_SIGMA = 0.022
-"""Relative error of all distances, standard deviation, from structure in tissue that the adaptation to
-coherent echoes leaves: simulated muscle full of fibres reads 5.5 % shorter than a phantom; tissue that is
-read and tissue that curves come from lie anywhere between."""
-TISSUE_SIGMA = 0.027
-"""`STRUCTURE_SIGMA`, and what tissue does that attenuates otherwise than what the curves were measured in:
-0.3 dB/cm/MHz more make 2.3 to 3.4 % on simulated sweeps, and soft tissues differ by 0.15."""
+ATTENUATION_SIGMA = 0.03
+"""Relative standard deviation of all distances from tissue that attenuates otherwise than what the curves
+were measured in: soft tissues lie within 0.3 dB/cm/MHz of a phantom, taken as uniform (a deviation of 0.17),
+and 0.1 dB/cm/MHz widens the beam by 1.6 to 2 % by diffraction."""
 PROBE_SIGMA = 0.08
-"""The same from a probe that is not the one the curves were measured on, tissue included. Lenses of one model
-focus within 10 %, apertures are as high within 5 %, either way: 8 to 13 and 5 % of length at those bounds on
-simulated sweeps, taken as evenly spread between them (over the root of 3), and `TISSUE_SIGMA`."""
+"""The same from a probe that is not the one the curves were measured on, attenuation included. Lenses of one
+model focus within 10 %, apertures are as high within 5 %, either way: 8 to 13 and 5 % of length at those
+bounds on simulated sweeps, taken as evenly spread between them (over the root of 3)."""
 
 BAND_ADVICE = (
     " (where a recording does not say its band, it is measured, and never twice the same: give bandwidth_hz)"
@@ -250,7 +247,7 @@ class DecorrelationCurves:
         same_probe : bool
             Whether a phantom's curves were measured with the very probe of the sweep.
         """
-        return TISSUE_SIGMA if same_probe and self.origin == "phantom" else self.scale_sigma
+        return ATTENUATION_SIGMA if same_probe and self.origin == "phantom" else self.scale_sigma
 
 
 def _settings(key: CurveKey) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import STRUCTURE_SIGMA, CurveKey, DecorrelationCurves, NominalProbe, TiltResponse
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, NominalProbe, TiltResponse
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
@@ -212,7 +212,7 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -
         ]
     )
     common = sensitivity(nominal, depth_mm).mean(axis=0)
-    return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2 + STRUCTURE_SIGMA**2))
+    return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2))
 
 
 def _band(sheet: ProbeSheet) -> tuple[float, float]:

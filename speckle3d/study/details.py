@@ -82,8 +82,6 @@ def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
     return {
         "mean_share": float(found.share.mean()),
         "mean_gain": float(found.gain.mean()),
-        "mean_stretch": float(found.stretch.mean()),
-        "length_over_phantom_reading": float(found.scale.mean()),
         "scale_sigma": found.scale_sigma,
     }
 

@@ -20,7 +20,7 @@ from speckle3d.config import Config
 from speckle3d.core.geometry import mirrored
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.matching.blocks import Block, MatchedBlock, match_block
-from speckle3d.stages import matcher_for
+from speckle3d.pipeline import matcher_for
 
 
 def apart_mm(poses, others, centre_mm):

@@ -3,8 +3,8 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
+
 from speckle3d.kernels.statistics import PatchCurves
 
 EDGES_MM = np.r_[0.0, 0.1, 0.25, 0.6, 1.0]

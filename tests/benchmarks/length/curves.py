@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from cache import DEFAULT
+from speckle3d.motion.corrected_curves import corrected_curves
 
 from length.rows import Row
 from length.scenes import borrowed_curves, crossing_pair
@@ -14,7 +15,6 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.blocks import Block, MatchedBlock, blocks_of
-from speckle3d.motion.corrected_curves import corrected_curves
 from speckle3d.motion.data_sheet import ProbeSheet
 from speckle3d.pipeline import Tracked, match_ahead, track
 from speckle3d.sheet_curves import data_sheet_curves

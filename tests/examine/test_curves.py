@@ -10,26 +10,26 @@ from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.matching.intensity import two_way_wavenumber
-from speckle3d.matching.patches import lay_patches
-from speckle3d.motion.curve_doubts import (
-    DepthFactors,
+from speckle3d.examine.curves import (
+    bend,
     doubt_bend,
     doubt_curves,
-    doubt_depths,
     doubt_noise,
     doubt_size,
     doubt_speed,
     doubt_sums,
-    doubt_widths,
     sum_ratios,
 )
+from speckle3d.examine.recording import doubt_depths, doubt_widths
+from speckle3d.matching.intensity import two_way_wavenumber
+from speckle3d.matching.patches import lay_patches
+from speckle3d.motion.coherence import RowScales
 
 PATCHES = lay_patches(ImageGrid(vectors=48, samples=500, vector_pitch_mm=0.3, sample_spacing_mm=0.06))
 ROWS = PATCHES.row_depth_mm
 SIZE = SpeckleSize(np.linspace(0.3, 0.4, ROWS.size), np.linspace(0.07, 0.08, ROWS.size))
 CURVES = replace(speckle.curves(depth_mm=tuple(ROWS)), speckle=SIZE)
-CLEAR = np.ones(len(PATCHES))
+CLEAR = np.ones(ROWS.size)
 
 
 def test_the_first_refuted_doubt_is_raised_and_the_others_are_returned():
@@ -73,39 +73,26 @@ def test_no_hand_is_faster_than_a_hand(mm_s, doubted):
     assert all(f"{mm_s:.0f} mm/s" in d.evidence for d in found)
 
 
-def bent(by, rows=9, sigma=0.03, evidence=200.0):
-    return DepthFactors(
-        np.linspace(3, 30, rows), by * np.linspace(-1, 1, rows), np.full(rows, sigma), evidence
-    )
-
-
-def test_a_bend_is_what_exceeds_the_factors_own_errors():
-    assert bent(0.3).bend == pytest.approx(np.sqrt(0.09 * np.var(np.linspace(-1, 1, 9))), rel=0.02)
-    assert bent(0.01, sigma=0.1).bend == 0.0
-    shifted = bent(0.3)
-    assert replace(shifted, logarithm=shifted.logarithm + 0.4).bend == pytest.approx(shifted.bend)
+def bent(by, rows=9, gain=1.0):
+    """Scales that rise by so much from the first row to the middle."""
+    line = by * np.linspace(-1, 1, rows)
+    return RowScales(np.linspace(3, 30, rows), line, np.full(rows, gain), np.zeros(rows))
 
 
 def test_rows_that_stand_out_alone_are_no_bend():
     # Sheets along the motion hold two rows back.
-    held = np.where(np.isin(np.arange(9), [2, 6]), -1.2, 0.0)
-    assert replace(bent(0.0), logarithm=held).bend < 0.05
-    assert replace(bent(0.3), logarithm=bent(0.3).logarithm + held).bend == pytest.approx(0.2, abs=0.05)
+    sheets = np.where(np.isin(np.arange(9), [2, 6]), -1.2, 0.0)
+    assert bend(replace(bent(0.0), logarithm=sheets)) < 0.1
+    assert bend(replace(bent(0.3), logarithm=bent(0.3).logarithm + sheets)) == pytest.approx(0.2, abs=0.07)
 
 
 @pytest.mark.parametrize(
-    ("factors", "refuted"),
-    [
-        (bent(0.08), []),
-        (bent(0.25), [False]),
-        (bent(0.6), [True]),
-        (bent(0.6, evidence=5.0), []),
-        (bent(0.6, rows=2), []),
-    ],
-    ids=["right", "doubtful", "reversed", "chance", "two rows"],
+    ("rows", "refuted"),
+    [(bent(0.08), []), (bent(0.25), [False]), (bent(0.6), [True]), (bent(0.6, gain=0.5), []), (None, [])],
+    ids=["right", "doubtful", "reversed", "noisy", "not adapted to"],
 )
-def test_depths_that_disagree_doubt_the_curves(factors, refuted):
-    assert [d.refuted for d in doubt_bend(factors)] == refuted
+def test_depths_that_disagree_doubt_the_curves(rows, refuted):
+    assert [d.refuted for d in doubt_bend(rows)] == refuted
 
 
 def pairs_of(path, reach, read=lambda d: d):
@@ -217,5 +204,5 @@ def test_noise_that_the_images_do_not_show_is_not(gain, refuted):
     ],
 )
 def test_two_independent_doubts_at_once_refute(lateral, by, ratio, refuted):
-    found = doubt_curves(scaled(lateral), bent(by), np.full(20, ratio), CURVES, PATCHES, None)
+    found = doubt_curves(scaled(lateral), bent(by), np.full(20, ratio), CURVES, PATCHES)
     assert [d.refuted for d in found] == refuted

@@ -7,29 +7,27 @@ another factor at each depth, since all depths of one image move together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.sweep import RFSettings
-from speckle3d.matching.intensity import two_way_wavenumber
+from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.errors import MismatchError
+from speckle3d.core.sweep import Sweep
+from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
-from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import Coherence, CoherenceSettings, EchoProblem, vertex
+from speckle3d.matching.texture import SpeckleSizes, speckle_size
+from speckle3d.motion.coherence import NOISY_GAIN, RowScales
+from speckle3d.motion.estimate import Motion
 
 FASTEST_MM_S = 300.0
 """Mean speed above which no hand sweeps a probe: scans take 1 to 50 mm/s, a fast one some 100."""
-WIDEST_MM = 8.0
-"""Distance over which no beam keeps half of its correlation: that of an unfocused element 25 mm high, which
-keeps (1 - d / 25)^2 of the echo's. Probes' elements are 2 to 15 mm high, and focused."""
 BENT, REFUTED_BEND = 0.12, 0.25
 """Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.06 in phantom,
 tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too high 0.20, reversed 0.53."""
-LEAST_EVIDENCE = 20.0
-"""Gain in twice the log-likelihood for a factor at each depth, below which a bend may be chance."""
 RESIZED = {"lateral_mm": 0.13, "axial_mm": 0.3}
 REFUTED_SIZE = {"lateral_mm": 0.3, "axial_mm": 0.6}
 """Median over depth of the logarithm of speckle sizes over the phantom's, either sign. Simulated: lateral up
@@ -37,8 +35,6 @@ to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong by 10 mm; axial
 by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of two 0.69."""
 LEAST_ROWS, ENOUGH_ROWS = 3, 4
 """Rows of patches from which doubts arise, and from which sizes refute."""
-NOISY_GAIN = 0.9
-"""Part of the correlation that noise leaves, below which it makes speckle look finer."""
 UNSEEN_NOISE, REFUTED_NOISE = 1.8, 2.5
 """Correlation of neighbouring vectors over what the noise taken from distances would leave of it. Simulated:
 up to 1.1 in nearly all of 64 good sweeps, 1.5 in the worst."""
@@ -49,77 +45,48 @@ it in images of few patches: alone, it refutes nothing."""
 LEAST_TRIPLES = 12
 FLAT = 0.3
 """Part of the distance that halves the correlation, below which it is too flat for distances to be summed."""
-TILT_FACTOR = 1.4
-"""Of tilt's spread over that of the curves' width, from which it is calculated when curves are measured."""
-_SCALES = np.geomspace(0.3, 3.4, 25)
 _ROW_ERROR = 0.03
-"""Of a row's factor, from the curves and tissue, beside the likelihood's."""
-_HUBER, _ROUNDS = 2.0, 20
+"""Of a row's factor, from the curves and tissue."""
+
+
+def examine_curves(
+    sweep: Sweep, matcher: FrameMatcher, sizes: SpeckleSizes, motion: Motion, usable: BoolArray
+) -> tuple[Doubt, ...]:
+    """Hold the curves against a sweep's own speckle and steps.
+
+    Raises
+    ------
+    MismatchError
+        If they are refuted.
+    """
+    size, problem, pairs = (
+        speckle_size(sweep, matcher, np.flatnonzero(usable), sizes),
+        motion.problem,
+        motion.pairs,
+    )
+    least = FLAT * float(problem.fitter.estimator.typical_distance(np.sqrt(0.5)))
+    ratios = sum_ratios(pairs.first, pairs.second, pairs.sign * pairs.planes.offset_mm, least)
+    doubts = doubt_curves(size, motion.rows, ratios, problem.curves, problem.patches)
+    return unrefuted([*doubt_speed(motion.path, sweep.frame_time_s), *doubts], sweep.name, MismatchError)
 
 
 def doubt_curves(
     seen: SpeckleSize,
-    factors: DepthFactors,
+    rows: RowScales | None,
     ratios: FloatArray,
     curves: DecorrelationCurves,
     patches: PatchGrid,
-    coherence: Coherence | None,
 ) -> tuple[Doubt, ...]:
     """Doubts that a sweep's own speckle raises: by its size, noise, depths that disagree, and steps' sums.
 
     Size, depths and sums say so independently of each other: two of them at once refute the curves.
     """
-    gain = np.ones(len(patches)) if coherence is None else coherence.gain.mean(axis=0)
-    kinds = doubt_size(seen, curves, patches, gain), doubt_bend(factors), doubt_sums(ratios)
+    gain = np.ones(patches.row_depth_mm.size) if rows is None else rows.gain
+    kinds = doubt_size(seen, curves, patches, gain), doubt_bend(rows), doubt_sums(ratios)
     found = tuple(doubt for kind in kinds for doubt in kind)
     if sum(map(bool, kinds)) > 1:
         found = tuple(replace(doubt, refuted=True) for doubt in found)
     return (*found, *doubt_noise(seen, curves, patches, gain))
-
-
-def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) -> tuple[Doubt, ...]:
-    """Tell that patches were left out because the curves did not measure their depths."""
-    rows, kept = laid.row_depth_mm, used.row_depth_mm
-    if rows.size == kept.size:
-        return ()
-    return (
-        Doubt(
-            "curves",
-            "depths",
-            f"expected patches at the curves' depths of {curves.depth_mm[0]:.1f} to "
-            f"{curves.depth_mm[-1]:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm: "
-            f"{rows.size - kept.size} of {rows.size} rows left out",
-            refuted=False,
-        ),
-    )
-
-
-def doubt_widths(curves: DecorrelationCurves) -> tuple[Doubt, ...]:
-    """Doubt curves that no beam has."""
-    half = np.array([np.interp(-0.5, -row, curves.distance_mm) for row in curves.correlation])
-    found = []
-    if curves.tilt is not None and isinstance(curves.key.signal, RFSettings):
-        width = np.array([np.interp(0.5, -np.log(row), curves.distance_mm) for row in curves.correlation])
-        ratio = float(np.median(curves.tilt.spread_mm / (two_way_wavenumber(curves.key.signal) * width**2)))
-        if abs(np.log(ratio)) > np.log(TILT_FACTOR):
-            found.append(
-                Doubt(
-                    "curves",
-                    "distances changed after the curves were measured",
-                    f"expected tilt to spread echoes as the curves' width has it, got {ratio:.2f} times that",
-                    refuted=True,
-                )
-            )
-    if np.median(half) > WIDEST_MM:
-        found.append(
-            Doubt(
-                "curves",
-                "units",
-                f"expected correlation to halve within {WIDEST_MM:g} mm, got {np.median(half):.3g} mm",
-                refuted=True,
-            )
-        )
-    return tuple(found)
 
 
 def doubt_speed(path: FloatArray, time_s: FloatArray) -> tuple[Doubt, ...]:
@@ -145,99 +112,38 @@ def doubt_speed(path: FloatArray, time_s: FloatArray) -> tuple[Doubt, ...]:
     )
 
 
-@dataclass(frozen=True)
-class DepthFactors:
-    """Distances read at each depth over those of all depths together.
+def bend(rows: RowScales) -> float:
+    """Weighted standard deviation of the logarithm's smooth course over depth: a parabola through clear rows.
 
-    Attributes
-    ----------
-    depth_mm, logarithm, sigma : ndarray, shape (r,)
-        Of rows of patches; the logarithm of the ratio, whose mean says nothing, and its standard deviation.
-    evidence : float
-        Gain in twice the log-likelihood over one factor for all.
+    A lens or a depth that is wrong bends all rows smoothly; rows that stand out alone hold structure.
     """
+    clear = rows.gain >= NOISY_GAIN
+    if clear.sum() < ENOUGH_ROWS:
+        return 0.0
+    depth, logarithm = rows.depth_mm[clear], rows.logarithm[clear]
+    design = np.vander((depth - depth.mean()) / np.ptp(depth), 3)
 
-    depth_mm: FloatArray
-    logarithm: FloatArray
-    sigma: FloatArray
-    evidence: float
+    def misfit(values: FloatArray) -> FloatArray:
+        return np.asarray(design @ values - logarithm)
 
-    @property
-    def bend(self) -> float:
-        """Standard deviation of the logarithm's smooth course over depth, beyond what its own errors make.
-
-        A lens or a depth that is wrong bends all rows smoothly; rows that stand out alone hold structure.
-        """
-        at = (self.depth_mm - self.depth_mm.mean()) / np.ptp(self.depth_mm)
-        design = np.vander(at, min(3, at.size - 1))
-        spread = np.hypot(self.sigma, _ROW_ERROR)
-        weight = 1.0 / spread
-        for _ in range(_ROUNDS):
-            fit = np.linalg.lstsq(design * weight[:, None], self.logarithm * weight, rcond=None)[0]
-            size = np.abs(self.logarithm - design @ fit) / spread
-            weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(size, 1e-9))) / spread
-        course, weight = design @ fit, weight**2
-        off = course - np.average(course, weights=weight)
-        chance = (design.shape[1] - 1) / weight.sum()
-        return float(np.sqrt(max(np.average(off**2, weights=weight) - chance, 0.0)))
+    fit = least_squares(misfit, np.zeros(3), loss="soft_l1", f_scale=_ROW_ERROR)
+    return float(np.std(design @ fit.x))
 
 
-def depth_factors(
-    table: CorrelationTable,
-    sound: BoolArray,
-    path: FloatArray,
-    curves: DecorrelationCurves,
-    patches: PatchGrid,
-    lateral_mm: FloatArray,
-    settings: CoherenceSettings,
-) -> DepthFactors:
-    """Fit a factor for each row of patches, coherent shares and noise granted as `estimate_coherence` does.
-
-    Parameters
-    ----------
-    sound : ndarray of bool, shape (e,)
-        Pairs both of whose frames are to be trusted.
-    path : ndarray, shape (n, 2)
-        Elevational position of each frame's centre and its slope along x.
-    lateral_mm : ndarray, shape (p,)
-        Of the patches, from the image's centre.
-    """
-    problem = EchoProblem(
-        table.first[sound],
-        table.second[sound],
-        table.correlation[sound],
-        curves,
-        patches,
-        lateral_mm,
-        settings,
-    )
-    cost = problem.cost_of_scales(path, _SCALES)
-    rows = patches.rows_of(cost).sum(axis=-1)  # shape (s, r)
-    logs = np.log(_SCALES)
-    best = rows.argmin(axis=0)
-    inner = np.clip(best, 1, _SCALES.size - 2)
-    each = np.arange(best.size)
-    curvature = rows[inner - 1, each] - 2 * rows[inner, each] + rows[inner + 1, each]
-    sigma = np.sqrt(2.0 / np.maximum(curvature / (logs[1] - logs[0]) ** 2, 1.0))
-    factor = np.array([vertex(logs, column) for column in rows.T])
-    return DepthFactors(
-        patches.row_depth_mm, factor, sigma, float(rows.sum(axis=1).min() - rows.min(axis=0).sum())
-    )
-
-
-def doubt_bend(factors: DepthFactors) -> tuple[Doubt, ...]:
+def doubt_bend(rows: RowScales | None) -> tuple[Doubt, ...]:
     """Doubt curves by which depths of one image are not as far from the next."""
-    if factors.depth_mm.size < LEAST_ROWS or factors.bend < BENT or factors.evidence < LEAST_EVIDENCE:
+    size = 0.0 if rows is None else bend(rows)
+    if rows is None or size < BENT:
         return ()
-    ratio = np.exp(np.ptp(factors.logarithm))
+    ratio = np.exp(np.ptp(rows.logarithm))
     return (
         Doubt(
             "curves",
             "curves of another probe, lens or depth",
-            f"expected all depths to tell the same distance, got distances at {factors.depth_mm[0]:.0f} to "
-            f"{factors.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} "
-            f"({100 * factors.bend:.0f} % rms, at most {100 * BENT:.0f} expected)",
-            refuted=factors.bend > REFUTED_BEND,
+            f"expected all depths to tell the same distance, got distances at {rows.depth_mm[0]:.0f} to "
+            f"{rows.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} "
+            f"({100 * size:.0f} % rms, at most {100 * BENT:.0f} expected)",
+            refuted=size > REFUTED_BEND,
         ),
     )
 
@@ -287,7 +193,7 @@ def doubt_sums(ratios: FloatArray) -> tuple[Doubt, ...]:
 
 
 def doubt_size(
-    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, gain: FloatArray
+    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, left: FloatArray
 ) -> tuple[Doubt, ...]:
     """Doubt a sweep whose speckle is not as large as the curves' phantom's at the same depths.
 
@@ -295,13 +201,12 @@ def doubt_size(
     ----------
     seen : SpeckleSize
         Of the rows of patches; NaN where they hold no speckle.
-    gain : ndarray, shape (p,)
-        Part of the patches' correlation that noise leaves.
+    left : ndarray, shape (r,)
+        Part of the correlation of each row of patches that noise leaves.
     """
     if curves.speckle is None:
         return ()
     known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
-    left = np.median(patches.rows_of(gain), axis=-1)
     excused = (left < NOISY_GAIN) & (_unseen_noise(seen, known, left, patches) < UNSEEN_NOISE)
     found = []
     for name in ("lateral_mm", "axial_mm"):
@@ -327,7 +232,7 @@ def doubt_size(
 
 
 def doubt_noise(
-    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, gain: FloatArray
+    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, left: FloatArray
 ) -> tuple[Doubt, ...]:
     """Doubt distances read with noise that the images do not show.
 
@@ -342,7 +247,6 @@ def doubt_noise(
     if curves.speckle is None:
         return ()
     known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
-    left = np.median(patches.rows_of(gain), axis=-1)
     excess = _unseen_noise(seen, known, left, patches)
     if excess < UNSEEN_NOISE:
         return ()

@@ -13,9 +13,14 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import Sweep
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.distances import LEAST_CORRELATION
+from speckle3d.motion.signs import SignedPairs
 from speckle3d.motion.trajectory import HELD_MM
 
 IMAGES = "images"
@@ -64,6 +69,54 @@ FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
 """Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
 to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
 a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
+
+
+def examine_standing(
+    sweep: Sweep,
+    matcher: FrameMatcher,
+    curves: DecorrelationCurves,
+    position_mm: FloatArray,
+    usable: BoolArray,
+) -> tuple[Doubt, ...]:
+    """Look for echoes that are the same in frames beyond the reach of speckle.
+
+    Raises
+    ------
+    InsufficientDataError
+        If so much stands still that distances mean nothing.
+    """
+    frames = far_apart(position_mm, usable, curves)
+    if len(frames) < 2:
+        return ()
+    share = standing_share(sweep, matcher, frames.tolist())
+    found = standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
+    return unrefuted([found], sweep.name, InsufficientDataError)
+
+
+def examine_path(
+    sweep: Sweep,
+    poses: RigidTransform,
+    covariance: FloatArray,
+    table: CorrelationTable,
+    pairs: SignedPairs,
+    patch_centre_mm: FloatArray,
+    reach_mm: float,
+    usable: BoolArray,
+) -> tuple[Doubt, ...]:
+    """Ask whether a length is open, a sweep in pieces, or a path contradicted by pairs.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the images do not determine the length, or cannot be those of one probe that moves.
+    """
+    z_mm, sigma_mm = poses.apply(sweep.grid.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2])
+    found = (
+        undetermined(z_mm, sigma_mm, reach_mm),
+        severed(pairs.first, pairs.second, usable),
+        folded(table, poses, patch_centre_mm, usable),
+    )
+    return unrefuted(found, sweep.name, InsufficientDataError)
 
 
 def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:

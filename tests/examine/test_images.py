@@ -5,10 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from speckle import curves
 
-from speckle3d.matching.inplane import InPlaneMotion
-from speckle3d.matching.schedule import PairSchedule
-from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.plausibility import (
+from speckle3d.examine.images import (
     MOST_FRAMES,
     far_apart,
     folded,
@@ -17,6 +14,9 @@ from speckle3d.motion.plausibility import (
     standing,
     undetermined,
 )
+from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.matching.schedule import PairSchedule
+from speckle3d.matching.table import CorrelationTable
 
 WIDTH_MM, CELLS = 0.45, 60.0
 PATCHES_MM = np.array([[x, y] for x in (2.0, 6.0, 10.0) for y in np.linspace(5.0, 25.0, 9)])
