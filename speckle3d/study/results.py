@@ -319,10 +319,10 @@ def copy_lines(copies: Mapping[str, str]) -> list[str]:
 def read_summary(folder: Path, name: str) -> Summary:
     """Read a sweep's summary back, without its details; a number that was not finite is NaN again."""
     (stored,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-    known: list[dict[str, Any]] = [
+    records: list[dict[str, Any]] = [
         {key: math.nan if value is None else value for key, value in row.items()} for row in stored["rows"]
     ]
-    rows = [ModeError(**row) for row in known]
+    rows = [ModeError(**row) for row in records]
     doubts = [Doubt(**each) for each in stored["doubts"]]
     return Summary(**stored | {"sweep": name, "rows": rows, "doubts": doubts, "details": {}})
 

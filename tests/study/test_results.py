@@ -129,12 +129,6 @@ def test_doubts_are_found_again_beside_the_reconstruction_they_belong_to(tmp_pat
     assert recorded_doubts(path, made) is None
 
 
-def test_a_directory_that_cannot_be_made_is_one_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(FileError, match="file"):
-        write_summary(tmp_path / "file", summary())
-
-
 def test_a_study_takes_the_place_of_the_one_before_with_all_that_was_made_from_it(tmp_path, monkeypatch):
     failed = [SweepOutcome("a", tmp_path / "a.h5", "failed", "first")]
     write_study(tmp_path, failed, "first")
