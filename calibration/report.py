@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,12 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.chain import SCALES, ChainSolution, free_jacobian
-from calibration.identifiability import judge
-from calibration.near import near_jacobian
+from calibration.plane import Solution
+from calibration.points import ANGLES, CHAIN, SCALES
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
-from speckle3d.core.geometry import roll_yaw_tilt
+from speckle3d.core.geometry import roll_yaw_tilt, skew
 from speckle3d.core.tables import text_rows
 
 USED, DROPPED = "#0072B2", "#D55E00"
@@ -55,7 +54,7 @@ class Shot:
 
 
 def as_calibration(
-    solution: ChainSolution, method: str, frames: FramesUsed, time_offset_s: float | None = None
+    solution: Solution, method: str, frames: FramesUsed, time_offset_s: float | None = None
 ) -> Calibration:
     """Bring a solution into the form that is saved, with standard errors of the published parameters.
 
@@ -80,20 +79,25 @@ def as_calibration(
         condition_number=solution.condition_number,
         frames=_frames_used(solution, frames),
         time_offset_s=time_offset_s,
-        verdict=judge(solution).verdict,
+        verdict=solution.adequacy.verdict,
     )
 
 
-def _parameters(solution: ChainSolution) -> tuple[Parameter, ...]:
-    """The parameters estimated, in the sensor's and the world's own frames."""
-    values, used = solution.chain.parameters(), solution.points_used
-    own = free_jacobian(used, solution.phantom, solution.chain, solution.free)
-    _, near = near_jacobian(used, solution.phantom, solution.chain, solution.free)
-    own_from_near = np.linalg.lstsq(own, near, rcond=None)[0]
-    errors = np.sqrt(np.diag(own_from_near @ solution.covariance @ own_from_near.T))
+def _parameters(solution: Solution) -> tuple[Parameter, ...]:
+    """The parameters estimated: places in the sensor's frame and the phantom's, angles about own axes.
+
+    An angle's error is that about the image's z, y and x axes (roll, yaw, tilt), or about the phantom's:
+    near a singularity of fixed angles it is as large as ever.
+    """
+    values = dict(zip(CHAIN, solution.chain.parameters(), strict=True))
+    turn = np.eye(len(CHAIN))
+    turn[2:5, 2:5] = solution.chain.sensor_from_image.rotation.as_matrix()
+    # Angles are in the order z, y, x; the world's origin moves as the phantom turns.
+    turn[8:11, 13:10:-1] = -skew(np.asarray(solution.chain.target_from_world.translation)[None])[0]
+    covariance = turn @ solution.full_covariance @ turn.T
+    errors = dict(zip(CHAIN, np.sqrt(np.diag(covariance)), strict=True))
     return tuple(
-        Parameter(name, float(values[column]), float(error), _unit(name))
-        for name, column, error in zip(solution.free, solution.free_columns, errors, strict=True)
+        Parameter(name, float(values[name]), float(errors[name]), _unit(name)) for name in solution.free
     )
 
 
@@ -103,7 +107,7 @@ def _unit(name: str) -> str:
     return "mm" if name[0] in "xyz" else "rad"
 
 
-def _frames_used(solution: ChainSolution, frames: FramesUsed) -> FramesUsed:
+def _frames_used(solution: Solution, frames: FramesUsed) -> FramesUsed:
     """Add the frames that contradict the others, with their residuals."""
     dropped = dict(frames.dropped)
     for number in np.unique(solution.points.frame[~solution.used]):
@@ -116,14 +120,15 @@ def _frames_used(solution: ChainSolution, frames: FramesUsed) -> FramesUsed:
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
     """What was found as description, value and unit, angles in degrees."""
     rows = [("method", calibration.method, ""), ("sensor", calibration.sensor, "")]
-    rows += [parameter.row() for parameter in calibration.parameters]
-    names = ("roll", "yaw", "tilt")
-    angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
-    errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
-    rows += [
-        (f"sensor_from_image, {name}", f"{angle:.3f} +- {error:.3f}", "deg")
-        for name, angle, error in zip(names, angles, errors, strict=True)
-    ]
+    words = dict(zip(ANGLES, ("roll (alpha)", "yaw (beta)", "tilt (gamma)"), strict=True))
+    rows += [replace(one, name=words.get(one.name, one.name)).row() for one in calibration.parameters]
+    if not any(one.name in words for one in calibration.parameters):
+        angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
+        errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
+        rows += [
+            (name, f"{angle:.3f} +- {error:.3f}", "deg")
+            for name, angle, error in zip(words.values(), angles, errors, strict=True)
+        ]
     used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
     rows += [
         (
@@ -196,7 +201,7 @@ def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict
     }
 
 
-def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
+def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
     """One page: images with what was found in them, residuals, and the motion."""
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -253,7 +258,7 @@ def _explain(axes: Axes, calibration: Calibration) -> None:
     axes.text(0.0, 1.0, "\n".join(told), va="top", fontsize=8, transform=axes.transAxes, parse_math=False)
 
 
-def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
+def _draw_residuals(axes: Axes, solution: Solution) -> None:
     values, unit = _shown(solution)
     used = solution.used
     axes.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
@@ -267,7 +272,7 @@ def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     )
 
 
-def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
+def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
     """Residuals against tilt, where a thick beam shows as a V."""
     values, unit = _shown(solution)
     turns = _turns_deg(solution)
@@ -276,21 +281,21 @@ def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
     axes.set(xlabel="tilt / deg", ylabel=f"largest residual / {unit}", title="and by tilt")
 
 
-def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
+def _draw_motion(axes: Axes, solution: Solution) -> None:
     turns = _turns_deg(solution)[solution.used]
     drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
     axes.set(xlabel="tilt / deg", ylabel="roll / deg", title="how the probe was turned")
 
 
-def _shown(solution: ChainSolution) -> tuple[FloatArray, str]:
+def _shown(solution: Solution) -> tuple[FloatArray, str]:
     """The largest residual of each point, with its sign, and its unit."""
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
     return (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
 
 
-def _turns_deg(solution: ChainSolution) -> FloatArray:
+def _turns_deg(solution: Solution) -> FloatArray:
     """Tilt, yaw and roll of every point's image about the mean orientation, shape (n, 3)."""
     turns = solution.chain.target_from_image(solution.points).rotation
     return np.asarray(np.rad2deg((turns.mean().inv() * turns).as_rotvec()))

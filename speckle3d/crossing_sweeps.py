@@ -14,7 +14,7 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
-from speckle3d.correction.trust import believed
+from speckle3d.examine.sensors import believed
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.motion.lens import Length, corrected_curves

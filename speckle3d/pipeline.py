@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.checks import examined_sensors
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
@@ -29,23 +28,18 @@ from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.examine.curves import examine_curves
+from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_path, examine_standing, interleaved
 from speckle3d.examine.recording import examine_recording
-from speckle3d.matching.blocks import (
-    Block,
-    BlockSource,
-    ImageSink,
-    MatchedBlock,
-    MatchedSweep,
-    StageTimes,
-    match_block,
-    match_sweep,
-)
+from speckle3d.examine.sensors import examined_sensors
 from speckle3d.matching.chosen import match_again
+from speckle3d.matching.frames import ImageSink, MatchedSweep, StageTimes, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames, sound_pairs
+from speckle3d.matching.spectra import row_spectra
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import SpeckleSizes
+from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
 from speckle3d.motion.coherence import Coherence, RowScales, scale_sigma
 from speckle3d.motion.direction import sensed_orientation, settle_direction
 from speckle3d.motion.estimate import Motion, MotionProblem, edges_of, estimate_motion, frame_pairs
@@ -95,6 +89,8 @@ class Tracked:
         Sign of the elevational motion, +1 or -1.
     direction_from : str
         What settled the sign.
+    attenuation : Attenuation
+        Of the tissue over the curves' phantom, by the echoes' spectrum.
     coherence : Coherence or None
         How the patches' echoes depart from a phantom's; None if not adapted to.
     curves : DecorrelationCurves
@@ -123,6 +119,7 @@ class Tracked:
     curves_sigma: float
     direction: int
     direction_from: str
+    attenuation: Attenuation
     coherence: Coherence | None
     curves: DecorrelationCurves
     rows: RowScales | None
@@ -169,7 +166,10 @@ class Tracked:
             ("direction", f"{self.direction:+d}, from {self.direction_from}"),
             ("subset", subset),
             ("pairs", f"{self.pairs} of frames"),
-            ("doubts", "; ".join(f"{each.about}: {each.suspect}" for each in self.doubts) or "none"),
+            (
+                "doubts",
+                "; ".join(f"{each.about}: {each.suspect or each.evidence}" for each in self.doubts) or "none",
+            ),
         ]
 
     @property
@@ -185,7 +185,6 @@ def track(
     progress: Progress | None = None,
     sink: PairSink | None = None,
     images: ImageSink | None = None,
-    matched: BlockSource | None = None,
 ) -> Tracked:
     """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
 
@@ -204,9 +203,7 @@ def track(
     sink : callable, optional
         Called with the frame pairs, some at a time.
     images : callable, optional
-        Called with every intensity image, but not with those of blocks that `matched` returns.
-    matched : callable, optional
-        Asked for each block of frames before it is matched here.
+        Called with every intensity image.
 
     Returns
     -------
@@ -216,10 +213,10 @@ def track(
     ------
     MismatchError
         If the curves belong to another probe, frequency, sampling, patch size or depth, by what the files say
-        or by what the images do; see `speckle3d.motion.curve_doubts`.
+        or by what the images do; see `speckle3d.examine`.
     InsufficientDataError
         If too many frames have no speckle in common with others, if the images do not determine the length,
-        or if they cannot be those of one probe that moves (`speckle3d.motion.plausibility`).
+        or if they cannot be those of one probe that moves (`speckle3d.examine.images`).
 
     Examples
     --------
@@ -238,14 +235,14 @@ def track(
     doubts = examine_recording(sweep, matcher, curves)
 
     sizes = SpeckleSizes(sweep, matcher, images)
-    matches = match_sweep(
-        sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep, matched
-    )
+    matches = match_sweep(sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep)
     table, flags = matches.table, frame_flags(sweep, matches, settings)
 
     with times.of(MOTION):
-        problem = motion_problem(curves, matcher, len(sweep), settings)
+        attenuation = estimate_attenuation(curves, row_spectra(sweep, matcher, np.flatnonzero(flags == 0)))
+        problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)
         motion = estimate_motion(problem, table, sound_pairs(table, flags))
+    doubts += attenuation.doubts
     flags = with_unplaced(sweep, flags, motion.pairs)
     with times.of("checks of the images"):
         doubts += examine_standing(sweep, matcher, curves, motion.path[:, 0], flags == 0)
@@ -254,7 +251,8 @@ def track(
     with times.of("revisits"):
         table, motion = tied_to_returns(sweep, matcher, table, motion, flags)
     with times.of("trajectory"):
-        slopes, mismatch = motion.slopes, motion.problem.curves.mismatch(settings.curves.same_probe)
+        slopes = motion.slopes
+        mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
         edges = edges_of(table, motion.pairs, slopes.applied(motion.pairs.planes))
         trajectory = solve_trajectory(edges, len(sweep), matcher.centre_mm, settings.trajectory, True)
         shared = SharedErrors(scale_sigma(motion.coherence), mismatch, slopes.deviation_per_mm)
@@ -273,9 +271,9 @@ def track(
     )
 
     with times.of("sensors"):
-        sensors = examined_sensors(sweep, trajectory.poses, covariance, settings)
+        sensors = examined_sensors(sweep, trajectory.poses, settings.sensors.examine)
         direction, source = settle_direction(
-            sensors.telling, trajectory.poses, settings.sensors, sensors.turn_confirmed
+            sensors.trusted, trajectory.poses, settings.sensors, sensors.turn_confirmed
         )
         subset, used = consistent_poses(sensors.trusted, table, motion, direction, settings)
 
@@ -283,9 +281,11 @@ def track(
     if sink:
         for some in frame_pairs(motion, table, edges, used, direction, sigma):
             sink(some)
+    image = _seen_from(direction, trajectory.poses)
+    covariance = covariance if direction > 0 else MIRROR @ covariance @ MIRROR
     return Tracked(
-        image=_seen_from(direction, trajectory.poses),
-        covariance=covariance if direction > 0 else MIRROR @ covariance @ MIRROR,
+        image=image,
+        covariance=covariance,
         subset=None if subset is None else _seen_from(direction, subset),
         rejected_share=float("nan") if subset is None else _rejected_share(motion.pairs, used),
         flags=flags,
@@ -294,35 +294,16 @@ def track(
         curves_sigma=mismatch,
         direction=direction,
         direction_from=source,
+        attenuation=attenuation,
         coherence=motion.coherence,
         curves=motion.problem.curves,
         rows=motion.rows,
         slopes=slopes,
         times=times,
-        doubts=(*doubts, *sensors.doubts),
+        doubts=(*doubts, *sensors.doubts, *disagreements(sensors.trusted, image, covariance, sigma)),
         grid=sweep.grid,
         frame_time_s=sweep.frame_time_s,
     )
-
-
-def match_ahead(
-    sweep: Sweep,
-    curves: DecorrelationCurves,
-    block: Block,
-    config: Config | None = None,
-    images: ImageSink | None = None,
-) -> MatchedBlock:
-    """Match one block of a sweep, for `track` to take; any process may do so, and in any order.
-
-    Raises
-    ------
-    MismatchError
-        As `track`, before any work is done: the curves are not used otherwise.
-    """
-    settings, times = config or Config(), StageTimes()
-    matcher = matcher_for(sweep, curves, settings)
-    frames = list(match_block(sweep, matcher, settings.trajectory, settings.quality, block, images, times))
-    return MatchedBlock(frames, times.seconds)
 
 
 def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:

@@ -49,8 +49,9 @@ class Scene:
         return (
             self.edges,
             self.image,
-            self.covariance,
+            0.0,
             self.scale_sigma,
+            0.0,
             self.turn_sigma_per_mm,
             CENTRE_MM,
             self.time_s,

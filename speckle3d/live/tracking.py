@@ -27,7 +27,7 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import on_one_thread
-from speckle3d.matching.blocks import FrameByFrame, FrameMaker, ImageSink
+from speckle3d.matching.frames import FrameByFrame, FrameMaker, ImageSink
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, sound_pairs
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence

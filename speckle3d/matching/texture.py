@@ -12,7 +12,7 @@ from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import SpeckleSize
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.matching.blocks import ImageSink
+from speckle3d.matching.frames import ImageSink
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 

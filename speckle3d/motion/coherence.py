@@ -49,8 +49,10 @@ NO_STRUCTURE = 0.02
 have 0.000 to 0.006, tissue 0.05 to 0.14."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
-MOST_SHARE, MOST_POWER = 0.95, 0.9
-"""Bounds of c and a: at one, structure is all there is, or speckle itself."""
+MOST_SHARE, MOST_POWER = {"echo": 0.5, "intensity": 0.95}, 0.9
+"""Bounds of c, by what is correlated, and of a. An echo that is structure for the most part is r^a alone, a
+curve of another width, and tells no scale; of intensity, structure's share is larger, because its phase does
+not count."""
 
 
 class CoherenceSettings(BaseModel):
@@ -188,7 +190,7 @@ class PatchCorrelations:
     def fit(
         self,
         log_scale: float | None = None,
-        most_share: float = MOST_SHARE,
+        most_share: float | None = None,
         most_power: float = 0.0,
         share_sigma: float = np.inf,
     ) -> FloatArray:
@@ -199,10 +201,11 @@ class PatchCorrelations:
         log_scale : float, optional
             To which ln s is held; by default each patch tells its own.
         most_share, most_power : float
-            Upper bounds of c and a.
+            Upper bounds of c (`MOST_SHARE` by default) and a.
         share_sigma : float
             Standard deviation of a normal prior of c about zero.
         """
+        most_share = MOST_SHARE["echo" if self.of_echo else "intensity"] if most_share is None else most_share
         lowest = np.array([-1.0 if log_scale is None else log_scale, 0.05, 0.0, 0.0])
         highest = np.array([1.0 if log_scale is None else log_scale, 1.2, most_share, most_power])
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, NominalProbe, TiltResponse
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra, NominalProbe, TiltResponse
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
@@ -104,28 +102,6 @@ class ProbeSheet(BaseModel):
         return RFSettings(
             1e6 * self.sampling_rate_mhz, self.speed_of_sound_m_s, (low + high) / 2.0, (low, high)
         )
-
-
-@dataclass(frozen=True)
-class EchoSpectra:
-    """Power spectrum of a sweep's echoes by depth: attenuation and the pulse's true frequency are in it.
-
-    Attributes
-    ----------
-    depth_mm : ndarray, shape (y,)
-    frequency_hz : ndarray, shape (f,)
-    power : ndarray, shape (y, f)
-    """
-
-    depth_mm: FloatArray
-    frequency_hz: FloatArray
-    power: FloatArray
-
-    def at(self, depth_mm: FloatArray, frequency_hz: FloatArray) -> FloatArray:
-        """Power at depths of any shape and at other frequencies, shape (..., f)."""
-        known = np.stack([np.interp(frequency_hz, self.frequency_hz, row) for row in self.power])
-        flat = [np.interp(depth_mm.ravel(), self.depth_mm, column) for column in known.T]
-        return np.stack(flat, axis=-1).reshape(*depth_mm.shape, -1)
 
 
 def sheet_curves(

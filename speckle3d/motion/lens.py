@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -12,12 +13,20 @@ from scipy.optimize import least_squares
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import ATTENUATION_SIGMA, DecorrelationCurves, TiltResponse
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import RFSettings
 from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
 from speckle3d.motion.diffraction import Lens, Nominal, half_distance
 
 FOCUS_SIGMA = 0.15 / np.sqrt(3.0)
 """Standard deviation of the logarithm of the focal length about its data sheet's: 15 % either way."""
 LEAST_ROWS = 4
+F_NUMBER = 2.0
+"""Assumed of the transmit aperture at the lens's focus."""
+BAND_HZ = 5e6, 10e6
+"""Assumed for images without phase; the aperture that is then fitted makes up for it."""
+FREQUENCY_SIGMA = 0.08
+"""Of the echo's frequency over the band's centre."""
+_STARTS, _START_F_NUMBER, _DEPTHS = (0.3, 0.5, 0.8, 1.3), 4.0, 7
 
 
 def stretched(curves: DecorrelationCurves, log_factor: FloatArray) -> DecorrelationCurves:
@@ -134,3 +143,46 @@ def corrected_curves(
 
 def _log_widths(curves: DecorrelationCurves) -> FloatArray:
     return np.log([half_distance(curves.distance_mm, row) for row in curves.correlation])
+
+
+def nominal_probe(curves: DecorrelationCurves) -> Nominal:
+    """Probe that curves were calculated for; of measured ones the one whose calculated curves are as wide."""
+    if (given := curves.nominal) is not None:
+        lens = Lens(given.aperture_mm, given.focus_mm, given.transmit_mm)
+        return Nominal(lens, (given.low_hz, given.high_hz), given.attenuation_db_cm_mhz)
+    band = curves.key.signal.bandwidth_hz if isinstance(curves.key.signal, RFSettings) else BAND_HZ
+    width = np.log([half_distance(curves.distance_mm, row) for row in curves.correlation])
+    return _fitted(band, tuple(curves.depth_mm.tolist()), tuple(width.tolist()))
+
+
+@lru_cache(maxsize=8)
+def _fitted(band_hz: tuple[float, float], depth_mm: tuple[float, ...], width: tuple[float, ...]) -> Nominal:
+    depths = np.linspace(depth_mm[0], depth_mm[-1], _DEPTHS)
+    wanted = np.interp(depths, depth_mm, width)
+
+    def of(values: FloatArray) -> Nominal:
+        aperture, focus, pitch = (float(np.exp(value)) for value in values)
+        lens = Lens(aperture, focus, focus / F_NUMBER)
+        return Nominal(lens, (band_hz[0] * pitch, band_hz[1] * pitch))
+
+    def misfit(values: FloatArray) -> FloatArray:
+        return np.asarray(of(values).log_width(depths) - wanted)
+
+    def doubted(values: FloatArray) -> FloatArray:
+        return np.append(misfit(values) / 0.02, values[2] / FREQUENCY_SIGMA)
+
+    low, high = np.log([0.5, 2.0, 0.7]), np.log([40.0, 4.0 * depths[-1], 1.4])
+
+    def start(share: float) -> FloatArray:
+        """Focus at a share of the depth, and the aperture that then makes the mean width."""
+        focus = np.log(share * depths[-1])
+        first = np.array([focus - np.log(_START_F_NUMBER), focus, 0.0])
+        first[0] += misfit(first).mean()
+        return np.asarray(np.clip(first, low + 1e-3, high - 1e-3))
+
+    def distance(values: FloatArray) -> float:
+        return float(np.abs(misfit(values)).sum())
+
+    best = min(map(start, _STARTS), key=distance)
+    fit = least_squares(doubted, best, bounds=(low, high), diff_step=np.full(3, 1e-2), xtol=1e-3, max_nfev=10)
+    return of(np.asarray(fit.x))

@@ -15,8 +15,6 @@ from speckle3d.core.reconstruction import ModeErrors, Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import sensor_of
-from speckle3d.correction.scale import ScaledPoses
-from speckle3d.correction.trust import name_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
@@ -51,7 +49,7 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
     suspicions = {}
     for mode in modes:
         sensor = None if mode == "image" else sensor_of(sweep, mode)
-        about = {"images", "curves", "" if sensor is None else name_of(sensor)}
+        about = {"images", "curves", "" if sensor is None else sensor.label}
         suspected = dict.fromkeys(doubt.suspect for doubt in doubts if doubt.about in about)
         if suspected:
             suspicions[mode] = ", ".join(suspected)
@@ -89,33 +87,22 @@ def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
 def claims_of(
     tracked: Tracked, centre_mm: FloatArray, corrections: Mapping[str, Correction]
 ) -> dict[str, float]:
-    """Relative standard deviation of the length that each mode claims, where it claims one."""
+    """Relative standard deviation of the length that each mode claims."""
     centre = tracked.image.apply(centre_mm)[:, 2]
     farthest = int(np.argmax(np.abs(centre - centre[0])))
     travelled = max(abs(float(centre[farthest] - centre[0])), 1e-9)
     claims = {"image": float(np.sqrt(tracked.covariance[farthest, 2, 2])) / travelled}
-    for mode, correction in corrections.items():
-        if isinstance(correction, DriftCorrection):
-            # Cubics about the image's centre leave the length, and its error, as the images have them.
-            if mode == "orientation":
-                claims[mode] = claims["image"]
-        else:
-            claims[mode] = correction.log_scale_sigma
-    return claims
+    return claims | {mode: correction.length_sigma for mode, correction in corrections.items()}
 
 
 def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:
     """What a reconstruction's file says of its poses' errors."""
-    modes = {
-        mode: ModeErrors(each.covariance, each.log_scale_sigma)
-        for mode, each in corrections.items()
-        if isinstance(each, ScaledPoses)
-    }
+    modes = {mode: ModeErrors(each.covariance, each.length_sigma) for mode, each in corrections.items()}
     return Trust(tracked.covariance, tracked.flags, tracked.shared, modes)
 
 
 def _correction_details(correction: Correction) -> dict[str, Any]:
-    if isinstance(correction, ScaledPoses):
+    if not isinstance(correction, DriftCorrection):
         return {
             "length_over_images": correction.scale,
             "relative_sigma": correction.log_scale_sigma,

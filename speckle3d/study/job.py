@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.progress import Progress, after
@@ -25,9 +24,9 @@ from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.modes import PUBLISHED
-from speckle3d.correction.scale import FusedPoses
-from speckle3d.correction.trust import believed, require_believed
 from speckle3d.corrections import Correction, correct
+from speckle3d.examine.disagreements import differing_lengths
+from speckle3d.examine.sensors import believed, require_believed
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
@@ -165,7 +164,10 @@ def run_job(
         every = poses if alone is None else {**poses, TRACKER: alone}
         curves_of = poses if compared is None or compared.name == TRACKER else every
         moved = sweep_curves(curves_of, sweep.grid.centre_mm, compared, tracked.covariance)
-        doubts = (*tracked.doubts, *_contradictions(corrections))
+        claims = claims_of(tracked, sweep.grid.centre_mm, corrections)
+        lengths = {mode: float(np.abs(curve[0, -1])) for mode, curve in moved.modes.items()}
+        claimed = {m: (lengths[m], lengths[m] * sigma) for m, sigma in claims.items() if m in lengths}
+        doubts = (*tracked.doubts, *differing_lengths(claimed))
         rows = error_rows(every, moved, compared, sweep.grid.centre_mm)
         summary = Summary(
             sweep.name,
@@ -177,7 +179,7 @@ def run_job(
             doubts,
             doubted_modes(sweep, doubts, every),
             left_out,
-            claims_of(tracked, sweep.grid.centre_mm, corrections) | _jitter(alone, poses, sweep),
+            claims | _jitter(alone, poses, sweep),
             _drift(every, compared, sweep, source),
         )
         save_figure(figure_drift(moved, _title(summary)), part / PICTURES[0])
@@ -270,12 +272,6 @@ def _corrected(
                 raise
             left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
     return poses | {mode: each.poses for mode, each in corrections.items()}, corrections, left_out
-
-
-def _contradictions(corrections: Mapping[str, Correction]) -> list[Doubt]:
-    """What correcting found of sensors and images that checks before had not."""
-    fused = [each for each in corrections.values() if isinstance(each, FusedPoses)]
-    return [doubt for each in fused for doubt in each.contradictions]
 
 
 def _title(summary: Summary) -> str:

@@ -9,7 +9,7 @@ from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.modes import require_modes
-from speckle3d.correction.trust import cleaned_readings
+from speckle3d.examine.sensors import cleaned_readings
 from speckle3d.motion.direction import sensed_orientation
 from speckle3d.scoring.references import Reference, find_reference
 

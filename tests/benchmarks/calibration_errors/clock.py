@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from calibration.job import JobSettings, Recording, plane_job
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Seen
-from calibration.job import JobSettings, Recording, plane_job
+from calibration.points import Seen
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.streams import TimedPoses
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ChainSolution, ImagePoints
+from calibration.points import ChainSolution, ImagePoints
 from calibration.registration import REGISTRATIONS, calibrate_registered
 from calibration.wires import calibrate_wires
 from speckle3d.core.errors import InsufficientDataError
