@@ -96,9 +96,9 @@ def test_what_numbers_do_not_say_stands_below_the_table(reference, mode, doubted
 
 def test_a_length_that_the_tracker_made_worse_is_told_with_the_jitters_share():
     rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-2.6)]
-    text = summary_text([summary("truth", rows, claims={"pose": 0.01})])
+    text = summary_text([summary("truth", rows, claims={"tracker": 0.01})])
     assert "pose is farther from the truth (-2.6 %) than image (+0.6 %)" in text
-    assert "jitter alone is +- 2.0 % (95 %)" in text
+    assert "jitter is +- 2.0 % of its length (95 %)" in text
     rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-0.5)]
     assert "farther" not in summary_text([summary("truth", rows, claims={"pose": 0.01})])
 
