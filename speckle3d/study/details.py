@@ -18,6 +18,7 @@ from speckle3d.correction.modes import sensor_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
+from speckle3d.scoring.lengths import TRACKER
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
@@ -45,11 +46,13 @@ def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | N
 
 
 def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:
-    """What is suspected of the sensor that each mode rests on; images are under all of them."""
+    """What is suspected of the sensor that each mode rests on; images are under all but the tracker alone."""
     suspicions = {}
     for mode in modes:
-        sensor = None if mode == "image" else sensor_of(sweep, mode)
-        about = {"images", "curves", "" if sensor is None else sensor.label}
+        sensor = None if mode == "image" else sensor_of(sweep, "pose" if mode == TRACKER else mode)
+        about = {"" if sensor is None else sensor.label}
+        if mode != TRACKER:
+            about |= {"images", "curves"}
         suspected = dict.fromkeys(doubt.suspect for doubt in doubts if doubt.about in about)
         if suspected:
             suspicions[mode] = ", ".join(suspected)

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sweep_examples
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.details import recorded_doubts
+from speckle3d.study.details import doubted_modes, recorded_doubts
 from speckle3d.study.results import (
     Summary,
     SweepOutcome,
@@ -101,6 +102,15 @@ def test_a_length_that_the_tracker_made_worse_is_told_with_the_jitters_share():
     assert "jitter is +- 2.0 % of its length (95 %)" in text
     rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-0.5)]
     assert "farther" not in summary_text([summary("truth", rows, claims={"pose": 0.01})])
+
+
+def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
+    images = Doubt("images", "frozen", "...", False)
+    modes = ["image", "orientation", "pose", "tracker"]
+    doubted = doubted_modes(sweep_examples.rf_sweep(), [SPIKES, METRES, images], modes)
+    assert doubted == {
+        "image": "frozen", "orientation": "spikes, frozen", "pose": "units, frozen", "tracker": "units",
+    }  # fmt: skip
 
 
 def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(tmp_path):
