@@ -161,7 +161,7 @@ def test_volume(run, reconstructed, tmp_path, name):
     assert (voxels > 0).mean() > 0.3
 
 
-@pytest.mark.parametrize(("options", "packing"), [((), "gzip"), (("--compression", "none"), None)])
+@pytest.mark.parametrize(("options", "packing"), [((), None), (("--compress", "gzip"), "gzip")])
 def test_convert_copies_a_sweep(run, bench, tmp_path, options, packing):
     code, _, err = run("convert", bench / "sweep.h5", tmp_path / "copy.h5", *options)
     assert code == 0, err

@@ -81,9 +81,8 @@ def test_what_was_appended_is_read_while_it_grows_and_when_it_is_closed(tmp_path
             assert len(found) == len(target) == i + 1
             np.testing.assert_array_equal(found.frames[i], sweep.frames[i])
             assert (found.tracker, found.orientation) == (None, None)
-            assert import_notes(path) == [
-                f"{path}: the recording goes on, or was ended without being closed: {i + 1} frames so far"
-            ]
+            (note,) = import_notes(path)
+            assert f"{i + 1} frames so far" in note
             assert ("recording", "goes on, or was ended without being closed", "") in describe(path)
             found.frames.close()
     with growing(tmp_path / "whole.h5", sweep, compression) as target:
