@@ -85,8 +85,8 @@ def curvature_of(
 ) -> tuple[FloatArray, FloatArray]:
     """Curvature of each patch's weighted correlation, (p, f, f), and of all, (f, f), over speckle's width.
 
-    By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full, is
-    several times too stiff.
+    By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full,
+    is several times too stiff.
     """
     base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
     wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
@@ -113,9 +113,9 @@ def claimed(
     """Covariance of an answer's turns, displacements and relative pixel sizes at the image's origin, (8, 8).
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
-    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for seconds
-    displaces one sweep against the other and shows in no such change; its effect is computed. To their sum
-    comes the scatter of fits started beside the answer.
+    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for
+    seconds displaces one sweep against the other and shows in no such change; its effect is computed. To
+    their sum comes the scatter of fits started beside the answer.
 
     Parameters
     ----------

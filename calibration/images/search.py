@@ -1,7 +1,7 @@
 """From a rough start to where the fit takes over: a box of calibrations searched from coarse to fine.
 
-Many places are looked at at a coarse resolution, and the best of them followed up by Gauss-Newton at finer and
-finer ones.
+Many places are looked at at a coarse resolution, and the best of them followed up by Gauss-Newton at finer
+and finer ones.
 """
 
 from __future__ import annotations

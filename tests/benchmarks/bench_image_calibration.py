@@ -19,8 +19,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_from_sweeps
-from calibration.settings import ImageFit
 from calibration.images.stacks import TrackedImages
+from calibration.settings import ImageFit
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.io.load import load_sweep
 from speckle3d.simulation.presets import SimulationSettings

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.points import ImagePoints
 from calibration.motion import MOTIONS
 from calibration.orientation import OrientationFit, calibrate_orientation
 from calibration.plane import PlaneFit, calibrate_plane
+from calibration.points import ImagePoints
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 
@@ -36,9 +36,7 @@ MISSING = {
     "no roll": ("roll",),
     "yaw only": ("tilt", "roll", "depth"),
 }
-WORDS = dict(
-    zip(("tilt", "yaw", "roll", "sideways", "depth"), MOTIONS, strict=True)
-)
+WORDS = dict(zip(("tilt", "yaw", "roll", "sideways", "depth"), MOTIONS, strict=True))
 DRIFT_S = 5.0
 
 
@@ -245,7 +243,11 @@ def judged(trial) -> tuple[float, float, frozenset[str] | None]:
         else:
             made = scan([seed, place], missing)
             lines = with_wrong_lines(made, seed) if kind == "wrong lines" else made.lines
-            given = {"prior": (made.given_mm,), "held": (made.pixel_mm, PlaneFit(fixed_pixels=True)), "unknown": ()}[mode]
+            given = {
+                "prior": (made.given_mm,),
+                "held": (made.pixel_mm, PlaneFit(fixed_pixels=True)),
+                "unknown": (),
+            }[mode]
             solution = calibrate_plane(lines, *given)
     except InsufficientDataError as refusal:
         return np.nan, np.nan, frozenset(word for word, text in WORDS.items() if text in str(refusal))

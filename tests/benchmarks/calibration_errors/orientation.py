@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.points import ImagePoints
 from calibration.orientation import calibrate_orientation
+from calibration.points import ImagePoints
 from speckle3d.core.errors import InsufficientDataError
 
 from .hand import smooth, wander

@@ -13,8 +13,8 @@ from imu_logs import samples
 from vqf import VQF, offlineVQF
 
 from calibration.images.solver import calibrate_from_sweeps
-from calibration.settings import ImageFit
 from calibration.plane import _three_stages, calibrate_plane
+from calibration.settings import ImageFit
 from speed.rows import Row, timed
 from xsens.fusion.methods import Method
 from xsens.fusion.orient import orient

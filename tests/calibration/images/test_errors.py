@@ -9,8 +9,15 @@ from crossing_scenes import crossing_sweeps, displaced, tissue
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.angulation import Angulation, point_motion
-from calibration.images.errors import DEEP_MM, MOST_MM, RESTARTED, _left_out, _scatter, require_known
-from calibration.images.errors import require_one_answer
+from calibration.images.errors import (
+    DEEP_MM,
+    MOST_MM,
+    RESTARTED,
+    _left_out,
+    _scatter,
+    require_known,
+    require_one_answer,
+)
 from calibration.images.fit import refine
 from calibration.images.search import DECIDED
 from calibration.images.similarity import Estimate, prepare
