@@ -13,8 +13,7 @@ from pydantic.fields import FieldInfo
 from speckle3d.core.units import unit_of
 from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
-from speckle3d.correction.fused.settings import FusedSettings
-from speckle3d.correction.inertial.settings import InertialSettings
+from speckle3d.correction.settings import FusedSettings
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.toml import load_toml, parsed, validated
 from speckle3d.matching.inplane import InPlaneSettings
@@ -29,6 +28,8 @@ from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.planes import PlaneSettings
 
 _COMMENT_WIDTH = 100
+REMOVED = (("inertial", None), ("fused", "contradiction_sigma"))
+"""Groups, and settings of groups, that older reconstructions' configurations hold and nothing reads now."""
 
 
 class Config(BaseModel):
@@ -55,7 +56,6 @@ class Config(BaseModel):
     sensors: SensorSettings = SensorSettings()
     drift: DriftSettings = DriftSettings()
     crossing: CrossingSettings = CrossingSettings()
-    inertial: InertialSettings = InertialSettings()
     fused: FusedSettings = FusedSettings()
     volume: CompoundingSettings = CompoundingSettings()
 
@@ -98,14 +98,20 @@ def _comment(name: str, field: FieldInfo) -> list[str]:
 
 
 def config_from_toml(text: str, where: str = "configuration") -> Config:
-    """Parse TOML; settings that are not given keep their defaults.
+    """Parse TOML; settings that are not given keep their defaults, and those of older versions are ignored.
 
     Raises
     ------
     InvalidInputError
         Naming the setting that is unknown or out of range.
     """
-    return validated(parsed(text, where), where, Config)
+    values = parsed(text, where)
+    for group, name in REMOVED:
+        if name is None:
+            values.pop(group, None)
+        elif isinstance(values.get(group), dict):
+            values[group].pop(name, None)
+    return validated(values, where, Config)
 
 
 def load_config(path: Path) -> Config:

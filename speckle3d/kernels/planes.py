@@ -159,7 +159,7 @@ def fit_planes(
     """
     most = rho.shape[1]
     patches = PairPatches(
-        np.empty((11, most)),
+        np.empty((8, most)),
         np.empty(most, np.int64),
         np.empty(most, np.int64),
         curves.amplitude.reshape(curves.amplitude.size),

@@ -68,6 +68,12 @@ class PoseError:
     mean_deg: float
     max_deg: float
 
+    @classmethod
+    def of(cls, errors: RigidTransform) -> PoseError:
+        """Sum up poses that would be the identity if nothing were wrong."""
+        sizes = np.linalg.norm(errors.translation, axis=1), np.rad2deg(errors.rotation.magnitude())
+        return cls(*(float(v) for e in sizes for v in (np.sqrt(np.mean(e**2)), e.mean(), e.max())))
+
 
 def absolute_pose_error(poses: RigidTransform, reference: RigidTransform) -> PoseError:
     """APE: the poses of ``T_i^-1 T^_i``, with the first frames laid on each other, over all frames.
@@ -76,13 +82,13 @@ def absolute_pose_error(poses: RigidTransform, reference: RigidTransform) -> Pos
     ----------
     .. [1] M. Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
     """
-    found, true = (each[0].inv() * each for each in (poses, reference))
-    return _pose_error(true.inv() * found)
+    estimate, true = (each[0].inv() * each for each in (poses, reference))
+    return PoseError.of(true.inv() * estimate)
 
 
 def relative_pose_error(poses: RigidTransform, reference: RigidTransform) -> PoseError:
     """RPE: the poses of ``t_i^-1 t^_i`` from each frame to the next, over all steps."""
-    return _pose_error(relative_poses(reference).inv() * relative_poses(poses))
+    return PoseError.of(relative_poses(reference).inv() * relative_poses(poses))
 
 
 def kind_of(path: Path) -> str:
@@ -111,8 +117,8 @@ def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | Non
     """
     if kind_of(path) != "text":
         return load_reconstructed(path, mode)
-    held = read_tum(path, length_unit)
-    return Trajectory(path.name, held.time_s, held.world_from_sensor)
+    text = read_tum(path, length_unit)
+    return Trajectory(path.name, text.time_s, text.world_from_sensor)
 
 
 def load_reconstructed(path: Path, mode: str) -> Trajectory:
@@ -223,14 +229,3 @@ def _snapped(time_s: FloatArray, onto_s: FloatArray) -> FloatArray:
     near = [onto_s[np.minimum(each, onto_s.size - 1)] for each in (right - 1, right)]
     nearest = np.where(np.abs(near[0] - time_s) <= np.abs(near[1] - time_s), *near)
     return np.where(np.abs(nearest - time_s) <= _ROUNDING_S + np.spacing(nearest), nearest, time_s)
-
-
-def _pose_error(errors: RigidTransform) -> PoseError:
-    shift = np.linalg.norm(errors.translation, axis=1)
-    angle = np.rad2deg(errors.rotation.magnitude())
-    values = [float(f(each)) for each in (shift, angle) for f in (_rms, np.mean, np.max)]
-    return PoseError(*values)
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

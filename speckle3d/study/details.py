@@ -15,12 +15,9 @@ from speckle3d.core.reconstruction import ModeErrors, Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import sensor_of
-from speckle3d.correction.scale import ScaledPoses
-from speckle3d.correction.trust import name_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
-from speckle3d.scoring.references import SweepCurves
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
@@ -52,7 +49,7 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
     found = {}
     for mode in modes:
         sensor = None if mode == "image" else sensor_of(sweep, mode)
-        about = {"images", "curves", "" if sensor is None else name_of(sensor)}
+        about = {"images", "curves", "" if sensor is None else sensor.label}
         suspected = dict.fromkeys(doubt.suspect for doubt in doubts if doubt.about in about)
         if suspected:
             found[mode] = ", ".join(suspected)
@@ -60,13 +57,11 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
 
 
 def details_of(
-    tracked: Tracked, corrections: Mapping[str, Correction], moved: SweepCurves, provenance: Provenance
+    tracked: Tracked, corrections: Mapping[str, Correction], provenance: Provenance
 ) -> dict[str, Any]:
     """Everything worth keeping of a reconstruction beside its errors, by name."""
-    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
     return {
         "provenance": provenance,
-        "estimates": {m: dict(zip(names, c[:, -1].tolist(), strict=True)) for m, c in moved.modes.items()},
         "pairs": tracked.pairs,
         "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
@@ -85,8 +80,6 @@ def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
     return {
         "mean_share": float(found.share.mean()),
         "mean_gain": float(found.gain.mean()),
-        "mean_stretch": float(found.stretch.mean()),
-        "length_over_phantom_reading": float(found.scale.mean()),
         "scale_sigma": found.scale_sigma,
     }
 
@@ -94,43 +87,28 @@ def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
 def claims_of(
     tracked: Tracked, centre_mm: FloatArray, corrections: Mapping[str, Correction]
 ) -> dict[str, float]:
-    """Relative standard deviation of the length that each mode claims, where it claims one."""
+    """Relative standard deviation of the length that each mode claims."""
     centre = tracked.image.apply(centre_mm)[:, 2]
     farthest = int(np.argmax(np.abs(centre - centre[0])))
     travelled = max(abs(float(centre[farthest] - centre[0])), 1e-9)
     claims = {"image": float(np.sqrt(tracked.covariance[farthest, 2, 2])) / travelled}
-    for mode, correction in corrections.items():
-        if isinstance(correction, DriftCorrection):
-            # Cubics about the image's centre leave the length, and its error, as the images have them.
-            if mode == "orientation":
-                claims[mode] = claims["image"]
-        else:
-            claims[mode] = correction.log_scale_sigma
-    return claims
+    return claims | {mode: correction.length_sigma for mode, correction in corrections.items()}
 
 
 def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:
     """What a reconstruction's file says of its poses' errors."""
-    modes = {
-        mode: ModeErrors(each.covariance, each.log_scale_sigma)
-        for mode, each in corrections.items()
-        if isinstance(each, ScaledPoses)
-    }
+    modes = {mode: ModeErrors(each.covariance, each.length_sigma) for mode, each in corrections.items()}
     return Trust(tracked.covariance, tracked.flags, tracked.shared, modes)
 
 
 def _correction_details(correction: Correction) -> dict[str, Any]:
-    if isinstance(correction, DriftCorrection):
-        return _fit_details(correction)
-    return {
-        "length_over_images": correction.scale,
-        "relative_sigma": correction.log_scale_sigma,
-        "rests_on": [each.source for each in correction.evidence],
-        **correction.details,
-    }
-
-
-def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
+    if not isinstance(correction, DriftCorrection):
+        return {
+            "length_over_images": correction.scale,
+            "relative_sigma": correction.log_scale_sigma,
+            "rests_on": [each.source for each in correction.evidence],
+            **correction.details,
+        }
     fit = correction.fit
     return {
         "curves": correction.settings.curves,

@@ -75,11 +75,9 @@ def posed_errors_of(reconstruction: Reconstruction, mode: str = "image") -> Pose
 def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors:
     """Joint errors of the poses of one mode.
 
-    `image`: what the file holds. `crossed`, `inertial`, `fused`: their own claims; the claimed error of the
-    length stretches the whole sweep, and what the covariances have beyond it has grown from frame to frame.
-    `orientation`: the images' error of length, with the angles' errors of the sensor, which bend the path.
-    `pose` and `consistent-subset` claim nothing and are taken to be no better than the images; in `pose` the
-    sweep's direction is further as uncertain as the image's place on the tracker is.
+    `image`: what the file holds. Other modes: their own claims; the claimed error of the length stretches the
+    whole sweep, and what the covariances have beyond it has grown from frame to frame. `consistent-subset`,
+    and `orientation` and `pose` of older files, claim nothing and are taken to be no better than the images.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from speckle3d.config import Config, config_from_toml
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.trust import believed
+from speckle3d.examine.sensors import believed
 
 
 class SweepPage:

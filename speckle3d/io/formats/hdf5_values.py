@@ -7,8 +7,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.io.hdf5 import has_member, locate, reading, require_dataset
-from speckle3d.io.hdf5_guard import require_readable
+from speckle3d.io.hdf5 import has_member, locate, reading, require_dataset, require_readable
 
 
 def flat(group: h5py.Group, name: str) -> FloatArray:

@@ -24,8 +24,16 @@ from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
 from speckle3d.io.formats.matlab_guard import require_sound
-from speckle3d.io.hdf5 import SIGNATURE, find_member, one_line, open_hdf5, reading, require_dataset
-from speckle3d.io.hdf5_guard import plain_attribute, require_readable
+from speckle3d.io.hdf5 import (
+    SIGNATURE,
+    find_member,
+    one_line,
+    open_hdf5,
+    plain_attribute,
+    reading,
+    require_dataset,
+    require_readable,
+)
 from speckle3d.io.lazy import HDF5Slices, Turn
 
 USER_BLOCK = 512

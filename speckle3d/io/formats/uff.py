@@ -37,11 +37,11 @@ from speckle3d.io.hdf5 import (
     hdf5_claim,
     locate,
     open_hdf5,
+    plain_attribute,
     reading,
     require_dataset,
     require_group,
 )
-from speckle3d.io.hdf5_guard import plain_attribute
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.lazy import Complex, HDF5Slices, Layout, Real
 from speckle3d.io.readers import Reader, Row

@@ -100,7 +100,7 @@ def save_cuts(
     figure: Figure,
     path: Path,
     cuts: Mapping[str, ReslicePlane | CurvedSheet],
-    panels: Mapping[str, Sequence[Axes]],
+    panels: Mapping[str, Axes],
     words: Mapping[str, Any] | None = None,
     anchors: Mapping[str, Anchors] | None = None,
 ) -> Path:
@@ -112,8 +112,8 @@ def save_cuts(
     path : path
     cuts : mapping of str to ReslicePlane or CurvedSheet
         By mode.
-    panels : mapping of str to sequence of Axes
-        The panels that show each.
+    panels : mapping of str to Axes
+        The panel that shows each.
     words : mapping, optional
         What else to keep: names of axes, of the input.
     anchors : mapping of str to mapping, optional
@@ -133,7 +133,7 @@ def save_cuts(
         {
             "mode": mode,
             **_as_record(cut),
-            "boxes_px": [_box(each, height) for each in panels[mode]],
+            "boxes_px": [_box(panels[mode], height)],
             "anchors": {number: pose.tolist() for number, pose in (anchors or {}).get(mode, {}).items()},
         }
         for mode, cut in cuts.items()

@@ -23,8 +23,10 @@ from speckle3d.imaging.images import Images
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT
+from speckle3d.scoring.lengths import END_FRAMES, ModeError, accumulated, compare_modes
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
+from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
 from speckle3d.study.reslices.cut_geometry import Anchors, anchors_of
 from speckle3d.study.reslices.places import (
@@ -78,28 +80,28 @@ class CutPicture:
     place : str
         Where the cut is.
     unit : str
-        Of the images: "dB" or "level", and of what.
+        Of the images: dB below the maximum, or "level", and of what.
     levels : tuple of float, optional
         Black and white.
-    reference : str, optional
-        Mode that the others are compared with.
     name : str
         Of the sweep or the volume.
     numbers : ndarray of int, shape (n,), optional
         Of the frames; by default from 0.
     anchors : mapping of str to mapping
         Poses of some frames of each mode; see `cut_geometry.anchors_of`.
+    lengths : mapping of str to str
+        How long each mode is, in words.
     """
 
     cuts: Mapping[str, DrawnCut]
     axes: tuple[str, str] = ("along the sweep", "depth")
     place: str = ""
-    unit: str = "dB"
+    unit: str = "dB, 0: maximum"
     levels: tuple[float, float] | None = None
-    reference: str | None = None
     name: str = ""
     numbers: IntArray | None = None
     anchors: Mapping[str, Anchors] = field(default_factory=dict)
+    lengths: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
 def cut_posed(
     opened: OpenedModes,
     place: Place,
-    dynamic_range_db: float = 60.0,
+    dynamic_range_db: float = RANGE_DB,
     voxels: tuple[Volume, ByteArray | None] | None = None,
     progress: Callable[[int, int], None] | None = None,
     made: tuple[Images, ImageGrid] | None = None,
@@ -234,13 +236,45 @@ def cut_posed(
     }
     shown = placed[opened.reference]
     where = ", ".join(filter(None, [place.words(grid), view_of(shown, there)]))
-    unit, limits = _unit_of_images(opened.posed, dynamic_range_db)
-    shown_range = limits if voxels is None else None
-    unit = unit if voxels is None else _unit_of(voxels[0])
-    reference = opened.reference if len(cuts) > 1 else None
-    axes, name = place.axes(shown, there), opened.posed.sweep.name
-    anchors = {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()}
-    return CutPicture(cuts, axes, where, unit, shown_range, reference, name, numbers, anchors)
+    unit, limits = ("dB, 0: maximum", (-dynamic_range_db, 0.0))
+    if not opened.posed.range_is_known:
+        unit, limits = "level", (0.0, 255.0)
+    return CutPicture(
+        cuts,
+        place.axes(shown, there),
+        where,
+        unit if voxels is None else _unit_of(voxels[0]),
+        limits if voxels is None else None,
+        opened.posed.sweep.name,
+        numbers,
+        {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()},
+        length_words(_rows(opened, grid.centre_mm), opened.reference),
+    )
+
+
+def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
+    """How long each mode is by its rows, and how far from the reference; of all parts of the sweep."""
+    words: dict[str, list[str]] = {}
+    for row in rows:
+        percent = "" if np.isnan(row.length_error_percent) else f" {row.length_error_percent:+.1f} %"
+        words.setdefault(row.mode, []).append(f"{row.estimate_mm:.2f} mm{percent}")
+        if row.mode == rows[0].mode and np.isfinite(row.reference_mm):
+            words.setdefault(reference, []).append(f"{row.reference_mm:.2f} mm")
+    return {mode: ", ".join(each) for mode, each in words.items()}
+
+
+def _rows(opened: OpenedModes, centre_mm: FloatArray) -> list[ModeError]:
+    """Lengths of the modes, against the reference if that is one."""
+    others = {mode: each for mode, each in opened.poses.items() if mode != opened.reference}
+    there = opened.poses[opened.reference]
+    if len(there) < 2:
+        return []
+    if not others:
+        length_mm = float(accumulated(there, centre_mm).length_mm[-1])
+        return [ModeError.of_estimate("all", opened.reference, len(there), length_mm)]
+    return compare_modes(
+        others, there, centre_mm, end_frames=END_FRAMES if opened.reference == "tracker" else 1
+    )
 
 
 def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:
@@ -255,11 +289,6 @@ def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | 
     drawn = DrawnCut(reslice_volume(volume, cut, state), cut)
     names = ("i", "j") if place.is_along_sweep else ("in the cut", "in the cut")
     return CutPicture({"volume": drawn}, names, place.words(), _unit_of(volume), name=name)
-
-
-def _unit_of_images(posed: PosedSweep, dynamic_range_db: float) -> tuple[str, tuple[float, float]]:
-    """Unit of a sweep's images, and the values that are shown black and white."""
-    return ("dB", (-dynamic_range_db, 0.0)) if posed.range_is_known else ("level", (0.0, 255.0))
 
 
 def _unit_of(volume: Volume) -> str:
@@ -290,7 +319,7 @@ def cut_as_volume(picture: CutPicture) -> Volume:
         # From 1 up, so that 0 means nothing was seen.
         level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
         voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
-        what = f"log-compressed, {high - low:g} dB" if picture.unit == "dB" else "grey levels of the B-mode"
+        what = f"log-compressed, {high - low:g} dB" if high == 0 else "grey levels of the B-mode"
         fields["levels"] = f"{what} from 1 to 255; 0 where nothing was seen"
     step = drawn.cut.pixel_mm
     return Volume(voxels[None].T, (step, step, step), drawn.cut.world_from_plane, fields)

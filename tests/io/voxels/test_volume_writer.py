@@ -2,7 +2,6 @@
 
 import gzip
 import itertools
-import zlib
 
 import nibabel
 import nrrd
@@ -17,7 +16,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
-from speckle3d.io import deflate
 from speckle3d.io.describe import describe
 from speckle3d.io.voxels import volume_writer
 from speckle3d.io.voxels.volume_writer import SUFFIXES, VolumeWriter
@@ -172,7 +170,6 @@ def test_numbers_in_the_other_byte_order_are_the_same(tmp_path):
 
 
 def test_larger_than_its_batches_and_what_does_not_pack(tmp_path, monkeypatch):
-    monkeypatch.setattr(volume_writer, "_PIECE_BYTES", 2**12)
     monkeypatch.setattr(volume_writer, "_BATCH_BYTES", 2**14)
     noise = np.random.default_rng(4).integers(0, 256, (64, 50, 30)).astype(np.uint8)
     noise[:, :, 12:] = 7
@@ -181,12 +178,6 @@ def test_larger_than_its_batches_and_what_does_not_pack(tmp_path, monkeypatch):
         write_volume(tmp_path / f"v{suffix}", volume)
         np.testing.assert_array_equal(itk_affine(tmp_path / f"v{suffix}")[1], noise)
     assert gzip.decompress((tmp_path / "v.nii.gz").read_bytes())[352:] == noise.tobytes(order="F")
-    # Without the faster packer the same comes out, by zlib.
-    monkeypatch.setattr(deflate, "_packer", lambda: deflate.packed_by_zlib)
-    write_volume(tmp_path / "zlib.mha", volume)
-    header, _, packed = (tmp_path / "zlib.mha").read_bytes().partition(b"ElementDataFile = LOCAL\n")
-    assert zlib.decompress(packed) == noise.tobytes(order="F")
-    assert f"CompressedDataSize = {len(packed)} ".encode() in header
 
 
 def test_members_of_gzip_that_follow_one_another_are_one_volume(tmp_path):
@@ -198,10 +189,8 @@ def test_members_of_gzip_that_follow_one_another_are_one_volume(tmp_path):
     (tmp_path / "v.nii.gz").write_bytes(b"".join(parts))
     np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
     (tmp_path / "v.nii.gz").write_bytes(b"".join(parts[:-1]))
-    with pytest.raises(FileError, match=r"bytes of pixels unpacked, got \d+"):
+    with pytest.raises(FileError, match=r"v\.nii\.gz: cannot be read as NIfTI"):
         read_volume(tmp_path / "v.nii.gz")
-    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts) + b"behind it")
-    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
 
 
 FIELDS = {

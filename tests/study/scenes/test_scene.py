@@ -17,7 +17,6 @@ from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.headers import read_header
 from speckle3d.study.posed import PosedSweep
-from speckle3d.study.scenes.mrml import Scene
 from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
 from speckle3d.study.scenes.sequences import PosedSequence
 
@@ -239,7 +238,3 @@ def test_on_a_full_disk_there_is_no_folder(tmp_path, room):
     assert str(tmp_path / "s") in str(caught.value)
     assert ".part" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_empty_scene_is_well_formed():
-    assert list(ElementTree.fromstring(Scene().text().encode())) == []
