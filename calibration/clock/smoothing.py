@@ -2,12 +2,12 @@
 
 A straight line between two samples halves the variance of their white noise midway and leaves it at the
 samples, so that a misfit as a function of the clock's offset has a bump at every sample. A smoothing spline
-has nearly the same noise at all times; how stiff it is the samples say themselves, by generalised
-cross-validation.
+has nearly the same noise at all times. How stiff it is the samples say themselves: every other one predicts
+those between.
 
 References
 ----------
-.. [1] G. Wahba, "Spline models for observational data", SIAM, 1990, chapter 4.
+.. [1] G. Wahba, "Spline models for observational data", SIAM, 1990, chapters 1 and 4.
 """
 
 from __future__ import annotations
@@ -27,8 +27,14 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 
 Curve = Callable[[FloatArray], FloatArray]
 
-_FEWEST = 5
+_FEWEST = 6
 """Samples of a spline; fewer are joined by straight lines."""
+
+_STIFFNESS = 10.0 ** np.arange(-3.0, 4.0)
+"""Tried, in samples to the fourth power: from the samples themselves to waves of 35 samples."""
+
+_MOST_COMPARED = 600
+"""Samples among which stiffness is chosen."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +49,21 @@ class _Curves:
         turns, places = readings.components
         back = np.sum(turns[1:] * turns[:-1], axis=1) < 0
         turns = turns * np.where(np.cumsum(np.append(0, back)) % 2, -1.0, 1.0)[:, None]
-        columns, time_s = np.hstack([turns, places]), readings.time_s
+        time_s = readings.time_s
         edges = np.flatnonzero(np.diff(time_s) > readings.max_gap_s) + 1
         parts = np.split(np.arange(len(time_s)), edges)
+        period = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+        sets = [(columns, _stiffness(time_s / period, columns)) for columns in (turns, places)]
         return cls(
             time_s[[part[0] for part in parts]],
-            [[_curve(time_s[part], column) for column in columns[part].T] for part in parts],
+            [
+                [
+                    _curve(time_s[part], one, period, stiff)
+                    for columns, stiff in sets
+                    for one in columns[part].T
+                ]
+                for part in parts
+            ],
         )
 
     def at(self, times_s: FloatArray) -> FloatArray:
@@ -61,12 +76,25 @@ class _Curves:
         return found
 
 
-def _curve(time_s: FloatArray, values: FloatArray) -> Curve:
+def _stiffness(places: FloatArray, columns: FloatArray) -> float:
+    """Stiffness with which every other sample predicts those between them best."""
+    at, values = places[:_MOST_COMPARED], columns[:_MOST_COMPARED]
+    if len(at) < 2 * _FEWEST:
+        return float(_STIFFNESS[0])
+    inner = slice(1, -1 if len(at) % 2 == 0 else None, 2)
+
+    def missed(stiffness: float) -> float:
+        curves = [_curve(at[::2], one, 2.0, stiffness) for one in values[::2].T]
+        return float(np.abs(np.column_stack([curve(at[inner]) for curve in curves]) - values[inner]).sum())
+
+    # Of a wave the filter is the same at half the samples if the stiffness is a sixteenth.
+    return 16.0 * float(min(_STIFFNESS, key=lambda one: missed(float(one))))
+
+
+def _curve(time_s: FloatArray, values: FloatArray, period: float, stiffness: float) -> Curve:
     if len(time_s) < _FEWEST or np.ptp(values) == 0.0:
         return lambda times_s: np.asarray(np.interp(times_s, time_s, values))
-    # In sampling periods, for the search of the stiffness has an absolute tolerance.
-    period = float(np.median(np.diff(time_s)))
-    spline = make_smoothing_spline(time_s / period, values)
+    spline = make_smoothing_spline(time_s / period, values, lam=stiffness)
     return lambda times_s: np.asarray(spline(times_s / period))
 
 
