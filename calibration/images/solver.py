@@ -77,8 +77,8 @@ class ImageCalibration:
         against the other by, and from the scatter of fits that start beside the answer. It does not know of
         an uncorrected delay of the sensor or a wrong speed of sound.
     condition_number : float
-        Of the similarity's curvature with scaled columns, as a root; a large one means that the sweeps leave
-        some motion of the image undetermined.
+        Of the similarity's curvature with scaled columns, as a root; a large one means that the sweeps
+        leave some motion of the image undetermined.
     alike : float
         Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
         support; see `LEAST_SIMILARITY`.
