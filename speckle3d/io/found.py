@@ -14,7 +14,7 @@ import numpy as np
 
 from speckle3d.core.files import PathLike
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings, settings_file, settings_for
-from speckle3d.io.readers import Row
+from speckle3d.io.recordings import Row
 
 CONTRADICTION = 0.01
 """Difference, as a share, above which `convert` tells that what is given is not what a file says."""

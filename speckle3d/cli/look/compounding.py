@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,9 +58,28 @@ def open_sweep_at(modes: Sequence[str | None], source: Path, options: Mapping[st
 
     others = said_of(source, options)
     opened = [open_posed(source, mode, *others) for mode in modes]
-    for line in opened[0].notes():
+    recorded = [] if opened[0].reconstruction is not None else recording_notes(source, others[1])
+    for line in (*recorded, *opened[0].notes()):
         note(line)
     return opened
+
+
+def recording_notes(source: Path, settings: ImportSettings) -> list[str]:
+    """What is to be told of a recording's poses; the grey levels' range does not count here."""
+    from speckle3d.io.load import import_notes
+
+    return import_notes(source, settings.model_copy(update={"dynamic_range_db": 60.0}))
+
+
+def clip_of(source: Path, options: Mapping[str, Any], posed: PosedSweep) -> str | None:
+    """Region of the images that a device set of PLUS clips volumes to; None without one."""
+    from speckle3d.io.import_settings import settings_for
+    from speckle3d.io.plus.device_set import read_device_set
+
+    config = settings_for(source, said_of(source, options)[1]).plus_config
+    clip = None if config is None else read_device_set(config).clip
+    grid = replace(posed.sweep.grid, skew_rad=posed.skew_rad)
+    return None if clip is None else clip.region_text(grid)
 
 
 def said_of(
