@@ -107,6 +107,7 @@ class RawFile:
     turn: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 
     def __call__(self) -> ReadFrame:
+        """Open nothing: the file is open only while a frame is read."""
         return self.read
 
     def read(self, i: int) -> npt.NDArray[Any]:

@@ -282,7 +282,7 @@ def _nrrd_steps(path: Path, lines: dict[str, str], count: int) -> list[float] | 
 def _nrrd_times(
     path: Path, lines: dict[str, str], axis: int | None, stored: tuple[int, ...]
 ) -> FloatArray | None:
-    """Times of frames by the index of their axis, as 3D Slicer writes it; or by its spacing in a unit of time."""
+    """Times of frames by their axis: its index, as 3D Slicer writes it, or its spacing in a unit of time."""
     if axis is None:
         return None
     units = _quoted(lines.get("units", ""), len(stored))
@@ -326,7 +326,7 @@ def _split(lines: dict[str, str]) -> tuple[dict[str, str], tuple[dict[str, str],
 
 
 def _spacing(steps: list[float] | None) -> tuple[float, float] | None:
-    """Of the first two axes; PLUS and ITK write 1 where nobody told them, and no image has millimetre samples."""
+    """Of the first two axes, but for the 1 that PLUS and ITK write where nobody told them."""
     if steps is None or not all(map(math.isfinite, steps[:2])) or steps[:2] == [1.0, 1.0]:
         return None
     return steps[0], steps[1]

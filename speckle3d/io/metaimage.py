@@ -55,6 +55,7 @@ class SequenceFile:
     layout: Layout
 
     def __call__(self) -> ReadFrame:
+        """Map or unpack them."""
         images = self.header.images()
         return lambda i: self.layout.frame(images[i])
 
@@ -194,7 +195,8 @@ class _Sequence:
             )
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
-                f"{header.path}: expected a sequence of images, got a volume, whose third axis is in space by "
+                f"{header.path}: expected a sequence of images, got a volume, whose third axis is in space "
+                "by "
                 "its Kinds; if it is time, say so by --frame-rate-hz"
             )
         self.layout.require_lines(header)
@@ -219,7 +221,7 @@ class _Sequence:
         return np.array(statuses + [True] * (count - len(statuses)), dtype=bool)
 
     def _frames(self, images: IntArray) -> FileFrames:
-        """Frames of the pixels' own type; wider whole numbers as int16 where it holds them all, else float32."""
+        """Frames of the pixels' type; wider whole numbers as int16 where it holds them, else float32."""
         header, layout = self.header, self.layout
         dtype = header.pixels.dtype.newbyteorder("=")
         stored: npt.DTypeLike = None
@@ -261,8 +263,10 @@ class _Sequence:
         scan = self.device.scan
         if scan.is_curved and self.settings.vector_pitch_mm is None:
             raise InvalidInputError(
-                f"{self.header.path}: expected lines of a linear transducer, got a {scan.geometry.lower()} one, "
-                "whose lines spread, by the device set: give its scan-converted B-mode, or parallel lines with "
+                f"{self.header.path}: expected lines of a linear transducer, got a {scan.geometry.lower()} "
+                "one, "
+                "whose lines spread, by the device set: give its scan-converted B-mode, or parallel lines "
+                "with "
                 "--vector-pitch-mm"
             )
         if sizes.value is not None:
@@ -388,7 +392,9 @@ class _Sequence:
                          + ("its lines spread and are taken for parallel" if self.layout.is_rf
                             else "images are taken for scan-converted"))  # fmt: skip
         if device.clip is not None and device.clip.is_part_of(header.size):
-            notes.append(f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}")
+            notes.append(
+                f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
+            )
         if header.is_volume:
             notes.append(
                 "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
@@ -433,7 +439,7 @@ class _Sequence:
         return used if name in self.header.fields else f"{used} (assumed)"
 
     def _sign_of_q(self, frames: FileFrames, values: dict[str, Value]) -> int:
-        """Sign of Q as it is stored: 1, -1, or 0 where the phase does not tell, as of I/Q that were shifted down.
+        """Sign of Q as it is stored: 1, -1, or 0 where the phase does not tell, as of I/Q shifted down.
 
         In lines that are stored from the far end on, depth runs backwards and so does the phase, unless the
         writer thought of it.

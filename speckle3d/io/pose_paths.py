@@ -13,8 +13,9 @@ from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import Frames, Sweep
 
 _FASTEST_MM_S, _SLACK_MM = 300.0, 3.0
-"""Of a point of the probe between two readings. The fastest path at hand, a motor's, has 255 mm/s, and freehand
-sweeps of PLUS at most 28; a jump of 22 mm in 50 ms is beyond. The slack is a tracker's noise with uneven stamps."""
+"""Of a point of the probe between two readings. The fastest path at hand, a motor's, has 255 mm/s, freehand
+sweeps of PLUS have at most 28; a jump of 22 mm in 50 ms is beyond. The slack is a tracker's noise and uneven
+time stamps."""
 
 _LEVER_MM = 50.0
 """From the sensor to points whose displacement stands for a rotation: half a probe's length."""
@@ -87,8 +88,8 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
     exact = np.isin(sweep.frame_time_s - tracker.time_offset_s, readings.time_s)
     between = np.count_nonzero(covered & ~exact)
     matched = (
-        f"poses of {chain}, mm: {len(readings)} poses, {len(sweep)} images, {np.count_nonzero(covered)} matched"
-        + (f", {between} of them between two poses" if between else "")
+        f"poses of {chain}, mm: {len(readings)} poses, {len(sweep)} images, {np.count_nonzero(covered)} "
+        "matched" + (f", {between} of them between two poses" if between else "")
     )
     notes += _repeats(readings, sweep.frames, sweep.frame_time_s - tracker.time_offset_s)
     places = readings.world_from_sensor.translation

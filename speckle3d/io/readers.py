@@ -53,7 +53,8 @@ class Reader:
         The sweep of a recording, with `ImportSettings` for what it does not say; or a `Recording`, which
         makes the sweep and describes itself.
     describe : callable, optional
-        Rows of what a recording holds, also where it is no sweep; by default the sweep's, or the `Recording`'s.
+        Rows of what a recording holds, also where it is no sweep; by default the sweep's or
+        the `Recording`'s.
     companions : callable
         Other files that the sweep's content depends on.
     notes : callable

@@ -8,6 +8,7 @@ at once. Readers fill a `Recording`; it makes the sweep, describes itself and te
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -153,10 +154,8 @@ class Recording:
         """Rows of what the file says, where each number is from, and what is odd."""
         numbers = [] if self.fault else [self._row(name, one) for name, one in self.needed.items()]
         remarks = list(self.remarks)
-        try:
+        with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._checked[1]
-        except (InvalidInputError, FileError):
-            pass  # why there is no sweep is told by who asks for it
         return [*self.rows, *numbers, *(("note", text, "") for text in remarks)]
 
     def contradictions(self) -> list[str]:

@@ -343,7 +343,9 @@ def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
         read_metaimage(path)
     wanted = {"sampling_rate_hz", "vector_pitch_mm", "centre_frequency_hz", "bandwidth_hz", "frame_rate_hz"}
     assert {*caught.value.settings} == wanted
-    sweep = read_metaimage(write_mha(tmp_path / "b.mha", grey(), frames=[]), given_over(BMODE, frame_rate_hz=20.0))
+    sweep = read_metaimage(
+        write_mha(tmp_path / "b.mha", grey(), frames=[]), given_over(BMODE, frame_rate_hz=20.0)
+    )
     np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
 
 
@@ -351,7 +353,9 @@ NRRD = "NRRD0004\ntype: uint8\nencoding: {}\nendian: little\n{}\n\n"
 
 
 def nrrd(path, pixels, fields, encoding="raw", content=None):
-    path.write_bytes(NRRD.format(encoding, fields).encode() + (pixels.tobytes() if content is None else content))
+    path.write_bytes(
+        NRRD.format(encoding, fields).encode() + (pixels.tobytes() if content is None else content)
+    )
     return path
 
 
@@ -403,7 +407,11 @@ def test_members_of_gzip_are_one_stream(tmp_path):
 
 @pytest.mark.parametrize("field", ["ElementNumberOfChannels", "Kinds", "UltrasoundImageType"])
 def test_colour_is_told(tmp_path, field):
-    value = {"ElementNumberOfChannels": 3, "Kinds": "vector domain domain", "UltrasoundImageType": "RGB_COLOR"}
+    value = {
+        "ElementNumberOfChannels": 3,
+        "Kinds": "vector domain domain",
+        "UltrasoundImageType": "RGB_COLOR",
+    }
     pixels = np.repeat(grey(), 3, axis=0)
     path = write_mha(tmp_path / "a.mha", pixels, {field: value[field], "DimSize": "5 4 3"}, frames=[])
     with pytest.raises(InvalidInputError, match=r"a\.mha: expected grey .*(colour|RGB_COLOR)"):

@@ -86,6 +86,7 @@ class DicomFile:
     spread: int
 
     def __call__(self) -> ReadFrame:
+        """Open nothing: each frame is read from the file anew."""
         return self.read
 
     def read(self, i: int) -> npt.NDArray[Any]:

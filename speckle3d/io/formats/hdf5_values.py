@@ -21,7 +21,8 @@ from speckle3d.io.recordings import where_of
 Turn: TypeAlias = Callable[[Sequence[npt.NDArray[Any]]], npt.NDArray[Any]]
 
 ENVELOPE_RANGE_DB = 80.0
-"""Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6 dB."""
+"""Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6
+dB."""
 _NOTHING_DB = -1e6
 
 
@@ -40,7 +41,8 @@ def member(group: h5py.Group, name: str) -> Any:
         link = node.get(part, getlink=True)
         if isinstance(link, h5py.ExternalLink):
             raise InvalidInputError(
-                f"{where_of(group.file.filename, name)}: expected data in the file itself, got a link to another"
+                f"{where_of(group.file.filename, name)}: expected data in the file itself, got a link to "
+                "another"
             )
         node = None if link is None else node.get(part)
     return node
@@ -117,6 +119,7 @@ class Grid:
     pairs: bool = False
 
     def __call__(self, parts: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Make a frame of one data set, or of real and imaginary parts."""
         if self.pairs:
             parts = [parts[0][..., 0], parts[0][..., 1]]
         elif parts[0].dtype.names:
@@ -144,6 +147,7 @@ class Levels:
     dynamic_range_db: float = ENVELOPE_RANGE_DB
 
     def __call__(self, parts: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Make a frame."""
         values = self.grid(parts).astype(np.float64)
         if self.top is None:
             return np.where(np.isneginf(values), _NOTHING_DB, values)
@@ -174,6 +178,7 @@ class HDF5File:
     turn: Turn
 
     def __call__(self) -> ReadFrame:
+        """Open the file."""
         file = open_hdf5(self.path)
         nodes = [dataset(file, name) for name in self.names]
         before = (slice(None),) * (self.axis or 0)

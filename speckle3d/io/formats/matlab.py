@@ -12,8 +12,8 @@ The mapping is the table ``arrays`` of the TOML file beside the recording, or of
     z_mm = "z * 1e3"                   # or positions: x_mm of vectors, z_mm of samples; time_s of frames
 
 Nothing is guessed of an array: neither what it is nor which of its axes is which. Versions 5 to 7 are read by
-SciPy, whole; version 7.3, which is HDF5 behind 512 bytes of text, frame by frame. An array is named as in MATLAB,
-``RcvData{1}`` or ``Trans.spacing`` or ``Receive(3).endSample``, counted from 1.
+SciPy, whole; version 7.3, which is HDF5 behind 512 bytes of text, frame by frame. An array is named as in
+MATLAB, ``RcvData{1}`` or ``Trans.spacing`` or ``Receive(3).endSample``, counted from 1.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class _Variables(ABC):
 
     @abstractmethod
     def children(self, node: Any) -> Iterator[tuple[str, Any]]:
-        """What is inside a node, by how MATLAB adds it to the node's name; nothing for the only struct of an array."""
+        """What is inside a node, and what MATLAB adds to its name; nothing for an only struct."""
 
     @abstractmethod
     def is_numeric(self, node: Any) -> bool:
@@ -161,10 +161,15 @@ class _Whole(_Variables):
         from scipy.io import loadmat
 
         super().__init__(path)
-        # SciPy crashes on some damaged files (1.17: an imaginary part that is missing), so a process of its own
-        # reads them first.
+        # SciPy crashes on some damaged files (1.17: an imaginary part that is missing), so a process of its
+        # own reads them first.
         probe = "import sys, scipy.io; scipy.io.loadmat(sys.argv[1])"
-        if subprocess.run([sys.executable, "-W", "ignore", "-c", probe, path], capture_output=True).returncode < 0:
+        if (
+            subprocess.run(
+                [sys.executable, "-W", "ignore", "-c", probe, path], capture_output=True
+            ).returncode
+            < 0
+        ):
             raise FileError(f"{path}: cannot be read: damaged")
         damage = (IndexError, AttributeError, EOFError, SystemError, AssertionError, NameError, zlib.error)
         with warnings.catch_warnings(), reading(path):
@@ -241,7 +246,7 @@ class _HDF5(_Variables):
 
 @dataclass(frozen=True)
 class _Axes:
-    """Axes of an array in MATLAB's order, with one for each that MATLAB leaves out as its last of length 1."""
+    """Axes of an array in MATLAB's order, with those of length 1 that MATLAB leaves out at its end."""
 
     size: tuple[int, ...]
     vector: int
@@ -288,6 +293,7 @@ class _Greys:
     grid: Grid
 
     def __call__(self, parts: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        """Make a frame."""
         made = self.grid(parts).astype(np.float64)
         if not ((made >= 0) & (made <= 255) & (made == np.rint(made))).all():
             raise InvalidInputError("bmode: expected grey levels, whole numbers from 0 to 255, got others")

@@ -160,7 +160,8 @@ def _axes(path: Path, group: h5py.Group) -> tuple[FloatArray, FloatArray]:
     where = where_of(path, f"{group.name}/scan")
     if kind != _LINEAR:
         raise InvalidInputError(
-            f"{where}: expected a {_LINEAR}, got {kind or 'none'}: beamform onto a {_LINEAR}, whose lines are "
+            f"{where}: expected a {_LINEAR}, got {kind or 'none'}: beamform onto a {_LINEAR}, whose lines "
+            "are "
             "parallel"
         )
     x, z = flat(scan, "x_axis"), flat(scan, "z_axis")

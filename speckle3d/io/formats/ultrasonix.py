@@ -128,7 +128,8 @@ def _frames(path: Path, header: _Header, size: int) -> FileFrames:
     if tag is None:
         whole = (size - _HEADER.size) // header.frame_bytes
         raise FileError(
-            f"{path}: ends early or late: expected {header.frames} frames of {header.frame_bytes} bytes, with or "
+            f"{path}: ends early or late: expected {header.frames} frames of {header.frame_bytes} bytes, "
+            "with or "
             f"without frame numbers, got {size} bytes, room for {whole}"
         )
     is_image = header.kind == 4

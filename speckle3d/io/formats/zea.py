@@ -5,8 +5,8 @@ made of it; ``scan`` beside it says how. Of ``beamformed_data`` (frame, z, x, ch
 two are I and Q; ``envelope_data`` (frame, z, x) are amplitudes; ``image`` (frame, z, x) is in decibels, or
 grey levels of eight bits. Since version 0.0.12 each is a group of ``values`` and ``coordinates``, the
 position (x, y, z) of each pixel in metres, by which the axes are told; before, a plain data set without
-positions. ``metadata/probe_pose`` is the tracker: poses of the transducer's tip, in metres, on a clock whose zero is the
-first transmission; its axes are x lateral, y elevational and z axial.
+positions. ``metadata/probe_pose`` is the tracker: poses of the transducer's tip, in metres, on a clock
+whose zero is the first transmission; its axes are x lateral, y elevational and z axial.
 
 zea's I/Q come both ways, by version: shifted down by ``demodulation_frequency``, or carrying their frequency
 again after delays were corrected. The phase of the data tells, see `carrier`.
@@ -217,7 +217,8 @@ def _shape(path: Path, node: h5py.Dataset, array: _Array) -> tuple[int, int, int
     if not sound or not shaped or 0 in node.shape:
         expected = "(frame, z, x, 1 or 2)" if is_beamformed else "(frame, z, x)"
         raise InvalidInputError(
-            f"{where_of(path, array.name)}: expected echoes of shape {expected}, got {node.shape} {node.dtype}"
+            f"{where_of(path, array.name)}: expected echoes of shape {expected}, got {node.shape} "
+            f"{node.dtype}"
         )
     count, first, second = node.shape[:3]
     return count, first, second, node.shape[3] if is_channelled else 1

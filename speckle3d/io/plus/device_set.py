@@ -1,10 +1,11 @@
-"""What a device set of PLUS says about images: where they are on the probe, their pixels, and what counts of them.
+"""What a device set of PLUS says about images: their place on the probe, their pixels, their clip.
 
 A result of PLUS's probe calibration, whose transforms are in ``CalibrationResults``, is read alike.
 
 References
 ----------
-.. [1] PLUS user manual, "Device set configuration", "Transformation matrix definition", "Volume reconstruction".
+.. [1] PLUS user manual, "Device set configuration", "Transformation matrix definition", "Volume
+   reconstruction".
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ class Clip:
         if self.columns is not None and self.rows is not None:
             parts.append("columns {:g} to {:g}, rows {:g} to {:g}".format(*self.columns, *self.rows))
         if self.fan is not None:
-            parts.append("fan about {:g}, {:g} from {:g} to {:g} pixels, {:g} to {:g} degrees".format(*self.fan))
+            parts.append(
+                "fan about {:g}, {:g} from {:g} to {:g} pixels, {:g} to {:g} degrees".format(*self.fan)
+            )
         return "; ".join(parts)
 
     def is_part_of(self, size: tuple[int, ...]) -> bool:
@@ -81,7 +84,7 @@ class Clip:
             outline = np.concatenate([outer * arc, inner * arc[::-1]])
             # PLUS moves both halves a pixel towards the middle (vtkIGSIOPasteSliceIntoVolume).
             outline[:, 0] -= (1 - _HAIR) * np.sign(outline[:, 0])
-            parts.append(_polygon(grid, outline + [x, y]))
+            parts.append(_polygon(grid, outline + np.array([x, y])))
         return " and ".join(parts)
 
 
@@ -138,7 +141,7 @@ class DeviceSet:
     """
 
     path: str = ""
-    names: Names = Names()
+    names: Names = field(default_factory=Names)
     origin_frame: str = "TransducerOrigin"
     transforms: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
     image_orientation: str | None = None

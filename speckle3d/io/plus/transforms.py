@@ -347,7 +347,7 @@ class _Column:
 
 
 def _poses_of_pixels(path: str, name: str, column: _Column) -> tuple[_Column, FloatArray | None]:
-    """Split transforms of pixels to mm into the image's poses and its pixels, which are those of all frames."""
+    """Split transforms of pixels to mm into the image's poses and its pixels, the same in all frames."""
     matrices, valid, reasons = column.matrices, column.valid.copy(), list(column.reasons)
     rigid = np.tile(np.eye(4), (len(matrices), 1, 1))
     sizes = np.ones((len(matrices), 3))

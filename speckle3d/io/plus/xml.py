@@ -19,8 +19,7 @@ def read_xml(path: PathLike) -> Element:
     FileError
         If the file cannot be read.
     InvalidInputError
-        If it is no XML. A document with a type declaration is refused, because the entities it may declare can
-        grow without bounds.
+        If it is no XML, or has a type declaration: the entities it may declare can grow without bounds.
     """
     with reading(path), open_regular(path) as stream:
         text = stream.read()
