@@ -295,7 +295,7 @@ def _nrrd_times(
             return None
     steps = lines.get("spacings", "").split()
     if unit in _S_PER and unit not in _MM_PER and len(steps) == len(stored) and float(steps[axis]) > 0:
-        return np.arange(stored[axis]) * float(steps[axis]) * _S_PER[unit]
+        return np.arange(float(stored[axis])) * float(steps[axis]) * _S_PER[unit]
     return None
 
 

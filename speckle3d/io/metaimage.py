@@ -158,7 +158,7 @@ class _Sequence:
             tracker=tracker,
             orientation=self._orientation(),
             chain="" if tracker is None else " * ".join(self._chain()),
-            probe=self.own.get("probe") or self.device.scan.probe,
+            probe=self.settings.probe or self.own.get("probe") or self.device.scan.probe,
             full_scale=self.own.get("full_scale", 255.0),
             assumptions=("parallel lines",) if self.layout.is_rf and not self.own else (),
             rows=tuple(rows),

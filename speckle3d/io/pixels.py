@@ -200,9 +200,10 @@ def _unpacked(stream: BinaryIO, pixels: Pixels) -> npt.NDArray[Any]:
                     unpacker = _unpacker(pixels)
                 packed = packed or stream.read(_PIECE_BYTES)
                 piece = unpacker.decompress(packed, _PIECE_BYTES)
-                if not packed and not piece:
+                rest = getattr(unpacker, "unconsumed_tail", b"")
+                if not piece and rest == packed:
                     break
-                packed = getattr(unpacker, "unconsumed_tail", b"")
+                packed = rest
                 made += room.write(piece)
         except (zlib.error, OSError, EOFError, ValueError) as error:
             raise FileError(f"{where}: expected packed pixels, got damaged ones: {error}") from error
@@ -213,7 +214,7 @@ def _unpacked(stream: BinaryIO, pixels: Pixels) -> npt.NDArray[Any]:
         room.seek(0)
         if size <= _MEMORY_BYTES:
             return np.frombuffer(room.read(), pixels.dtype)
-        return np.memmap(room._file, pixels.dtype, "r", 0, (pixels.count,))  # type: ignore[attr-defined]
+        return np.memmap(room._file, pixels.dtype, "r", 0, (pixels.count,))
 
 
 def _unpacker(pixels: Pixels) -> Any:

@@ -135,7 +135,7 @@ class Receive:
 
     def at_hz(self, depth_mm: FloatArray | float) -> FloatArray:
         """Demodulation frequency at depths."""
-        return np.interp(depth_mm, [0.0, self.filter_depth_mm], [self.shallow_hz, self.deep_hz])
+        return np.asarray(np.interp(depth_mm, [0.0, self.filter_depth_mm], [self.shallow_hz, self.deep_hz]))
 
 
 @dataclass(frozen=True)

@@ -107,13 +107,12 @@ def open_dicom(path: Path, settings: ImportSettings) -> Recording:
     header, syntax = _header(path)
     rows = _facts(header, syntax)
     try:
-        return _recording(path, settings, header, syntax, rows)
+        return _recording(path, settings, header, rows)
     except (InvalidInputError, FileError) as error:
         return Recording(path, settings, rows=tuple(rows), fault=error)
 
 
-def _recording(path: Path, settings: ImportSettings, header: Any, syntax: Any, rows: list[Row]) -> Recording:
-    _require_decoder(path, syntax)
+def _recording(path: Path, settings: ImportSettings, header: Any, rows: list[Row]) -> Recording:
     count = _require_grey(path, header)
     region, values, notes = _place(path, header)
     kind = _text(header, "PhotometricInterpretation")
@@ -185,20 +184,6 @@ def _require_all_frames(path: Path, count: int) -> None:
             except FileError:
                 high = middle
         raise FileError(f"{path}: ends early: {low + 1} of {count} frames") from error
-
-
-def _require_decoder(path: Path, syntax: Any) -> None:
-    from pydicom.pixels.decoders.base import get_decoder
-
-    with _reading(str(path)):
-        name = printable(str(syntax.name))
-        try:
-            decoder = get_decoder(syntax)
-        except NotImplementedError:
-            raise InvalidInputError(f"{path}: expected pixels that pydicom unpacks, got {name}") from None
-    if not decoder.is_available:
-        needs = ", or ".join(printable(text) for text in decoder.missing_dependencies)
-        raise InvalidInputError(f"{path}: {name}: expected a package that unpacks it: {needs}")
 
 
 def _require_grey(path: Path, header: Any) -> int:

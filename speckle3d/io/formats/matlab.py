@@ -19,8 +19,6 @@ MATLAB, ``RcvData{1}`` or ``Trans.spacing`` or ``Receive(3).endSample``, counted
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 import warnings
 import zlib
 from abc import ABC, abstractmethod
@@ -161,16 +159,6 @@ class _Whole(_Variables):
         from scipy.io import loadmat
 
         super().__init__(path)
-        # SciPy crashes on some damaged files (1.17: an imaginary part that is missing), so a process of its
-        # own reads them first.
-        probe = "import sys, scipy.io; scipy.io.loadmat(sys.argv[1])"
-        if (
-            subprocess.run(
-                [sys.executable, "-W", "ignore", "-c", probe, path], capture_output=True
-            ).returncode
-            < 0
-        ):
-            raise FileError(f"{path}: cannot be read: damaged")
         damage = (IndexError, AttributeError, EOFError, SystemError, AssertionError, NameError, zlib.error)
         with warnings.catch_warnings(), reading(path):
             warnings.simplefilter("ignore")

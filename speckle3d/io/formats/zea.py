@@ -144,7 +144,7 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         time_s=_times(path, file, array, count),
         tracker=tracker,
         chain=_POSES,
-        probe=text_attribute(file, "probe_name") or text_attribute(file, "probe"),
+        probe=settings.probe or text_attribute(file, "probe_name") or text_attribute(file, "probe"),
         assumptions=() if pixels is not None else ("parallel lines",),
         rows=tuple(rows),
         remarks=tuple(remarks),

@@ -326,7 +326,7 @@ class _Column:
             except InvalidInputError:
                 reasons[i] = "whose pose is not 16 finite numbers"
         if is_inverse:
-            for i in np.flatnonzero(~(np.abs(np.linalg.det(matrices)) > 0)):
+            for i in np.flatnonzero(~(np.abs(np.linalg.det(matrices)) > 0)).tolist():
                 matrices[i], reasons[i] = np.eye(4), "whose pose has no inverse"
             matrices = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
         return cls(matrices, np.array([not reason for reason in reasons], dtype=bool), reasons)
@@ -364,7 +364,8 @@ def _poses_of_pixels(path: str, name: str, column: _Column) -> tuple[_Column, Fl
             raise fault
         return _Column(rigid, valid, reasons), None
     middle = np.median(sizes[valid], axis=0)
-    for i in np.flatnonzero(valid & (np.abs(sizes / middle - 1.0) > ROUNDING_TOLERANCE).any(axis=1)):
+    other = valid & (np.abs(sizes / middle - 1.0) > ROUNDING_TOLERANCE).any(axis=1)
+    for i in np.flatnonzero(other).tolist():
         valid[i], reasons[i] = False, f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
     column_mm, row_mm, leaning = sizes[valid].mean(axis=0).tolist()
     pixels = image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning - 1.0)

@@ -6,7 +6,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings, ImageGrid
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 
 pytest.importorskip("pydicom")
 
@@ -237,3 +237,25 @@ def test_the_reference_pixel_is_counted_from_the_regions_first(tmp_path):
     changes = {"ReferencePixelY0": 10, "ReferencePixelPhysicalValueY": 0.0}
     sweep = load_sweep(write_dicom(tmp_path / "a.dcm", images(), [region(*BOX, **changes)]), RANGE)
     assert sweep.grid.first_sample_depth_mm == pytest.approx(-100 * TISSUE["PhysicalDeltaY"])
+
+
+@pytest.mark.parametrize("kept", [0.5, 0.99])
+def test_a_file_cut_short_tells_how_many_frames_are_whole(tmp_path, kept):
+    images = np.random.default_rng(0).integers(0, 255, (10, 64, 48)).astype(np.uint8)
+    path = write_dicom(tmp_path / "a.dcm", images, PixelSpacing=[0.1, 0.2])
+    content = path.read_bytes()
+    start = len(content) - images.size
+    path.write_bytes(content[: start + int(kept * images.size)])
+    with pytest.raises(FileError, match=f"ends early: {int(10 * kept)} of 10 frames"):
+        load_sweep(path, ImportSettings(dynamic_range_db=60.0))
+    assert "ends early" in dict(row[:2] for row in describe(path))["sweep"]
+
+
+def test_frames_of_a_repeated_time_are_left_out(tmp_path):
+    images = np.random.default_rng(0).integers(0, 255, (4, 64, 48)).astype(np.uint8)
+    path = write_dicom(
+        tmp_path / "a.dcm", images, PixelSpacing=[0.1, 0.2], FrameTime=None, FrameTimeVector=[0, 40, 0, 40]
+    )
+    recording = open_recording(path, ImportSettings(dynamic_range_db=60.0))
+    np.testing.assert_allclose(recording.sweep.frame_time_s, [0, 0.04, 0.08])
+    assert any("1 of 4 left out" in note for note in recording.notes)
