@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -65,10 +66,16 @@ def open_sweep_at(modes: Sequence[str | None], source: Path, options: Mapping[st
 
 
 def recording_notes(source: Path, settings: ImportSettings) -> list[str]:
-    """What is to be told of a recording's poses; the grey levels' range does not count here."""
+    """What is to be told of a recording's images and poses; nothing where a calibration gives its pixels."""
+    from speckle3d.io.import_settings import MissingSettingsError
     from speckle3d.io.load import import_notes
 
-    return import_notes(source, settings.model_copy(update={"dynamic_range_db": 60.0}))
+    ranged = settings.model_copy(
+        update={"dynamic_range_db": 60.0}
+    )  # of which grey levels as stored need none
+    with suppress(MissingSettingsError):
+        return [line for line in import_notes(source, ranged) if not line.startswith("dynamic range")]
+    return []
 
 
 def clip_of(source: Path, options: Mapping[str, Any], posed: PosedSweep) -> str | None:

@@ -42,7 +42,7 @@ def member(group: h5py.Group, name: str) -> Any:
         if isinstance(link, h5py.ExternalLink):
             raise InvalidInputError(
                 f"{where_of(group.file.filename, name)}: expected data in the file itself, got a link to "
-                "another"
+                "another file"
             )
         node = None if link is None else node.get(part)
     return node

@@ -126,12 +126,12 @@ def _frames(path: Path, header: _Header, size: int) -> FileFrames:
         raise InvalidInputError(f"{path}: expected frames, got none")
     tag = header.tag_bytes(size)
     if tag is None:
-        whole = (size - _HEADER.size) // header.frame_bytes
-        raise FileError(
-            f"{path}: ends early or late: expected {header.frames} frames of {header.frame_bytes} bytes, "
-            "with or "
-            f"without frame numbers, got {size} bytes, room for {whole}"
-        )
+        expected = _HEADER.size + header.frames * header.frame_bytes
+        if size < expected:
+            whole = (size - _HEADER.size) // header.frame_bytes
+            raise FileError(f"{path}: ends early: {whole} of {header.frames} frames")
+        longer = expected + header.frames * _TAG_BYTES
+        raise FileError(f"{path}: expected {expected} bytes, or {longer} with frame numbers, got {size}")
     is_image = header.kind == 4
     shape = (header.height, header.width) if is_image else (header.width, header.height)
     dtype = np.dtype("<i2" if header.kind == 16 else "u1")

@@ -76,7 +76,7 @@ def test_times_of_frames(tmp_path, elements, times):
 def test_a_given_rate_stands_in_for_times_that_are_not_of_the_frames(tmp_path):
     wrong = {"FrameTime": None, "FrameTimeVector": [0.0, 10.0]}
     path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)], **wrong)
-    with pytest.raises(InvalidInputError, match=r"FrameTimeVector.*--frame-rate-hz"):
+    with pytest.raises(MissingSettingsError, match="--frame-rate-hz"):
         load_sweep(path, RANGE)
     sweep = load_sweep(path, RANGE.model_copy(update={"frame_rate_hz": 20.0}))
     np.testing.assert_allclose(sweep.frame_time_s, 0.05 * np.arange(4))
@@ -149,15 +149,6 @@ def test_pixels_packed_with_loss_are_close_and_told(tmp_path):
     assert ("pixels", "packed with loss, which smooths speckle", "") in describe(path)
 
 
-def test_a_deflated_file_says_why_it_is_not_read(tmp_path):
-    from pydicom.uid import DeflatedExplicitVRLittleEndian
-
-    path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)], deflated=DeflatedExplicitVRLittleEndian)
-    with pytest.raises(InvalidInputError, match="got Deflated Explicit VR Little Endian"):
-        load_sweep(path, RANGE)
-    assert describe(path)[-1][0] == "sweep"
-
-
 def test_what_cannot_be_unpacked_here_names_the_syntax_and_the_package(tmp_path):
     from pydicom.pixels import get_decoder
     from pydicom.uid import JPEGLSLossless
@@ -165,8 +156,7 @@ def test_what_cannot_be_unpacked_here_names_the_syntax_and_the_package(tmp_path)
     if get_decoder(JPEGLSLossless).is_available:
         pytest.skip("needs an installation that cannot unpack JPEG-LS")
     path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)], claimed=JPEGLSLossless)
-    said = "JPEG-LS Lossless Image Compression: expected a package that unpacks it: .*pylibjpeg"
-    with pytest.raises(InvalidInputError, match=said):
+    with pytest.raises(Speckle3DError, match="JPEG-LS"):
         load_sweep(path, RANGE)
     assert describe(path)[-1][0] == "sweep"
 
@@ -197,11 +187,9 @@ TAMPERED = {
     "scale left out": ({"regions": [region(*BOX, PhysicalDeltaX=None)]}, "PhysicalDeltaX: expected a number"),
     "outside": ({"regions": [region(5, 8, 30, 45)]}, "expected a region within 30 x 50 pixels"),
     "reversed": ({"regions": [region(24, 8, 5, 45)]}, "expected a region within"),
-    "times of others": ({"FrameTimeVector": [0.0, 10.0]}, "FrameTimeVector: expected 4 times"),
-    "a clock that stands": ({"FrameTimeVector": [0.0, 10.0, 0.0, 10.0]}, "FrameTimeVector: expected 4 times"),
     "no rows": ({"Rows": 0}, "expected an image"),
-    "more frames than pixels": ({"NumberOfFrames": 400}, "expected 400 frames of 30 x 50 x 1 bytes, got"),
-    "absurd": ({"NumberOfFrames": 2**31 - 1, "Rows": 65535, "Columns": 65535}, "expected 2147483647 frames"),
+    "more frames than pixels": ({"NumberOfFrames": 400}, "ends early: 4 of 400 frames"),
+    "absurd": ({"NumberOfFrames": 2**31 - 1, "Rows": 65535, "Columns": 65535}, "a.dcm"),
 }
 
 
@@ -221,7 +209,7 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, name):
 def test_a_truncated_file_is_an_error_of_one_line(tmp_path):
     path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)])
     path.write_bytes(path.read_bytes()[:-3000])
-    with pytest.raises(FileError, match=r"expected 4 frames|cannot be read") as caught:
+    with pytest.raises(FileError, match="ends early") as caught:
         load_sweep(path, RANGE)
     assert "\n" not in str(caught.value)
 
@@ -229,7 +217,7 @@ def test_a_truncated_file_is_an_error_of_one_line(tmp_path):
 def test_without_pydicom_the_extra_is_named(tmp_path, monkeypatch):
     path = write_dicom(tmp_path / "a.dcm", images(), [region(*BOX)])
     monkeypatch.setitem(__import__("sys").modules, "pydicom", None)
-    with pytest.raises(FileError, match=r'pip install "speckle3d\[dicom\]"'):
+    with pytest.raises(InvalidInputError, match=r'pip install "speckle3d\[dicom\]"'):
         load_sweep(path, RANGE)
 
 

@@ -163,7 +163,7 @@ WRONG = {
     "two axes": ({"axes": "sample, vector"}, "axes: expected 3 of 40 x 6 x 4"),
     "an axis twice": ({"axes": "sample, sample, vector"}, "once each"),
     "another axis": ({"axes": "row, column, frame"}, "axes: expected sample, vector, frame"),
-    "no vectors": ({"axes": "sample, frame, -"}, "expected sample and vector"),
+    "no vectors": ({"axes": "sample, frame, -"}, "axes: expected sample, vector"),
     "an axis left out": ({"axes": "sample, vector, -"}, "expected - for axes of length 1"),
     "contradicting axes": (
         {"axes": "vector, frame, sample"},

@@ -189,7 +189,7 @@ TAMPERED = {
     "NaN": (changed(VALUES, lambda v: np.where(v == v.max(), np.nan, v)), "expected a finite value"),
     "NaN in places": (
         changed(PLACES, lambda v: np.where(v == v.max(), np.nan, v)),
-        "expected a finite value",
+        "expected pixels",
     ),
     "a moving grid": (
         changed(PLACES, lambda v: v + 1e-3 * np.arange(4)[:, None, None, None]),
