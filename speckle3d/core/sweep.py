@@ -243,6 +243,8 @@ class _Sensor(Generic[Samples]):
     sensor_from_image: Samples | None = None
     time_offset_s: float = 0.0
 
+    label: ClassVar[str]
+    """What messages call the sensor."""
     uncalibrated: ClassVar[str]
     """Message that the sensor's mounting is missing, which names the attribute of a sweep file."""
 
@@ -269,6 +271,7 @@ class _Sensor(Generic[Samples]):
 class OrientationSensor(_Sensor[Rotation]):
     """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
 
+    label: ClassVar[str] = "orientation sensor"
     uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/orientation", "sensor_from_image_wxyz")
 
     readings: TimedRotations
@@ -290,6 +293,7 @@ class Tracker(_Sensor[RigidTransform]):
         volumes and pictures of the tracker's poses look at it.
     """
 
+    label: ClassVar[str] = "tracker"
     uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/tracker", "sensor_from_image")
 
     readings: TimedPoses

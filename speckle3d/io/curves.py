@@ -1,4 +1,4 @@
-"""Decorrelation curves on disk (format ``speckle3d.curves``, version 1)."""
+"""Decorrelation curves on disk (format ``speckle3d.curves``, version 1; 2 with a spectrum)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     FileError
         If the file cannot be written.
     """
-    with HDF5Writer(path, FORMAT) as writer:
+    with HDF5Writer(path, FORMAT, 1 if curves.spectrum is None else 2) as writer:
         root, signal = writer.file, curves.key.signal
         writer.put_fields(root, curves, skip=["key"])
         writer.put_fields(root, curves.key, skip=["signal"])
@@ -64,7 +64,7 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
     >>> curves.key.correlation_of
     'echo'
     """
-    with opened(path, FORMAT) as file, naming(str(path)):
+    with opened(path, FORMAT, (1, 2)) as file, naming(str(path)):
         kind = read_text(file, "signal")
         if kind not in ("rf", "bmode"):
             raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
