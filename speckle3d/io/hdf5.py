@@ -142,10 +142,10 @@ def open_hdf5(path: PathLike) -> h5py.File:
 
 
 def _require_sound_texts(path: PathLike) -> None:
-    """Refuse a damaged file whose texts HDF5 would look for without end, as it does at a text of no length.
+    """Refuse a file whose texts have zeros over them, as a broken copy leaves: HDF5 would search without end.
 
-    Texts lie in heaps, which begin with GCOL [1]_; looked at are those near both ends of a file, where
-    attributes are.
+    Texts lie in heaps, which begin with GCOL and go on from length to length [1]_; HDF5 2.0 does not check
+    that a length is above zero. Looked at are those near both ends of a file, where attributes are.
 
     References
     ----------
@@ -157,10 +157,8 @@ def _require_sound_texts(path: PathLike) -> None:
             stream.seek(start)
             content = stream.read(_HEAPS_BYTES)
             for heap in re.finditer(rb"GCOL\x01\x00{3}", content):
-                at, stop = (
-                    heap.start() + 16,
-                    heap.start() + int.from_bytes(content[heap.end() :][:8], "little"),
-                )
+                at = heap.start() + 16
+                stop = heap.start() + int.from_bytes(content[heap.end() : heap.end() + 8], "little")
                 while at + 16 <= min(stop, len(content)):
                     index, length = struct.unpack_from("<H6xQ", content, at)
                     step = 16 + -(-length // 8) * 8 if index else length
