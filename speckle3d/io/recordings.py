@@ -190,7 +190,7 @@ class Recording:
         if given_rate or (self.time_s is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
         needed = {name: self.values.get(name, ASSUMED.get(name, Value())) for name in names}
-        if given_rate and self.time_s is not None:
+        if given_rate and self.time_s is not None and "frame_rate_hz" not in self.values:
             needed["frame_rate_hz"] = Value(rate_of(self.time_s), "of its times")
         if "sampling_rate_hz" in needed and self.sample_spacing_mm is not None:
             speed = self.settings.speed_of_sound_m_s or needed["speed_of_sound_m_s"].value
