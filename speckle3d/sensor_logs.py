@@ -13,6 +13,7 @@ from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
 from xsens.logs.clocks import timeline_of_times
+from xsens.logs.faults import measured
 from xsens.logs.samples import Gap, ImuLog
 
 
@@ -41,7 +42,7 @@ def _inside_probe(path: Path) -> ImuLog | None:
     samples, fit = sensor_of(path)
     clock = timeline_of_times(samples.time_s)
     found = "is not used: it does not agree with gravity" if fit is None else f"is {fit.meaning}"
-    return ImuLog(
+    log = ImuLog(
         clock.time_s,
         samples.accelerometer_m_s2(fit),
         samples.gyroscope_rad_s,
@@ -51,12 +52,13 @@ def _inside_probe(path: Path) -> ImuLog | None:
         notes=(*clock.notes, f"the sensor's quaternion {found}", *samples.remarks),
         source=path.name,
     )
+    return measured(log)
 
 
 def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
     """Log of a sweep's orientation sensor, on its own clock."""
     clock = timeline_of_times(sensor.readings.time_s)
-    return ImuLog(
+    log = ImuLog(
         clock.time_s,
         **{name: getattr(sensor, name) for name in INERTIAL},
         world_from_sensor=sensor.readings.world_from_sensor,
@@ -64,6 +66,7 @@ def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
         notes=clock.notes,
         source=source,
     )
+    return measured(log)
 
 
 def _pauses(gaps: Sequence[Gap]) -> tuple[Gap, ...]:

@@ -100,8 +100,8 @@ def _is_picture(path: Path) -> bool:
 
 def _is_log(path: Path) -> bool:
     """Whether a file begins as `xsens.write_csv` writes it: comments, then a heading from ``time_s`` on."""
-    lines = (line for line in _start(path).splitlines() if not line.startswith(b"#"))
-    return next(lines, b"").startswith(b"time_s,")
+    with path.open("rb") as lines:
+        return next((line for line in lines if not line.startswith(b"#")), b"").startswith(b"time_s,")
 
 
 def _is_volume(path: Path) -> bool:

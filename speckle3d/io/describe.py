@@ -21,8 +21,15 @@ from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
 from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_dataset, require_group
-from speckle3d.io.hdf5_guard import plain_attribute
+from speckle3d.io.hdf5 import (
+    PathLike,
+    find_member,
+    open_hdf5,
+    plain_attribute,
+    reading,
+    require_dataset,
+    require_group,
+)
 from speckle3d.io.import_settings import settings_for
 from speckle3d.io.load import kind_of, recording_of
 from speckle3d.io.readers import Reader, Row, find_reader

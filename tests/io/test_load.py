@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import h5py
@@ -12,7 +13,7 @@ from speckle3d.core.reconstruction import Provenance
 from speckle3d.io.curves import write_curves
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import import_notes, load_sweep
+from speckle3d.io.load import import_notes, import_record, load_sweep
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import write_sweep
 
@@ -148,3 +149,14 @@ def test_a_calibration_that_is_given_is_told_against_the_spacing(tmp_path):
     assert import_notes(path, given)[:1] == [
         "pixels of 0.2 x 0.2 mm, given by image_to_probe: the file says 0.1 x 0.1"
     ]
+
+
+def test_settings_that_were_in_force_are_told_and_a_sweep_file_has_none(tmp_path):
+    recording = write_mha(tmp_path / "a.mha", grey())
+    assert import_record(recording) is None
+    (tmp_path / "import.toml").write_text("dynamic_range_db = 50\nbandwidth_hz = [3e6, 7e6]")
+    record = import_record(recording)
+    assert record.name == "import.toml"
+    assert json.loads(record.settings_json) == {"dynamic_range_db": 50, "bandwidth_hz": [3e6, 7e6]}
+    write_sweep(tmp_path / "s.h5", sweep_examples.bmode_sweep())
+    assert import_record(tmp_path / "s.h5") is None

@@ -16,9 +16,10 @@ from speckle3d.kernels.orientation.inclination import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingBank
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
-from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, real_field, real_force, require_metres
+from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
+from xsens.logs.faults import LiveFaults
 
 _JUDGED_S = 0.99
 """The accelerometer's unit is judged by the median of the first second, less rounding of the steps."""
@@ -92,6 +93,7 @@ class OnlineFilter:
         self._force = np.full(3, np.nan)
         self._first: list[FloatArray] = []
         self._judged_s = 0.0
+        self._live = LiveFaults()
 
     def push(
         self,
@@ -146,7 +148,7 @@ class OnlineFilter:
 
     def _judge(self, step_s: float, force: FloatArray) -> None:
         """Raise if the accelerometer is in other units, after a second of it."""
-        if self._judged_s >= _JUDGED_S or not np.isfinite(force).all():
+        if self._judged_s >= _JUDGED_S or not (np.isfinite(force).all() and force.any()):
             return
         self._first.append(force)
         self._judged_s += min(step_s, BRIDGED_S)
@@ -160,8 +162,9 @@ class OnlineFilter:
                 self._first = []
 
     def _take(self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
+        rate, force, field = self._live.measured(rate, force, field)
         self._forceless_s += step_s
-        if real_force(force[None])[0]:
+        if np.isfinite(force).all():
             self._force, self._forceless_s = force, 0.0
         if not (np.isfinite(rate).all() and self._forceless_s <= PAUSE_S and np.isfinite(self._force).all()):
             self._skipped_s += step_s
@@ -239,5 +242,4 @@ def _checked(
     fast = np.linalg.norm(np.where(np.isfinite(vectors[0]), vectors[0], 0.0), axis=1).max(initial=0.0)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
-    vectors[2], _ = real_field(vectors[2])
     return step, vectors[0], vectors[1], vectors[2]

@@ -32,6 +32,12 @@ _SHORTER = 0.6
 
 _MOST_PERIODS = 2.0**53
 
+_LATE = 64
+"""A sample that comes at most so many samples late was overtaken; one further back shows a new start."""
+
+_AGREES = 1.1
+"""Ratio up to which a stated rate and that of the times agree: clocks of sensors are good to 1 %."""
+
 
 @dataclass(frozen=True)
 class Stamps:
@@ -63,9 +69,12 @@ class Stamps:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Times of the samples that are kept (of those sent twice, one), with their counter made to rise."""
+    """Times of the samples that are kept (of those sent twice, one), with their counter made to rise.
 
-    kept: BoolArray
+    `rows` are the indices of those samples in order of time; None if they are all, in their order.
+    """
+
+    rows: IntArray | None
     time_s: FloatArray
     counter: IntArray | None = None
     gaps: tuple[Gap, ...] = ()
@@ -94,19 +103,56 @@ def timeline(stamps: Stamps) -> Timeline:
         raise InvalidInputError(
             f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
         )
+    order = _order_of(stamps)
+    stamps = stamps if order is None else _taken(stamps, order)
     same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
     if stamps.starts is not None:
         same.append(~stamps.starts[1:])
     kept = np.concatenate(([True], ~np.logical_and.reduce(same)))
     if not kept.all():
-        arrays: dict[str, Any] = {k: v[kept] for k, v in vars(stamps).items() if isinstance(v, np.ndarray)}
-        stamps = replace(stamps, **arrays)
+        stamps = _taken(stamps, kept)
     steps, counts = _steps(stamps)
-    told = steps.gaps(), steps.notes(kept, "came twice; the second was")
+    told = (*_order_notes(order), *steps.notes(int((~kept).sum()), "came twice; the second was"))
     time_s = _risen(0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s, steps.seconds)
+    gaps = steps.gaps()
     del steps  # a large log's arrays, of which few may be held at once
     first = 0 if stamps.counter is None else int(stamps.counter[0])
-    return Timeline(kept, time_s, None if counts is None else _risen(first, counts), *told)
+    rows = None if order is None and kept.all() else (np.arange(kept.size) if order is None else order)[kept]
+    return Timeline(rows, time_s, None if counts is None else _risen(first, counts), gaps, told)
+
+
+def _taken(stamps: Stamps, which: Any) -> Stamps:
+    arrays: dict[str, Any] = {k: v[which] for k, v in vars(stamps).items() if isinstance(v, np.ndarray)}
+    return replace(stamps, **arrays)
+
+
+def _order_of(stamps: Stamps) -> IntArray | None:
+    """Indices that put samples which came late, by counter or else clock, in order; None if none did."""
+    values, span = stamps.counter, stamps.counter_span
+    late = _LATE
+    if values is None:
+        assert stamps.ticks is not None  # one of the two is there
+        values, span = stamps.ticks, _TICK_SPAN
+        steps = np.diff(values) % span
+        usual = np.median(steps[steps < span // 2]) if (steps < span // 2).any() else 0
+        late = int(_LATE * usual)
+    signed = (np.diff(values) + span // 2) % span - span // 2
+    back = (signed < 0) & (signed >= -late)
+    if stamps.starts is not None:
+        back &= ~stamps.starts[1:]
+    if not back.any():
+        return None
+    signed[(signed < -late) | (signed > span // 4)] = late  # a new start
+    if stamps.starts is not None:
+        signed[stamps.starts[1:]] = late
+    return np.asarray(np.argsort(np.append(0, np.cumsum(signed)), kind="stable"))
+
+
+def _order_notes(order: IntArray | None) -> tuple[str, ...]:
+    if order is None:
+        return ()
+    late = int((order < np.maximum.accumulate(order)).sum())
+    return (f"{late} samples came out of order and were sorted",)
 
 
 def _risen(first: float, steps: Any) -> Any:
@@ -118,23 +164,51 @@ def _risen(first: float, steps: Any) -> Any:
     return sums
 
 
-def timeline_of_times(time_s: FloatArray, counter: IntArray | None = None) -> Timeline:
-    """Find gaps in samples that have times, and perhaps a counter that does not wrap round.
+def timeline_of_times(
+    time_s: FloatArray, counter: IntArray | None = None, stated_hz: float = float("nan")
+) -> Timeline:
+    """Find gaps in samples that have times, and perhaps a counter.
 
-    Samples not later than all before them are left out.
+    Samples out of order are sorted; of several at one time, the first is kept.
+
+    Raises
+    ------
+    InvalidInputError
+        If the times contradict a stated sampling rate.
     """
-    before = np.concatenate(([-np.inf], np.maximum.accumulate(time_s)[:-1]))
-    kept = time_s > before
-    time_s, counter = time_s[kept], None if counter is None else counter[kept]
+    order = None if (np.diff(time_s) >= 0.0).all() else np.argsort(time_s, kind="stable")
+    time_s = time_s if order is None else time_s[order]
+    kept = np.append(True, np.diff(time_s) > 0.0)
+    rows = None if order is None and kept.all() else (np.arange(kept.size) if order is None else order)[kept]
+    time_s = time_s[kept]
+    counter = counter if counter is None or rows is None else counter[rows]
     seconds = np.diff(time_s)
     never = np.zeros(seconds.size, dtype=bool)
     period_s = float(np.median(seconds)) if seconds.size else float("nan")
     if counter is None:
         taken, irregular = _by_clock(seconds, never)
     else:
-        taken, irregular = _by_counter(np.diff(counter), never), False
+        counts = np.diff(counter)
+        if (counts < 0).any():
+            counts %= _WORD
+            counter = _risen(int(counter[0]), counts)
+        taken, irregular = _by_counter(counts, never), False
+        _require_agreement(seconds, counts, stated_hz)
     steps = _Steps(seconds, taken, never, never, period_s, irregular)
-    return Timeline(kept, time_s, counter, steps.gaps(), steps.notes(kept, "whose time did not rise were"))
+    notes = (*_order_notes(order), *steps.notes(int((~kept).sum()), "at the time of another were"))
+    return Timeline(rows, time_s, counter, steps.gaps(), notes)
+
+
+def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) -> None:
+    """Raise if a stated rate is neither that of the samples nor that of the counter by their clock."""
+    going = (seconds > 0.0) & (counts > 0)
+    if not (stated_hz > 0.0 and going.any()):
+        return
+    rates = (float(np.median(1.0 / seconds[going])), float(np.median(counts[going] / seconds[going])))
+    if not any(1.0 / _AGREES < rate / stated_hz < _AGREES for rate in rates):
+        raise InvalidInputError(
+            f"expected times at the stated rate, {stated_hz:g} Hz, got {rates[0]:.4g} Hz by their clock"
+        )
 
 
 @dataclass(frozen=True)
@@ -161,9 +235,9 @@ class _Steps:
             Gap(int(i), int(lost), float(self.seconds[i])) for i, lost in zip(at, missing, strict=True)
         )
 
-    def notes(self, kept: BoolArray, why: str) -> tuple[str, ...]:
-        """What was left out and why, an irregular clock, and new starts."""
-        notes = [] if kept.all() else [f"{int((~kept).sum())} samples {why} left out"]
+    def notes(self, left_out: int, why: str) -> tuple[str, ...]:
+        """How many were left out and why, an irregular clock, and new starts."""
+        notes = [f"{left_out} samples {why} left out"] if left_out else []
         if self.irregular:
             shortest, longest = 1e3 * self.seconds.min(), 1e3 * self.seconds.max()
             notes.append(
@@ -192,6 +266,8 @@ def _steps(stamps: Stamps) -> tuple[_Steps, IntArray | None]:
         taken, irregular = _by_clock(seconds, anew)
     else:
         taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
+        if seconds is not None and stamps.period_s > 0.0:
+            _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
         if seconds is None:
             seconds = taken * period_s
         elif period_s > 0.0:  # the clock tells how often the counter went all the way round

@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from xsens.logs.clocks import Stamps, Timeline, require_rate, timeline
-from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.faults import measured
+from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import Claim, nwu_from, settle, turned, upright_part
-
-_ABSURD = 1e6
-"""Larger values, in any of the units, are damage: the sensors' ranges end at 160 m/s² and 35 rad/s."""
 
 _WORST_NORM = 0.05
 """How far a quaternion's length may be from 1, and a matrix's rows from orthonormal: far beyond rounding in
@@ -115,34 +113,24 @@ def assembled(line: Timeline, parts: Parts) -> ImuLog:
     """Build the log of the samples that the timeline keeps."""
     there = None if parts.there is None or not parts.there.any() else parts.there
     notes = list(parts.notes)
-    sane = []
-    for name, vectors in zip(VECTORS, parts.vectors, strict=True):
-        rows: FloatArray | None = only(vectors, line.kept)
-        if rows is not None and not _within(rows):
-            good = np.asarray((np.abs(rows) < _ABSURD).all(axis=1))
-            if wrong := int((np.abs(rows) >= _ABSURD).any(axis=1).sum()):
-                notes.append(f"{wrong} {name.split('_')[0]} readings out of range were left out")
-            rows = np.where(good[:, None], rows, np.nan) if good.any() else None
-        sane.append(rows)
     if parts.there is not None and not parts.there.all():
         notes.append(f"{int((~parts.there).sum())} samples lack the sensor's own orientation")
-    return ImuLog(
+    log = ImuLog(
         line.time_s,
-        sane[0],
-        sane[1],
-        sane[2],
-        None if there is None else only(parts.orientations, line.kept),
+        *(_at(rows, line.rows) for rows in parts.vectors),
+        None if there is None else _at(parts.orientations, line.rows),
         line.counter,
         line.gaps,
         (*notes, *line.notes),
         parts.source,
-        np.zeros(0, dtype=bool) if there is None else there[line.kept],
+        np.zeros(0, dtype=bool) if there is None else _at(there, line.rows),
     )
+    return measured(log)
 
 
-def _within(rows: FloatArray) -> bool:
-    """Whether all are numbers that may be a measurement; without a copy of them."""
-    return bool(rows.max(initial=0.0) < _ABSURD and rows.min(initial=0.0) > -_ABSURD)  # false for a NaN
+def _at(values: Any, rows: IntArray | None) -> Any:
+    """Rows of an array or Rotation; all, without a copy, if `rows` is None."""
+    return values if values is None or rows is None else values[rows]
 
 
 # -- the sensor's own orientation

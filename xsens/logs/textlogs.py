@@ -1,8 +1,8 @@
 """Read text logs: exports of the MT9 software, MT Manager and Xsens DOT, RepoIMU's, and plain CSV files.
 
 Exports of the MT9 software name no columns: time, then 3 angles; or acceleration, rate of turn, field and
-perhaps temperature; or the 9 elements of a matrix. All other files name their columns, in any order.
-Plain files are written here too.
+perhaps temperature; or the 9 elements of a matrix. All other files name their columns, in any order, perhaps
+with their units. Plain files are written here too.
 """
 
 from __future__ import annotations
@@ -16,41 +16,28 @@ from pathlib import Path
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import cannot_write, clear_parts, marked, part_beside
 from xsens.logs.clocks import Stamps, timeline_of_times
+from xsens.logs.columns import Names, column_of, suggestion
 from xsens.logs.parts import Hints, Parts, are_rotations, assembled, on_clock, only, oriented
 from xsens.logs.samples import VECTORS, Gap, ImuLog
-from xsens.logs.texttables import Names, TextTable, number, read_table
+from xsens.logs.texttables import TextTable, number, read_table
 from xsens.logs.worlds import Claim
 
-
-def _axes(*sensors: str, axes: str = "xyz") -> tuple[Names, ...]:
-    return tuple(tuple(sensor.replace("?", axis) for axis in axes) for sensor in sensors)
-
-
-PLAIN_VECTORS = _axes("accelerometer_?_m_s2", "gyroscope_?_rad_s", "magnetometer_?_au")
-_VENDOR_VECTORS = _axes("acc_?", "gyr_?", "mag_?")
-_REPO_VECTORS = _axes("imu acceleration_?", "imu gyroscope_?", "imu magnetometer_?")
-_QUATERNIONS = (*_axes("quaternion_?", "quat_?", axes="wxyz"), *_axes("quat_q?", axes="0123"))
-_OPTICAL = _axes("vicon orientation_?", axes="wxyz")
-_ANGLES: tuple[Names, ...] = (("roll", "pitch", "yaw"), ("euler_x", "euler_y", "euler_z"))
-_MATRIX: Names = tuple(f"mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3))
-_TIMES, _TICKS, _COUNTERS = ("time_s", "time (s)"), "sampletimefine", ("packetcounter", "counter")
-
-_VECTOR_GROUPS = (*PLAIN_VECTORS, *_VENDOR_VECTORS, *_REPO_VECTORS)
-_GROUPS = (*_VECTOR_GROUPS, *_QUATERNIONS, *_OPTICAL, *_ANGLES, _MATRIX, _COUNTERS, _TIMES, (_TICKS,))
-_KNOWN = frozenset(name for names in _GROUPS for name in names)
-
-_MEASURED = re.compile(r"(acc|gyr|mag)[a-z]*[ _.]?([xyz])(?![a-z])", re.ASCII)
 _SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
 _MOST_NAMED = 9
 _RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.e+-]+)\s*hz", re.IGNORECASE)
-_WORLD = re.compile(r"# world: (\w+)")
+_WORLD = re.compile(r".*coordinate system\s*:[,;\s]*(ENU|NED|NWU)\b", re.IGNORECASE)
+_OWN_WORLD = re.compile(r"# world: (\w+)")
 _GAP = re.compile(r"# gap: after sample (\d+), (\d+) lost, (\S+) s$")
 _ENOUGH = 1000
 """Lines that show whether nine numbers are a matrix."""
+
+_SLOWEST_HZ = 5.0
+"""An MT Manager's clock of 0.1 ms by which samples come more slowly is a DOT's, of 1 us: at 5 Hz no hand's
+movement can be followed."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +70,10 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
     Raises
     ------
     InvalidInputError
-        If there is no table, or it holds no samples of the sensor, or they have no time.
+        If there is no table, or it holds no samples of one sensor, or they have no time.
     """
     with naming(source):
-        table = read_table(StringIO(text, newline=None) if isinstance(text, str) else text, _KNOWN)
+        table = read_table(StringIO(text, newline=None) if isinstance(text, str) else text)
         parts = Parts(source)
         if table.left_out:
             parts = parts.noting(f"{table.left_out} lines of another length or without a digit were left out")
@@ -96,65 +83,99 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
 
 
 def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
-    dialect = _dialect(table)
-    columns = [table.column(name) for name in (*_COUNTERS, _TICKS)]
-    times = [column for name in _TIMES if (column := table.column(name)) is not None]
+    stamps = {key: table.column(key) for key in ("counter", "ticks", "time")}
     timed = np.ones(len(table.values), dtype=bool)
-    for good in (*map(_is_whole, columns), *map(np.isfinite, times)):
-        timed &= good
+    for key, column in stamps.items():
+        if column is not None:
+            timed &= np.isfinite(column)
+            if key != "time":
+                with np.errstate(invalid="ignore"):
+                    timed &= (column >= 0.0) & (column < 2.0**53) & (column == np.floor(column))
     if not timed.any():
         raise InvalidInputError("expected lines with a time, got none")
     if untimed := int((~timed).sum()):
         parts = parts.noting(f"{untimed} lines without a time were left out")
-    whole = [None if column is None else only(column, timed).astype(np.int64) for column in columns]
-    counter, ticks = whole[1] if whole[0] is None else whole[0], whole[2]
-    table = replace(table, values=only(table.values, timed))
-    parts = _measured(table, parts, dialect, hints)
-    if times:
-        log = assembled(timeline_of_times(only(times[0], timed), counter), parts)
-        told = _gaps_told(table.header, len(log))
-        return log if told is None else replace(log, gaps=told)
-    rate = _RATE.search("\n".join(table.header))
-    rate_hz = number(rate.group(1)) if rate else float("nan")
+    counter, ticks = (
+        None if column is None else only(column, timed).astype(np.int64)
+        for column in (stamps["counter"], stamps["ticks"])
+    )
+    time = None if stamps["time"] is None else only(stamps["time"], timed) * table.scale("time")
+    dialect = _dialect(table, counter, ticks)
+    if dialect.tick_s == _DOT.tick_s and not _says_dot(table):
+        parts = parts.noting("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
+    parts = _measured(replace(table, values=only(table.values, timed)), parts, dialect, hints)
+    told = _RATE.search("\n".join(table.header))
+    rate_hz = number(told.group(1)) if told else float("nan")
+    if time is not None:
+        line = timeline_of_times(time, counter, hints.rate_hz or rate_hz)
+        log = assembled(line, parts)
+        gaps = _gaps_told(table.header, len(log)) if line.rows is None else None
+        return log if gaps is None else replace(log, gaps=gaps)
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
-    stamps = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
-    return on_clock(stamps, len(table.values), parts, hints)
+    line = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
+    return on_clock(line, int(timed.sum()), parts, hints)
 
 
-def _dialect(table: TextTable) -> _Dialect:
-    if any(time in table.names for time in _TIMES):
-        told = next((match[1] for line in table.header if (match := _WORLD.match(line))), None)
-        return _PLAIN if told is None else replace(_PLAIN, claim=Claim(told, "as the file says", final=True))
-    return _DOT if any("devicetag" in line.lower() for line in table.header) else _MT_MANAGER
+def _dialect(table: TextTable, counter: IntArray | None, ticks: IntArray | None) -> _Dialect:
+    """Program that wrote the table; the world is as its header says, if it says one."""
+    dialect = _MT_MANAGER
+    if table.column("time") is not None:
+        dialect = _PLAIN
+    elif _says_dot(table) or _ticks_of_dot(counter, ticks):
+        dialect = _DOT
+    if own := next((match[1] for line in table.header if (match := _OWN_WORLD.match(line))), None):
+        return replace(dialect, claim=Claim(own, "as the file says", final=True))
+    told = next((match[1] for line in table.header if (match := _WORLD.match(line))), None)
+    return dialect if told is None else replace(dialect, claim=Claim(told, "as its header says"))
 
 
-def _is_whole(column: FloatArray | None) -> BoolArray:
-    if column is None:
-        return np.asarray(True)
-    with np.errstate(invalid="ignore"):
-        return np.asarray((column >= 0.0) & (column < 2.0**53) & (column == np.floor(column)))
+def _says_dot(table: TextTable) -> bool:
+    return any("devicetag" in line.lower() for line in table.header)
+
+
+def _ticks_of_dot(counter: IntArray | None, ticks: IntArray | None) -> bool:
+    """Whether a clock without a header is a DOT's, by how far its samples would be apart."""
+    if ticks is None or ticks.size < 2:
+        return False
+    steps = np.diff(ticks) % (1 << 32)
+    counts = np.ones(steps.size) if counter is None else np.maximum(np.diff(counter), 1)
+    return bool(np.median(steps / counts) * _MT_MANAGER.tick_s > 1.0 / _SLOWEST_HZ)
 
 
 def _measured(table: TextTable, parts: Parts, dialect: _Dialect, hints: Hints) -> Parts:
-    found = [table.first(names) for names in zip(PLAIN_VECTORS, _VENDOR_VECTORS, _REPO_VECTORS, strict=True)]
-    if found[1] is not None:
-        found[1] = found[1] * dialect.gyroscope_to_rad
-    odd = _not_understood(table.names, every=dialect not in (_MT_MANAGER, _DOT))
-    parts = replace(parts.noting(*odd), vectors=tuple(found))
-    if (optical := table.first(_OPTICAL)) is not None:
+    vectors = [_vector(table, quantity, dialect) for quantity in ("acc", "gyr", "mag")]
+    odd = _not_understood(table.names, every=dialect.tick_s == _PLAIN.tick_s and "time" in _keys(table))
+    parts = replace(parts.noting(*odd), vectors=tuple(vectors))
+    if (optical := table.group("optical_{}", "wxyz")) is not None:
         note = "orientation: by cameras, in a world of their own whose x and z need not be north and up"
         parts = oriented(parts, _PLAIN.claim, Hints(as_stated=True), optical).noting(note)
     else:
-        notations = (table.first(_QUATERNIONS), table.columns(_MATRIX), table.first(_ANGLES))
-        parts = oriented(parts, dialect.claim, hints, *notations)
-    if all(vectors is None for vectors in (*found, parts.orientations)):
+        matrix = table.group("mat_{}", [f"{row}{column}" for row in "123" for column in "123"])
+        angles = table.group("euler_{}", ("roll", "pitch", "yaw"))
+        parts = oriented(parts, dialect.claim, hints, table.group("quat_{}", "wxyz"), matrix, angles)
+    if all(part is None for part in (*vectors, parts.orientations)):
         got = "; ".join(odd) or "got none"
         raise InvalidInputError(
             f"expected columns of acceleration, rate of turn, field or orientation, {got}"
         )
-    if found[0] is None and "freeacc_x" in table.names:
+    if vectors[0] is None and "freeacc_x" in table.names:
         parts = parts.noting("acceleration without gravity is no accelerometer's reading and was left out")
     return parts
+
+
+def _keys(table: TextTable) -> list[str]:
+    return [column.key for column in table.columns]
+
+
+def _vector(table: TextTable, quantity: str, dialect: _Dialect) -> FloatArray | None:
+    """Readings of a sensor in SI units; None if an axis is missing."""
+    rows = table.group(f"{quantity}_{{}}", "xyz")
+    if rows is None:
+        return None
+    usual = dialect.gyroscope_to_rad if quantity == "gyr" else 1.0
+    scales = [table.scale(f"{quantity}_{axis}") for axis in "xyz"]
+    factors = np.array([usual if scale is None else scale for scale in scales])
+    return rows if (factors == 1.0).all() else rows * factors
 
 
 def _gaps_told(header: Names, samples: int) -> tuple[Gap, ...] | None:
@@ -169,12 +190,10 @@ def _gaps_told(header: Names, samples: int) -> tuple[Gap, ...] | None:
 def _unnamed(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
     """Log of an export of the MT9 software; its kind is told by the number of columns."""
     count = table.values.shape[1]
-    for separator in ",;\t" if table.header else "":  # names of which only the time's is known
-        names = tuple(cell.strip(' "#').lower() for cell in table.header[-1].split(separator))
-        if len(names) == count and any(name in _KNOWN or name.startswith("time") for name in names):
-            raise InvalidInputError("; ".join(_not_understood(names, every=True)))
     if count not in (4, 10, 11):  # angles, matrix or vectors, vectors and temperature
-        raise InvalidInputError(f"expected 4, 10 or 11 columns where none has a name, got {count}")
+        raise InvalidInputError(
+            f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {count} without"
+        )
     timed = np.isfinite(table.values[:, 0])
     if not timed.any():
         raise InvalidInputError("expected times in the first column, got none")
@@ -193,24 +212,20 @@ def _not_understood(names: Names, every: bool) -> Names:
 
     A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.
     """
-    unknown = [n for n in names if n and n not in _KNOWN and (every or _SENSOR_LIKE.match(n))]
+    columns = {name: column_of(name) for name in names if name}
+    unknown = [n for n, column in columns.items() if column is None and (every or _SENSOR_LIKE.match(n))]
     notes = []
     if unknown:
         more = [f"and {len(unknown) - _MOST_NAMED} more"] if len(unknown) > _MOST_NAMED else []
-        notes.append(f"columns not understood: {', '.join([*map(_likely, unknown[:_MOST_NAMED]), *more])}")
-    for group in (*_VECTOR_GROUPS, _QUATERNIONS[0]):
-        there, missing = ([n for n in group if (n in names) is found] for found in (True, False))
-        if missing and there:
-            notes.append(f"{', '.join(there)} left out: expected {', '.join(missing)} beside")
+        listed = ", ".join([*map(suggestion, unknown[:_MOST_NAMED]), *more])
+        notes.append(f"columns not understood: {listed}")
+    keys = {column.key for column in columns.values() if column is not None}
+    for kind, axes in (("acc", "xyz"), ("gyr", "xyz"), ("mag", "xyz"), ("quat", "wxyz")):
+        missing = [axis for axis in axes if f"{kind}_{axis}" not in keys]
+        if missing and len(missing) < len(axes):
+            found = ", ".join(n for n, c in columns.items() if c is not None and c.key.startswith(f"{kind}_"))
+            notes.append(f"{found} left out: expected {', '.join(missing)} beside")
     return tuple(notes)
-
-
-def _likely(name: str) -> str:
-    short = name if len(name) <= 40 else f"{name[:40]}..."
-    if (match := _MEASURED.match(name)) is None:
-        return short
-    group = next(names for names in PLAIN_VECTORS if names[0].startswith(match[1]))
-    return f"{short} (expected {group['xyz'.index(match[2])]})"
 
 
 # -- writing
@@ -263,13 +278,14 @@ def _csv_columns(log: ImuLog) -> Iterator[tuple[str, FloatArray | IntArray]]:
     yield "time_s", log.time_s
     if log.counter is not None:
         yield "counter", log.counter
-    for names, vectors in zip(PLAIN_VECTORS, VECTORS, strict=True):
+    for vectors in VECTORS:
         if (values := getattr(log, vectors)) is not None:
-            yield from zip(names, values.T, strict=True)
+            sensor, _, unit = vectors.partition("_")
+            yield from zip([f"{sensor}_{axis}_{unit}" for axis in "xyz"], values.T, strict=True)
     if log.world_from_sensor is not None:
         quaternions = log.world_from_sensor.as_quat(scalar_first=True)
         quaternions[~log.oriented] = np.nan
-        yield from zip(_QUATERNIONS[0], quaternions.T, strict=True)
+        yield from zip([f"quaternion_{axis}" for axis in "wxyz"], quaternions.T, strict=True)
 
 
 def _comments(log: ImuLog) -> Iterator[str]:

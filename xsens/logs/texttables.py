@@ -11,8 +11,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-
-Names = tuple[str, ...]
+from xsens.logs.columns import Column, Names, column_of, names_a_sensor, suggestion
 
 _SEPARATORS = ("\t", ";", ",", None)
 """In order of trust: a tab only separates, a comma may be a decimal point, blanks (None) may be padding."""
@@ -20,75 +19,68 @@ _SEPARATORS = ("\t", ";", ",", None)
 _LONGEST_HEADER = 64
 """Lines, not counting comments, among which the names of the columns or the first numbers must be."""
 
-_LONGEST_LINE = 1 << 16
-_MOST_COLUMNS = 256
-_MANY_WORDS = 100_000
 _COMMENT = "#"
 _DIGIT = re.compile("[0-9]")
+_LIKE_NAMES = re.compile(r"(?:[a-z°²µ_][\w .()\[\]/^°²µ-]*|)$")
 _AXES = frozenset("wxyzs")
 """Second line of names; s is the unit of a time."""
 
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of numbers: the lines before it, names in lower case, and its known columns' values.
+    """A table of numbers: the lines before it, names in lower case, and the columns that are understood.
 
-    `left_out` counts lines of another length than the first or without a digit, `words` other cells that hold
-    no number.
+    `values` has a column for each of `columns`, or for each cell where none has a name. `left_out` counts
+    lines of another length than the first or without a digit, `words` other cells that hold no number.
     """
 
     header: Names
     names: Names
-    kept: Names
+    columns: tuple[Column, ...]
     values: FloatArray
     left_out: int = 0
     words: int = 0
 
-    def column(self, name: str) -> FloatArray | None:
-        """The column called `name`, shape (rows,); None if there is none, or it is blank."""
-        values = self.values[:, self.kept.index(name)] if name in self.kept else None
-        return values if values is not None and np.isfinite(values).any() else None
+    def column(self, key: str) -> FloatArray | None:
+        """Numbers of the column, shape (rows,); None if there is none, or it is blank."""
+        at = next((i for i, column in enumerate(self.columns) if column.key == key), None)
+        return None if at is None or not np.isfinite(self.values[:, at]).any() else self.values[:, at]
 
-    def columns(self, names: Names) -> FloatArray | None:
-        """Columns side by side, shape (rows, len(names)); None if one is missing."""
-        found = [column for name in names if (column := self.column(name)) is not None]
-        return np.stack(found, axis=1) if len(found) == len(names) else None
+    def group(self, pattern: str, axes: Iterable[str]) -> FloatArray | None:
+        """Columns side by side, shape (rows, axes); None if one is missing."""
+        columns = [column for axis in axes if (column := self.column(pattern.format(axis))) is not None]
+        return np.stack(columns, axis=1) if len(columns) == len(tuple(axes)) else None
 
-    def first(self, groups: Iterable[Names]) -> FloatArray | None:
-        """Columns of the first group of names of which none is missing; None if there is no such group."""
-        return next((found for names in groups if (found := self.columns(names)) is not None), None)
+    def scale(self, key: str) -> float | None:
+        """Factor to SI units that the column's name states; None if it states none."""
+        return next((column.scale for column in self.columns if column.key == key), None)
 
 
-def read_table(lines: Iterable[str], known: frozenset[str]) -> TextTable:
+def read_table(lines: Iterable[str]) -> TextTable:
     """Find the table in some lines and read it.
 
     Names may be in one line, or in two: ``Acceleration;;;Field`` above ``X;Y;Z;X`` names ``acceleration_x``.
-
-    Parameters
-    ----------
-    lines : iterable of str
-    known : frozenset of str
-        Names of columns, in lower case; a line that holds at least two of them is the line of names.
+    A line that holds two known names at least is the line of names.
 
     Raises
     ------
     InvalidInputError
-        If there is no table.
+        If there is no table, a quantity has two columns, or its rows are of several sensors.
     """
-    lines, header, seen = iter(lines), [""], 0
+    lines, header, count = iter(lines), [""], 0
     for line in lines:
-        if len(line) <= _LONGEST_LINE and not line.startswith(_COMMENT):
+        if not line.startswith(_COMMENT):
             for separator in _SEPARATORS:
                 cells = _cells(line, separator)
                 for names in (cells, _of_two_lines(_cells(header[-1], separator), cells)):
-                    if len(known & set(names)) >= 2:
-                        return _Rows(separator, len(names)).table(lines, tuple(header[1:]), names, known)
+                    if sum(column_of(name) is not None for name in names) >= 2:
+                        return _named(chain(lines), header, names, separator)
                 if len(cells) >= 4 and all(map(_is_number, cells)):
-                    rows = _Rows(separator, len(cells))
-                    return rows.table(chain([line], lines), tuple(header[1:]), (), known)
-        header.append(line.rstrip("\n")[:_LONGEST_LINE])
-        seen += not line.startswith(_COMMENT)
-        if seen > _LONGEST_HEADER:
+                    _refuse_unknown_names(header[-1], len(cells))
+                    return _rows(chain([line], lines), header, (), (), separator, len(cells))
+        header.append(line.rstrip("\n"))
+        count += not line.startswith(_COMMENT)
+        if count > _LONGEST_HEADER:
             break
     raise InvalidInputError("expected a table of numbers, got none")
 
@@ -113,53 +105,86 @@ def _of_two_lines(groups: Names, axes: Names) -> Names:
     return tuple(names[:last])  # without what a separator at the end of the line makes
 
 
-class _Rows:
-    """Lines of as many cells as the table has columns, and counts of what is left out."""
+def _refuse_unknown_names(line: str, count: int) -> None:
+    """Raise if a line above numbers names their columns, none of them by a name that is understood."""
+    for separator in ("\t", ";", ",", None):
+        names = tuple(cell.strip(' "#') for cell in _cells(line, separator))
+        if len(names) == count and sum(map(bool, names)) > 1 and all(map(_LIKE_NAMES.match, names)):
+            listed = ", ".join(map(suggestion, names))
+            raise InvalidInputError(f"columns not understood: {listed}")
 
-    def __init__(self, separator: str | None, count: int) -> None:
-        if count > _MOST_COLUMNS:
-            raise InvalidInputError(f"expected a table of at most {_MOST_COLUMNS} columns, got {count}")
-        self.separator, self.count = separator, count
-        self.left_out = self.words = 0
 
-    def table(self, lines: Iterable[str], header: Names, names: Names, known: frozenset[str]) -> TextTable:
-        """Read the table's known columns, or all if they have no names."""
-        kept = tuple(dict.fromkeys(name for name in names if name in known))
-        rows = self._even(lines, len(kept) or self.count)
-        if (first := next(rows, None)) is None:
-            raise InvalidInputError(f"expected lines of {self.count} numbers, got {self.left_out} others")
-        values = np.loadtxt(
-            chain([first], rows),
-            delimiter=self.separator,
-            comments=None,
-            converters=self._number,
-            usecols=[names.index(name) for name in kept] or None,
-            ndmin=2,
-            encoding=None,
-        )
-        return TextTable(header, names, kept, values, self.left_out, self.words)
+def _named(lines: Iterator[str], header: list[str], names: Names, separator: str | None) -> TextTable:
+    first = next((line for line in lines if line.strip("\r\n") and _DIGIT.search(line)), "")
+    if len(_cells(first, separator)) != len(names):  # a blank where a tab should be, or the like
+        blanks = tuple(part for name in names for part in name.split())
+        names = blanks if len(blanks) == len(_cells(first, separator)) else names
+    columns = [column_of(name) for name in names]
+    keys = [column.key for column in columns if column is not None and column.key != "counter"]
+    if twice := next((key for key in keys if keys.count(key) > 1), None):
+        both = [name for name in names if (column := column_of(name)) and column.key == twice]
+        raise InvalidInputError(f"expected the columns of one sensor, got two of {twice}: {', '.join(both)}")
+    return _rows(chain([first], lines), header, names, tuple(columns), separator, len(names))
 
-    def _even(self, lines: Iterable[str], columns: int) -> Iterator[str]:
-        rows = 0
+
+def _rows(
+    lines: Iterable[str],
+    header: list[str],
+    names: Names,
+    columns: tuple[Column | None, ...],
+    separator: str | None,
+    count: int,
+) -> TextTable:
+    """Read the columns that are understood, or all if none has a name."""
+    kept = [i for i, column in enumerate(columns) if column is not None]
+    whose = [i for i, name in enumerate(names) if names_a_sensor(name)]
+    counts = {"lines": 0, "words": 0}
+    sensors: list[dict[str, None]] = [{} for _ in whose]
+
+    def even() -> Iterator[str]:
         for line in lines:
             if not line.strip("\r\n"):
                 continue
-            cells = line.count(self.separator) + 1 if self.separator else len(line.split())
-            if cells != self.count or not _DIGIT.search(line):
-                self.left_out += 1
+            cells = line.count(separator) + 1 if separator else len(line.split())
+            if cells != count or not _DIGIT.search(line):
+                counts["lines"] += 1
                 continue
-            rows += 1
-            if self.words > max(_MANY_WORDS, rows * columns / 2):
-                raise InvalidInputError(f"expected numbers, got words in {self.words} cells of {rows} lines")
-            yield line if self.separator == "," else line.replace(",", ".")
+            if whose:
+                parts = line.split(separator)
+                for values, i in zip(sensors, whose, strict=True):
+                    values[parts[i].strip()] = None
+            yield line if separator == "," else line.replace(",", ".")
 
-    def _number(self, cell: str) -> float:
+    def converted(cell: str) -> float:
         try:
             return float(cell)
         except ValueError:  # quoted, blank, or a word
             value = number(cell)
-            self.words += value != value and bool(cell.strip())
+            counts["words"] += value != value and bool(cell.strip())
             return value
+
+    rows = even()
+    if (first := next(rows, None)) is None:
+        raise InvalidInputError(
+            f"expected lines of {count} cells below the names, got {counts['lines']} lines of another length"
+        )
+    values = np.loadtxt(
+        chain([first], rows),
+        delimiter=separator,
+        comments=None,
+        converters=converted,
+        usecols=kept or None,
+        ndmin=2,
+        encoding=None,
+    )
+    for i, ids in zip(whose, sensors, strict=True):
+        if len(ids) > 1:
+            listed = ", ".join(list(ids)[:4]) + (", ..." if len(ids) > 4 else "")
+            raise InvalidInputError(
+                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({listed}): split the table"
+            )
+    known = tuple(column for column in columns if column is not None)
+    return TextTable(tuple(header[1:]), names, known, values, counts["lines"], counts["words"])
 
 
 def number(cell: str) -> float:

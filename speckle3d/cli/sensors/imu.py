@@ -58,6 +58,7 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, world: WorldOption = None, a
     import numpy as np
 
     from speckle3d.core.sweep import INERTIAL
+    from xsens.logs.contradictions import contradictions
 
     log = read(log_file, rate_hz, world)
     rows = [
@@ -76,7 +77,8 @@ def imu_info(log_file: Log, rate_hz: RateHz = None, world: WorldOption = None, a
         else:
             norm = np.nanmedian(np.linalg.norm(values, axis=1))
             rows.append((f"{spoken}, median norm", f"{norm:.4f}", unit))
-    rows += [("note", text, "") for text in log.notes]
+    told = (*log.notes, *filter(None, contradictions(log).values()))
+    rows += [("note", text, "") for text in told]
     emit_rows(rows, as_json)
 
 
