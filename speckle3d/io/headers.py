@@ -22,7 +22,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.pixels import Pixels, meta_pixels, nrrd_pixels, read_pixels
+from speckle3d.io.pixels import Pixels, map_pixels, meta_pixels, nrrd_pixels
 from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
@@ -116,7 +116,7 @@ class SequenceHeader:
             If pixels are damaged or missing.
         """
         try:
-            values = read_pixels(self.pixels).reshape(self.stored[::-1])
+            values = map_pixels(self.pixels).reshape(self.stored[::-1])
         except FileError as error:
             if self.path in str(error):
                 raise

@@ -151,6 +151,11 @@ def nrrd_pixels(path: Path, fields: Mapping[str, str], count: int, start: int) -
 
 
 def read_pixels(pixels: Pixels) -> npt.NDArray[Any]:
+    """Read the numbers into memory, shape (count,), in the machine's byte order; as `map_pixels`."""
+    return np.array(map_pixels(pixels))
+
+
+def map_pixels(pixels: Pixels) -> npt.NDArray[Any]:
     """Map or unpack the numbers, shape (count,); raw ones of the machine's byte order stay on the disk.
 
     Raises
