@@ -228,7 +228,7 @@ def _unpacker(pixels: Pixels) -> tuple[Any, tuple[type[Exception], ...]]:
         from isal import isal_zlib
     except ImportError:
         return zlib.decompressobj(_ZLIB_OR_GZIP), damage
-    own: type[Exception] = isal_zlib.error
+    own: Any = isal_zlib.error
     return isal_zlib.decompressobj(_ZLIB_OR_GZIP), (*damage, own)
 
 

@@ -203,7 +203,9 @@ class Recording:
         with naming(str(self.path)):
             sweep = self._made() if self.ready is None else self.ready
             require_plausible(sweep)
-            return checked_path(sweep, self.chain)
+            checked, notes = checked_path(sweep, self.chain)
+        # Of a format that says all, its poses are told where something is odd of them.
+        return checked, notes if self.ready is None or len(notes) > 1 else []
 
     def _made(self) -> Sweep:
         if self.fault is not None:
