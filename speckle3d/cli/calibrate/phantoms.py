@@ -37,7 +37,7 @@ class _OfSettings(Command):
     """A command whose options are the fields of its settings, loaded when it is asked for them."""
 
     @property
-    def params(self) -> list[Any]:  # type: ignore[override]
+    def params(self) -> list[Any]:
         """Of the command, as click has them."""
         if "_params" not in vars(self):
             alone = typer.Typer(add_completion=False)
