@@ -214,32 +214,37 @@ class Equations:
 
     def at(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Residuals, (n, r), and derivatives by the small displacements of `Chain.displaced`, (n, r, 14)."""
-        turns, place = self._placed(chain)
-        u, v = self.points.pixels.T[..., None]
+        probe, target = (
+            pose.rotation.as_matrix() for pose in (chain.sensor_from_image, chain.target_from_world)
+        )
+        place, (u, v) = self._places(chain), self.points.pixels.T[..., None]
         x, y = u * chain.pixel_mm[0], v * chain.pixel_mm[1]
-        across, down, out = np.moveaxis(self.rows @ turns, 2, 0)  # the rows in the image's axes
-        slopes = np.empty((*self.offsets.shape, len(CHAIN)))
-        slopes[..., 0], slopes[..., 1] = across * u, down * v
-        slopes[..., 2], slopes[..., 3], slopes[..., 4] = across, down, out
-        slopes[..., 5], slopes[..., 6], slopes[..., 7] = x * down - y * across, -x * out, y * out
-        slopes[..., 8:11] = self.rows
-        slopes[..., 11:14] = np.cross(place[:, None], self.rows)[..., ::-1]
-        values = np.einsum("nri,ni->nr", self.rows, place) - self.offsets
+        in_world = (self.rows.reshape(-1, 3) @ target).reshape(self.rows.shape)
+        in_sensor = np.einsum("nri,nij->nrj", in_world, self.points.turns)
+        # The rows in the image's axes.
+        across, down, out = (in_sensor.reshape(-1, 3) @ probe).T.reshape(3, *self.offsets.shape)
+        (a, b, c), (p, q, r) = np.moveaxis(self.rows, 2, 0), place.T[..., None]
+        slopes = np.empty((len(CHAIN), *self.offsets.shape))
+        slopes[0], slopes[1] = across * u, down * v
+        slopes[2], slopes[3], slopes[4] = across, down, out
+        slopes[5], slopes[6], slopes[7] = x * down - y * across, -x * out, y * out
+        slopes[8], slopes[9], slopes[10] = a, b, c
+        slopes[11], slopes[12], slopes[13] = p * b - q * a, r * a - p * c, q * c - r * b
+        values = p * a + q * b + r * c - self.offsets
         if self.weights is not None:
-            return values * self.weights, slopes * self.weights[..., None]
-        return values, slopes
+            values, slopes = values * self.weights, slopes * self.weights
+        return values, np.moveaxis(slopes, 0, 2)
 
     def residuals(self, chain: Chain) -> FloatArray:
         """What does not vanish, shape (n, r)."""
-        return np.asarray(np.einsum("nri,ni->nr", self.rows, self._placed(chain)[1]) - self.offsets)
+        return np.asarray(np.einsum("nri,ni->nr", self.rows, self._places(chain)) - self.offsets)
 
-    def _placed(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
-        """The images' axes in the phantom's frame, (n, 3, 3), and where the points are in it, (n, 3)."""
+    def _places(self, chain: Chain) -> FloatArray:
+        """Where the points are in the phantom's frame, mm, shape (n, 3)."""
         probe, target = chain.sensor_from_image.as_matrix(), chain.target_from_world.as_matrix()
-        half = target[:3, :3] @ self.points.turns
-        flat = (self.points.pixels * chain.pixel_mm) @ probe[:3, :2].T + probe[:3, 3]
-        origin_mm = self.points.shifts_mm @ target[:3, :3].T + target[:3, 3]
-        return half @ probe[:3, :3], np.einsum("nij,nj->ni", half, flat) + origin_mm
+        in_sensor = (self.points.pixels * chain.pixel_mm) @ probe[:3, :2].T + probe[:3, 3]
+        in_world = np.einsum("nij,nj->ni", self.points.turns, in_sensor) + self.points.shifts_mm
+        return np.asarray(in_world @ target[:3, :3].T + target[:3, 3])
 
 
 @dataclass(frozen=True)
