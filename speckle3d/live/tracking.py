@@ -249,6 +249,7 @@ class LiveTracker:
         pairs = planes_of(problem, table, alike_pairs(problem, table), latest_of(motion.coherence))
         if not len(pairs):
             return
+        pairs = replace(pairs, planes=pairs.planes.scaled(motion.scale))
         earlier = elevation_of(known, problem.centre_mm)[:, :2]
         path = signed_path(problem, table, np.ones(len(table), dtype=bool), pairs, known=earlier)
         pairs = pairs.with_signs(pair_signs(path, *pairs.signless))

@@ -35,6 +35,10 @@ class PatchDistances:
     distance_mm: FloatArray
     sigma_mm: FloatArray
 
+    def scaled(self, factor: float) -> PatchDistances:
+        """Return the same distances multiplied by a factor."""
+        return PatchDistances(factor * self.distance_mm, factor * self.sigma_mm)
+
 
 @dataclass(frozen=True)
 class EchoModel:

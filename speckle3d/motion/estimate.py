@@ -75,6 +75,10 @@ class MotionProblem:
     trajectory: TrajectorySettings
     adapt: bool = True
 
+    def with_curves(self, curves: DecorrelationCurves) -> MotionProblem:
+        """Return the same problem with other curves."""
+        return replace(self, curves=curves)
+
     @cached_property
     def fitter(self) -> PlaneFitter:
         """Fitter of planes to the patches of a pair."""
@@ -97,6 +101,8 @@ class Motion:
         Scales that rows of patches ask for; None if not adapted to.
     path : ndarray, shape (n, 3)
         Elevational position of the image's centre and slopes along x and y of every frame.
+    scale : float
+        Of all distances over those that planes fitted with `coherence` have; in `pairs` and `path`.
     """
 
     problem: MotionProblem
@@ -104,6 +110,7 @@ class Motion:
     coherence: Coherence | None
     rows: RowScales | None
     path: FloatArray
+    scale: float = 1.0
 
     @property
     def structure(self) -> float:
@@ -134,12 +141,16 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
     InsufficientDataError
         If no pair determines a plane.
     """
-    motion = _in_turn(problem, table, sound, rough_path(problem, table))
-    for _ in range(LENS_ROUNDS if problem.curves.origin == "data sheet" and motion.rows is not None else 0):
-        assert motion.rows is not None
-        problem = replace(problem, curves=with_fitted_lens(problem.curves, motion.rows))
-        motion = _in_turn(problem, table, sound, motion.path)
-    return motion
+    path = rough_path(problem, table)
+    if problem.curves.origin == "data sheet" and problem.adapt:
+        # Tilt bends rows as a lens does: it is left out until the lens is known.
+        tilt, problem = problem.curves.tilt, problem.with_curves(replace(problem.curves, tilt=None))
+        for _ in range(LENS_ROUNDS):
+            motion = _in_turn(problem, table, sound, path)
+            assert motion.rows is not None
+            problem, path = problem.with_curves(with_fitted_lens(problem.curves, motion.rows)), motion.path
+        problem = problem.with_curves(replace(problem.curves, tilt=tilt))
+    return _in_turn(problem, table, sound, path)
 
 
 def _in_turn(problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray) -> Motion:
@@ -156,7 +167,7 @@ def _in_turn(problem: MotionProblem, table: CorrelationTable, sound: BoolArray, 
         path = path_of(problem, table, pairs, coherence)
         coherence, scale, rows = coherence_of(problem, table, path, sound)
     pairs = replace(pairs, planes=pairs.planes.scaled(scale))
-    return Motion(problem, pairs, coherence, rows, path_of(problem, table, pairs, coherence))
+    return Motion(problem, pairs, coherence, rows, path_of(problem, table, pairs, coherence), scale)
 
 
 def rough_path(problem: MotionProblem, table: CorrelationTable) -> FloatArray:
@@ -301,6 +312,7 @@ def frame_pairs(
     for start in range(0, max(len(pairs), 1), PAIRS_AT_ONCE):
         some = slice(start, start + PAIRS_AT_ONCE)
         d = problem.fitter.distances(table.correlation[pairs.row[some]], motion.coherence, pairs.first[some])
+        d = d.scaled(motion.scale)
         yield FramePairs(
             first=edges.first[some],
             second=edges.second[some],

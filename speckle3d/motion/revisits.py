@@ -7,7 +7,7 @@ earlier one however far the probe travelled between them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -82,6 +82,7 @@ def tie_returns(returns: Sequence[Return], motion: Motion, table: CorrelationTab
     alike = [row for row in rows.values() if table.median[row] >= problem.trajectory.least_correlation]
     # Structure is taken as the earlier visit has it.
     read = planes_of(problem, table, np.array(alike, dtype=np.int64), motion.coherence)
+    read = replace(read, planes=read.planes.scaled(motion.scale))
     at = {row: k for k, row in enumerate(read.row.tolist())}
     travel, sign = _travel(position_mm), np.zeros(len(read))
     for each in returns:

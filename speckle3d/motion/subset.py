@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -38,8 +40,12 @@ def consistent_planes(
         # Only frames that cross, or nearly, leave the side open.
         open_side[some] = offset[some] < np.ptp(raised, axis=1)
         distances = fitter.distances(correlation[some], motion.coherence, pairs.first[some])
+        distances = distances.scaled(motion.scale)
         agreed[some] = consistent_subset(distances, raised, fitter.settings.support_sigma, open_side[some])
     planes = fitter.fit(correlation, moved, motion.coherence, pairs.first, agreed, slopes, offset, open_side)
+    # Slopes are the sensor's; distances have the scale of all patches.
+    scaled = planes.scaled(motion.scale)
+    planes = replace(scaled, coefficients=np.column_stack([scaled.offset_mm, planes.coefficients[:, 1:]]))
     return planes.where(planes.determined, pairs.planes)
 
 
