@@ -82,7 +82,7 @@ def calibrate_images(
     if time_offset_s is not None and not abs(time_offset_s) < MOST_OFFSET_S:
         raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
     if method not in (None, "gauss-newton"):
-        raise InvalidInputError("--method: Nelder-Mead was removed; the search by derivatives finds what it did")
+        raise InvalidInputError("--method: was removed; the search by derivatives finds what Nelder-Mead did")
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
     settings = from_options(ImageFit, locals())
