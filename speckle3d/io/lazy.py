@@ -7,7 +7,6 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
@@ -15,8 +14,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
 
@@ -192,61 +191,6 @@ class _Part:
         return lambda: values.reshape(self._shape)
 
 
-class RawFrames(LazyFrames):
-    """Frames of numbers one after the other in a plain file.
-
-    Parameters
-    ----------
-    start : int
-        Byte of the first frame's first number.
-    step : int
-        Bytes from frame to frame.
-    stored : dtype
-        Of the numbers in the file, with their byte order.
-    turn : callable
-        Makes a frame of its numbers, which come flat.
-    """
-
-    def __init__(
-        self,
-        path: PathLike,
-        start: int,
-        step: int,
-        stored: npt.DTypeLike,
-        turn: Turn,
-        shape: tuple[int, int, int],
-        dtype: npt.DTypeLike,
-    ) -> None:
-        super().__init__(path, shape, dtype)
-        self.start, self.step, self.stored, self.turn = start, step, np.dtype(stored), turn
-
-    def _opened(self) -> OpenFrames:
-        return _OpenRaw(self)
-
-
-class _OpenRaw:
-    def __init__(self, frames: RawFrames) -> None:
-        self._frames = frames
-
-    def read(self, i: int) -> Unpack:
-        return partial(self._frame, i)
-
-    def _frame(self, i: int) -> npt.NDArray[Any]:
-        frames = self._frames
-        count = frames.shape[1] * frames.shape[2]
-        expected = count * frames.stored.itemsize
-        with open_regular(frames.path) as stream:
-            stream.seek(frames.start + i * frames.step)
-            content = stream.read(expected)
-        if len(content) != expected:
-            where = f"{frames.path}: frame {i}"
-            raise FileError(f"{where}: expected {expected} bytes, got {len(content)}: truncated")
-        return frames.turn([np.frombuffer(content, frames.stored)])
-
-    def close(self) -> None:
-        """Nothing stays open between frames."""
-
-
 @dataclass(frozen=True)
 class Layout:
     """Order of a frame's numbers in a file.
@@ -277,28 +221,3 @@ class Real:
     def __call__(self, slices: Slices) -> npt.NDArray[Any]:
         """Make a frame."""
         return self.layout.of(slices[0])
-
-
-@dataclass(frozen=True)
-class Complex:
-    """Turns real and imaginary parts, or I and Q."""
-
-    layout: Layout
-
-    def __call__(self, slices: Slices) -> npt.NDArray[Any]:
-        """Make a frame."""
-        real, imaginary = (self.layout.of(part) for part in slices)
-        made = np.empty(real.shape, np.complex64)
-        made.real, made.imag = real, imaginary
-        return made
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Turns numbers whose last axis is I and Q."""
-
-    layout: Layout
-
-    def __call__(self, slices: Slices) -> npt.NDArray[Any]:
-        """Make a frame."""
-        return Complex(self.layout)([slices[0][..., 0], slices[0][..., 1]])
