@@ -232,7 +232,7 @@ class _Sequence:
         """Frames of the pixels' type; wider whole numbers as int16 where it holds them, else float32."""
         header, layout = self.header, self.layout
         dtype = header.pixels.dtype.newbyteorder("=")
-        stored: npt.DTypeLike = None
+        stored: npt.DTypeLike | None = None
         if layout.is_complex:
             stored = np.int16 if dtype == np.int16 else None
             dtype = np.dtype(np.complex64)

@@ -169,7 +169,7 @@ class Gain:
         return np.asarray(10.0 ** ((self._db(self.curves[0]) - self._db(self.curves[i])) / 20.0))
 
     def _db(self, curve: Curve) -> FloatArray:
-        return np.interp(self.depth_mm, *np.array(curve).T)
+        return np.asarray(np.interp(self.depth_mm, *np.array(curve).T))
 
 
 class _Unpacker:

@@ -279,15 +279,17 @@ def _region(where: str, item: Any) -> _Region:
             raise InvalidInputError(f"{where}: {name}: expected a number, got {got}")
         return value
 
-    box = [int(number(f"RegionLocation{name}")) for name in ("MinX0", "MinY0", "MaxX1", "MaxY1")]
-    kind = int(number("RegionSpatialFormat")), int(number("RegionDataType"))
+    spatial, data = int(number("RegionSpatialFormat")), int(number("RegionDataType"))
+    corners = ("MinX0", "MinY0", "MaxX1", "MaxY1")
+    left, top, right, bottom = (int(number(f"RegionLocation{name}")) for name in corners)
     units = int(number("PhysicalUnitsXDirection")), int(number("PhysicalUnitsYDirection"))
-    if kind[0] != 1:
-        return _Region(*kind, *box, units)
+    if spatial != 1:
+        return _Region(spatial, data, left, top, right, bottom, units)
     names = ("ReferencePixelY0", "ReferencePixelPhysicalValueY")
     has_reference = all(item.get(name) is not None for name in names)
     reference = (number(names[0]), number(names[1])) if has_reference else None
-    return _Region(*kind, *box, units, (number("PhysicalDeltaX"), number("PhysicalDeltaY")), reference)
+    delta = number("PhysicalDeltaX"), number("PhysicalDeltaY")
+    return _Region(spatial, data, left, top, right, bottom, units, delta, reference)
 
 
 def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, list[str]]:
@@ -332,7 +334,7 @@ def _grey(image: npt.NDArray[Any], spread: int) -> npt.NDArray[np.uint8]:
             f"expected grey, got {int(coloured.sum())} pixels of a colour, the first at column {column}, "
             f"row {row} of the region: colour Doppler or an overlay"
         )
-    return np.rint(image.mean(axis=2)).astype(np.uint8)
+    return np.asarray(np.rint(image.mean(axis=2)), dtype=np.uint8)
 
 
 def _facts(header: Any, syntax: Any) -> list[Row]:

@@ -196,7 +196,8 @@ def read_device_set(path: PathLike) -> DeviceSet:
             f"got {root.tag}"
         )
     with naming(str(path)):
-        usual, named = Names(), {}
+        usual = Names()
+        named: dict[str, str] = {}
         for place in _ALGORITHMS:
             for element in root.iterfind(place):
                 named |= element.attrib
@@ -271,7 +272,7 @@ def _clip(element: Element | None) -> Clip | None:
     inner = values(1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
     fan = None
     if angles is not None and apex is not None and outer is not None and angles[0] != angles[1]:
-        fan = (*apex, inner[0], outer[0], min(angles), max(angles))
+        fan = (apex[0], apex[1], inner[0], outer[0], min(angles), max(angles))
     return None if columns is None and fan is None else Clip(columns, rows, fan)
 
 
