@@ -58,6 +58,8 @@ _OTHER = 5.0
 
 _ENOUGH = 50
 _MOST_SENSORS = 8
+_LOOKED_AT = 1000
+"""Rows on either side of the log's middle that tell whether sensors take turns."""
 
 
 def measured(log: ImuLog) -> ImuLog:
@@ -108,6 +110,7 @@ _WORDS = {
 def _bad(name: str, rows: FloatArray, dead: BoolArray, log: ImuLog) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
     limits, finite = _LIMITS[name], np.isfinite(rows).all(axis=1)
+    rows = rows if finite.all() else np.where(finite[:, None], rows, np.nan)
     size = np.abs(np.where(finite[:, None], rows, 0.0)).max(axis=1)
     zero, unit = finite & (size == 0.0), 1.0
     if name == VECTORS[2]:
@@ -123,7 +126,7 @@ def _bad(name: str, rows: FloatArray, dead: BoolArray, log: ImuLog) -> dict[str,
     repeat = (length > max(2, 2 * usual)) & ((after > limits.change * unit) | (np.isnan(after) & (start > 0)))
     if name == VECTORS[1]:
         slow = np.linalg.norm(rows[start], axis=1) < _SLOW_RAD_S
-        begun = np.isnan(before) | np.isnan(after) | (before > _SLOW_RAD_S)
+        begun = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
         still = slow & begun & _steady(log.accelerometer_m_s2, start, length)
         repeat &= ~still
         dropped = (np.fmax(before, after) > _DROP_RAD_S) & ~still
@@ -180,6 +183,8 @@ def _clipped(rows: FloatArray) -> BoolArray:
     bad = np.zeros(len(rows), dtype=bool)
     changes = np.append(0, np.cumsum((rows[1:] != rows[:-1]).any(axis=1)))
     for axis in rows.T:
+        if np.isnan(axis).all():
+            continue
         steps = np.abs(np.diff(axis))
         digit = np.min(steps[steps > 0.0], initial=np.inf)
         start, length = _runs(axis)
@@ -226,6 +231,8 @@ def _require_one_sensor(log: ImuLog) -> None:
     for rows in (log.accelerometer_m_s2, log.magnetometer_au, quaternions):
         if rows is None or len(rows) < _ENOUGH:
             continue
+        middle = len(rows) // 2
+        rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
         apart = [
             float(np.nanmedian(np.linalg.norm(rows[lag:] - rows[:-lag], axis=1)))
             if np.isfinite(rows).all(axis=1).any()
