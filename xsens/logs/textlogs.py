@@ -175,7 +175,8 @@ def _vector(table: TextTable, quantity: str, dialect: _Dialect) -> FloatArray | 
     usual = dialect.gyroscope_to_rad if quantity == "gyr" else 1.0
     scales = [table.scale(f"{quantity}_{axis}") for axis in "xyz"]
     factors = np.array([usual if scale is None else scale for scale in scales])
-    return rows if (factors == 1.0).all() else rows * factors
+    with np.errstate(over="ignore"):  # damage, which is left out as no measurement
+        return rows if (factors == 1.0).all() else rows * factors
 
 
 def _gaps_told(header: Names, samples: int) -> tuple[Gap, ...] | None:
