@@ -4,6 +4,7 @@
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -83,10 +84,10 @@ _LARGEST_SCORE, _LARGEST_CHANGE = 50.0, 0.5
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def find_headings(
-    bins: FloatArray,
-    room: FloatArray,
-    kept: FloatArray,
-    found: FloatArray,
+    bins: Any,
+    room: Any,
+    kept: Any,
+    found: Any,
     states: FloatArray,
     covariances: FloatArray,
     transitions: FloatArray,
@@ -157,7 +158,7 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _begin(s: FloatArray, b: FloatArray, r: FloatArray) -> None:
+def _begin(s: Any, b: Any, r: Any) -> None:
     """Begin with the bin's reading; after a pause with the iron and lag found so far."""
     place = r.place if s.ran else r.first_place
     if not s.ran:
@@ -173,7 +174,7 @@ def _begin(s: FloatArray, b: FloatArray, r: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _forget(s: FloatArray, first: int, count: int, sd: float) -> None:
+def _forget(s: Any, first: int, count: int, sd: float) -> None:
     """Set states anew, to zero with that deviation."""
     for i in range(first, first + count):
         s.x[i], s.p[i], s.p[:, i] = 0.0, 0.0, 0.0
@@ -181,7 +182,7 @@ def _forget(s: FloatArray, first: int, count: int, sd: float) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _predict(s: FloatArray, b: FloatArray, r: FloatArray, f: FloatArray, q: FloatArray) -> None:
+def _predict(s: Any, b: Any, r: Any, f: FloatArray, q: FloatArray) -> None:
     """Predict over a bin; fill its transition and noise."""
     span, across, along = b.span_s, s.x[ROOM], s.x[ROOM + 1]
     moving = 0.0 if b.resting else 1.0
@@ -216,9 +217,7 @@ def _predict(s: FloatArray, b: FloatArray, r: FloatArray, f: FloatArray, q: Floa
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _correct(
-    s: FloatArray, b: FloatArray, r: FloatArray, rows: FloatArray, q: FloatArray, out: FloatArray
-) -> None:
+def _correct(s: Any, b: Any, r: Any, rows: FloatArray, q: FloatArray, out: Any) -> None:
     """Correct by a reading, the less the less likely it is: its errors have Student's distribution.
 
     Of fields only that of the room is turned by errors of the heading: place and stray have random
@@ -271,7 +270,7 @@ def _inverse(m: FloatArray) -> tuple[FloatArray, float]:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _spread(s: FloatArray, b: FloatArray, r: FloatArray, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _spread(s: Any, b: Any, r: Any, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Covariance of the state with the expected field, and that of the reading.
 
     The reading's holds its noise, and what the level axes' tilt makes of the field.
@@ -285,9 +284,7 @@ def _spread(s: FloatArray, b: FloatArray, r: FloatArray, rows: FloatArray) -> tu
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _adapt(
-    s: FloatArray, b: FloatArray, r: FloatArray, off: FloatArray, misfit: float, inverse: FloatArray
-) -> None:
+def _adapt(s: Any, b: Any, r: Any, off: FloatArray, misfit: float, inverse: FloatArray) -> None:
     """Follow the stray's variance by the slope of the reading's likelihood: the room may become another."""
     weighted = inverse @ off
     believed = min(1.0, _LARGEST_SCORE / misfit)
