@@ -72,8 +72,6 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     require_metres(force if there.all() else force[there], source)
     _require_radians(rate, source)
     notes += _agreement(log, source)
-    if used.size < len(log):
-        notes.append(f"{len(log) - used.size} samples without gyroscope or accelerometer left out")
     if not there.all():
         notes.append(f"{int((~there).sum())} accelerometer readings missing: interpolated")
         force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
