@@ -103,12 +103,6 @@ class Added:
         return self._frames[index] + self._others[index]
 
 
-def config():
-    """Settings as they come, without straightening as long as there is one."""
-    straightens = hasattr(Config().curves, "straighten")
-    return Config.model_validate({"curves": {"straighten": False}} if straightens else {})
-
-
 def short(sweep):
     return sweep.part(0, SHORT_FRAMES)
 
@@ -170,7 +164,7 @@ class AccuracySet:
     """The sweeps of a folder that `simulate_set` has filled, tracked when they are asked for."""
 
     def __init__(self, folder, shipped):
-        self.folder, self.shipped, self.config = folder, shipped, config()
+        self.folder, self.shipped, self.config = folder, shipped, Config()
         # Of the instance, so that a test's change to another leaves this one alone.
         self.errors, self.curves = cache(self._errors), cache(self._curves)
 

@@ -18,7 +18,6 @@ import numpy.typing as npt
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import require_finite
-from speckle3d.core.memory import borrowed
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
 
 Slices: TypeAlias = Sequence[npt.NDArray[Any]]
@@ -180,7 +179,7 @@ class _Part:
         )
 
     def read(self, i: int) -> Unpack:
-        values = borrowed(self._shape or (1,), self._dtype)
+        values = np.empty(self._shape or (1,), self._dtype)
         if self._axis is not None:
             self._start[self._axis] = i
         if self._is_plain:

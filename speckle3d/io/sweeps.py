@@ -260,7 +260,10 @@ def unfinished_note(path: PathLike) -> str | None:
         if not has_format(file, FORMAT) or not is_growing(file):
             return None
         times = _read_rows(file, "frame_time_s", ("frame",))
-    return f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far"
+    return (
+        f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far, of "
+        "which speckle3d convert makes a whole file"
+    )
 
 
 def _notes(path: Path, _: ImportSettings) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.config import Config, config_from_toml
+from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
@@ -197,7 +197,7 @@ def grey_images(
     """
     settings = None
     if reconstruction is not None and reconstruction.config_toml:
-        settings = config_from_toml(reconstruction.config_toml).intensity
+        settings = stored_config(reconstruction.config_toml).intensity
     if levels == "stored":
         return StoredImages(sweep, progress)
     if levels == "linear":
@@ -238,10 +238,10 @@ def part_at(sweep: Sweep, time_s: FloatArray) -> Sweep:
         If no frames in a row have these times.
     """
     first = int(np.searchsorted(sweep.frame_time_s, time_s[0]))
-    held = sweep.frame_time_s[first : first + len(time_s)]
-    if not np.array_equal(held, time_s):
+    times = sweep.frame_time_s[first : first + len(time_s)]
+    if not np.array_equal(times, time_s):
         raise MismatchError(f"{sweep.name}: expected frames at the times that were reconstructed, got others")
-    return sweep if len(held) == len(sweep) else sweep.part(first, first + len(held))
+    return sweep if len(times) == len(sweep) else sweep.part(first, first + len(times))
 
 
 class Strip:

@@ -5,7 +5,7 @@ import oracles
 import pytest
 
 from speckle3d.kernels.plane_misfit import EchoModels, FitRules, Levers
-from speckle3d.kernels.planes import FittedPlanes, agreeing_patches, fit_planes, sum_by_halves
+from speckle3d.kernels.planes import FittedPlanes, agreeing_patches, fit_planes
 from speckle3d.kernels.statistics import PatchCurves
 
 STEP_MM, PATCHES, PAIRS = 0.01, 37, 24
@@ -131,11 +131,3 @@ def test_subsets_are_those_of_trying_every_plane():
     for e in range(40):
         expected = oracles.consistent_patches(d[e], sigma[e], at, slopes[e], 1.0)
         assert any(np.array_equal(support[e], each) for each in expected)
-
-
-@pytest.mark.parametrize("size", [0, 1, 7, 8, 40, 128, 129, 140, 300, 2049])
-def test_sums_round_as_numpys(size):
-    rng = np.random.default_rng(size)
-    for _ in range(20):
-        values = np.linspace(-18.0, 18.0, size) - 0.1 * rng.normal()
-        assert sum_by_halves(values, size) == np.sum(values)

@@ -86,7 +86,7 @@ def test_curves_stretch_as_the_beam_widens(difference):
     assert abs(_found(stretched, _power(0.5 + difference)).difference_db_cm_mhz) < 0.01
 
 
-@pytest.mark.parametrize("shift_hz", [-0.7e6, 0.7e6])
+@pytest.mark.parametrize("shift_hz", [-0.5e6, 0.5e6])
 def test_another_transmit_band_is_told_and_not_taken_for_attenuation(shift_hz):
     band = (BAND[0] + shift_hz, BAND[1] + shift_hz)
     found = _found(_curves(), _power(0.5, np.random.default_rng(1), band=band))
