@@ -178,7 +178,7 @@ def calibrate_from_sweeps(
         scale_errors=np.sqrt(np.diag(covariance)[6:8]),
         pixel_mm=crossing.pixel_mm * found.scales,
         covariance=covariance[:6, :6],
-        condition_number=condition_number(np.linalg.cholesky(curvature).T),
+        condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, dtype=np.float64)),
         alike=alike,
         similarity=_improvement(crossing.whole(SHOWN_SIGMA_MM, near, 10), first, found),
         held_out=_improvement(crossing.whole(SHOWN_SIGMA_MM, near), first, found),

@@ -22,7 +22,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.pixels import Pixels, meta_pixels, nrrd_pixels, read_pixels
+from speckle3d.io.pixels import Pixels, map_pixels, meta_pixels, nrrd_pixels
 from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
@@ -115,7 +115,12 @@ class SequenceHeader:
         FileError
             If pixels are damaged or missing.
         """
-        values = read_pixels(self.pixels).reshape(self.stored[::-1])
+        try:
+            values = map_pixels(self.pixels).reshape(self.stored[::-1])
+        except FileError as error:
+            if self.path in str(error):
+                raise
+            raise FileError(f"{self.path}: expected its pixels in a file beside it: {error}") from error
         axis = 0 if self.frame_axis is None else len(self.stored) - 1 - self.frame_axis
         turned = values if self.frame_axis is None else np.moveaxis(values, axis, 0)
         return turned.reshape(self.frame_count, self.size[1], self.size[0])
@@ -245,6 +250,8 @@ def _header(
     known = None if steps is None else [steps[i] for i in spatial]
     size = tuple(stored[i] for i in (*spatial, *(() if frame_axis is None else (frame_axis,))))
     fields, frames = _split(lines)
+    if frame_axis is not None and len(frames) == stored[frame_axis] + 1 and not frames[0]:
+        frames = frames[1:]  # of a writer that counts from 1
     times = _nrrd_times(path, lines, frame_axis, stored)
     if frame_axis is not None and frame_axis == len(stored) - 1:
         pixels = replace(pixels, frames=max(stored[frame_axis], 1))

@@ -37,7 +37,7 @@ from speckle3d.io.plus.transforms import (
 from speckle3d.io.plus.write import own_values
 from speckle3d.io.pose_paths import left_out, rising
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, differs
+from speckle3d.io.recordings import Recording, Row, Value, differs, rate_of
 
 _SIZE_TOLERANCE = 0.1
 """How far the pixel of a header and that of its image calibration may differ; a nominal size and a measured
@@ -174,16 +174,24 @@ class _Sequence:
         )  # fmt: skip
 
     @cached_property
-    def times(self) -> FloatArray | None:
-        """Time of every frame, NaN where it has none: of a rate that is given, stamped, or of their axis."""
-        header, rate = self.header, self.settings.frame_rate_hz
-        count = max(header.frame_count if header.pixels.count else 0, len(header.frames))
-        if rate is not None:
-            return np.arange(count) / rate
+    def stamps(self) -> FloatArray | None:
+        """Time of every frame by its stamp or its axis, NaN where it has none."""
+        header = self.header
         stamps = [_number(frame.get("Timestamp")) for frame in header.frames]
-        if np.isfinite(stamps).any():
-            return np.array(stamps + [np.nan] * (count - len(stamps)))
-        return header.index_s
+        if not np.isfinite(stamps).any():
+            return header.index_s
+        return np.array(stamps + [np.nan] * (self._count - len(stamps)))
+
+    @property
+    def _count(self) -> int:
+        images = self.header.frame_count if self.header.pixels.count else 0
+        return max(images, len(self.header.frames))
+
+    @cached_property
+    def times(self) -> FloatArray | None:
+        """Time of every frame: of a rate that is given, or `stamps`."""
+        rate = self.settings.frame_rate_hz
+        return self.stamps if rate is None else np.arange(self._count) / rate
 
     def _images(self) -> tuple[IntArray, FloatArray | None]:
         """Numbers of the frames that are images with a time, and the times of all."""
@@ -244,6 +252,8 @@ class _Sequence:
             for name, value in self.own.items()
             if name not in ("probe", "full_scale")
         }
+        if self.stamps is not None and (rate := rate_of(self.stamps[np.isfinite(self.stamps)])):
+            values["frame_rate_hz"] = Value(rate, "of its time stamps")
         sizes = self._pixel_mm()
         if not self.layout.is_rf:
             if sizes.value is not None and "column_pitch_mm" not in values:

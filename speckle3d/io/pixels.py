@@ -151,6 +151,11 @@ def nrrd_pixels(path: Path, fields: Mapping[str, str], count: int, start: int) -
 
 
 def read_pixels(pixels: Pixels) -> npt.NDArray[Any]:
+    """Read the numbers into memory, shape (count,), in the machine's byte order; as `map_pixels`."""
+    return np.array(map_pixels(pixels))
+
+
+def map_pixels(pixels: Pixels) -> npt.NDArray[Any]:
     """Map or unpack the numbers, shape (count,); raw ones of the machine's byte order stay on the disk.
 
     Raises
@@ -164,11 +169,7 @@ def read_pixels(pixels: Pixels) -> npt.NDArray[Any]:
 
 def _stored(pixels: Pixels) -> npt.NDArray[Any]:
     """The numbers in the file's byte order."""
-    try:
-        stream = open_regular(pixels.path)
-    except FileError as error:
-        raise FileError(f"expected pixels in a file that is there: {error}") from error
-    with stream:
+    with open_regular(pixels.path) as stream:
         size = stream.seek(0, 2)
         start = size - pixels.size_bytes if pixels.start < 0 else pixels.start
         stream.seek(max(start, 0))
@@ -190,14 +191,15 @@ def _unpacked(stream: BinaryIO, pixels: Pixels) -> npt.NDArray[Any]:
     """Unpack all, never more than there must be; members of gzip that follow one another are one stream."""
     size, where = pixels.size_bytes, str(pixels.path)
     with tempfile.SpooledTemporaryFile(_MEMORY_BYTES) as room:
-        made, packed, unpacker = 0, b"", _unpacker(pixels)
+        made, packed = 0, b""
+        unpacker, damage = _unpacker(pixels)
         try:
             while made <= size:
                 if unpacker.eof:
                     packed = unpacker.unused_data or stream.read(_PIECE_BYTES)
                     if packed[:2] != b"\x1f\x8b":
                         break
-                    unpacker = _unpacker(pixels)
+                    unpacker, _ = _unpacker(pixels)
                 packed = packed or stream.read(_PIECE_BYTES)
                 piece = unpacker.decompress(packed, _PIECE_BYTES)
                 rest = getattr(unpacker, "unconsumed_tail", b"")
@@ -205,7 +207,7 @@ def _unpacked(stream: BinaryIO, pixels: Pixels) -> npt.NDArray[Any]:
                     break
                 packed = rest
                 made += room.write(piece)
-        except (zlib.error, OSError, EOFError, ValueError) as error:
+        except damage as error:
             raise FileError(f"{where}: expected packed pixels, got damaged ones: {error}") from error
         if made < size:
             raise pixels.ends_early(made)
@@ -217,14 +219,17 @@ def _unpacked(stream: BinaryIO, pixels: Pixels) -> npt.NDArray[Any]:
         return np.memmap(room._file, pixels.dtype, "r", 0, (pixels.count,))
 
 
-def _unpacker(pixels: Pixels) -> Any:
+def _unpacker(pixels: Pixels) -> tuple[Any, tuple[type[Exception], ...]]:
+    """What unpacks, and the errors that it raises of damaged bytes."""
+    damage = (zlib.error, OSError, EOFError, ValueError)
     if pixels.packing == "bzip2":
-        return bz2.BZ2Decompressor()
+        return bz2.BZ2Decompressor(), damage
     try:  # four times as fast as zlib
         from isal import isal_zlib
     except ImportError:
-        return zlib.decompressobj(_ZLIB_OR_GZIP)
-    return isal_zlib.decompressobj(_ZLIB_OR_GZIP)
+        return zlib.decompressobj(_ZLIB_OR_GZIP), damage
+    own: Any = isal_zlib.error
+    return isal_zlib.decompressobj(_ZLIB_OR_GZIP), (*damage, own)
 
 
 def _from_text(text: bytes, pixels: Pixels) -> npt.NDArray[Any]:

@@ -23,9 +23,9 @@ _LEVER_MM = 50.0
 _MOST_PIECES = 2000
 """Of a path cut at its jumps; with more it is no path."""
 
-_REPEATS_S = 0.5
-"""A pose that stays the same to the last digit for longer is none of a tracker's: its noise alone changes it.
-Trackers slower than images, of 10 readings/s and more, repeat for less."""
+_MOST_ALIKE, _MOST_TIMES = 3, 3
+"""Poses in a row that are the same to the last digit: a tracker's noise alone changes them, and 2 of 5,000 at
+hand are alike. Of a tracker slower than the images, runs are regular: three times their median is odd."""
 
 _LEAST_OF_WIDTH, _LONGEST_MM = 1 / 200, 3000.0
 """Length of a path as a share of the image's width, below which it is in metres or stands still; and the
@@ -169,19 +169,18 @@ def _reach(time_s: FloatArray) -> FloatArray:
 def _repeats(readings: TimedPoses, frames: Frames, frame_time_s: FloatArray) -> list[str]:
     """Tell the longest run of one pose while images change."""
     matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
-    same = (matrices[1:] == matrices[:-1]).all(axis=(1, 2))
-    edges = np.flatnonzero(np.diff(np.r_[False, same, False].astype(int))).reshape(-1, 2)
-    if not edges.size:
+    changes = np.flatnonzero((matrices[1:] != matrices[:-1]).any(axis=(1, 2))) + 1
+    starts, stops = np.r_[0, changes], np.r_[changes, len(readings)]
+    lengths = stops - starts
+    odd = lengths > max(_MOST_ALIKE, _MOST_TIMES * float(np.median(lengths)))
+    if changes.size == 0 or not odd.any():
         return []
-    spans = time_s[edges[:, 1]] - time_s[edges[:, 0]]
-    first, last = edges[int(np.argmax(spans))]
-    if spans.max() < _REPEATS_S:
-        return []
-    inside = np.flatnonzero((frame_time_s >= time_s[first]) & (frame_time_s <= time_s[last]))
+    k = int(np.argmax(lengths))
+    first_s, last_s = time_s[starts[k]], time_s[stops[k] - 1]
+    inside = np.flatnonzero((frame_time_s >= first_s) & (frame_time_s <= last_s))
     if inside.size < 2 or np.array_equal(frames[int(inside[0])], frames[int(inside[-1])]):
         return []
-    runs = int(np.count_nonzero(spans >= _REPEATS_S))
     return [
-        f"poses: {runs} run(s) of one pose while images change, the longest {spans.max():.3g} s from "
-        f"{time_s[first]:.3f} s: the tracker's output stood still"
+        f"poses: {np.count_nonzero(odd)} run(s) of one pose while images change, the longest of {lengths[k]} "
+        f"poses, {last_s - first_s:.3g} s from {first_s:.3f} s: the tracker's output stood still"
     ]

@@ -190,7 +190,7 @@ class Recording:
         if given_rate or (self.time_s is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
         needed = {name: self.values.get(name, ASSUMED.get(name, Value())) for name in names}
-        if given_rate and self.time_s is not None:
+        if given_rate and self.time_s is not None and "frame_rate_hz" not in self.values:
             needed["frame_rate_hz"] = Value(rate_of(self.time_s), "of its times")
         if "sampling_rate_hz" in needed and self.sample_spacing_mm is not None:
             speed = self.settings.speed_of_sound_m_s or needed["speed_of_sound_m_s"].value
@@ -203,7 +203,9 @@ class Recording:
         with naming(str(self.path)):
             sweep = self._made() if self.ready is None else self.ready
             require_plausible(sweep)
-            return checked_path(sweep, self.chain)
+            checked, notes = checked_path(sweep, self.chain)
+        # Of a format that says all, its poses are told where something is odd of them.
+        return checked, notes if self.ready is None or len(notes) > 1 else []
 
     def _made(self) -> Sweep:
         if self.fault is not None:

@@ -126,17 +126,13 @@ def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
     assert told["vector pitch"] == "0.2005 (given by import.toml, the file says 0.2)"
     assert told["centre frequency"] == "5 (given by import.toml)"
     assert told["speed of sound"] == "1540 (assumed)"
-    assert import_notes(path)[:1] == [  # 0.2005 is within 1 %
-        "sampling rate 80 MHz, given by import.toml: the file says 40 (of samples 0.01925 mm apart, by "
-        "ElementSpacing, at 1540 m/s)"
-    ]
+    notes = import_notes(path)
+    assert notes[0].startswith("sampling rate 80 MHz, given by import.toml: the file says 40 (of samples")
+    assert not any("vector pitch" in note for note in notes)  # 0.2005 is within 1 %
     option = ImportSettings(vector_pitch_mm=0.05)
-    assert import_notes(path, option)[1] == "vector pitch 0.05 mm, given: the file says 0.2 (ElementSpacing)"
+    assert "vector pitch 0.05 mm, given: the file says 0.2 (ElementSpacing)" in import_notes(path, option)
     rated = ImportSettings(frame_rate_hz=20.0)
-    assert import_notes(path, rated)[1:] == [
-        "frame rate 20 Hz, given: the file says 10 (of its time stamps)",
-        "frame times are those of the frame rate from 0; poses keep the file's time stamps",
-    ]
+    assert "frame rate 20 Hz, given: the file says 10 (of its time stamps)" in import_notes(path, rated)
 
 
 def test_a_calibration_that_is_given_is_told_against_the_spacing(tmp_path):

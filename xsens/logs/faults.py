@@ -107,7 +107,7 @@ _WORDS = {
 
 def _bad(name: str, rows: FloatArray, dead: BoolArray, log: ImuLog) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
-    limits, finite = _LIMITS[name], np.isfinite(rows).all(axis=1)
+    limits, finite = _LIMITS[name], np.asarray(np.isfinite(rows).all(axis=1))
     size = np.abs(np.where(finite[:, None], rows, 0.0)).max(axis=1)
     zero, unit = finite & (size == 0.0), 1.0
     if name == VECTORS[2]:

@@ -112,8 +112,8 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
         gaps = _gaps_told(table.header, len(log)) if line.rows is None else None
         return log if gaps is None else replace(log, gaps=gaps)
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
-    line = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
-    return on_clock(line, int(timed.sum()), parts, hints)
+    stamped = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
+    return on_clock(stamped, int(timed.sum()), parts, hints)
 
 
 def _dialect(table: TextTable, counter: IntArray | None, ticks: IntArray | None) -> _Dialect:

@@ -13,6 +13,7 @@ References
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -86,11 +87,9 @@ def read_header(member: Member, said: Description) -> tuple[RawHeader, npt.NDArr
     if 0 in (header.frames, header.lines, header.samples):
         raise InvalidInputError(f"{where}: expected frames of lines and samples, got {header}")
     stamps = [read(HEADER.size + i * header.step_bytes, _TIME_BYTES) for i in range(header.frames)]
-    last = len(read(HEADER.size + (header.frames - 1) * header.step_bytes, header.step_bytes))
-    whole = sum(len(stamp) == _TIME_BYTES for stamp in stamps) - (
-        last < header.step_bytes and last >= _TIME_BYTES
-    )
-    if whole < header.frames:
+    ends = [HEADER.size + (i + 1) * header.step_bytes - 1 for i in range(header.frames)]
+    if not read(ends[-1], 1):
+        whole = sum(len(read(end, 1)) for end in ends)
         raise FileError(f"{where}: ends early: {whole} of {header.frames} frames")
     return header, np.frombuffer(b"".join(stamps), dtype="<u8").astype(np.int64)
 
@@ -179,16 +178,18 @@ class _Unpacker:
     def __init__(self, member: Member) -> None:
         self._member = member
         self._lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)")
-        self._blocks: list[tuple[int, int, int, int]] = []  # first byte, place, packed and unpacked length
-        at, sums = self._header()
+        self._blocks: list[tuple[int, int, int, int, bytes]] = []  # first byte, place, lengths, check sum
+        at, self._flags = self._header()
+        plain, packs = (sum(bool(self._flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
         first = 0
         while True:
             lengths = member.read(at, 8).ljust(8, b"\0")
             unpacked, packed = struct.unpack(">II", lengths)
             if not unpacked:
                 break
-            at += 8 + 4 * (sums[0] + (sums[1] if packed < unpacked else 0))
-            self._blocks.append((first, at, packed, unpacked))
+            check = member.read(at + 8, 4)
+            at += 8 + 4 * (plain + (packs if packed < unpacked else 0))
+            self._blocks.append((first, at, packed, unpacked, check))
             first, at = first + unpacked, at + packed
         self._firsts = np.array([block[0] for block in self._blocks])
         self._block = lru_cache(_KEPT_BLOCKS)(self._unpacked)
@@ -207,20 +208,22 @@ class _Unpacker:
         return b"".join(parts)
 
     def _unpacked(self, k: int) -> bytes:
-        _, place, packed, unpacked = self._blocks[k]
+        _, place, packed, unpacked, check = self._blocks[k]
         content, where = self._member.read(place, packed), f"{self._member.where}: block {k}"
-        if packed == unpacked and len(content) == packed:
-            return content
-        try:
-            plain = self._lzo.LZOCompressor.decompress(content, unpacked)
-        except (self._lzo.LZOError, ValueError, MemoryError) as error:
-            raise FileError(f"{where}: expected packed bytes, got damaged ones: {error}") from error
-        if len(plain) != unpacked:
-            raise FileError(f"{where}: expected {unpacked} bytes unpacked, got {len(plain)}")
-        return bytes(plain)
+        plain = content
+        if packed != unpacked:
+            try:
+                plain = bytes(self._lzo.LZOCompressor.decompress(content, unpacked))
+            except (self._lzo.LZOError, ValueError, MemoryError) as error:
+                raise FileError(f"{where}: expected packed bytes, got damaged ones: {error}") from error
+        method = zlib.adler32 if self._flags & 0x1 else zlib.crc32
+        is_right = not self._flags & 0x101 or struct.pack(">I", method(plain)) == check
+        if len(plain) != unpacked or not is_right:
+            raise FileError(f"{where}: expected {unpacked} bytes unpacked, got damaged ones")
+        return plain
 
-    def _header(self) -> tuple[int, tuple[int, int]]:
-        """Place of the first block, and how many check sums of unpacked and of packed bytes each has."""
+    def _header(self) -> tuple[int, int]:
+        """Place of the first block, and the flags, which say which check sums there are."""
         head = self._member.read(0, 1024)
         if not head.startswith(_MAGIC):
             raise FileError(f"{self._member.where}: expected a file of lzop (.lzo), got another")
@@ -230,8 +233,6 @@ class _Unpacker:
             at += 8 if is_newer else 5
             (flags,) = struct.unpack_from(">I", head, at)
             at += 4 + (4 if flags & 0x800 else 0) + (12 if is_newer else 8)
-            at += 1 + head[at] + 4
+            return at + 1 + head[at] + 4, flags
         except (struct.error, IndexError):
             raise FileError(f"{self._member.where}: header: ends early") from None
-        bits = [bool(flags & bit) for bit in (0x1, 0x100, 0x2, 0x200)]
-        return at, (sum(bits[:2]), sum(bits[2:]))

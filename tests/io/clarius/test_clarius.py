@@ -70,7 +70,7 @@ def test_tar_with_sub_folders_and_hidden_files(tmp_path):
         last = archive.getmembers()[-1]
     tar.write_bytes(tar.read_bytes()[: last.offset_data + -(-last.size // 512) * 512])
     assert any("without the blocks that close" in note for note in import_notes(tar, GIVEN))
-    tar.write_bytes(tar.read_bytes()[:-700])
+    tar.write_bytes(tar.read_bytes()[:1500])
     with pytest.raises(Speckle3DError, match=r"x\.tar"):
         load_sweep(tar, GIVEN)
 
@@ -281,7 +281,7 @@ def test_frames_of_a_repeated_time_are_left_out_and_cut_files_told(tmp_path):
     assert any("images: 1 of 4 left out" in note for note in import_notes(package, GIVEN))
     raw = next((tmp_path / "p").glob("*.raw"))
     whole = raw.read_bytes()
-    for cut, count in ((whole[:-1], 3), (whole[: len(whole) // 2 + 5], 2), (whole[:30], 0)):
+    for cut, count in ((whole[:-1], 3), (whole[: len(whole) // 2 + 50], 2), (whole[:30], 0)):
         raw.write_bytes(cut)
         with pytest.raises(FileError, match=f"ends early: {count} of 4 frames"):
             load_sweep(package, GIVEN)
@@ -397,16 +397,6 @@ def test_an_accelerometer_in_other_units_is_told(tmp_path):
     strong = replace(sweep.orientation, accelerometer_m_s2=9.81 * sweep.orientation.accelerometer_m_s2)
     package = examples.write_package(tmp_path / "q", replace(sweep, orientation=strong))
     assert any("9.81 g" in note and "m/s^2" in note for note in import_notes(package, GIVEN))
-
-
-def test_frames_that_the_sensor_does_not_cover_are_told(tmp_path):
-    sweep = sweep_of("rf")
-    times = examples.bursts_s(sweep.frame_time_s[1], sweep.frame_time_s[2] + 0.06)
-    late = replace(sweep, orientation=examples.sensor_of(examples.swayed(times), times))
-    rows = rows_of(examples.write_package(tmp_path / "p", late))
-    assert rows["frames without orientation"].startswith(
-        "1 before the sensor's first sample, 1 after its last"
-    )
 
 
 def test_damaged_blocks_of_lzop_are_named(tmp_path):

@@ -230,8 +230,8 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, name):
 @pytest.mark.parametrize("kind", ["quaternion_wxyz", "quaternion_xyzw", "euler_xyz"])
 def test_probe_poses_are_the_tracker(tmp_path, kind):
     """As zea 0.1.8 writes them: of the transducer's tip, in metres, y elevational and z axial."""
-    places = np.array([[0.0, 1e-4 * i, 0.0] for i in range(8)])
-    turns = Rotation.from_rotvec(0.01 * np.arange(8)[:, None] * [0.0, 0.0, 1.0])
+    places = np.array([[0.0, 1e-4 * i, 0.0] for i in range(10)])
+    turns = Rotation.from_rotvec(0.01 * np.arange(10)[:, None] * [0.0, 0.0, 1.0])
     rotation = {
         "quaternion_wxyz": turns.as_quat(scalar_first=True),
         "quaternion_xyzw": turns.as_quat(),
@@ -249,7 +249,7 @@ def test_probe_poses_are_the_tracker(tmp_path, kind):
     recording = open_recording(path, ImportSettings(dynamic_range_db=60.0))
     sweep = recording.sweep
     np.testing.assert_allclose(
-        sweep.tracker.readings.time_s, -0.1 + 0.05 * np.delete(np.arange(8), 3), atol=1e-6
+        sweep.tracker.readings.time_s, -0.1 + 0.05 * np.delete(np.arange(10), 3), atol=1e-6
     )
     image = sweep.tracker.world_from_image(sweep.frame_time_s)
     # A step along zea's y is one against the image's normal.
@@ -259,5 +259,5 @@ def test_probe_poses_are_the_tracker(tmp_path, kind):
     )
     left_mm = np.linalg.norm(sweep.tracker.sensor_from_image.translation)
     assert left_mm == pytest.approx(PITCH_MM * (VECTORS - 1) / 2, abs=1e-6)
-    assert any("1 of 8 left out" in note for note in recording.notes)
+    assert any("1 of 10 left out" in note for note in recording.notes)
     assert any(note.startswith("poses of metadata/probe_pose") for note in recording.notes)
