@@ -82,7 +82,7 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
         raise InvalidInputError(
             f"{own}: expected none beside a {reader.format}, which says all itself: it would not be read"
         )
-    with naming(str(path)):
+    with reading(path), naming(str(path)):
         made = reader.read(path, settings)
     if isinstance(made, Recording):
         return made
