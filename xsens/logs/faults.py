@@ -113,7 +113,8 @@ _WORDS = {
 
 def _without_damage(log: ImuLog) -> ImuLog:
     """The log without numbers that are damage in any unit, counted in its notes."""
-    changed, notes = {}, []
+    changed: dict[str, Any] = {}
+    notes = []
     for name in VECTORS:
         rows = getattr(log, name)
         if rows is not None and (np.abs(rows) >= _ABSURD).any():
