@@ -14,9 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.chain import ChainSolution
-from calibration.plane import Plane
-from calibration.solver import solve_chain
+from calibration.plane import Problem, Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 
@@ -48,13 +46,7 @@ class BeamBias:
 
 
 def depth_error_mm(normal_in_image: FloatArray, width_mm: float) -> FloatArray:
-    """How much too shallow lines appear: (w / 2) |n_z / n_y|, the same all along the line.
-
-    Parameters
-    ----------
-    normal_in_image : ndarray, shape (m, 3)
-        The wall's unit normal in the image frame of each line.
-    """
+    """How much too shallow lines appear, (w / 2) |n_z / n_y|, for normals of the wall in images, (m, 3)."""
     return np.asarray(width_mm / 2.0 * np.abs(normal_in_image[:, 2] / normal_in_image[:, 1]))
 
 
@@ -62,12 +54,7 @@ def bias_along_beam_mm(normal_in_image: FloatArray, width_mm: float) -> float:
     """Closed form of the bias along y if only the heights of the image and the wall were unknown.
 
     Least squares explain the height error (w / 2)|n_z| by moving the wall, and the image along its y axis by
-    (w / 2) cov(|n_z|, |n_y|) / var(|n_y|).
-
-    Returns
-    -------
-    float
-        NaN where the wall was met at one angle only.
+    (w / 2) cov(|n_z|, |n_y|) / var(|n_y|). NaN where the wall was met at one angle only.
     """
     oblique, along = np.abs(normal_in_image[:, 2]), np.abs(normal_in_image[:, 1])
     spread = float(np.var(along))
@@ -76,7 +63,7 @@ def bias_along_beam_mm(normal_in_image: FloatArray, width_mm: float) -> float:
     return width_mm / 2.0 * float(np.mean((oblique - oblique.mean()) * (along - along.mean()))) / spread
 
 
-def predict_bias(solution: ChainSolution, width_mm: float) -> BeamBias:
+def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
     """Predict the bias of a calibration with a bare wall, by simulation of its own motions.
 
     Lines are placed where a thick beam would show the wall, and a calibration is solved from them.
@@ -96,7 +83,7 @@ def predict_bias(solution: ChainSolution, width_mm: float) -> BeamBias:
     rows = (exact - depth_error_mm(normal, width_mm)) / chain.pixel_mm[1]
     thick = replace(points, pixels=np.column_stack([points.pixels[:, 0], rows]))
     probe = tuple(name for name in solution.free if name not in solution.phantom.determined)
-    seen = solve_chain(thick, Plane(), chain, probe, outlier_sigma=np.inf)
+    seen = Problem(solution.phantom, probe, np.inf).solve(thick, chain)
     middle = points.pixels.mean(axis=0)
     before, after = (
         one.sensor_from_image.apply(np.append(middle * one.pixel_mm, 0.0)) for one in (chain, seen.chain)

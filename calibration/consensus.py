@@ -16,13 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.special import gammaln
 
-from calibration.chain import Chain, ImagePoints
+from calibration.points import ImagePoints
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import nearest_rotation
 
 GATES_MM = (1.0, 1.5, 2.5, 4.0)
 """How near the crossing a candidate must come to agree. Points picked by hand leave 1 mm RMS, the worst of
@@ -63,8 +61,8 @@ class Consensus:
 
     Attributes
     ----------
-    chain : Chain
-        A start for the solver.
+    affine : (image, point), shapes (3, 3) and (3,)
+        See `nearest_candidates`: a start for the solver.
     nearest : ndarray of int, shape (f,)
         For each frame, ascending, the candidate nearest to where the point should be, as a row of the points.
     away_mm : ndarray, shape (f,)
@@ -74,7 +72,7 @@ class Consensus:
         Number of calibrations with as much agreement expected among chance candidates.
     """
 
-    chain: Chain
+    affine: tuple[FloatArray, FloatArray]
     nearest: IntArray
     away_mm: FloatArray
     gate_mm: float
@@ -134,7 +132,7 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
     affine = voters.affine(model)
     nearest, away = nearest_candidates(points, *affine)
     alarms = float(10.0 ** min(log_alarms, 300.0))
-    return Consensus(_squared(*affine), nearest, away, gate, alarms)
+    return Consensus(affine, nearest, away, gate, alarms)
 
 
 def nearest_candidates(
@@ -161,14 +159,6 @@ def nearest_candidates(
     order = np.lexsort((away, of_frame))
     first = order[np.searchsorted(of_frame[order], np.arange(len(frames)))]
     return first, away[first]
-
-
-def _squared(image: FloatArray, point_mm: FloatArray) -> Chain:
-    """The nearest chain whose axes are square."""
-    size = np.maximum(np.linalg.norm(image[1:], axis=1), 1e-6)
-    turn = Rotation.from_matrix(nearest_rotation((image[1:] / size[:, None]).T))
-    probe = RigidTransform.from_components(image[0], turn)
-    return Chain(size, probe, RigidTransform.from_translation(-point_mm))
 
 
 class _Candidates:

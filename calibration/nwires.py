@@ -19,10 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Chain, ImagePoints, Seen
 from calibration.detection.dots import Dots
-from calibration.detection.labelling import LabelSettings, label_by_calibration, label_dots
-from calibration.starts import rigid_fits, wire_start
+from calibration.detection.labelling import label_by_calibration, label_dots
+from calibration.plane import Chain
+from calibration.points import ImagePoints, Seen
+from calibration.wire_fits import rigid_fits
+from calibration.wires import wire_start
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import nearest_rotation
@@ -170,7 +172,6 @@ def label_and_start(
     phantom: WirePhantom,
     world_from_sensor: RigidTransform,
     pixel_mm: npt.ArrayLike,
-    settings: LabelSettings | None = None,
 ) -> tuple[Seen, Chain]:
     """Assign dots to wires, first by themselves, then by the calibration that follows from most frames.
 
@@ -188,12 +189,12 @@ def label_and_start(
     """
     if len(dots.frame) and dots.frame[-1] >= len(world_from_sensor):
         raise MismatchError(f"expected a pose for frame {dots.frame[-1]}, got {len(world_from_sensor)} poses")
-    alone = label_dots(dots, phantom, pixel_mm, settings)
+    alone = label_dots(dots, phantom, pixel_mm)
     if len(alone) == 0:
         reasons = sorted(set(alone.dropped.values())) or ["no frames"]
         raise InsufficientDataError(f"expected frames that show all wires, got none: {reasons[0]}")
     start = start_from_nwires(alone.points(world_from_sensor[alone.frame]), phantom, pixel_mm)
-    found = label_by_calibration(dots, phantom, start, world_from_sensor, settings)
+    found = label_by_calibration(dots, phantom, start, world_from_sensor)
     registered = replace(phantom, world_from_phantom=start.target_from_world.inv())
     return found, start_from_nwires(found.points(world_from_sensor[found.frame]), registered)
 

@@ -1,61 +1,144 @@
-"""Calibration with a plane.
+"""The plane module: from pixels to a phantom, the solver that all phantoms share, and the plane itself.
+
+A pixel (u, v) of size (s_x, s_y) is carried by ``target_from_world * world_from_sensor * sensor_from_image``
+into the phantom's frame, where the phantom says which components must vanish: for a plane the height above
+it, [1]_ equation 8; `wires` and `orientation` bring their own. Fourteen parameters in all; those that a
+phantom leaves undetermined are held.
+
+Parameters are refined as small displacements in the image's own frame and in the phantom's: there no angle
+is near a singularity, wherever the sensor is mounted, and all are of one scale.
 
 References
 ----------
-.. [1] Prager et al., "Automatic calibration for 3-D free-hand ultrasound", CUED/F-INFENG/TR 303, 1997:
-   sections 3.3, 4.2 and appendix A.
+.. [1] R. W. Prager et al., "Automatic calibration for 3-D free-hand ultrasound", CUED/F-INFENG/TR 303, 1997.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import cached_property, partial
+from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.alternatives import apart, best_solution
-from calibration.chain import (
-    ANGLES,
+from calibration.motion import Adequacy, judge, require_adequate
+from calibration.noise import Noise, fit_noise
+from calibration.points import (
+    CHAIN,
+    POSE,
     PROBE,
-    Chain,
-    ChainSolution,
+    SCALES,
+    SOME_FRAMES,
     ImagePoints,
-    Phantom,
-    PixelPrior,
     SeenAs,
     as_directions,
+    columns_of,
 )
-from calibration.identifiability import Adequacy, judge, require_adequate
-from calibration.solver import (
-    OUTLIER_SIGMA,
-    SOME_FRAMES,
-    first_guess,
-    probe_parameters,
-    residuals_of,
-)
-from calibration.starts import angle_starts, distance_start, hemisphere, in_plane_mirror
-from speckle3d.core.arrays import FloatArray
+from calibration.settings import OUTLIER_SIGMA, PlaneFit, Stages
+from calibration.starts import Angles, angle_starts, hemisphere, in_plane_mirror, rotation_to_z
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import roll_yaw_tilt, skew
+from speckle3d.core.leastsquares import (
+    autocorrelation_time,
+    condition_number,
+    huber_weights,
+    robust_linear,
+    robust_sigma,
+)
+from speckle3d.core.shown import shown
 
 _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
-
 _PIXEL_MM = 0.15
-"""Pixel size of an image some hundred pixels high and some centimetres deep, if none is given."""
-
-_BEGINNING = 2
-"""Rounds after which starts that have met go on as one."""
-_HOPELESS = 3.0
-"""Ends of iterations whose mean absolute residual is as many times the least are not looked at again."""
-_TRIED = 3
-"""Angles that are followed to the end."""
-PIXEL_ERROR = 0.02
-"""Standard error of a pixel size from a scanner's calipers, as a share of it: of distances they show."""
+"""Pixel size to start from where none is given and free ones fail: some hundred rows over some
+centimetres."""
+_MOST_STEPS = 100
+_TOLERANCE = 1e-12
+"""Relative decrease of the sum of squares that a last step promises."""
+_ROUGHLY = 1e-3
+_NEARLY_ABSOLUTE = 0.06745
+"""Limit of Huber's weights, a tenth of the median: nearly all residuals count by their absolute value."""
+_REWEIGHTINGS = 8
+_SMALLEST_SIGMA = 1e-7
+"""Residuals of exact data are rounding; nothing in them is an outlier."""
+_FREE_ROUNDS, _MOST_ROUNDS = 5, 30
+"""After so many rounds frames may be left out but not taken back, so that the rounds end."""
+_RUNAWAY, _RESIZED = 2.0, 0.1
+"""A fit with wandering errors that doubles the residuals or changes pixel sizes by a tenth has run away along
+what the motion leaves open."""
+_CUT = 3.0
+"""Residuals count up to so many standard deviations where answers are compared."""
+_APART_RAD, _APART = np.deg2rad(5.0), 0.1
+"""Two answers differ by this angle, or by this share of the image's size."""
 _CONTRADICTS = 3.0
-"""Standard errors by which lines must move the pixel size given for it to be doubted."""
+"""Standard errors by which lines must move a pixel size given for it to be doubted."""
 
-Stages = Literal["three", "one"]
+
+# 1. The chain: image -> sensor -> world -> phantom (TR 303, section 3)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """An estimate of all fourteen parameters.
+
+    Attributes
+    ----------
+    pixel_mm : ndarray, shape (2,)
+        Column pitch and row spacing.
+    """
+
+    pixel_mm: FloatArray
+    sensor_from_image: RigidTransform
+    target_from_world: RigidTransform
+
+    def target_from_image(self, points: ImagePoints) -> RigidTransform:
+        """Pose of the image of each point in the phantom's frame."""
+        probe, target = self.sensor_from_image.as_matrix(), self.target_from_world.as_matrix()
+        return RigidTransform(target @ points.world_from_sensor.as_matrix() @ probe, normalize=False)
+
+    def parameters(self) -> FloatArray:
+        """The parameters as published, in the order of `CHAIN`: x-y-z fixed angles, abs(beta) <= pi / 2."""
+        parts = [self.pixel_mm]
+        for pose in (self.sensor_from_image, self.target_from_world):
+            parts += [np.asarray(pose.translation), roll_yaw_tilt(pose.rotation)]
+        return np.concatenate(parts)
+
+    def displaced(self, step: FloatArray) -> Chain:
+        """Displace the image in its frame and the world in the phantom's, `step` in the order of `CHAIN`.
+
+        A pixel size that becomes negative is made positive by turning the image by half about its other axis,
+        which is the same calibration; TR 303, appendix C, does so with angles.
+        """
+        size = self.pixel_mm + step[:2]
+        sign = np.where(size < 0, -1.0, 1.0)
+        moved, shifted = np.eye(4), np.eye(4)
+        moved[:3, :3] = Rotation.from_rotvec(step[7:4:-1]).as_matrix() * [*sign, sign.prod()]
+        moved[:3, 3] = step[2:5]
+        shifted[:3, :3], shifted[:3, 3] = Rotation.from_rotvec(step[13:10:-1]).as_matrix(), step[8:11]
+        probe, target = self.sensor_from_image.as_matrix(), self.target_from_world.as_matrix()
+        return Chain(
+            np.abs(size),
+            RigidTransform(probe @ moved, normalize=False),
+            RigidTransform(shifted @ target, normalize=False),
+        )
+
+
+class Phantom(Protocol):
+    """What must vanish in the phantom's frame."""
+
+    @property
+    def seen_as(self) -> SeenAs:
+        """What the points are: the two ends of a line, the direction of one, or a dot."""
+
+    @property
+    def determined(self) -> tuple[str, ...]:
+        """Those of `TARGET` that images of the phantom determine."""
+
+    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
+        """Rows, shape (n, r, 3), and offsets, (n, r): ``rows @ position - offsets`` is the residual, mm."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +147,6 @@ class Plane:
 
     determined: tuple[str, ...] = ("z_c", "beta_c", "gamma_c")
     seen_as: SeenAs = "line"
-    kept_in_plane: bool = False
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Height above the plane."""
@@ -74,9 +156,9 @@ class Plane:
 
 @dataclass(frozen=True)
 class LineDirections:
-    """A plane known by the directions of its lines alone: lines lie in it, wherever it is (appendix A).
+    """A plane of which line directions alone are used, wherever it is (TR 303, appendix A; Housden 2008).
 
-    `ImagePoints.pixels` then holds directions and the poses of the sensor are used without their translation.
+    `ImagePoints.pixels` then holds directions, and the poses have no translation.
 
     Parameters
     ----------
@@ -89,7 +171,6 @@ class LineDirections:
     pixel_mm: FloatArray
     level: bool = False
     seen_as: SeenAs = "direction"
-    kept_in_plane: bool = False
 
     @property
     def determined(self) -> tuple[str, ...]:
@@ -98,20 +179,475 @@ class LineDirections:
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Sine of the angle between line and plane."""
-        lengths = np.linalg.norm(points.pixels * self.pixel_mm, axis=1)
         rows = np.zeros((len(points), 1, 3))
-        rows[:, 0, 2] = 1.0 / lengths
+        rows[:, 0, 2] = 1.0 / np.linalg.norm(points.pixels * self.pixel_mm, axis=1)
         return rows, np.zeros((len(points), 1))
 
 
+# 2. Residuals and their derivatives
+
+
+@dataclass(frozen=True)
+class Equations:
+    """What must vanish for each point of a phantom.
+
+    Attributes
+    ----------
+    rows, offsets : ndarray, shapes (n, r, 3) and (n, r)
+        See `Phantom.vanishing`.
+    weights : ndarray, shape (n, r), optional
+        Factor on each equation.
+    """
+
+    points: ImagePoints
+    rows: FloatArray
+    offsets: FloatArray
+    weights: FloatArray | None = None
+
+    @classmethod
+    def of(cls, points: ImagePoints, phantom: Phantom) -> Equations:
+        """Those of a phantom's points."""
+        return cls(points, *phantom.vanishing(points))
+
+    def __getitem__(self, chosen: BoolArray) -> Equations:
+        return Equations(self.points[chosen], self.rows[chosen], self.offsets[chosen])
+
+    def at(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
+        """Residuals, (n, r), and derivatives by the small displacements of `Chain.displaced`, (n, r, 14)."""
+        probe, target = (
+            pose.rotation.as_matrix() for pose in (chain.sensor_from_image, chain.target_from_world)
+        )
+        place, (u, v) = self._places(chain), self.points.pixels.T[..., None]
+        x, y = u * chain.pixel_mm[0], v * chain.pixel_mm[1]
+        in_world = (self.rows.reshape(-1, 3) @ target).reshape(self.rows.shape)
+        in_sensor = np.einsum("nri,nij->nrj", in_world, self.points.turns)
+        # The rows in the image's axes.
+        across, down, out = (in_sensor.reshape(-1, 3) @ probe).T.reshape(3, *self.offsets.shape)
+        (a, b, c), (p, q, r) = np.moveaxis(self.rows, 2, 0), place.T[..., None]
+        slopes = np.empty((len(CHAIN), *self.offsets.shape))
+        slopes[0], slopes[1] = across * u, down * v
+        slopes[2], slopes[3], slopes[4] = across, down, out
+        slopes[5], slopes[6], slopes[7] = x * down - y * across, -x * out, y * out
+        slopes[8], slopes[9], slopes[10] = a, b, c
+        slopes[11], slopes[12], slopes[13] = p * b - q * a, r * a - p * c, q * c - r * b
+        values = p * a + q * b + r * c - self.offsets
+        if self.weights is not None:
+            values, slopes = values * self.weights, slopes * self.weights
+        return values, np.moveaxis(slopes, 0, 2)
+
+    def residuals(self, chain: Chain) -> FloatArray:
+        """What does not vanish, shape (n, r)."""
+        return np.asarray(np.einsum("nri,ni->nr", self.rows, self._places(chain)) - self.offsets)
+
+    def _places(self, chain: Chain) -> FloatArray:
+        """Where the points are in the phantom's frame, mm, shape (n, 3)."""
+        probe, target = chain.sensor_from_image.as_matrix(), chain.target_from_world.as_matrix()
+        in_sensor = (self.points.pixels * chain.pixel_mm) @ probe[:3, :2].T + probe[:3, 3]
+        in_world = np.einsum("nij,nj->ni", self.points.turns, in_sensor) + self.points.shifts_mm
+        return np.asarray(in_world @ target[:3, :3].T + target[:3, 3])
+
+
+@dataclass(frozen=True)
+class PixelPrior:
+    """What is known of the pixel size before anything is measured: `error` is a share of `pixel_mm`."""
+
+    pixel_mm: FloatArray
+    error: float
+
+    def deviation(self, pixel_mm: FloatArray) -> FloatArray:
+        """Deviation of other sizes, in standard errors, shape (2,)."""
+        return np.asarray((pixel_mm / self.pixel_mm - 1.0) / self.error)
+
+
+# 3. The solver
+
+
+def least_squares(
+    equations: Equations,
+    start: Chain,
+    free: Sequence[str],
+    prior: PixelPrior | None = None,
+    sigma: float = 1.0,
+    tolerance: float = _TOLERANCE,
+) -> Chain:
+    """Minimise the sum of squares by Levenberg's and Marquardt's steps, in frames that move along.
+
+    Parameters
+    ----------
+    prior : PixelPrior, optional
+        Counts as two further residuals of standard deviation `sigma`. Lines then err by rows: in millimetres,
+        an image that shrinks to nothing would leave no residual.
+    tolerance : float
+        Relative decrease of the sum of squares below which a step is the last.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are fewer residuals than parameters, or some are not finite.
+    """
+    columns, row_mm = columns_of(free), float(start.pixel_mm[1])
+    by_rows = prior is not None and equations.rows.shape[1] == 1
+
+    def at(chain: Chain) -> tuple[FloatArray, FloatArray, float]:
+        values, slopes = equations.at(chain)
+        r, j = values.ravel(), slopes.reshape(values.size, -1)[:, columns]
+        if prior is not None:
+            if by_rows:
+                larger = chain.pixel_mm[1] / row_mm
+                r, j = r / larger, j / larger
+                j[:, columns.index(1)] -= r / chain.pixel_mm[1]
+            slope = sigma / (prior.error * prior.pixel_mm[:, None])
+            more = (np.array(columns) == np.arange(2)[:, None]) * slope
+            r, j = np.append(r, sigma * prior.deviation(chain.pixel_mm)), np.vstack([j, more])
+        return j.T @ j, j.T @ r, float(r @ r)
+
+    chain, (normal, pull, cost) = start, at(start)
+    count = equations.offsets.size + (2 if prior else 0)
+    if count < len(columns):
+        raise InvalidInputError(f"expected at least {len(columns)} residuals, got {count}")
+    if not np.isfinite(cost):
+        raise InvalidInputError("expected finite residuals at the starting point, got some that are not")
+    damping, step = 1e-6, np.zeros(len(CHAIN))
+    for _ in range(_MOST_STEPS):
+        scale = np.sqrt(np.diag(normal))
+        scale = np.where(scale > 0, scale, 1.0)
+        scaled = normal / np.outer(scale, scale) + damping * np.eye(len(scale))
+        moved = np.linalg.solve(scaled, pull / scale) / scale
+        step[columns] = -moved
+        moved_chain = chain.displaced(step)
+        trial = at(moved_chain)
+        promised = float(moved @ pull)
+        if trial[2] <= cost:
+            chain, (normal, pull, cost), damping = moved_chain, trial, max(damping / 10.0, 1e-12)
+        else:
+            damping = max(10.0 * damping, 1e-6)
+        if promised <= tolerance * cost + count * np.finfo(float).eps ** 2 or damping > 1e6:
+            break
+    return chain
+
+
+def nearly_absolute(
+    equations: Equations, start: Chain, free: Sequence[str], rounds: int = _REWEIGHTINGS
+) -> Chain:
+    """Nearly least absolute residuals, by reweighting, so that wrong frames pull little."""
+    chain, before = start, np.inf
+    for _ in range(rounds):
+        size = np.abs(equations.residuals(chain))
+        if size.mean() > 0.99 * before:
+            break
+        before = size.mean()
+        weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
+        chain = least_squares(replace(equations, weights=weights), chain, free, tolerance=_ROUGHLY)
+    return chain
+
+
+def sigma_of(residuals: FloatArray) -> float:
+    """Robust standard deviation of residuals, not less than rounding."""
+    return robust_sigma(residuals, _SMALLEST_SIGMA)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another answer, far away, to which a discrete ambiguity leads.
+
+    Attributes
+    ----------
+    evidence : float
+        By how much the sum of its squared residuals exceeds the solution's, in variances of an independent
+        one.
+    """
+
+    chain: Chain
+    evidence: float
+
+
+@shown
+@dataclass(frozen=True)
+class Solution:
+    """A calibration as the solver leaves it: the chain, its certainty, and the frames it is made from.
+
+    Attributes
+    ----------
+    free : tuple of str, length p
+        The parameters estimated, among `CHAIN`.
+    noise : Noise
+        What the sensor's errors are like, and the covariance of the free parameters that follows: of small
+        displacements in the image's frame and in the phantom's.
+    points : ImagePoints
+        All that were given.
+    used : ndarray of bool, shape (n,)
+    residuals : ndarray, shape (n, r)
+        Of all points, mm (sines of angles for directions).
+    sigma : float
+        Robust standard deviation of the residuals of the points used.
+    assumed : str
+        What no image tells, and was taken for granted.
+    """
+
+    chain: Chain
+    phantom: Phantom
+    free: tuple[str, ...]
+    noise: Noise
+    points: ImagePoints
+    used: BoolArray
+    residuals: FloatArray
+    sigma: float
+    prior: PixelPrior | None = None
+    rival: Rival | None = None
+    assumed: str = ""
+
+    @property
+    def angular(self) -> bool:
+        """Whether only directions are known: residuals are sines of angles, and nothing has a length."""
+        return self.phantom.seen_as == "direction"
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the free parameters, shape (p, p)."""
+        return self.noise.covariance
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Derivatives of the residuals used by small displacements, shape (n r, p)."""
+        _, slopes = Equations.of(self.points_used, self.phantom).at(self.chain)
+        return slopes.reshape(-1, len(CHAIN))[:, columns_of(self.free)]
+
+    @property
+    def condition_number(self) -> float:
+        """Of the derivatives, columns scaled to one length."""
+        return condition_number(self.jacobian)
+
+    @property
+    def corners_moved(self) -> FloatArray:
+        """Derivatives of the image's corners, mm, by the displacements of `CHAIN`, shape (4, 3, 14).
+
+        The image is taken to reach as far as points are in it.
+        """
+        right, bottom = self.points_used.pixels.max(axis=0)
+        corners = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+        moved = np.zeros((4, 3, len(CHAIN)))
+        moved[:, 0, 0], moved[:, 1, 1] = corners.T
+        moved[:, :, 2:5] = np.eye(3)
+        moved[:, :, 7:4:-1] = -skew(np.column_stack([corners * self.chain.pixel_mm, np.zeros(4)]))
+        return moved
+
+    @cached_property
+    def adequacy(self) -> Adequacy:
+        """Whether the motion was sufficient, and what is missing."""
+        return judge(self)
+
+    @cached_property
+    def points_used(self) -> ImagePoints:
+        """The points that the solution is made from."""
+        return self.points[self.used]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual of the points used."""
+        return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
+
+    @cached_property
+    def full_covariance(self) -> FloatArray:
+        """Covariance of all of `CHAIN`, zero for parameters held, shape (14, 14)."""
+        full, columns = np.zeros((len(CHAIN), len(CHAIN))), columns_of(self.free)
+        full[np.ix_(columns, columns)] = self.covariance
+        return full
+
+    def image_covariance(self, names: Sequence[str]) -> FloatArray:
+        """Covariance of some of the parameters, zero for those held."""
+        columns = columns_of(names)
+        return self.full_covariance[np.ix_(columns, columns)]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is solved, from whichever start.
+
+    Parameters
+    ----------
+    phantom : Phantom
+    probe : tuple of str
+        Which of `PROBE` to estimate, besides all that the phantom determines.
+    outlier_sigma : float
+        Frames whose largest residual exceeds so many robust standard deviations are left out.
+    prior : PixelPrior, optional
+        Counts where the pixel size is estimated.
+    """
+
+    phantom: Phantom
+    probe: tuple[str, ...] = PROBE
+    outlier_sigma: float = OUTLIER_SIGMA
+    prior: PixelPrior | None = None
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters estimated."""
+        return (*self.probe, *self.phantom.determined)
+
+    def solve(self, points: ImagePoints, start: Chain) -> Solution:
+        """Refine a start until residuals are least, leaving out frames that contradict the others.
+
+        Raises
+        ------
+        InsufficientDataError
+            If there are too few points, or fewer than half of the frames agree.
+        """
+        chain, used = self.agreed(points, start)
+        equations, free = Equations.of(points, self.phantom), self.free
+        least = sigma_of(equations[used].residuals(chain))
+        settled, noise = fit_noise(equations[used], chain, free, self.phantom.seen_as, self.prior)
+        resized = np.abs(np.log(settled.pixel_mm / chain.pixel_mm)).max()
+        if sigma_of(equations[used].residuals(settled)) < _RUNAWAY * least and resized < _RESIZED:
+            chain = settled
+        if self.phantom.determined:
+            # Where the phantom is, as the readings say on average: what wanders is not in its place.
+            chain = least_squares(equations[used], chain, self.phantom.determined)
+        residuals = equations.residuals(chain)
+        sigma = sigma_of(residuals[used])
+        return Solution(chain, self.phantom, free, noise, points, used, residuals, sigma, self.prior)
+
+    def agreed(self, points: ImagePoints, start: Chain) -> tuple[Chain, BoolArray]:
+        """Least squares of the frames that do not contradict the others, and which points those are."""
+        equations = Equations.of(points, self.phantom)
+        # Pixel sizes that are known somewhat are held while wrong frames still pull.
+        first = [name for name in self.free if self.prior is None or name not in SCALES]
+        chain = nearly_absolute(equations, start, first)
+        residuals = equations.residuals(chain)
+        used = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals))
+        for number in range(_MOST_ROUNDS):
+            frames, agreeing = len(points.frames), len(np.unique(points.frame[used]))
+            if 2 * agreeing <= frames:
+                raise InsufficientDataError(
+                    f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the "
+                    "images and the sensor readings belong together, and is the phantom the one named?"
+                )
+            sigma = sigma_of(residuals[used])
+            chain = least_squares(equations[used], chain, self.free, self.prior, sigma)
+            residuals = equations.residuals(chain)
+            now = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals[used]))
+            if number >= _FREE_ROUNDS:
+                now &= used
+            if (now == used).all():
+                break
+            used = now
+        return chain, used
+
+    def best(self, points: ImagePoints, starts: Sequence[Chain]) -> Solution:
+        """Solve from several starts and their discrete alternatives; the best solution, with its rival.
+
+        Where a motion is missing, an image turned by half about one of its axes shows nearly the same: the
+        lines of a plane that is always equally deep do not tell the image from its in-plane mirror.
+        """
+        few = points.of_some_frames(SOME_FRAMES)
+        chains = [chain for start in starts if (chain := self._tried(few, start)) is not None]
+        if not chains:
+            return self.solve(points, starts[0])
+        best = chains[int(np.argmin(self._costs(few, chains)))]
+        turned = [self._tried(few, start) for start in half_turns(best, few, self.phantom)]
+        chains += [chain for chain in turned if chain is not None]
+        costs = self._costs(few, chains)
+        best = chains[int(np.argmin(costs))]
+        solution = self.solve(points, best)
+        others = [k for k, chain in enumerate(chains) if apart(best, chain, few, self.phantom)]
+        if not others:
+            return solution
+        rival = self._tried(points, chains[min(others, key=lambda k: float(costs[k]))])
+        if rival is None or not apart(solution.chain, rival, points, self.phantom):
+            return solution
+        ours, theirs = self._costs(solution.points_used, [solution.chain, rival])
+        if theirs < ours:
+            return replace(self.solve(points, rival), rival=Rival(solution.chain, float(ours - theirs)))
+        return replace(solution, rival=Rival(rival, float(theirs - ours)))
+
+    def _tried(self, points: ImagePoints, start: Chain) -> Chain | None:
+        """Where iterations from a start end; None if most points contradict it there."""
+        try:
+            return self.agreed(points, start)[0]
+        except InsufficientDataError:
+            return None
+
+    def _costs(self, points: ImagePoints, chains: Sequence[Chain]) -> FloatArray:
+        """Sums of squared residuals, each cut off, in the variance of an independent one at the least sum."""
+        equations = Equations.of(points, self.phantom)
+        lines = self.phantom.seen_as == "line"
+        residuals = [equations.residuals(one) / (one.pixel_mm[1] if lines else 1.0) for one in chains]
+        cut = _CUT * min(sigma_of(one) for one in residuals)
+        sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in residuals])
+        best = np.clip(residuals[int(np.argmin(sums))], -cut, cut)
+        independent = best.size / together(best, points.frame)
+        priors = [
+            0.0 if self.prior is None else np.sum(self.prior.deviation(c.pixel_mm) ** 2) for c in chains
+        ]
+        return np.asarray(
+            independent * sums / max(float(sums.min()), np.finfo(float).tiny) + np.array(priors)
+        )
+
+
+def _within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
+    """Points of the frames none of whose residuals exceeds `limit`."""
+    return ~np.isin(frame, frame[(np.abs(residuals) > limit).any(axis=1)])
+
+
+def together(residuals: FloatArray, frame: IntArray) -> float:
+    """How many residuals, shape (n, r), count as one: a sensor's error moves all of a frame, and wanders."""
+    index = np.unique(frame, return_inverse=True)[1]
+    sums = np.stack([np.bincount(index, column) for column in residuals.T])
+    whole = float(np.sum(residuals**2))
+    times = [autocorrelation_time(one) * float(one @ one) for one in sums]
+    return max(1.0, sum(times) / whole) if whole > 0 else 1.0
+
+
+def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chain]:
+    """The image turned by half about each of its axes through the middle of what it shows.
+
+    About its z axis not where directions alone are known: they stay exactly as they are.
+    """
+    directions = phantom.seen_as == "direction"
+    middle = np.append(np.median(points.pixels, axis=0) * chain.pixel_mm, 0.0) * (not directions)
+    turns = [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)[: 2 if directions else 3]]
+    steps = [RigidTransform.from_components(middle - turn.apply(middle), turn) for turn in turns]
+    return [replace(chain, sensor_from_image=chain.sensor_from_image * step) for step in steps]
+
+
+def apart(one: Chain, other: Chain, points: ImagePoints, phantom: Phantom) -> bool:
+    """Whether two chains are two answers, not one."""
+    step = (one.sensor_from_image.inv() * other.sensor_from_image).rotation
+    if phantom.seen_as == "direction":
+        # Half a turn about the image's z axis is the same to directions.
+        return bool(min(step.magnitude(), in_plane_mirror(step).magnitude()) > _APART_RAD)
+    right_down = points.pixels.max(axis=0)
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * right_down
+    places = [
+        chain.sensor_from_image.apply(np.column_stack([corners * chain.pixel_mm, np.zeros(4)]))
+        for chain in (one, other)
+    ]
+    far = float(np.linalg.norm(places[0] - places[1], axis=1).max())
+    return bool(step.magnitude() > _APART_RAD or far > _APART * np.linalg.norm(right_down * one.pixel_mm))
+
+
+def probe_parameters(
+    fixed_pixels: bool, pixel_mm: FloatArray | None
+) -> tuple[tuple[str, ...], FloatArray | None]:
+    """Which of `PROBE` to estimate, and the pixel size to hold, if any.
+
+    Raises
+    ------
+    InvalidInputError
+        If the pixel size is neither fitted nor given.
+    """
+    if not fixed_pixels:
+        return PROBE, None
+    if pixel_mm is None:
+        raise InvalidInputError("pixel_mm: expected the scanner's pixel size unless it is fitted, got none")
+    return POSE, np.asarray(pixel_mm, dtype=float)
+
+
+# 4. The plane in three stages (TR 303, appendix A)
+
+
 def calibrate_plane(
-    lines: ImagePoints,
-    pixel_mm: FloatArray | None = None,
-    fit_pixels: bool = True,
-    stages: Stages = "three",
-    outlier_sigma: float = OUTLIER_SIGMA,
-    pixel_error: float = PIXEL_ERROR,
-) -> ChainSolution:
+    lines: ImagePoints, pixel_mm: FloatArray | None = None, settings: PlaneFit | None = None
+) -> Solution:
     """Calibrate a 6-DOF sensor from lines of a plane: the floor of a water bath, or the Cambridge phantom.
 
     Parameters
@@ -119,14 +655,7 @@ def calibrate_plane(
     lines : ImagePoints
         Two points of the plane's line in each frame (`ImagePoints.of_lines`).
     pixel_mm : ndarray, shape (2,), optional
-        Column pitch and row spacing from the scanner's calipers; needed unless they are fitted.
-    fit_pixels : bool
-        Estimate the pixel size too: eleven parameters, else nine.
-    stages : str
-        ``"three"``: angles from line directions, then distances, then all. ``"one"``: all at once, from
-        several mountings.
-    pixel_error : float
-        Standard error of the pixel size given, as a share of it; infinite if it is a guess.
+        Column pitch and row spacing from the scanner's calipers; needed if they are fixed.
 
     Raises
     ------
@@ -134,45 +663,71 @@ def calibrate_plane(
         If there are too few lines, they contradict each other or the pixel size, or the motion does not
         determine the answer; then the missing motions are named.
     """
+    s = settings or PlaneFit()
     if len(lines) < 2 * _FEWEST_LINES:
         raise InsufficientDataError(
             f"expected lines in at least {_FEWEST_LINES} frames, got {len(lines) // 2}"
         )
-    if not pixel_error > 0:
-        raise InvalidInputError(f"pixel_error: expected a positive share, got {pixel_error:g}")
-    probe, held = probe_parameters(fit_pixels, pixel_mm)
+    probe, fixed_mm = probe_parameters(s.fixed_pixels, pixel_mm)
     prior = None
-    if fit_pixels and pixel_mm is not None and np.isfinite(pixel_error):
-        prior = PixelPrior(np.asarray(pixel_mm, dtype=float), pixel_error)
-    solution, verdict = _solved(lines, held, prior, stages, probe, outlier_sigma)
+    if fixed_mm is None and pixel_mm is not None and np.isfinite(s.pixel_error):
+        prior = PixelPrior(np.asarray(pixel_mm, dtype=float), s.pixel_error)
+    solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma, prior), fixed_mm, s.stages)
     if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
-        solution, verdict = _without_prior(lines, solution, stages, outlier_sigma), None
-    return facing_up(require_adequate(solution, verdict))
+        solution = _without_prior(lines, solution, s)
+    return _facing_up(require_adequate(solution))
 
 
-def _solved(
-    lines: ImagePoints,
-    held: FloatArray | None,
-    prior: PixelPrior | None,
-    stages: Stages,
-    probe: tuple[str, ...],
-    outlier_sigma: float,
-) -> tuple[ChainSolution, Adequacy | None]:
-    """The best solution, and the verdict on it if it was asked for."""
-    given = held if prior is None else prior.pixel_mm
-    starts = _one_stage(lines, given) if stages == "one" else _three_stages(lines, given)
-    found = best_solution(lines, Plane(), starts, probe, outlier_sigma, prior)
-    verdict = None if given is not None or stages == "one" else judge(found)
-    if verdict is None or not verdict.refused:
-        return found, verdict
+def _from_stages(
+    lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | None, stages: Stages
+) -> Solution:
+    """Angles from line directions, then distances, then all; or all at once from several mountings."""
+    pixel_mm = fixed_mm if problem.prior is None else problem.prior.pixel_mm
+
+    def starts(size: FloatArray | None) -> list[Chain]:
+        few = lines.of_some_frames(SOME_FRAMES)
+        directions, ratio = as_directions(few), 1.0 if size is None else float(size[0] / size[1])
+        three = stages == "three"
+        mountings = angle_starts(
+            directions.pixels, directions.turns, ratio, hemisphere(), size is None and three, refine=three
+        )
+        return [_with_distances(few, angles, size) for angles in mountings]
+
+    solution = problem.best(lines, starts(pixel_mm))
+    if pixel_mm is not None or stages == "one" or not solution.adequacy.refused:
+        return solution
     # Free pixels may shrink to nothing on the way where the motion is poor.
-    also = _three_stages(lines, np.full(2, _PIXEL_MM))
-    return best_solution(lines, Plane(), [found.chain, *also], probe, outlier_sigma), None
+    return problem.best(lines, [solution.chain, *starts(np.full(2, _PIXEL_MM))])
 
 
-def _without_prior(
-    lines: ImagePoints, solution: ChainSolution, stages: Stages, outlier_sigma: float
-) -> ChainSolution:
+def _with_distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> Chain:
+    """Second stage: linear distances, for the image or its in-plane mirror, which they tell apart."""
+    mirror = replace(angles, sensor_from_image=in_plane_mirror(angles.sensor_from_image))
+    return min((_distances(lines, either, pixel_mm) for either in (angles, mirror)), key=lambda one: one[1])[
+        0
+    ]
+
+
+def _distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> tuple[Chain, float]:
+    """The chain with these angles, and the median height, mm, at which it leaves the points."""
+    up, turn = angles.normal @ lines.turns, angles.sensor_from_image
+    square = np.array([angles.ratio, 1.0]) if pixel_mm is None else pixel_mm
+    height = np.sum(up * ((lines.pixels * square) @ turn.as_matrix()[:, :2].T), axis=1)
+    unknown, target_mm = [up, np.ones((len(lines), 1))], -lines.shifts_mm @ angles.normal
+    if pixel_mm is None:
+        unknown.append(height[:, None])
+    else:
+        target_mm = target_mm - height
+    fit = robust_linear(np.hstack(unknown), target_mm, partial(huber_weights, limit=0.6745), rounds=4)
+    size = square * (fit.parameters[4] if pixel_mm is None else 1.0)
+    if size[1] < 0:
+        turn, size = in_plane_mirror(turn), -size
+    probe = RigidTransform.from_components(fit.parameters[:3], turn)
+    target = RigidTransform.from_components([0.0, 0.0, fit.parameters[3]], rotation_to_z(angles.normal))
+    return Chain(size, probe, target), float(np.median(np.abs(fit.residuals)))
+
+
+def _without_prior(lines: ImagePoints, solution: Solution, s: PlaneFit) -> Solution:
     """Believe lines that contradict the pixel size given if they determine it by themselves.
 
     Raises
@@ -180,97 +735,24 @@ def _without_prior(
     InsufficientDataError
         If they do not.
     """
-    alone, found_so = _solved(lines, None, None, stages, PROBE, outlier_sigma)
-    verdict = found_so or judge(alone)
-    if not verdict.refused:
+    alone = _from_stages(lines, Problem(Plane(), PROBE, s.outlier_sigma), None, s.stages)
+    if not alone.adequacy.refused:
         return alone
-    if judge(solution).refused or solution.prior is None:
+    if solution.adequacy.refused or solution.prior is None:
         return solution
-    given, found = solution.prior.pixel_mm, solution.chain.pixel_mm
+    stated, fitted = solution.prior.pixel_mm, solution.chain.pixel_mm
     raise InsufficientDataError(
-        f"expected lines that agree with pixels of {given[0]:.4g} x {given[1]:.4g} mm to "
-        f"{100 * solution.prior.error:g} %, got {found[0]:.4g} x {found[1]:.4g} mm with them, and without "
-        f"them {verdict.verdict}"
+        f"expected lines that agree with pixels of {stated[0]:.4g} x {stated[1]:.4g} mm to "
+        f"{100 * solution.prior.error:g} %, got {fitted[0]:.4g} x {fitted[1]:.4g} mm with them, and without "
+        f"them {alone.adequacy.verdict}"
     )
 
 
-def _three_stages(lines: ImagePoints, pixel_mm: FloatArray | None) -> list[Chain]:
-    """The first two stages: angles from some directions, then distances. The caller refines all together."""
-    directions = as_directions(lines.of_some_frames(SOME_FRAMES))
-    found = settled_angles(directions, _ratio(pixel_mm), hemisphere(), fit_ratio=pixel_mm is None)
-    return [_with_distances(lines, angles, pixel_mm) for angles in found[:_TRIED]]
-
-
-def _one_stage(lines: ImagePoints, pixel_mm: FloatArray | None) -> list[Chain]:
-    """Starts of all parameters at once, from several mountings."""
-    few = lines.of_some_frames(SOME_FRAMES)
-    directions = as_directions(few)
-    turns = directions.world_from_sensor.rotation
-    starts = angle_starts(directions.pixels, turns, _ratio(pixel_mm), hemisphere())
-    return [_with_distances(few, start, pixel_mm) for start in starts]
-
-
-def _ratio(pixel_mm: FloatArray | None) -> float:
-    return 1.0 if pixel_mm is None else float(pixel_mm[0] / pixel_mm[1])
-
-
-def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> Chain:
-    """Second stage, for the image and its in-plane mirror, which distances tell apart."""
-    turned = RigidTransform.from_rotation(in_plane_mirror(angles.sensor_from_image.rotation))
-    mirror = replace(angles, sensor_from_image=turned)
-    found = [distance_start(lines, either, pixel_mm) for either in (angles, mirror)]
-    return min(found, key=lambda pair: pair[1])[0]
-
-
-def settled_angles(
-    lines: ImagePoints, ratio: float, normals: FloatArray, fit_ratio: bool = False, level: bool = False
-) -> list[Chain]:
-    """First stage: find the angles that make line directions lie in the plane, robustly.
-
-    Parameters
-    ----------
-    lines : ImagePoints
-        With directions for pixels (`as_directions`).
-
-    Returns
-    -------
-    list of Chain
-        Where iterations end, the one that leaves least first; those that leave more than the best by a
-        factor of `_HOPELESS` are left out.
-    """
-    phantom = LineDirections(np.array([ratio, 1.0]), level)
-    free = ("s_x", *ANGLES, *phantom.determined) if fit_ratio else (*ANGLES, *phantom.determined)
-    starts = angle_starts(lines.pixels, lines.world_from_sensor.rotation, ratio, normals)
-    if not starts:
-        raise InsufficientDataError("expected line directions that are finite, got others")
-    begun = [first_guess(lines, phantom, start, free, rounds=_BEGINNING) for start in starts]
-    # Few starts are left, for most meet on the way.
-    settled = [first_guess(lines, phantom, start, free) for start in _different(lines, phantom, begun)]
-    return _different(lines, phantom, settled, _HOPELESS)
-
-
-def _different(
-    lines: ImagePoints, phantom: Phantom, chains: list[Chain], hopeless: float = np.inf
-) -> list[Chain]:
-    """Those that are not one answer, the one that leaves least first, and none that leaves far more."""
-    left = [float(np.abs(residuals_of(lines, phantom, chain)).mean()) for chain in chains]
-    found: list[Chain] = []
-    for k in np.argsort(left):
-        alike = any(not apart(other, chains[k], lines, phantom) for other in found)
-        if not alike and left[k] <= hopeless * min(left):
-            found.append(chains[k])
-    return found
-
-
-def facing_up(solution: ChainSolution) -> ChainSolution:
+def _facing_up(solution: Solution) -> Solution:
     """The same solution with the plane's normal on the probe's side: heights of images are positive."""
-    target = solution.chain.target_from_world
     heights = solution.chain.target_from_image(solution.points).translation[:, 2]
     if np.median(heights) >= 0:
         return solution
     over = RigidTransform.from_rotation(Rotation.from_euler("x", np.pi))
-    return replace(
-        solution,
-        chain=replace(solution.chain, target_from_world=over * target),
-        residuals=-solution.residuals,
-    )
+    chain = replace(solution.chain, target_from_world=over * solution.chain.target_from_world)
+    return replace(solution, chain=chain, residuals=-solution.residuals)

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.chain import ChainSolution, ImagePoints
-from calibration.solver import OUTLIER_SIGMA, refined, residuals_of
-from calibration.wires import Registration, calibrate_wires
+from calibration.plane import Equations, Solution, least_squares
+from calibration.points import ImagePoints
+from calibration.settings import Registration, WireFit
+from calibration.wires import calibrate_wires
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.wires import WirePhantom
@@ -60,14 +61,13 @@ def calibrate_registered(
     points: ImagePoints,
     geometry: WirePhantom,
     pixel_mm: FloatArray | None = None,
-    fit_pixels: bool = True,
-    outlier_sigma: float = OUTLIER_SIGMA,
-) -> tuple[ChainSolution, Choice]:
+    settings: WireFit | None = None,
+) -> tuple[Solution, Choice]:
     """Calibrate with wires whose place in the world is stated, believing as much of it as is right.
 
     Parameters
     ----------
-    points, geometry, pixel_mm, fit_pixels, outlier_sigma
+    points, geometry, pixel_mm, settings
         See `calibrate_wires`.
 
     Raises
@@ -75,11 +75,11 @@ def calibrate_registered(
     InsufficientDataError
         If no registration gives a calibration; see `calibrate_wires`.
     """
-    whole: dict[Registration, ChainSolution] = {}
+    whole: dict[Registration, Solution] = {}
     refusals = []
     for name in REGISTRATIONS:
         try:
-            whole[name] = calibrate_wires(points, geometry, pixel_mm, fit_pixels, name, outlier_sigma)
+            whole[name] = calibrate_wires(points, geometry, pixel_mm, settings, name)
         except InsufficientDataError as error:
             refusals.append(error)
     if not whole:
@@ -112,10 +112,12 @@ def _blocks(points: ImagePoints) -> list[BoolArray]:
     return [np.isin(points.frame, frames) for frames in np.array_split(points.frames, FOLDS)]
 
 
-def _missed_mm(solution: ChainSolution, blocks: list[BoolArray]) -> FloatArray:
+def _missed_mm(solution: Solution, blocks: list[BoolArray]) -> FloatArray:
     """Mean distance of the dots of each block from their wires, by the other blocks' calibration."""
     points, phantom, missed = solution.points, solution.phantom, []
     for out in blocks:
-        chain = refined(points[solution.used & ~out], phantom, solution.chain, solution.free)
-        missed.append(float(np.linalg.norm(residuals_of(points[out], phantom, chain), axis=1).mean()))
+        kept = Equations.of(points[solution.used & ~out], phantom)
+        chain = least_squares(kept, solution.chain, solution.free)
+        left = Equations.of(points[out], phantom).residuals(chain)
+        missed.append(float(np.linalg.norm(left, axis=1).mean()))
     return np.array(missed)

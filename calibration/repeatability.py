@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.chain import ChainSolution, ImagePoints, as_directions, residuals_and_jacobian
-from calibration.solver import solve_chain
+from calibration.plane import Equations, Problem, Solution
+from calibration.points import ImagePoints, as_directions
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -97,7 +97,7 @@ def _centre_and_corners(calibration: Calibration, size_px: tuple[int, int]) -> F
     return np.asarray((flat @ calibration.pixel_matrix().T)[:, :3])
 
 
-def validate(solution: ChainSolution, points: ImagePoints) -> FloatArray:
+def validate(solution: Solution, points: ImagePoints) -> FloatArray:
     """Hold a calibration and see how well it explains another recording.
 
     The plane's position is estimated anew, for it may be another plane, unless it is level; wires are held
@@ -121,5 +121,5 @@ def validate(solution: ChainSolution, points: ImagePoints) -> FloatArray:
     chain, phantom = solution.chain, solution.phantom
     points = as_directions(points) if solution.angular else points
     if phantom.seen_as != "dot" and phantom.determined:
-        return solve_chain(points, phantom, chain, probe=(), outlier_sigma=np.inf).residuals
-    return residuals_and_jacobian(chain.parameters(), points, phantom)[0]
+        return Problem(phantom, (), np.inf).solve(points, chain).residuals
+    return Equations.of(points, phantom).residuals(chain)

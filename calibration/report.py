@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.chain import SCALES, ChainSolution, free_jacobian
-from calibration.identifiability import judge
-from calibration.near import near_jacobian
+from calibration.plane import Solution
+from calibration.points import ANGLES, CHAIN, SCALES
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
-from speckle3d.core.geometry import roll_yaw_tilt
+from speckle3d.core.geometry import roll_yaw_tilt, skew
 from speckle3d.core.tables import text_rows
 
 USED, DROPPED = "#0072B2", "#D55E00"
@@ -26,6 +26,9 @@ USED, DROPPED = "#0072B2", "#D55E00"
 
 IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
 """Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
+
+ANGLES_IN_WORDS = ("roll (alpha)", "yaw (beta)", "tilt (gamma)")
+"""About the image's z, y and x axes."""
 
 _LONGEST_REASONS = 6
 _MOST_NAMED = 20
@@ -55,7 +58,7 @@ class Shot:
 
 
 def as_calibration(
-    solution: ChainSolution, method: str, frames: FramesUsed, time_offset_s: float | None = None
+    solution: Solution, method: str, frames: FramesUsed, time_offset_s: float | None = None
 ) -> Calibration:
     """Bring a solution into the form that is saved, with standard errors of the published parameters.
 
@@ -80,20 +83,25 @@ def as_calibration(
         condition_number=solution.condition_number,
         frames=_frames_used(solution, frames),
         time_offset_s=time_offset_s,
-        verdict=judge(solution).verdict,
+        verdict=solution.adequacy.verdict,
     )
 
 
-def _parameters(solution: ChainSolution) -> tuple[Parameter, ...]:
-    """The parameters estimated, in the sensor's and the world's own frames."""
-    values, used = solution.chain.parameters(), solution.points_used
-    own = free_jacobian(used, solution.phantom, solution.chain, solution.free)
-    _, near = near_jacobian(used, solution.phantom, solution.chain, solution.free)
-    own_from_near = np.linalg.lstsq(own, near, rcond=None)[0]
-    errors = np.sqrt(np.diag(own_from_near @ solution.covariance @ own_from_near.T))
+def _parameters(solution: Solution) -> tuple[Parameter, ...]:
+    """The parameters estimated: places in the sensor's frame and the phantom's, angles about own axes.
+
+    An angle's error is that about the image's z, y and x axes (roll, yaw, tilt), or about the phantom's:
+    near a singularity of fixed angles it is as large as ever.
+    """
+    values = dict(zip(CHAIN, solution.chain.parameters(), strict=True))
+    turn = np.eye(len(CHAIN))
+    turn[2:5, 2:5] = solution.chain.sensor_from_image.rotation.as_matrix()
+    # Angles are in the order z, y, x; the world's origin moves as the phantom turns.
+    turn[8:11, 13:10:-1] = -skew(np.asarray(solution.chain.target_from_world.translation)[None])[0]
+    covariance = turn @ solution.full_covariance @ turn.T
+    errors = dict(zip(CHAIN, np.sqrt(np.diag(covariance)), strict=True))
     return tuple(
-        Parameter(name, float(values[column]), float(error), _unit(name))
-        for name, column, error in zip(solution.free, solution.free_columns, errors, strict=True)
+        Parameter(name, float(values[name]), float(errors[name]), _unit(name)) for name in solution.free
     )
 
 
@@ -103,7 +111,7 @@ def _unit(name: str) -> str:
     return "mm" if name[0] in "xyz" else "rad"
 
 
-def _frames_used(solution: ChainSolution, frames: FramesUsed) -> FramesUsed:
+def _frames_used(solution: Solution, frames: FramesUsed) -> FramesUsed:
     """Add the frames that contradict the others, with their residuals."""
     dropped = dict(frames.dropped)
     for number in np.unique(solution.points.frame[~solution.used]):
@@ -116,13 +124,12 @@ def _frames_used(solution: ChainSolution, frames: FramesUsed) -> FramesUsed:
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
     """What was found as description, value and unit, angles in degrees."""
     rows = [("method", calibration.method, ""), ("sensor", calibration.sensor, "")]
-    rows += [parameter.row() for parameter in calibration.parameters]
-    names = ("roll", "yaw", "tilt")
+    rows += [one.row() for one in calibration.parameters if one.name not in ANGLES]
     angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
     errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
     rows += [
-        (f"sensor_from_image, {name}", f"{angle:.3f} +- {error:.3f}", "deg")
-        for name, angle, error in zip(names, angles, errors, strict=True)
+        (name, f"{angle:.3f} +- {error:.3f}", "deg")
+        for name, angle, error in zip(ANGLES_IN_WORDS, angles, errors, strict=True)
     ]
     used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
     rows += [
@@ -196,7 +203,7 @@ def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict
     }
 
 
-def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
+def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[Shot]) -> Figure:
     """One page: images with what was found in them, residuals, and the motion."""
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
@@ -205,14 +212,12 @@ def figure_report(solution: ChainSolution, calibration: Calibration, shots: Sequ
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
     for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
         _draw_shot(axes, shot, aspect)
-    if len(shots) < panels.shape[1]:
-        _explain(panels[0, -1], calibration)
     _draw_residuals(panels[1, 0], solution)
     _draw_against_tilt(panels[1, 1], solution)
     _draw_motion(panels[1, 2], solution)
     for axes in panels[1]:
         axes.grid(alpha=0.3)
-    figure.suptitle(calibration.verdict, fontsize=10)
+    figure.suptitle(fill(calibration.verdict, 150), fontsize=9)
     figure.supxlabel(_colours(shots), fontsize=8)
     return figure
 
@@ -247,13 +252,7 @@ def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
     axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
 
 
-def _explain(axes: Axes, calibration: Calibration) -> None:
-    """Say in a panel without an image what was found."""
-    told = [f"{name}: {value} {unit}" for name, value, unit in (p.row() for p in calibration.parameters)]
-    axes.text(0.0, 1.0, "\n".join(told), va="top", fontsize=8, transform=axes.transAxes, parse_math=False)
-
-
-def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
+def _draw_residuals(axes: Axes, solution: Solution) -> None:
     values, unit = _shown(solution)
     used = solution.used
     axes.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
@@ -267,7 +266,7 @@ def _draw_residuals(axes: Axes, solution: ChainSolution) -> None:
     )
 
 
-def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
+def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
     """Residuals against tilt, where a thick beam shows as a V."""
     values, unit = _shown(solution)
     turns = _turns_deg(solution)
@@ -276,21 +275,23 @@ def _draw_against_tilt(axes: Axes, solution: ChainSolution) -> None:
     axes.set(xlabel="tilt / deg", ylabel=f"largest residual / {unit}", title="and by tilt")
 
 
-def _draw_motion(axes: Axes, solution: ChainSolution) -> None:
+def _draw_motion(axes: Axes, solution: Solution) -> None:
     turns = _turns_deg(solution)[solution.used]
     drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
-    axes.set(xlabel="tilt / deg", ylabel="roll / deg", title="how the probe was turned")
+    title = "\n".join(["how the probe was turned", *filter(None, [solution.assumed])])
+    axes.set(xlabel="tilt / deg", ylabel="roll / deg")
+    axes.set_title(title, fontsize=9)
 
 
-def _shown(solution: ChainSolution) -> tuple[FloatArray, str]:
+def _shown(solution: Solution) -> tuple[FloatArray, str]:
     """The largest residual of each point, with its sign, and its unit."""
     worst = np.abs(solution.residuals).argmax(axis=1)
     values = solution.residuals[np.arange(len(worst)), worst]
     return (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
 
 
-def _turns_deg(solution: ChainSolution) -> FloatArray:
+def _turns_deg(solution: Solution) -> FloatArray:
     """Tilt, yaw and roll of every point's image about the mean orientation, shape (n, 3)."""
     turns = solution.chain.target_from_image(solution.points).rotation
     return np.asarray(np.rad2deg((turns.mean().inv() * turns).as_rotvec()))

@@ -1,44 +1,51 @@
-"""Where iterations start: closed-form estimates of the whole chain that need no guess.
+"""First stage of a plane's calibration: angles from line directions, whatever the mounting.
 
-For a plane, mountings are tried all over against the directions of its lines; the distances are then linear.
-For wires, every dot gives equations that are linear in the image's origin and its two axes, of any lengths
-and at any angle: in the phantom's frame for one image (`free_fits`, `rigid_fits`, many hypotheses at once),
-in the sensor's frame for all images of a recording (`wire_start`).
+A line of the plane lies in it, wherever the plane is: the plane's normal is square to the line's direction
+(TR 303, appendix A). Mountings are tried all over, and the best of them are refined side by side.
 
 References
 ----------
-.. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, appendix A (the stages; they are iterative there).
+.. [1] R. W. Prager et al., "Automatic calibration for 3-D free-hand ultrasound", CUED/F-INFENG/TR 303, 1997.
+.. [2] M. Alexa, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)", CVPR, 2022.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
-from calibration.chain import Chain, ImagePoints
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.geometry import nearest_rotation, skew
-from speckle3d.core.leastsquares import RobustFit, huber_weights, robust_linear
-from speckle3d.core.wires import WirePhantom
 
-_NORMALS = 30
-_ROTATIONS = 800
+_NORMALS, _ROTATIONS = 30, 800
 """About 26 and 30 degrees apart: refinement converges from further away."""
+_REFINED, _KEPT = 12, 3
+_ROUNDS = 20
+_HOPELESS = 3.0
+"""Ends whose mean absolute residual is as many times the least are not looked at again."""
+_SAME_RAD = np.deg2rad(5.0)
+_DAMPING = 1e-3
+_TINY = 1e-12
 
-NEARLY_ABSOLUTE = partial(huber_weights, limit=0.6745)
-"""Least absolute values for residuals above the median, 0.6745 standard deviations."""
-_REWEIGHTINGS = 4
 
-_RIDGE_MM2 = 1e-3
-"""Holds axes that the wires leave open near zero; a dot 10 mm off the centre weighs 100 mm^2."""
-_STEPS = 10
-_DAMPING = 1e-4
-_DOT_MM = 0.3
-"""How far a dot is from its wire, typically: what the pixel size's uncertainty is weighed against."""
+@dataclass(frozen=True)
+class Angles:
+    """A mounting and a plane, without distances.
+
+    Attributes
+    ----------
+    ratio : float
+        Column pitch over row spacing.
+    sensor_from_image : Rotation
+    normal : ndarray, shape (3,)
+        Of the plane, in the world.
+    """
+
+    ratio: float
+    sensor_from_image: Rotation
+    normal: FloatArray
 
 
 def hemisphere() -> FloatArray:
@@ -51,54 +58,12 @@ def hemisphere() -> FloatArray:
 
 
 def rotations_all_over() -> Rotation:
-    """Rotations spread evenly over the whole rotation group.
-
-    References
-    ----------
-    .. [1] M. Alexa, "Super-Fibonacci spirals: fast, low-discrepancy sampling of SO(3)", CVPR, 2022.
-    """
+    """Rotations spread evenly over the whole rotation group, [2]_."""
     s = np.arange(_ROTATIONS) + 0.5
-    t = s / _ROTATIONS
     first, second = 2 * np.pi * s / np.sqrt(2.0), 2 * np.pi * s / 1.533751168755204288118041
-    inner, outer = np.sqrt(t), np.sqrt(1.0 - t)
+    inner, outer = np.sqrt(s / _ROTATIONS), np.sqrt(1.0 - s / _ROTATIONS)
     parts = (inner * np.sin(first), inner * np.cos(first), outer * np.sin(second), outer * np.cos(second))
     return Rotation.from_quat(np.column_stack(parts))
-
-
-def angle_starts(
-    directions_px: FloatArray, world_from_sensor: Rotation, ratio: float, normals: FloatArray, keep: int = 12
-) -> list[Chain]:
-    """Try mountings of the sensor and normals of the plane all over, and keep the best; no distances.
-
-    Parameters
-    ----------
-    directions_px : ndarray, shape (m, 2)
-        Columns and rows from one end of each line to the other.
-    world_from_sensor : Rotation, length m
-    ratio : float
-        Column pitch over row spacing.
-        The chains have it as their pixel size, with a row spacing of one.
-    normals : ndarray, shape (k, 3)
-    """
-    length = directions_px * [ratio, 1.0]
-    flat = length / np.linalg.norm(length, axis=1, keepdims=True)
-    up = np.einsum("ki,nij->knj", normals, world_from_sensor.as_matrix())
-    tried = rotations_all_over()
-    # Half a turn about z leaves the directions of lines as they are.
-    tried = tried[tried.as_matrix()[:, 0, 0] >= 0]
-    axes = tried.as_matrix()[:, :, :2]
-    # Mean absolute sine of the angle between line and plane: wrong lines pull little.
-    sines = np.einsum("kni,jia,na->jkn", up, axes, flat, optimize=True)
-    costs = np.abs(sines).mean(axis=2)
-    best = np.argsort(costs, axis=None)[:keep]
-    return [
-        Chain(
-            np.array([ratio, 1.0]),
-            RigidTransform.from_rotation(tried[int(j)]),
-            RigidTransform.from_rotation(rotation_to_z(normals[k])),
-        )
-        for j, k in zip(*np.unravel_index(best, costs.shape), strict=True)
-    ]
 
 
 def in_plane_mirror(rotation: Rotation) -> Rotation:
@@ -111,197 +76,112 @@ def rotation_to_z(normal: FloatArray) -> Rotation:
     return Rotation.align_vectors([[0.0, 0.0, 1.0]], [normal])[0]
 
 
-def distance_start(points: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> tuple[Chain, float]:
-    """Find the distances that belong to given angles, by linear least squares.
+def angle_starts(
+    directions_px: FloatArray,
+    turns: FloatArray,
+    ratio: float,
+    normals: FloatArray,
+    fit_ratio: bool = False,
+    level: bool = False,
+    refine: bool = True,
+) -> list[Angles]:
+    """Find the angles that make line directions lie in a plane, robustly; the best first.
 
     Parameters
     ----------
-    pixel_mm : ndarray, shape (2,), optional
-        Column pitch and row spacing; estimated without it, from the ratio of those in `angles`.
-
-    Returns
-    -------
-    chain : Chain
-    cost : float
-        Median absolute height of the points above the plane, mm.
-    """
-    turned = angles.sensor_from_image.rotation
-    normal = angles.target_from_world.rotation.as_matrix()[2]
-    up = normal @ points.turns
-    square = angles.pixel_mm / angles.pixel_mm[1] if pixel_mm is None else pixel_mm
-    image = (points.pixels * square) @ turned.as_matrix()[:, :2].T
-    height = np.einsum("ni,ni->n", up, image)
-    one = np.ones((len(points), 1))
-    unknown = np.concatenate([up, one] if pixel_mm is not None else [up, one, height[:, None]], axis=1)
-    wanted = -points.shifts_mm @ normal - (height if pixel_mm is not None else 0.0)
-    fit = robust_linear(unknown, wanted, NEARLY_ABSOLUTE, _REWEIGHTINGS)
-    found = fit.parameters
-    size = square * (1.0 if pixel_mm is not None else found[4])
-    if size[1] < 0:
-        turned, size = in_plane_mirror(turned), -size
-    chain = Chain(
-        size,
-        RigidTransform.from_components(found[:3], turned),
-        RigidTransform.from_components([0.0, 0.0, found[3]], rotation_to_z(normal)),
-    )
-    return chain, float(np.median(np.abs(fit.residuals)))
-
-
-def wire_start(
-    points: ImagePoints,
-    equations: tuple[FloatArray, FloatArray],
-    target_from_world: RigidTransform | Rotation,
-    weights: Callable[[FloatArray], FloatArray] = NEARLY_ABSOLUTE,
-    rounds: int = _REWEIGHTINGS,
-    least_singular: float | None = None,
-) -> tuple[Chain, RobustFit]:
-    """Find the image among wires from all frames of a recording, by robust linear least squares.
-
-    The axes come out free of the constraint that they be square; the chain has the nearest that are.
-
-    Parameters
-    ----------
-    equations : (rows, offsets), shapes (n, r, 3) and (n, r)
-        ``rows @ position = offsets`` in the phantom's frame, as from `Phantom.vanishing`; those of one point
-        get one weight.
-    target_from_world : RigidTransform or Rotation
-        If a rotation, the translation is found too.
-    weights, rounds
-        See `robust_linear`.
-    least_singular : float, optional
-        Ratio of singular values below which the answer counts as not determined.
-
-    Returns
-    -------
-    chain : Chain
-    fit : RobustFit
-        Residuals of shape (n, r), mm, before the axes are squared.
+    directions_px : ndarray, shape (m, 2)
+        Columns and rows from one end of each line to the other.
+    turns : ndarray, shape (m, 3, 3)
+        ``world_from_sensor``, rotation matrices.
+    ratio : float
+        Column pitch over row spacing, to begin with where it is fitted too.
+    normals : ndarray, shape (k, 3)
+        Of the plane, tried first.
+    level : bool
+        The normal stays what it is.
+    refine : bool
+        Without it, the best of those tried are returned as they are.
 
     Raises
     ------
     InsufficientDataError
-        If the points do not determine the answer, judged by `least_singular`; without it, the smallest
-        parameters that explain the points are returned.
+        If directions are not finite.
     """
-    rows, offsets = equations
-    shifted = isinstance(target_from_world, Rotation)
-    known = (
-        RigidTransform.from_rotation(target_from_world)
-        if isinstance(target_from_world, Rotation)
-        else target_from_world
-    )
-    # Pixels are centred and scaled, for a well-conditioned matrix.
-    centre, spread = points.pixels.mean(axis=0), float(points.pixels.std()) or 1.0
-    matrix = _affine_equations(
-        (points.pixels - centre) / spread, rows @ known.rotation.as_matrix() @ points.turns
-    )
-    if shifted:
-        matrix = np.concatenate([matrix, rows], axis=2)
-    wanted = offsets - np.einsum("nri,ni->nr", rows, known.apply(points.shifts_mm))
-    fit = robust_linear(matrix, wanted, weights, rounds, least_singular)
-    if least_singular is not None and fit.rank < fit.parameters.size:
-        raise InsufficientDataError("the dots do not determine where the image is: too few wires or poses")
-    axes = fit.parameters[3:9].reshape(2, 3) / spread
-    size = np.linalg.norm(axes, axis=1)
-    turn = Rotation.from_matrix(nearest_rotation((axes / size[:, None]).T))
-    probe = RigidTransform.from_components(fit.parameters[:3] - centre @ axes, turn)
-    shift = RigidTransform.from_translation(fit.parameters[9:] if shifted else np.zeros(3))
-    return Chain(size, probe, shift * known), fit
+    if not np.isfinite(directions_px).all():
+        raise InsufficientDataError("expected line directions that are finite, got others")
+    length = np.linalg.norm(directions_px * [ratio, 1.0], axis=1)
+    unit = directions_px / length[:, None]  # of length one once the columns are scaled
+    tried = rotations_all_over()
+    # Half a turn about z leaves the directions of lines as they are.
+    tried = tried[tried.as_matrix()[:, 0, 0] >= 0]
+    up = np.einsum("ki,nij->knj", normals, turns)
+    sines = np.einsum("kni,jia,na->jkn", up, tried.as_matrix()[:, :, :2], unit * [ratio, 1.0], optimize=True)
+    costs = np.abs(sines).mean(axis=2)
+    mounting, plane = np.unravel_index(np.argsort(costs, axis=None)[:_REFINED], costs.shape)
+    probe, normal = tried[mounting].as_matrix(), normals[plane].astype(float)
+    ratios = np.full(len(probe), ratio)
+    if not refine:
+        return [Angles(ratio, tried[int(m)], normals[p]) for m, p in zip(mounting, plane, strict=True)]
+    for _ in range(_ROUNDS):
+        _step(unit, turns, ratios, probe, normal, fit_ratio, level)
+    left = np.abs(_sines(unit, turns, ratios, probe, normal)[0]).mean(axis=1)
+    return _distinct(left, ratios, probe, normal)
 
 
-def free_fits(
-    positions_mm: FloatArray, wires: IntArray, phantom: WirePhantom
-) -> tuple[FloatArray, FloatArray]:
-    """Fit origins and axes of images to dots on wires, the axes not constrained to be square.
-
-    Parameters
-    ----------
-    positions_mm : ndarray, shape (b, m, 2)
-        Dots in each image, relative to any point of it.
-    wires : ndarray of int, shape (b, m)
-
-    Returns
-    -------
-    affine : ndarray, shape (b, 3, 3)
-        Origin, x axis and y axis in the phantom's frame, as rows.
-    rms_mm : ndarray, shape (b,)
-        Of the components of the dots' distances from their wires.
-    """
-    rows, offsets = phantom.equations(wires)
-    b, m = wires.shape
-    matrix = _affine_equations(positions_mm, rows).reshape(b, 2 * m, 9)
-    wanted = offsets.reshape(b, 2 * m)
-    normal = np.swapaxes(matrix, 1, 2) @ matrix + _RIDGE_MM2 * np.eye(9)
-    found = np.linalg.solve(normal, np.swapaxes(matrix, 1, 2) @ wanted[..., None])
-    misfit = (matrix @ found)[..., 0] - wanted
-    return np.asarray(found.reshape(b, 3, 3)), np.sqrt(np.mean(misfit**2, axis=1))
+def _sines(
+    unit: FloatArray, turns: FloatArray, ratios: FloatArray, probe: FloatArray, normal: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sines between lines and plane, (k, m), the normal in the image, (k, m, 3), and the lines in it."""
+    seen = np.einsum("ki,nij->knj", normal, turns) @ probe
+    along = unit * np.stack([ratios, np.ones_like(ratios)], axis=1)[:, None]
+    return np.sum(seen[..., :2] * along, axis=2), seen, along
 
 
-def rigid_fits(
-    positions_mm: FloatArray, wires: IntArray, phantom: WirePhantom, scale_tolerance: float
-) -> tuple[RigidTransform, FloatArray, FloatArray]:
-    """Fit poses of images whose pixel size is known to `scale_tolerance`, as a standard deviation.
-
-    Parameters
-    ----------
-    positions_mm, wires
-        See `free_fits`; positions count from the image's origin.
-
-    Returns
-    -------
-    phantom_from_image : RigidTransform, length b
-        Of images whose pixel size is as found.
-    scale : ndarray, shape (b, 2)
-        Found pixel size over the one given.
-    rms_mm : ndarray, shape (b,)
-        Of the components of the dots' distances from their wires.
-    """
-    centre = positions_mm.mean(axis=1)
-    seen = positions_mm - centre[:, None]
-    affine, _ = free_fits(seen, wires, phantom)
-    rows, offsets = phantom.equations(wires)
-    origin, turn = affine[:, 0], nearest_rotation(np.swapaxes(affine[:, 1:], 1, 2))
-    log_scale = np.zeros((len(seen), 2))
-    prior = _DOT_MM / scale_tolerance
-    for _ in range(_STEPS):
-        residual, jacobian = _linearised(seen * np.exp(log_scale)[:, None], origin, turn, rows, offsets)
-        normal = np.swapaxes(jacobian, 1, 2) @ jacobian + np.diag([_DAMPING] * 6 + [prior**2] * 2)
-        pull = (np.swapaxes(jacobian, 1, 2) @ residual[..., None])[..., 0]
-        pull[:, 6:] += prior**2 * log_scale
-        step = -np.linalg.solve(normal, pull[..., None])[..., 0]
-        turn = Rotation.from_rotvec(step[:, :3]).as_matrix() @ turn
-        origin = origin + step[:, 3:6]
-        log_scale = np.clip(log_scale + step[:, 6:], -0.5, 0.5)
-    residual, _ = _linearised(seen * np.exp(log_scale)[:, None], origin, turn, rows, offsets)
-    scale = np.exp(log_scale)
-    corner = origin - np.einsum("bij,bj->bi", turn[:, :, :2], centre * scale)
-    pose = RigidTransform.from_components(corner, Rotation.from_matrix(turn))
-    return pose, scale, np.sqrt(np.mean(residual**2, axis=1))
+def _step(
+    unit: FloatArray,
+    turns: FloatArray,
+    ratios: FloatArray,
+    probe: FloatArray,
+    normal: FloatArray,
+    fit_ratio: bool,
+    level: bool,
+) -> None:
+    """One step of least absolute sines, by reweighting, from each start; in place."""
+    sines, seen, along = _sines(unit, turns, ratios, probe, normal)
+    (x, y), (a, b, c) = np.moveaxis(along, 2, 0), np.moveaxis(seen, 2, 0)
+    columns = [y * c, -x * c, x * b - y * a]
+    _, _, axes = np.linalg.svd(normal[:, None])
+    tangents = axes[:, 1:]
+    if not level:
+        world = np.einsum("nij,kja,kna->kni", turns, probe[:, :, :2], along)
+        columns += list(np.einsum("kni,kti->tkn", world, tangents))
+    if fit_ratio:
+        columns.append(a * x)
+    matrix = np.stack(columns, axis=2)
+    size = np.abs(sines)
+    weight = 1.0 / np.maximum(size, 0.1 * np.median(size, axis=1, keepdims=True) + _TINY)
+    weighted = matrix * weight[..., None]
+    system = np.swapaxes(weighted, 1, 2) @ matrix
+    lift = _DAMPING * np.einsum("kii->ki", system) + _TINY
+    system += lift[:, :, None] * np.eye(len(columns))
+    step = -np.linalg.solve(system, np.einsum("knp,kn->kp", weighted, sines)[..., None])[..., 0]
+    step = np.clip(step, -0.5, 0.5)
+    probe[:] = probe @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    if not level:
+        normal += np.einsum("kt,kti->ki", step[:, 3:5], tangents)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    if fit_ratio:
+        ratios *= np.exp(step[:, -1])
 
 
-def _affine_equations(places: FloatArray, rows: FloatArray) -> FloatArray:
-    """Equations of points of an image in its origin and two axes, shape (..., r, 9).
-
-    Parameters
-    ----------
-    places : ndarray, shape (..., 2)
-        In the image.
-    rows : ndarray, shape (..., r, 3)
-        Of each point's equations for its position.
-    """
-    lifted = np.concatenate([np.ones((*places.shape[:-1], 1)), places], axis=-1)
-    return np.asarray(np.einsum("...k,...ri->...rki", lifted, rows).reshape(*rows.shape[:-1], 9))
-
-
-def _linearised(
-    seen_mm: FloatArray, origin: FloatArray, turn: FloatArray, rows: FloatArray, offsets: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Residuals, shape (b, 2m), and derivatives by a small turn, a shift and two logarithms of scale."""
-    b, m = seen_mm.shape[:2]
-    parts = seen_mm[..., None] * np.swapaxes(turn[:, :, :2], 1, 2)[:, None]
-    arm = parts.sum(axis=2)
-    residual = np.einsum("bmri,bmi->bmr", rows, arm + origin[:, None]) - offsets
-    turned = np.einsum("bmri,bmij->bmrj", rows, -skew(arm))
-    scaled = np.einsum("bmri,bmki->bmrk", rows, parts)
-    jacobian = np.concatenate([turned, rows, scaled], axis=3)
-    return residual.reshape(b, 2 * m), jacobian.reshape(b, 2 * m, 8)
+def _distinct(left: FloatArray, ratios: FloatArray, probe: FloatArray, normal: FloatArray) -> list[Angles]:
+    """Ends that are not one answer, the one that leaves least first, and none that leaves far more."""
+    turns, kept = Rotation.from_matrix(probe), list[int]()
+    for k in np.argsort(left):
+        away = [
+            min(step.magnitude(), in_plane_mirror(step).magnitude())
+            for step in (turns[j].inv() * turns[int(k)] for j in kept)
+        ]
+        if left[k] <= _HOPELESS * left.min() + _TINY and all(one > _SAME_RAD for one in away):
+            kept.append(int(k))
+    return [Angles(float(ratios[k]), turns[k], normal[k]) for k in kept[:_KEPT]]

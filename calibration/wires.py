@@ -9,29 +9,30 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
 
 import numpy as np
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.alternatives import best_solution
-from calibration.chain import POSE, TARGET, Chain, ChainSolution, ImagePoints, SeenAs, residuals_and_jacobian
 from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
-from calibration.identifiability import require_adequate
-from calibration.near import near_jacobian
-from calibration.solver import OUTLIER_SIGMA, SOME_FRAMES, probe_parameters, solve_chain
-from calibration.starts import rotations_all_over, wire_start
-from speckle3d.core.arrays import BoolArray, FloatArray
+from calibration.motion import require_adequate
+from calibration.plane import Chain, Equations, Problem, Solution, probe_parameters
+from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs
+from calibration.settings import Registration, WireFit
+from calibration.starts import rotations_all_over
+from calibration.wire_fits import affine_equations
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import nearest_rotation
+from speckle3d.core.leastsquares import RobustFit, huber_weights, robust_linear
 from speckle3d.core.wires import WirePhantom
 
-Registration = Literal["held", "turned", "free"]
-
 _ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "free": TARGET}
-BESIDE_MM = 0.1
-"""A crossing is bright within tenths of a millimetre of the middle of the beam, where a hand keeps it."""
+NEARLY_ABSOLUTE = partial(huber_weights, limit=0.6745)
+"""Least absolute values for residuals above the median, 0.6745 standard deviations."""
 
 _FEWEST_FRAMES = 6
 _STARTS = 6
@@ -44,7 +45,6 @@ class CrossWire:
 
     determined: tuple[str, ...] = TARGET[:3]
     seen_as: SeenAs = "dot"
-    kept_in_plane: bool = True
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the crossing."""
@@ -66,7 +66,6 @@ class Wires:
     geometry: WirePhantom
     determined: tuple[str, ...] = TARGET
     seen_as: SeenAs = "dot"
-    kept_in_plane: bool = False
 
     def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
         """Displacement from the wire, along two directions across it."""
@@ -76,12 +75,8 @@ class Wires:
 
 
 def calibrate_cross_wire(
-    points: ImagePoints,
-    pixel_mm: FloatArray | None = None,
-    fit_pixels: bool = True,
-    outlier_sigma: float = OUTLIER_SIGMA,
-    beside_mm: float = BESIDE_MM,
-) -> ChainSolution:
+    points: ImagePoints, pixel_mm: FloatArray | None = None, settings: WireFit | None = None
+) -> Solution:
     """Calibrate a 6-DOF sensor from images of two crossing wires, or of a bead.
 
     Parameters
@@ -90,12 +85,7 @@ def calibrate_cross_wire(
         The crossing in each frame, or several candidates for it, frames ascending and the likeliest first.
         Frames none of whose candidates agrees with the others are not used; they may be most.
     pixel_mm : ndarray, shape (2,), optional
-        Column pitch and row spacing; needed unless they are fitted.
-    fit_pixels : bool
-        Eleven parameters, else nine.
-    beside_mm : float
-        Root mean square distance by which the hand misses the crossing, out of plane; claimed errors allow
-        for it.
+        Column pitch and row spacing; needed if they are fixed.
 
     Raises
     ------
@@ -103,33 +93,36 @@ def calibrate_cross_wire(
         If there are too few points, no more of them agree than chance candidates would, or the motion does
         not determine the answer.
     """
+    s = settings or WireFit()
     _require_frames(points)
-    probe, held = probe_parameters(fit_pixels, pixel_mm)
+    probe, held = probe_parameters(s.fixed_pixels, pixel_mm)
+    problem = Problem(CrossWire(), probe, s.outlier_sigma)
     found = find_consensus(points, pixel_mm)
     if not found.believed and len(points) == len(points.frames):
         # Poor motion, too, can leave no consensus; then that is said.
         start, _ = wire_start(points, CrossWire().vanishing(points), Rotation.identity())
-        require_adequate(best_solution(points, CrossWire(), [_sized(start, held)], probe, outlier_sigma))
+        require_adequate(problem.best(points, [_sized(start, held)]))
     found.require()
     agreeing = points[found.nearest[found.agreed]]
-    first = solve_chain(agreeing, CrossWire(), _sized(found.chain, held), probe, outlier_sigma)
+    first = problem.solve(agreeing, _sized(squared(*found.affine), held))
     # The rigid chain, from all that agree, tells candidates better than the sample did.
     nearest, away = nearest_candidates(points, *_image_and_point(first.chain))
     near, chosen = away <= GATES_MM[-1], points[nearest]
-    solution = best_solution(chosen[near], CrossWire(), [first.chain], probe, outlier_sigma)
-    solution = _beside(solution, beside_mm)
-    return require_adequate(_with_contradicting(solution, chosen, near))
+    solution = _beside(problem.best(chosen[near], [first.chain]), s.beside_mm)
+    used = near.copy()
+    used[near] = solution.used
+    residuals = Equations.of(chosen, CrossWire()).residuals(solution.chain)
+    return require_adequate(replace(solution, points=chosen, used=used, residuals=residuals))
 
 
-def _beside(solution: ChainSolution, beside_mm: float) -> ChainSolution:
+def _beside(solution: Solution, beside_mm: float) -> Solution:
     """Allow for a hand that misses the point by `beside_mm`, at the pace at which it turns the probe.
 
     So slow an error the fit takes for tilt and yaw, and residuals tell nothing of it: its size is assumed,
     its autocorrelation is that of the motions that it is taken for.
     """
-    points, phantom, chain, free = solution.points_used, solution.phantom, solution.chain, solution.free
-    _, jacobian = near_jacobian(points, phantom, chain, free)
-    out_of_plane = chain.target_from_image(points).rotation.as_matrix()[:, :, 2]
+    points, free, jacobian = solution.points_used, solution.free, solution.jacobian
+    out_of_plane = solution.chain.target_from_image(points).rotation.as_matrix()[:, :, 2]
     pull = np.einsum("nip,ni->pn", jacobian.reshape(len(points), 3, -1), out_of_plane)
     moved = np.linalg.pinv(jacobian.T @ jacobian, hermitian=True) @ pull
     posed = moved[[free.index(name) for name in POSE]]
@@ -145,22 +138,21 @@ def _image_and_point(chain: Chain) -> tuple[FloatArray, FloatArray]:
     return np.vstack([pose.translation, axes]), np.asarray(chain.target_from_world.inv().translation)
 
 
-def _with_contradicting(solution: ChainSolution, points: ImagePoints, held: BoolArray) -> ChainSolution:
-    """The solution from `points[held]` with the residuals of the others, which are not used."""
-    used = held.copy()
-    used[held] = solution.used
-    residuals, _ = residuals_and_jacobian(solution.chain.parameters(), points, solution.phantom)
-    return replace(solution, points=points, used=used, residuals=residuals)
+def squared(image: FloatArray, point_mm: FloatArray) -> Chain:
+    """The chain whose axes are square and nearest to an image's origin and axes, shape (3, 3)."""
+    size = np.maximum(np.linalg.norm(image[1:], axis=1), 1e-6)
+    turn = Rotation.from_matrix(nearest_rotation((image[1:] / size[:, None]).T))
+    probe = RigidTransform.from_components(image[0], turn)
+    return Chain(size, probe, RigidTransform.from_translation(-point_mm))
 
 
 def calibrate_wires(
     points: ImagePoints,
     geometry: WirePhantom,
     pixel_mm: FloatArray | None = None,
-    fit_pixels: bool = True,
+    settings: WireFit | None = None,
     registration: Registration = "turned",
-    outlier_sigma: float = OUTLIER_SIGMA,
-) -> ChainSolution:
+) -> Solution:
     """Calibrate a 6-DOF sensor from dots on straight wires.
 
     Parameters
@@ -173,19 +165,20 @@ def calibrate_wires(
     registration : {"held", "turned", "free"}
         What to do with the place stated in `geometry`: hold it; hold the wires' middle and estimate how the
         phantom is turned about it; or estimate all. Stylus registrations find a place to half a millimetre,
-        and, over 50 mm, a turn only to a degree.
+        and, over 50 mm, a turn only to a degree. `registration.calibrate_registered` chooses.
 
     Raises
     ------
     InsufficientDataError
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
+    s = settings or WireFit()
     if registration not in _ESTIMATED:
         raise InvalidInputError(
             f"registration: expected one of {', '.join(_ESTIMATED)}, got {registration!r}"
         )
     _require_frames(points)
-    probe, held = probe_parameters(fit_pixels, pixel_mm)
+    probe, held = probe_parameters(s.fixed_pixels, pixel_mm)
     centred = _about_middle(geometry)
     place = centred.world_from_phantom
     if place is not None:
@@ -193,9 +186,12 @@ def calibrate_wires(
         starts = [wire_start(points, phantom.vanishing(points), place.inv())[0]]
     else:
         phantom = Wires(centred)
-        starts = _anywhere(points.of_some_frames(SOME_FRAMES), phantom)
+        few = points.of_some_frames(SOME_FRAMES)
+        tried = [wire_start(few, phantom.vanishing(few), turn) for turn in rotations_all_over()]
+        tried.sort(key=lambda one: float(np.median(np.abs(one[1].residuals))))
+        starts = [chain for chain, _ in tried[:_STARTS]]
     sized = [_sized(start, held) for start in starts]
-    return require_adequate(best_solution(points, phantom, sized, probe, outlier_sigma))
+    return require_adequate(Problem(phantom, probe, s.outlier_sigma).best(points, sized))
 
 
 def _about_middle(geometry: WirePhantom) -> WirePhantom:
@@ -208,14 +204,6 @@ def _about_middle(geometry: WirePhantom) -> WirePhantom:
     return replace(geometry, points_mm=geometry.points_mm - middle, ends_mm=shifted, world_from_phantom=moved)
 
 
-def _anywhere(few: ImagePoints, phantom: Wires) -> list[Chain]:
-    """Best starts among orientations of the phantom spread over all rotations."""
-    equations = phantom.vanishing(few)
-    tried = [wire_start(few, equations, turn) for turn in rotations_all_over()]
-    best = sorted(tried, key=lambda one: float(np.median(np.abs(one[1].residuals))))[:_STARTS]
-    return [chain for chain, _ in best]
-
-
 def _sized(start: Chain, pixel_mm: FloatArray | None) -> Chain:
     return start if pixel_mm is None else replace(start, pixel_mm=pixel_mm)
 
@@ -225,3 +213,65 @@ def _require_frames(points: ImagePoints) -> None:
         raise InsufficientDataError(
             f"expected the wires in at least {_FEWEST_FRAMES} frames, got {len(points.frames)}"
         )
+
+
+def wire_start(
+    points: ImagePoints,
+    equations: tuple[FloatArray, FloatArray],
+    target_from_world: RigidTransform | Rotation,
+    weights: Callable[[FloatArray], FloatArray] = NEARLY_ABSOLUTE,
+    rounds: int = 4,
+    least_singular: float | None = None,
+) -> tuple[Chain, RobustFit]:
+    """Find the image among wires from all frames of a recording, by robust linear least squares.
+
+    The axes come out free of the constraint that they be square; the chain has the nearest that are.
+
+    Parameters
+    ----------
+    equations : (rows, offsets), shapes (n, r, 3) and (n, r)
+        ``rows @ position = offsets`` in the phantom's frame, as from `Phantom.vanishing`; those of one point
+        get one weight.
+    target_from_world : RigidTransform or Rotation
+        If a rotation, the translation is found too.
+    weights, rounds
+        See `robust_linear`.
+    least_singular : float, optional
+        Ratio of singular values below which the answer counts as not determined.
+
+    Returns
+    -------
+    chain : Chain
+    fit : RobustFit
+        Residuals of shape (n, r), mm, before the axes are squared.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the points do not determine the answer, judged by `least_singular`; without it, the smallest
+        parameters that explain the points are returned.
+    """
+    rows, offsets = equations
+    shifted = isinstance(target_from_world, Rotation)
+    known = (
+        RigidTransform.from_rotation(target_from_world)
+        if isinstance(target_from_world, Rotation)
+        else target_from_world
+    )
+    # Pixels are centred and scaled, for a well-conditioned matrix.
+    centre, spread = points.pixels.mean(axis=0), float(points.pixels.std()) or 1.0
+    matrix = affine_equations(
+        (points.pixels - centre) / spread, rows @ known.rotation.as_matrix() @ points.turns
+    )
+    if shifted:
+        matrix = np.concatenate([matrix, rows], axis=2)
+    wanted = offsets - np.einsum("nri,ni->nr", rows, known.apply(points.shifts_mm))
+    fit = robust_linear(matrix, wanted, weights, rounds, least_singular)
+    if least_singular is not None and fit.rank < fit.parameters.size:
+        raise InsufficientDataError("the dots do not determine where the image is: too few wires or poses")
+    axes = fit.parameters[3:9].reshape(2, 3) / spread
+    size = np.linalg.norm(axes, axis=1)
+    turn = Rotation.from_matrix(nearest_rotation((axes / size[:, None]).T))
+    probe = RigidTransform.from_components(fit.parameters[:3] - centre @ axes, turn)
+    shift = RigidTransform.from_translation(fit.parameters[9:] if shifted else np.zeros(3))
+    return Chain(size, probe, shift * known), fit

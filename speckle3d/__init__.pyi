@@ -20,12 +20,14 @@ from .io.curves import write_curves as write_curves
 from .io.import_settings import ImportSettings as ImportSettings
 from .io.load import load_sweep as load_sweep
 from .io.readers import Reader as Reader
+from .io.reconstructions import load_reconstruction as load_reconstruction
 from .io.reconstructions import read_reconstruction as read_reconstruction
 from .io.shapes.surfaces import read_surface as read_surface
 from .io.shapes.surfaces import write_surface as write_surface
 from .io.shapes.transforms import write_transform as write_transform
 from .io.sweep_writer import write_sweep as write_sweep
 from .io.voxels.volume_writer import VolumeWriter as VolumeWriter
+from .io.voxels.volumes import load_volume as load_volume
 from .io.voxels.volumes import read_volume as read_volume
 from .io.voxels.volumes import write_volume as write_volume
 from .phantom_curves import calibrate_curves as calibrate_curves

@@ -5,18 +5,19 @@ from __future__ import annotations
 import json
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import tomlkit
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.units import unit_of
 from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
-from speckle3d.correction.fused.settings import FusedSettings
-from speckle3d.correction.inertial.settings import InertialSettings
+from speckle3d.correction.settings import FusedSettings
 from speckle3d.imaging.voxels.settings import CompoundingSettings
-from speckle3d.io.toml import load_toml, parsed, validated
+from speckle3d.io.toml import parsed, read_toml, validated
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import MatchingSettings
@@ -29,6 +30,18 @@ from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.planes import PlaneSettings
 
 _COMMENT_WIDTH = 100
+REMOVED_SETTINGS = {
+    "curves.straighten": "measured curves stay as they are, and a data sheet's lens is always fitted",
+    "coherence.block_frames": "patches are fitted over at least 10 mm of travel",
+    "coherence.evidence": "no patch is judged to hold structure or not",
+    "coherence.redundancy": "errors come from the scatter of rows of patches",
+    "trajectory.block_frames": "a sweep is matched in one go",
+    "inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first",
+    "fused.contradiction_sigma": "where images and sensors differ both numbers are told",
+}
+"""Settings, or whole stages, of older files, and what is there instead."""
+REMOVED = (("inertial", None), ("fused", "contradiction_sigma"))
+"""Groups, and settings of groups, that older reconstructions' configurations hold and nothing reads now."""
 
 
 class Config(BaseModel):
@@ -55,7 +68,6 @@ class Config(BaseModel):
     sensors: SensorSettings = SensorSettings()
     drift: DriftSettings = DriftSettings()
     crossing: CrossingSettings = CrossingSettings()
-    inertial: InertialSettings = InertialSettings()
     fused: FusedSettings = FusedSettings()
     volume: CompoundingSettings = CompoundingSettings()
 
@@ -103,9 +115,33 @@ def config_from_toml(text: str, where: str = "configuration") -> Config:
     Raises
     ------
     InvalidInputError
-        Naming the setting that is unknown or out of range.
+        Naming the setting that is unknown, removed or out of range.
     """
-    return validated(parsed(text, where), where, Config)
+    values = parsed(text, where)
+    for name in _removed(values):
+        raise InvalidInputError(f"{where}: {name} was removed: {REMOVED_SETTINGS[name]}")
+    return validated(values, where, Config)
+
+
+def stored_config(text: str) -> Config:
+    """Parse the configuration that a file was made with, whose removed settings no longer matter."""
+    values = parsed(text, "configuration")
+    for name in _removed(values):
+        stage, _, setting = name.partition(".")
+        if setting:
+            del values[stage][setting]
+        else:
+            del values[stage]
+    return validated(values, "configuration", Config)
+
+
+def _removed(values: dict[str, Any]) -> list[str]:
+    """Names of settings given that are no more."""
+    names = [
+        *values,
+        *(f"{s}.{name}" for s, some in values.items() if isinstance(some, dict) for name in some),
+    ]
+    return [name for name in names if name in REMOVED_SETTINGS]
 
 
 def load_config(path: Path) -> Config:
@@ -127,4 +163,4 @@ def load_config(path: Path) -> Config:
     InvalidInputError
         Naming the setting that is unknown or out of range.
     """
-    return load_toml(Config, path)
+    return config_from_toml(read_toml(path), str(path))

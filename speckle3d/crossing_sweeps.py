@@ -14,10 +14,10 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
-from speckle3d.correction.trust import believed
+from speckle3d.examine.sensors import believed
 from speckle3d.matching.intensity import IntensityExtractor
-from speckle3d.motion.corrected_curves import corrected_curves
 from speckle3d.motion.direction import sensed_orientation
+from speckle3d.motion.lens import Length, corrected_curves
 from speckle3d.pipeline import Tracked, track
 
 
@@ -120,6 +120,4 @@ def curves_from(
         The first and the second sweep.
     """
     sides = pair.first, pair.second
-    return corrected_curves(
-        curves, tracked, [side.log_scale for side in sides], [side.log_scale_sigma for side in sides]
-    )
+    return corrected_curves(curves, tracked, [Length(s.log_scale, s.log_scale_sigma) for s in sides])

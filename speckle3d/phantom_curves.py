@@ -15,6 +15,7 @@ from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.chosen import match_in_order
 from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.spectra import PHANTOM_FRAMES, mean_spectra, row_spectra
 from speckle3d.matching.texture import speckle_size
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
@@ -47,7 +48,7 @@ def calibrate_curves(
     settings = config or Config()
     if not sweeps:
         raise InsufficientDataError("expected at least one phantom sweep, got none")
-    samples, keys, sizes = [], [], []
+    samples, keys, sizes, spectra = [], [], [], []
     total, before = sum(len(sweep) for sweep in sweeps), 0
     for sweep in sweeps:
         matcher = FrameMatcher(
@@ -59,6 +60,11 @@ def calibrate_curves(
         matches = match_in_order(sweep, matcher, wanted, after(progress, before, total))
         samples.append(phantom_samples(sweep, matcher.patches, matches))
         sizes.append((matcher.patches.row_depth_mm, speckle_size(sweep, matcher)))
+        spectra.append(row_spectra(sweep, matcher, most=PHANTOM_FRAMES))
         before += len(sweep)
     curves = fit_curves(keys[0], samples, settings.curves)
-    return replace(curves, speckle=phantom_speckle(curves.depth_mm, sizes))
+    return replace(
+        curves,
+        speckle=phantom_speckle(curves.depth_mm, sizes),
+        spectrum=mean_spectra([each for each in spectra if each is not None]),
+    )

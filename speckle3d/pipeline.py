@@ -7,18 +7,17 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.checks import doubts_of_curves, doubts_of_path, doubts_of_standing, examined_sensors
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, naming
 from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.handover.plots import plot_poses
@@ -28,42 +27,37 @@ from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.matching.blocks import (
-    Block,
-    BlockSource,
-    ImageSink,
-    MatchedBlock,
-    MatchedSweep,
-    StageTimes,
-    match_block,
-    match_sweep,
-)
+from speckle3d.examine.curves import examine_curves
+from speckle3d.examine.disagreements import disagreements
+from speckle3d.examine.images import examine_path, examine_standing, interleaved
+from speckle3d.examine.recording import examine_recording
+from speckle3d.examine.sensors import examined_sensors
 from speckle3d.matching.chosen import match_again
+from speckle3d.matching.frames import ImageSink, MatchedSweep, StageTimes, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.quality import FrameFlag, describe, flag_frames, sound_pairs
+from speckle3d.matching.spectra import row_spectra
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import SpeckleSizes, doubt_images
-from speckle3d.motion.coherence import Coherence, scale_sigma
-from speckle3d.motion.curve_doubts import doubt_depths
-from speckle3d.motion.curve_prior import RowsSeen
+from speckle3d.matching.texture import SpeckleSizes
+from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
+from speckle3d.motion.coherence import Coherence, RowScales, scale_sigma
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import PairReader
-from speckle3d.motion.plausibility import interleaved
+from speckle3d.motion.estimate import Motion, MotionProblem, edges_of, estimate_motion, frame_pairs
 from speckle3d.motion.revisits import find_returns, tie_returns
 from speckle3d.motion.signs import SignedPairs
-from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance, with_common_scale
-from speckle3d.stages import PLANES, matcher_for, measured, rows_of, sound_pairs, straightened_by
+from speckle3d.motion.subset import consistent_planes
+from speckle3d.motion.trajectory import solve_trajectory, unjoined
+from speckle3d.motion.uncertainty import SlopeEvidence, claimed_covariance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-"""Called with frames done and frames in all."""
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
+MOTION = "distances, planes and scale"
+"""Name of the stage in `StageTimes`."""
 MOST_LOST = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
-STRAIGHTENING = "curves"
-"""Name of a stage in `StageTimes`."""
 
 
 @shown
@@ -95,12 +89,14 @@ class Tracked:
         Sign of the elevational motion, +1 or -1.
     direction_from : str
         What settled the sign.
+    attenuation : Attenuation
+        Of the tissue over the curves' phantom, by the echoes' spectrum.
     coherence : Coherence or None
         How the patches' echoes depart from a phantom's; None if not adapted to.
     curves : DecorrelationCurves
-        With which the images were read: those given, straightened by what depths disagree on.
-    rows : RowsSeen
-        Distances that rows of patches still want, over those of all.
+        With which the images were read.
+    rows : RowScales or None
+        Scales that rows of patches ask for, over that of all; None if not adapted to.
     slopes : SlopeEvidence
         What the images' own yaw and tilt are worth.
     times : StageTimes
@@ -123,9 +119,10 @@ class Tracked:
     curves_sigma: float
     direction: int
     direction_from: str
+    attenuation: Attenuation
     coherence: Coherence | None
     curves: DecorrelationCurves
-    rows: RowsSeen
+    rows: RowScales | None
     slopes: SlopeEvidence
     times: StageTimes
     doubts: tuple[Doubt, ...] = ()
@@ -169,7 +166,10 @@ class Tracked:
             ("direction", f"{self.direction:+d}, from {self.direction_from}"),
             ("subset", subset),
             ("pairs", f"{self.pairs} of frames"),
-            ("doubts", "; ".join(f"{each.about}: {each.suspect}" for each in self.doubts) or "none"),
+            (
+                "doubts",
+                "; ".join(f"{each.about}: {each.suspect or each.evidence}" for each in self.doubts) or "none",
+            ),
         ]
 
     @property
@@ -185,7 +185,6 @@ def track(
     progress: Progress | None = None,
     sink: PairSink | None = None,
     images: ImageSink | None = None,
-    matched: BlockSource | None = None,
 ) -> Tracked:
     """Estimate the pose of every frame from the images, and from the orientation-consistent patches.
 
@@ -204,9 +203,7 @@ def track(
     sink : callable, optional
         Called with the frame pairs, some at a time.
     images : callable, optional
-        Called with every intensity image, but not with those of blocks that `matched` returns.
-    matched : callable, optional
-        Asked for each block of frames before it is matched here.
+        Called with every intensity image.
 
     Returns
     -------
@@ -216,10 +213,10 @@ def track(
     ------
     MismatchError
         If the curves belong to another probe, frequency, sampling, patch size or depth, by what the files say
-        or by what the images do; see `speckle3d.motion.curve_doubts`.
+        or by what the images do; see `speckle3d.examine`.
     InsufficientDataError
         If too many frames have no speckle in common with others, if the images do not determine the length,
-        or if they cannot be those of one probe that moves (`speckle3d.motion.plausibility`).
+        or if they cannot be those of one probe that moves (`speckle3d.examine.images`).
 
     Examples
     --------
@@ -231,148 +228,121 @@ def track(
     """
     require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
     require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
+    if len(sweep) < 2:
+        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
     settings, times = config or Config(), StageTimes()
-    matcher = _matcher_for(sweep, curves, settings)
-    doubts = unrefuted(
-        [*doubt_depths(curves, matcher.laid, matcher.patches), *doubt_images(sweep)],
-        sweep.name,
-        MismatchError,
-    )
-    reader = PairReader(
-        curves, matcher.patches, matcher.centre_mm, len(sweep), settings.planes, settings.trajectory
-    )
+    matcher = matcher_for(sweep, curves, settings)
+    doubts = examine_recording(sweep, matcher, curves)
 
-    # RF -> intensity -> in-plane motion -> patch correlation
     sizes = SpeckleSizes(sweep, matcher, images)
-    found = match_sweep(
-        sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep, matched
-    )
-    flags = _flagged(sweep, found, settings)
+    matches = match_sweep(sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep)
+    table, flags = matches.table, frame_flags(sweep, matches, settings)
 
-    # -> |distance| and its sigma -> plane per frame pair, with its sign
-    pairs, coherence, path = measured(found.table, flags, reader, settings, times)
+    with times.of(MOTION):
+        attenuation = estimate_attenuation(curves, row_spectra(sweep, matcher, np.flatnonzero(flags == 0)))
+        problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)
+        motion = estimate_motion(problem, table, sound_pairs(table, flags))
+    doubts += attenuation.doubts
+    flags = with_unplaced(sweep, flags, motion.pairs)
     with times.of("checks of the images"):
-        sound = sound_pairs(found.table, flags)
-        flags = _with_unjoined(flags, reader, pairs)
-        _require_placed(sweep, flags)
-        # What stands still would be blamed on the curves.
-        doubts += doubts_of_standing(sweep, matcher, curves, path, flags)
-        factors = reader.depth_factors(found.table, path, sound, settings.coherence)
-        doubts += doubts_of_curves(
-            sweep, curves, matcher, sizes, reader, factors, flags, pairs, coherence, path
-        )
+        doubts += examine_standing(sweep, matcher, curves, motion.path[:, 0], flags == 0)
+        doubts += examine_curves(sweep, matcher, sizes, motion, flags == 0)
 
-    # -> curves of the lens that the depths of the images agree on, and everything read with them
-    given = curves
-    with times.of(STRAIGHTENING):
-        curves, mismatch = straightened_by(factors, curves, coherence, matcher.patches, settings)
-    if curves is not given:
-        reader = reader.with_curves(curves)
-        pairs, coherence, path = measured(found.table, flags, reader, settings, times, path)
-        with times.of(STRAIGHTENING):
-            factors = reader.depth_factors(found.table, path, sound, settings.coherence)
-
-    # -> pairs of frames from different visits of the same tissue, which the path shows
     with times.of("revisits"):
-        returns = find_returns(path[:, 0], settings.trajectory.revisit_mm)
-        wanted = [pair for each in returns for pair in each.pairs()]
-        table = found.table.followed_by(match_again(sweep, matcher, wanted))
-        ties = tie_returns(
-            returns, table, path[:, 0], reader.fitter, coherence, settings.trajectory.least_correlation
-        )
-        pairs = pairs.and_also(ties[(flags[ties.first] == 0) & (flags[ties.second] == 0)])
-
-    # -> graph of relative poses -> trajectory
+        table, motion = tied_to_returns(sweep, matcher, table, motion, flags)
     with times.of("trajectory"):
-        slopes = reader.slopes(pairs, coherence)
-        edges = reader.edges(table, pairs, slopes.applied(pairs.planes))
-        trajectory = reader.solve(edges, with_covariance=True)
-        covariance = pose_covariance(
-            trajectory.poses,
-            trajectory.covariance,
-            matcher.centre_mm,
-            scale_sigma(coherence),
-            slopes,
-            0.0 if coherence is None else float(coherence.share.mean()),
+        slopes = motion.slopes
+        mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
+        edges = edges_of(table, motion.pairs, slopes.applied(motion.pairs.planes))
+        trajectory = solve_trajectory(edges, len(sweep), matcher.centre_mm, settings.trajectory, True)
+        shared = SharedErrors(scale_sigma(motion.coherence), mismatch, slopes.deviation_per_mm)
+        covariance = claimed_covariance(
+            trajectory.poses, trajectory.covariance, matcher.centre_mm, shared, motion.structure
         )
-        doubts += doubts_of_path(
-            sweep, trajectory.poses, covariance, found.table, pairs, matcher, curves, flags
-        )
+    doubts += examine_path(
+        sweep,
+        trajectory.poses,
+        covariance,
+        matches.table,
+        motion.pairs,
+        problem.patches.centre_mm,
+        float(curves.distance_mm[-1]),
+        flags == 0,
+    )
 
-    # Checks ask what contradicts images and curves as given: a mismatch shows in them and excuses nothing.
-    # Claimed errors include it.
-    whole = with_common_scale(covariance, trajectory.poses, matcher.centre_mm, mismatch)
-    sigma = float(np.hypot(scale_sigma(coherence), mismatch))
-
-    # -> sensors that images and their own readings do not contradict -> sign of the motion
     with times.of("sensors"):
-        sensors = examined_sensors(sweep, trajectory.poses, covariance, settings)
+        sensors = examined_sensors(sweep, trajectory.poses, settings.sensors.examine)
         direction, source = settle_direction(
-            sensors.telling, trajectory.poses, settings.sensors, sensors.turn_confirmed
+            sensors.trusted, trajectory.poses, settings.sensors, sensors.turn_confirmed
         )
+        subset, used = consistent_poses(sensors.trusted, table, motion, direction, settings)
 
-    # -> orientation-consistent subset -> its own trajectory
-    with times.of(PLANES):
-        subset, used = _consistent(sensors.trusted, table, pairs, direction, reader, settings)
-
+    sigma = float(np.hypot(scale_sigma(motion.coherence), mismatch))
     if sink:
-        for rows in reader.rows(table, pairs, edges, used, direction, sigma):
-            sink(rows)
+        for some in frame_pairs(motion, table, edges, used, direction, sigma):
+            sink(some)
+    image = _seen_from(direction, trajectory.poses)
+    covariance = covariance if direction > 0 else MIRROR @ covariance @ MIRROR
     return Tracked(
-        image=_seen_from(direction, trajectory.poses),
-        covariance=whole if direction > 0 else MIRROR @ whole @ MIRROR,
+        image=image,
+        covariance=covariance,
         subset=None if subset is None else _seen_from(direction, subset),
-        rejected_share=float("nan") if subset is None else _rejected_share(pairs, used),
-        flags=_with_unjoined(flags, reader, pairs),
+        rejected_share=float("nan") if subset is None else _rejected_share(motion.pairs, used),
+        flags=flags,
         edges=edges if direction > 0 else edges.mirrored(),
         scale_sigma=sigma,
         curves_sigma=mismatch,
         direction=direction,
         direction_from=source,
-        coherence=coherence,
-        curves=curves,
-        rows=rows_of(factors, coherence, matcher.patches),
+        attenuation=attenuation,
+        coherence=motion.coherence,
+        curves=motion.problem.curves,
+        rows=motion.rows,
         slopes=slopes,
         times=times,
-        doubts=(*doubts, *sensors.doubts),
+        doubts=(*doubts, *sensors.doubts, *disagreements(sensors.trusted, image, covariance, sigma)),
         grid=sweep.grid,
         frame_time_s=sweep.frame_time_s,
     )
 
 
-def match_ahead(
-    sweep: Sweep,
-    curves: DecorrelationCurves,
-    block: Block,
-    config: Config | None = None,
-    images: ImageSink | None = None,
-) -> MatchedBlock:
-    """Match one block of a sweep, for `track` to take; any process may do so, and in any order.
+def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
+    """Make the matcher of a sweep's frames, none of which is read.
 
     Raises
     ------
-    MismatchError, InsufficientDataError
-        As `track`, before any work is done: the curves are not used otherwise.
+    MismatchError
+        If the curves belong to another probe, frequency, sampling, patch size or depth.
     """
-    settings, times = config or Config(), StageTimes()
-    matcher = _matcher_for(sweep, curves, settings)
-    frames = list(match_block(sweep, matcher, settings.trajectory, settings.quality, block, images, times))
-    return MatchedBlock(frames, times.seconds)
+    matcher = FrameMatcher(sweep, config.intensity, config.patches, config.inplane, config.matching)
+    curves.key.require_same(matcher.key)
+    with naming(sweep.name):
+        matcher.keep_depths(curves.depth_mm)
+    return matcher
 
 
-def _matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
-    if len(sweep) < 2:
-        raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
-    return matcher_for(sweep, curves, config)
+def motion_problem(
+    curves: DecorrelationCurves, matcher: FrameMatcher, frames: int, config: Config
+) -> MotionProblem:
+    """Gather what correlations are read with."""
+    planes, trajectory, adapt = config.planes, config.trajectory, config.coherence.adapt
+    return MotionProblem(curves, matcher.patches, matcher.centre_mm, frames, planes, trajectory, adapt)
 
 
-def _flagged(sweep: Sweep, found: MatchedSweep, config: Config) -> IntArray:
+def frame_flags(sweep: Sweep, matches: MatchedSweep, config: Config) -> IntArray:
     """Flags of all frames, if few enough have one."""
-    flags = flag_frames(found.features, config.quality)
-    flags[found.table.unmatched(len(sweep), config.trajectory.least_correlation)] |= FrameFlag.UNMATCHED
+    least = config.trajectory.least_correlation
+    flags = flag_frames(matches.features, config.quality)
+    flags[matches.table.unmatched(len(sweep), least)] |= FrameFlag.UNMATCHED
     _require_placed(sweep, flags)
-    mixed = interleaved(found.table, len(sweep), config.trajectory.least_correlation)
-    unrefuted([mixed], sweep.name, InsufficientDataError)
+    unrefuted([interleaved(matches.table, len(sweep), least)], sweep.name, InsufficientDataError)
+    return flags
+
+
+def with_unplaced(sweep: Sweep, flags: IntArray, pairs: SignedPairs) -> IntArray:
+    """Flags in which sound frames that no pair joins to earlier ones are unmatched, too."""
+    flags = np.where(unjoined(pairs.second, len(sweep)) & (flags == 0), int(FrameFlag.UNMATCHED), flags)
+    _require_placed(sweep, flags)
     return flags
 
 
@@ -386,26 +356,29 @@ def _require_placed(sweep: Sweep, flags: IntArray) -> None:
         )
 
 
-def _with_unjoined(flags: IntArray, reader: PairReader, pairs: SignedPairs) -> IntArray:
-    """Flags in which sound frames that no pair joins to earlier ones are unmatched, too."""
-    lone = reader.unjoined(pairs.second)
-    return np.where(lone & (flags == 0), int(FrameFlag.UNMATCHED), flags)
+def tied_to_returns(
+    sweep: Sweep, matcher: FrameMatcher, table: CorrelationTable, motion: Motion, flags: IntArray
+) -> tuple[CorrelationTable, Motion]:
+    """Match frames of different visits of the same tissue, which the path shows, and add their pairs."""
+    returns = find_returns(motion.path[:, 0], motion.problem.trajectory.revisit_mm)
+    wanted = [pair for each in returns for pair in each.pairs()]
+    table = table.followed_by(match_again(sweep, matcher, wanted))
+    ties = tie_returns(returns, motion, table)
+    ties = ties[(flags[ties.first] == 0) & (flags[ties.second] == 0)]
+    return table, replace(motion, pairs=motion.pairs.and_also(ties))
 
 
-def _consistent(
-    sweep: Sweep,
-    table: CorrelationTable,
-    pairs: SignedPairs,
-    direction: int,
-    reader: PairReader,
-    config: Config,
+def consistent_poses(
+    sweep: Sweep, table: CorrelationTable, motion: Motion, direction: int, config: Config
 ) -> tuple[RigidTransform | None, BoolArray]:
     """Poses from the orientation-consistent patches (None without a sensor), and each pair's patches used."""
     sensed = sensed_orientation(sweep, config.sensors)
     if sensed is None:
-        return None, pairs.planes.used
-    planes = reader.consistent(table, pairs, sensed, direction)
-    return reader.solve(reader.edges(table, pairs, planes)).poses, planes.used
+        return None, motion.pairs.planes.used
+    planes = consistent_planes(motion, table, sensed, direction)
+    edges = edges_of(table, motion.pairs, planes)
+    poses = solve_trajectory(edges, len(sweep), motion.problem.centre_mm, config.trajectory).poses
+    return poses, planes.used
 
 
 def _rejected_share(pairs: SignedPairs, used: BoolArray) -> float:

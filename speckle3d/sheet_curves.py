@@ -6,12 +6,12 @@ import numpy as np
 
 from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.texture import echo_spectra, speckle_size
-from speckle3d.motion.data_sheet import EchoSpectra, ProbeSheet, sheet_curves
+from speckle3d.motion.data_sheet import ProbeSheet, sheet_curves
 
 
 def data_sheet_curves(

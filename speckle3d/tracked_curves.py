@@ -19,7 +19,7 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
-from speckle3d.motion.corrected_curves import corrected_curves
+from speckle3d.motion.lens import Length, corrected_curves
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.pipeline import Tracked, track
 
@@ -64,7 +64,7 @@ def tracked_curves(
     for _ in range(ROUNDS):
         tracked = [track(sweep, curves, settings, progress) for sweep in bare]
         lengths = [tracker_scale(sweep, found) for sweep, found in zip(bare, tracked, strict=True)]
-        curves = corrected_curves(curves, tracked, *zip(*lengths, strict=True))
+        curves = corrected_curves(curves, tracked, lengths)
     return replace(curves, origin="tracked")
 
 
@@ -78,8 +78,8 @@ def jitters(sweep: Sweep) -> bool:
     return bool(robust_sigma(z[2:] - 2.0 * z[1:-1] + z[:-2]) > np.sqrt(6.0) * STEADY_MM)
 
 
-def tracker_scale(sweep: Sweep, tracked: Tracked) -> tuple[float, float]:
-    """Logarithm of the tracker's elevational length over the images', and its standard deviation.
+def tracker_scale(sweep: Sweep, tracked: Tracked) -> Length:
+    """Tracker's elevational length over the images'.
 
     Raises
     ------
@@ -111,4 +111,4 @@ def tracker_scale(sweep: Sweep, tracked: Tracked) -> tuple[float, float]:
             f"{sweep.name}: expected a length that the tracker knows to {100 * LEAST_SURE:g} %, got "
             f"{np.ptp(z):.1f} mm to {100 * sigma:.1f} %: a longer sweep would help"
         )
-    return float(np.log(scale)), sigma
+    return Length(float(np.log(scale)), sigma)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints
+from calibration.points import ImagePoints
 
 BEAM_DOWN = Rotation.from_matrix([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """An image that looks straight down in a world with z up: its x is the world's, its y points down."""

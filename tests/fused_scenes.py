@@ -12,10 +12,11 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.motion.trajectory import solve_trajectory
-from speckle3d.motion.uncertainty import SlopeEvidence, pose_covariance
+from speckle3d.motion.uncertainty import claimed_covariance
 from speckle3d.simulation.movement import HandMotion, frame_times, hand_sweep
 from speckle3d.simulation.sensors import (
     OrientationModel,
@@ -48,8 +49,9 @@ class Scene:
         return (
             self.edges,
             self.image,
-            self.covariance,
+            0.0,
             self.scale_sigma,
+            0.0,
             self.turn_sigma_per_mm,
             CENTRE_MM,
             self.time_s,
@@ -76,8 +78,8 @@ def scene(
     edges = _edges(truth, scale_sigma, rng)
     found = solve_trajectory(edges, frames, CENTRE_MM, with_covariance=True)
     turn = np.full(2, TURN_PER_MM)
-    slopes = SlopeEvidence(np.ones(2), turn)
-    covariance = pose_covariance(found.poses, found.covariance, CENTRE_MM, scale_sigma, slopes)
+    shared = SharedErrors(scale_sigma, 0.0, turn)
+    covariance = claimed_covariance(found.poses, found.covariance, CENTRE_MM, shared, 0.0)
     span = (-0.3, seconds + 0.3)
     return Scene(
         truth,

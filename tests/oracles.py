@@ -434,26 +434,6 @@ def elevational_width_mm(beam, level_db=-6.0):
     return 2.0 * (beam.elevation_mm[last] + part * beam.elevation_mm[1])
 
 
-def lzf_length(packed):
-    """Twin of `speckle3d.kernels.packing.lzf_length`: unpacks, by the format's description."""
-    ahead, unpacked = list(packed), []
-    try:
-        while ahead:
-            control = ahead.pop(0)
-            if control < 32:
-                unpacked += [ahead.pop(0) for _ in range(control + 1)]
-                continue
-            length = control // 32
-            if length == 7:
-                length += ahead.pop(0)
-            start = len(unpacked) - 1 - (control % 32 * 256 + ahead.pop(0))
-            for i in range(length + 2):
-                unpacked.append(unpacked[start + i])
-    except IndexError:
-        return -1
-    return len(unpacked)
-
-
 def look_up_on_planes(points_mm, volume, planes, pixels):
     """Twin of `speckle3d.kernels.crossing.look_up`: values alone, every point against every plane."""
     found = np.full(len(points_mm), np.nan)

@@ -17,26 +17,13 @@ def pair(planes, k=0):
     return SimpleNamespace(offset_mm=offset, slope_x=slope_x, slope_y=slope_y, **fields)
 
 
-class SameEchoes:
-    """One echo model in place of those that a sweep's coherence gives its pairs."""
-
-    def __init__(self, model):
-        self._model = model
-
-    def __getitem__(self, pairs):
-        return self
-
-    def models(self):
-        return self._model
-
-
-def fit(fitter, rho, moved_mm, model=None, subset=None, slopes=None, start_mm=None, either_side=True):
+def fit(fitter, rho, moved_mm, coherence=None, subset=None, slopes=None, start_mm=None, either_side=True):
     """Plane of one pair, from correlations of shape (p,); None if they determine none."""
     alone = [None if x is None else np.asarray(x)[None] for x in (subset, slopes, start_mm, either_side)]
     if alone[1] is not None:
         alone[1] = alone[1].astype(float)
-    echoes = None if model is None else SameEchoes(model)
-    return pair(fitter.fit(np.asarray(rho, np.float32)[None], np.asarray(moved_mm)[None], echoes, *alone))
+    pairs = np.asarray(rho, np.float32)[None], np.asarray(moved_mm)[None]
+    return pair(fitter.fit(*pairs, coherence, np.zeros(1), *alone))
 
 
 def made(coefficients, covariance, sigma_mm=1.0, patches=1):

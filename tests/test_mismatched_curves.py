@@ -7,8 +7,7 @@ import pytest
 
 from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.errors import InsufficientDataError, MismatchError
-from speckle3d.matching.blocks import Block
-from speckle3d.pipeline import match_ahead, track
+from speckle3d.pipeline import track
 
 FRAMES = 32
 
@@ -37,12 +36,6 @@ def part(sweep):
     )
 
 
-@pytest.fixture(scope="module")
-def matched(part, curves):
-    block = match_ahead(part, curves, Block(0, FRAMES))
-    return lambda _: block
-
-
 def turned_over(curves):
     """Curves reversed in depth, all that belongs to a depth with them."""
     tilt = TiltResponse(*(each[::-1].copy() for each in vars(curves.tilt).values()))
@@ -61,17 +54,17 @@ def at_rate(sweep, factor):
     return replace(sweep, signal=signal, grid=grid)
 
 
-def test_right_curves_raise_no_doubt(tracked, part, curves, matched):
+def test_right_curves_raise_no_doubt(tracked, part, curves):
     assert tracked.doubts == ()
-    found = track(part, curves, matched=matched)
+    found = track(part, curves)
     assert found.doubts == ()
     true = np.linalg.norm((part.truth[0].inv() * part.truth[-1]).translation)
     assert np.linalg.norm(found.image.translation[-1]) == pytest.approx(true, rel=0.05)
 
 
-def test_reversed_curves_are_refused(part, curves, matched):
+def test_reversed_curves_are_refused(part, curves):
     with pytest.raises(MismatchError, match=r"^phantom: curves: expected all depths to tell the same dist"):
-        track(part, turned_over(curves), matched=matched)
+        track(part, turned_over(curves))
 
 
 @pytest.mark.parametrize(("factor", "why"), [(1.5, "tilt"), (1000.0, "tilt")])

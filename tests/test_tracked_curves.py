@@ -26,9 +26,9 @@ def test_the_length_is_the_trackers_and_its_error_grows_with_jitter(sweep, track
     true = sweep.truth[0].inv() * sweep.truth
     z, seen = (abs(poses.apply(sweep.grid.centre_mm)[-1, 2]) for poses in (true, tracked.image))
     scales = [tracker_scale(shaken(sweep, jitter), tracked) for jitter in (0.05, 0.3)]
-    for scale, sigma in scales:
-        assert abs(scale - np.log(z / seen)) < 3 * sigma
-    assert 0.005 < scales[0][1] < scales[1][1] < 0.03
+    for length in scales:
+        assert abs(length.log_scale - np.log(z / seen)) < 3 * length.sigma
+    assert 0.005 < scales[0].sigma < scales[1].sigma < 0.03
     with pytest.raises(InsufficientDataError, match="expected a length that the tracker knows to 3 %, got"):
         tracker_scale(shaken(sweep, 2.0), tracked)
 

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import Chain, ChainSolution, ImagePoints, as_directions
 from calibration.clock.offset import ClockOffset, covered, delays_around, require_peak
 from calibration.clock.smoothing import smooth
-from calibration.identifiability import InadequateError
-from calibration.solver import SOME_FRAMES, at_first, first_guess, residuals_of, sigma_of
-from calibration.wandering import settle
+from calibration.motion import InadequateError
+from calibration.noise import fit_noise
+from calibration.plane import Chain, Equations, Solution, nearly_absolute, sigma_of
+from calibration.points import SCALES, SOME_FRAMES, ImagePoints, as_directions
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -36,7 +36,7 @@ _SETTLED = 0.1
 """Steps end when one is below this share of the standard error."""
 _DERIVATIVE_S = 1e-3
 
-Calibrate = Callable[[ImagePoints], ChainSolution]
+Calibrate = Callable[[ImagePoints], Solution]
 
 
 def estimate_offset(
@@ -97,8 +97,8 @@ def estimate_offset(
 
 
 def with_uncertain_offset(
-    solution: ChainSolution, readings: TimedPoses | TimedRotations, seconds: float
-) -> ChainSolution:
+    solution: Solution, readings: TimedPoses | TimedRotations, seconds: float
+) -> Solution:
     """Return a solution whose covariance includes that of the clock offset it was made with."""
     there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
     shown = replace(solution, points=solution.points[there], used=solution.used[there])
@@ -122,7 +122,7 @@ class _Reader:
 
 
 def _joint_fit(
-    solution: ChainSolution, points_at: Callable[[float], ImagePoints], seconds: float
+    solution: Solution, points_at: Callable[[float], ImagePoints], seconds: float
 ) -> tuple[Chain, float, FloatArray]:
     """Solve for chain and offset together: the chain, the offset's step, s, and their covariance.
 
@@ -134,13 +134,14 @@ def _joint_fit(
         _as_seen(solution, points_at(at))[used]
         for at in (seconds, seconds + _DERIVATIVE_S, seconds - _DERIVATIVE_S)
     )
-    change = residuals_of(later, phantom, chain) - residuals_of(sooner, phantom, chain)
+    change = Equations.of(later, phantom).residuals(chain) - Equations.of(sooner, phantom).residuals(chain)
     column = change.reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
-    found, noise = settle(here, phantom, chain, solution.free, solution.prior, column)
+    equations, seen_as = Equations.of(here, phantom), phantom.seen_as
+    found, noise = fit_noise(equations, chain, solution.free, seen_as, solution.prior, column)
     return found, float(noise.step[-1]), noise.covariance
 
 
-def _as_seen(solution: ChainSolution, points: ImagePoints) -> ImagePoints:
+def _as_seen(solution: Solution, points: ImagePoints) -> ImagePoints:
     """The points, or their directions without places for a solution that knows no more."""
     if not solution.angular:
         return points
@@ -165,17 +166,17 @@ def _sigmas(
         for side in (mine[mine >= begin], mine[mine < begin][::-1]):
             chain = solution.chain
             for number in side:
-                points = _as_seen(solution, some[number])
-                free = at_first(solution.free, solution.prior)
-                chain = first_guess(points, solution.phantom, chain, free)
-                sigmas[number] = sigma_of(residuals_of(points, solution.phantom, chain))
+                equations = Equations.of(_as_seen(solution, some[number]), solution.phantom)
+                free = [name for name in solution.free if solution.prior is None or name not in SCALES]
+                chain = nearly_absolute(equations, chain, free)
+                sigmas[number] = sigma_of(equations.residuals(chain))
     return sigmas
 
 
-def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, ChainSolution]:
+def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, Solution]:
     """Calibrations from nothing at some of the offsets; at all, until there is one, if those fail."""
     first = list(range(len(some) // 2 % _ANEW, len(some), _ANEW))
-    found: dict[int, ChainSolution] = {}
+    found: dict[int, Solution] = {}
     refusal: InsufficientDataError | None = None
     for number in first + [k for k in range(len(some)) if k not in first]:
         if found and number not in first:
@@ -191,7 +192,7 @@ def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, ChainSolut
     return found
 
 
-def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> ChainSolution:
+def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> Solution:
     """Calibrate, whatever the motion: at a wrong offset it may seem to determine too little."""
     try:
         return calibrate(points)

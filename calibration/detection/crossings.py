@@ -20,12 +20,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft, ndimage
 
-from calibration.chain import Seen
-from calibration.detection.everyframe import in_every_frame, require_image
+from calibration.detection.everyframe import in_every_frame
 from calibration.detection.region import checked_pixel, region_mask
+from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
@@ -38,11 +37,11 @@ long wires in speckle, all 30 degrees apart are found, 25 apart three in four, 2
 _LEAK = 0.2
 """Part of a lone line's contrast that filters well apart from it may see; taken off the second line's."""
 _SIDE = 2.5
-"""Where the two sides are, in `width_mm`: beyond the line itself."""
+"""Where the two sides are, in `_WIDTH_MM`: beyond the line itself."""
 _WIDTHS = (1.0, 2.0)
-"""Filters across a line, in `width_mm`."""
+"""Filters across a line, in `_WIDTH_MM`."""
 _STEPS = 1.5
-"""Samples to a `width_mm` of the images that are filtered."""
+"""Samples to a `_WIDTH_MM` of the images that are filtered."""
 _GLANCES = 40
 """Frames compared to see what stands still."""
 _FEWEST_GLANCES = 8
@@ -55,63 +54,16 @@ _PEAKS = 40
 """Maxima looked at for each width."""
 
 
-class CrossingSettings(BaseModel):
-    """How crossings are found."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    width_mm: float = Field(
-        1.0, gt=0, description="Standard deviation of the finest filter across a line; a second is twice it."
-    )
-    length: float = Field(6.0, ge=1.0, description="Of the filters along a line, over their width.")
-    apart_mm: float = Field(
-        2.0, gt=0, description="Of candidates nearer to each other than this, the strongest counts."
-    )
-    candidates: int = Field(6, ge=1, description="The strongest candidates of an image that are kept.")
-
-
-def crossings_in_image(
-    image: npt.NDArray[Any],
-    pixel_mm: npt.ArrayLike,
-    settings: CrossingSettings | None = None,
-    region_px: npt.ArrayLike | None = None,
-    standing: Float32Array | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Find places where lines may cross in one image.
-
-    Parameters
-    ----------
-    image : ndarray, shape (column, row)
-        Grey levels of any real type, rows down from the probe.
-    pixel_mm : array_like, shape (2,)
-        Distance between columns and between rows, mm; a third more or less does not matter.
-    region_px : array_like, shape (k, 2), optional
-        Corners (column, row) of a polygon outside which nothing counts.
-    standing : ndarray, shape (column, row), optional
-        What stands still in the recording, as from `standing_still`.
-
-    Returns
-    -------
-    pixels : ndarray, shape (n, 2)
-    score : ndarray, shape (n,)
-        Contrast of the two lines with their sides, grey levels, descending.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is not what it must be.
-    """
-    s = settings or CrossingSettings()
-    size = checked_pixel(pixel_mm)
-    require_image(image)
-    inside = None if region_px is None else region_mask(image.shape, region_px)
-    return _crossings(image, size, s, inside, standing)
+_WIDTH_MM, _LENGTH = 1.0, 6.0
+"""Standard deviation of the finest filter across a line, and its length over its width."""
+_APART_MM = 2.0
+"""Of candidates nearer to each other than this, the strongest counts."""
+_MOST_CANDIDATES = 6
 
 
 def crossings_in_frames(
     frames: Frames,
     pixel_mm: npt.ArrayLike,
-    settings: CrossingSettings | None = None,
     region_px: npt.ArrayLike | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Seen:
@@ -120,8 +72,10 @@ def crossings_in_frames(
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
-    pixel_mm, settings, region_px
-        See `crossings_in_image`.
+    pixel_mm : array_like, shape (2,)
+        Distance between columns and between rows, mm; a third more or less does not matter.
+    region_px : array_like, shape (k, 2), optional
+        Corners (column, row) of a polygon outside which nothing counts.
     progress : callable, optional
         Called with the number of frames done and their total.
 
@@ -130,11 +84,10 @@ def crossings_in_frames(
     InvalidInputError
         If an argument is not what it must be.
     """
-    s = settings or CrossingSettings()
     size, count = checked_pixel(pixel_mm), frames.shape[0]
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
     standing = standing_still(frames)
-    found = in_every_frame(frames, lambda image: _crossings(image, size, s, inside, standing)[0], progress)
+    found = in_every_frame(frames, lambda image: _crossings(image, size, inside, standing)[0], progress)
     held = [len(pixels) for pixels in found]
     return Seen(
         np.repeat(np.arange(count), held),
@@ -158,7 +111,6 @@ def standing_still(frames: Frames) -> Float32Array | None:
 def _crossings(
     image: npt.NDArray[Any],
     pixel_mm: FloatArray,
-    s: CrossingSettings,
     inside: BoolArray | None,
     standing: Float32Array | None,
 ) -> tuple[FloatArray, FloatArray]:
@@ -169,17 +121,17 @@ def _crossings(
     if inside is not None:
         grey = np.where(inside, grey, np.float32(0.0))
     peaks, scores = [], []
-    for width in s.width_mm * np.array(_WIDTHS):
+    for width in _WIDTH_MM * np.array(_WIDTHS):
         coarse, step_px = _resampled(grey, pixel_mm, width)
-        pixels, score = _maxima(_two_lines(coarse, step_px * pixel_mm, width, s), step_px, pixel_mm, s)
+        pixels, score = _maxima(_two_lines(coarse, step_px * pixel_mm, width), step_px, pixel_mm)
         peaks.append(pixels)
         scores.append(score)
     pixels, score = np.concatenate(peaks), np.concatenate(scores)
     if inside is not None:
         column, row = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape) - 1).T
         pixels, score = pixels[inside[column, row]], score[inside[column, row]]
-    pixels, score = _strongest(pixels, score, pixel_mm, s)
-    return np.reshape([_centred(grey, one, pixel_mm, s.width_mm) for one in pixels], (-1, 2)), score
+    pixels, score = _strongest(pixels, score, pixel_mm)
+    return np.reshape([_centred(grey, one, pixel_mm, _WIDTH_MM) for one in pixels], (-1, 2)), score
 
 
 def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tuple[Float32Array, FloatArray]:
@@ -191,9 +143,9 @@ def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tup
     return ndimage.map_coordinates(smooth, grid, order=1, mode="nearest", output=np.float32), step
 
 
-def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float, s: CrossingSettings) -> Float32Array:
+def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float) -> Float32Array:
     """Geometric mean of the contrasts of the best line and of the best that is well apart from it."""
-    pad = np.ceil(3.0 * s.length * width_mm / step_mm).astype(int)
+    pad = np.ceil(3.0 * _LENGTH * width_mm / step_mm).astype(int)
     padded = np.pad(grey, [(n, n) for n in pad], mode="edge")
     shape = [fft.next_fast_len(n, real=True) for n in padded.shape]
     spectrum = fft.rfft2(padded, shape)
@@ -205,7 +157,7 @@ def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float, s: Cros
     lines = np.empty((_ORIENTATIONS, *grey.shape), np.float32)
     for number, angle in enumerate(along):
         cosine, sine = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-        length = 2.0 * (np.pi * s.length * width_mm * (frequency[0] * cosine + frequency[1] * sine)) ** 2
+        length = 2.0 * (np.pi * _LENGTH * width_mm * (frequency[0] * cosine + frequency[1] * sine)) ** 2
         across = 2.0 * (np.pi * width_mm * (frequency[1] * cosine - frequency[0] * sine)) ** 2
         mean = fft.irfft2(spectrum * np.exp(-length - across), shape)
         shift = np.rint(_SIDE * width_mm * np.array([-sine, cosine]) / step_mm).astype(int)
@@ -225,10 +177,10 @@ def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float, s: Cros
 
 
 def _maxima(
-    response: Float32Array, step_px: FloatArray, pixel_mm: FloatArray, s: CrossingSettings
+    response: Float32Array, step_px: FloatArray, pixel_mm: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels of the maxima, between samples by parabolas, and their values."""
-    near = max(1, int(s.apart_mm / 2.0 / float((step_px * pixel_mm).max())))
+    near = max(1, int(_APART_MM / 2.0 / float((step_px * pixel_mm).max())))
     features = extra_module("skimage.feature", "calibrate", "finding crossings")
     peaks = features.peak_local_max(response, min_distance=near, num_peaks=_PEAKS, exclude_border=False)
     score = response[tuple(peaks.T)].astype(float)
@@ -262,15 +214,13 @@ def _centred(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray, width_
     return centre
 
 
-def _strongest(
-    pixels: FloatArray, score: FloatArray, pixel_mm: FloatArray, s: CrossingSettings
-) -> tuple[FloatArray, FloatArray]:
+def _strongest(pixels: FloatArray, score: FloatArray, pixel_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The strongest candidates of both widths that are apart."""
     kept: list[int] = []
     for one in np.argsort(-score, kind="stable"):
         away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
-        if score[one] > 0 and (away >= s.apart_mm).all():
+        if score[one] > 0 and (away >= _APART_MM).all():
             kept.append(int(one))
-        if len(kept) == s.candidates:
+        if len(kept) == _MOST_CANDIDATES:
             break
     return pixels[kept], score[kept]

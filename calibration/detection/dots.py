@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 from scipy import ndimage
 
 from calibration.detection.everyframe import in_every_frame, require_image
@@ -31,31 +30,23 @@ _PLACING = 0.35
 """Smoothing before a dot is placed, as part of the dot's own size: enough to join the grains of one dot."""
 _ANGLES = 24
 _LINE_REACH = 2.5
-"""Distance from a peak, in `surround_mm`, at which it is tested for a line; the 24 directions are then less
+"""Distance from a peak, in `_SURROUND_MM`, at which it is tested for a line; the 24 directions are then less
 than half a millimetre apart."""
 _MOST_MAXIMA = 500
 """Bounds the time; weaker maxima are no candidates."""
 _REACH = 2.0
-"""Half the window in which a dot is placed, in `surround_mm`."""
+"""Half the window in which a dot is placed, in `_SURROUND_MM`."""
 
 
-class DotSettings(BaseModel):
-    """How dots are found."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    dot_mm: float = Field(0.35, gt=0, description="Standard deviation of the Gaussian that a dot resembles.")
-    surround_mm: float = Field(
-        1.2, gt=0, description="Standard deviation of the Gaussian that it must stand out from."
-    )
-    apart_mm: float = Field(
-        0.8, gt=0, description="Of dots nearer to each other than this, the strongest counts."
-    )
-    noise_sds: float = Field(
-        5.0, ge=0, description="Least contrast of a dot, in robust standard deviations of the whole image's."
-    )
-    level: float = Field(0.5, gt=0, lt=1, description="Part of its peak above which a dot's pixels count.")
-    candidates: int = Field(20, ge=1, description="The strongest dots of an image that are kept.")
+_DOT_MM, _SURROUND_MM = 0.35, 1.2
+"""Standard deviations of the Gaussian that a dot resembles, and of the one that it must stand out from."""
+_APART_MM = 0.8
+"""Of dots nearer to each other than this, the strongest counts."""
+_NOISE_SDS = 5.0
+"""Least contrast of a dot, in robust standard deviations of the whole image's."""
+_LEVEL = 0.5
+"""Part of its peak above which a dot's pixels count."""
+_MOST_DOTS = 20
 
 
 @dataclass(frozen=True)
@@ -89,7 +80,6 @@ class Dots:
 def dots_in_image(
     image: npt.NDArray[Any],
     pixel_mm: npt.ArrayLike,
-    settings: DotSettings | None = None,
     region_px: npt.ArrayLike | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Find the bright dots of one image.
@@ -114,17 +104,15 @@ def dots_in_image(
     InvalidInputError
         If an argument is not what it must be.
     """
-    s = settings or DotSettings()
     size = checked_pixel(pixel_mm)
     require_image(image)
     inside = None if region_px is None else region_mask(image.shape, region_px)
-    return _dots(image, size, s, inside)
+    return _dots(image, size, inside)
 
 
 def dots_in_frames(
     frames: Frames,
     pixel_mm: npt.ArrayLike,
-    settings: DotSettings | None = None,
     region_px: npt.ArrayLike | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Dots:
@@ -133,7 +121,7 @@ def dots_in_frames(
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
-    pixel_mm, settings, region_px
+    pixel_mm, region_px
         See `dots_in_image`.
     progress : callable, optional
         Called with the number of frames done and their total.
@@ -143,10 +131,9 @@ def dots_in_frames(
     InvalidInputError
         If an argument is not what it must be.
     """
-    s = settings or DotSettings()
     size, count = checked_pixel(pixel_mm), frames.shape[0]
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    found = in_every_frame(frames, lambda image: _dots(image, size, s, inside), progress)
+    found = in_every_frame(frames, lambda image: _dots(image, size, inside), progress)
     held = [len(score) for _, score in found]
     return Dots(
         frame=np.repeat(np.arange(count), held),
@@ -157,51 +144,47 @@ def dots_in_frames(
 
 
 def _dots(
-    image: npt.NDArray[Any], pixel_mm: FloatArray, s: DotSettings, inside: BoolArray | None
+    image: npt.NDArray[Any], pixel_mm: FloatArray, inside: BoolArray | None
 ) -> tuple[FloatArray, FloatArray]:
     grey = np.asarray(image, dtype=np.float32)
     require_finite(grey, "image")
-    contrast = ndimage.gaussian_filter(grey, s.dot_mm / pixel_mm)
-    contrast -= ndimage.gaussian_filter(grey, s.surround_mm / pixel_mm, truncate=3.0)
-    limit = _limit(contrast if inside is None else contrast[inside], s)
-    peaks = _maxima(contrast, limit, pixel_mm, s, inside)
-    score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm, s)
+    contrast = ndimage.gaussian_filter(grey, _DOT_MM / pixel_mm)
+    contrast -= ndimage.gaussian_filter(grey, _SURROUND_MM / pixel_mm, truncate=3.0)
+    limit = _limit(contrast if inside is None else contrast[inside])
+    peaks = _maxima(contrast, limit, pixel_mm, inside)
+    score = contrast[tuple(peaks.T)] - _along_lines(contrast, peaks, pixel_mm)
     best = np.argsort(-score, kind="stable")
-    best = best[score[best] > limit][: s.candidates]
-    fine = ndimage.gaussian_filter(grey, _PLACING * s.dot_mm / pixel_mm)
-    places = [_placed(fine, peak, pixel_mm, s) for peak in peaks[best]]
+    best = best[score[best] > limit][:_MOST_DOTS]
+    fine = ndimage.gaussian_filter(grey, _PLACING * _DOT_MM / pixel_mm)
+    places = [_placed(fine, peak, pixel_mm) for peak in peaks[best]]
     return np.reshape(places, (-1, 2)), score[best].astype(float)
 
 
-def _limit(contrast: Float32Array, s: DotSettings) -> float:
+def _limit(contrast: Float32Array) -> float:
     # Every seventh pixel: enough for the noise, in a seventh of the time.
     noise = robust_sigma(contrast.ravel()[::7])
     rounding = float(np.finfo(np.float32).eps * np.abs(contrast).max())
-    return float(np.max([s.noise_sds * noise, _FAINTEST * float(contrast.max()), rounding]))
+    return float(np.max([_NOISE_SDS * noise, _FAINTEST * float(contrast.max()), rounding]))
 
 
-def _maxima(
-    contrast: Float32Array, limit: float, pixel_mm: FloatArray, s: DotSettings, inside: BoolArray | None
-) -> IntArray:
-    """Columns and rows of maxima that are `apart_mm` apart, shape (n, 2), strongest first."""
-    size = 2 * np.maximum(np.rint(s.apart_mm / 2 / pixel_mm), 1).astype(int) + 1
+def _maxima(contrast: Float32Array, limit: float, pixel_mm: FloatArray, inside: BoolArray | None) -> IntArray:
+    """Columns and rows of maxima that are `_APART_MM` apart, shape (n, 2), strongest first."""
+    size = 2 * np.maximum(np.rint(_APART_MM / 2 / pixel_mm), 1).astype(int) + 1
     around = np.ones(size, dtype=bool)
     features = extra_module("skimage.feature", "calibrate", "finding dots of wires")
     peaks = features.peak_local_max(contrast, footprint=around, threshold_abs=limit, exclude_border=False)
     if inside is not None:
         peaks = peaks[inside[tuple(peaks.T)]]
-    return _far_apart(peaks[:_MOST_MAXIMA], s.apart_mm / pixel_mm)
+    return _far_apart(peaks[:_MOST_MAXIMA], _APART_MM / pixel_mm)
 
 
-def _along_lines(
-    contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray, s: DotSettings
-) -> Float32Array:
+def _along_lines(contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray) -> Float32Array:
     """Contrast of lines that peaks may be part of, shape (n,): the lesser of that on two opposite sides.
 
     Specular echoes, as of the floor or the phantom's frame, would otherwise be taken for rows of dots.
     """
     angle = np.linspace(0.0, np.pi, _ANGLES, endpoint=False)
-    away = _LINE_REACH * s.surround_mm * np.column_stack([np.cos(angle), np.sin(angle)]) / pixel_mm
+    away = _LINE_REACH * _SURROUND_MM * np.column_stack([np.cos(angle), np.sin(angle)]) / pixel_mm
     sides = []
     for step in (away, -away):
         places = np.rint(peaks[:, None] + step).astype(int)
@@ -221,22 +204,22 @@ def _far_apart(peaks: IntArray, apart_px: FloatArray) -> IntArray:
     return peaks[kept]
 
 
-def _placed(fine: Float32Array, peak: IntArray, pixel_mm: FloatArray, s: DotSettings) -> FloatArray:
-    """Centroid of the pixels of a dot above `level`, weighted by their height above it.
+def _placed(fine: Float32Array, peak: IntArray, pixel_mm: FloatArray) -> FloatArray:
+    """Centroid of the pixels of a dot above `_LEVEL`, weighted by their height above it.
 
-    The parts of a grainy dot count together: all that reach within `dot_mm` of its peak. scikit-image's
+    The parts of a grainy dot count together: all that reach within `_DOT_MM` of its peak. scikit-image's
     `regionprops` knows one part only, and takes twice the time.
     """
-    reach = np.rint(_REACH * s.surround_mm / pixel_mm).astype(int)
+    reach = np.rint(_REACH * _SURROUND_MM / pixel_mm).astype(int)
     start = np.maximum(peak - reach, 0)
     window = fine[start[0] : peak[0] + reach[0] + 1, start[1] : peak[1] + reach[1] + 1]
     row, column = np.meshgrid(*(np.arange(n) for n in window.shape[::-1]))
     away = np.hypot((column + start[0] - peak[0]) * pixel_mm[0], (row + start[1] - peak[1]) * pixel_mm[1])
     base = float(np.median(window))
-    top = float(window[away <= s.dot_mm].max(initial=base))
-    height = window - (base + s.level * (top - base))
+    top = float(window[away <= _DOT_MM].max(initial=base))
+    height = window - (base + _LEVEL * (top - base))
     labels = ndimage.label(height > 0)[0]
-    own = np.unique(labels[(away <= s.dot_mm) & (height > 0)])
+    own = np.unique(labels[(away <= _DOT_MM) & (height > 0)])
     weight = np.where(np.isin(labels, own) & (labels > 0), height, 0.0)
     total = float(weight.sum())
     if total <= 0:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from calibration.detection.region import Columns
+from calibration.settings import Place
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.kernels.lines import echo_fronts, echo_levels, filter_columns, first_edges
-
-Place = Literal["front", "slope", "peak"]
 
 _FINE = 0.25
 """Smoothing for placing an echo, as a share of that for finding it: enough against noise, little against

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
-from calibration.chain import Chain, Seen
 from calibration.detection.dots import Dots
-from calibration.starts import free_fits, rigid_fits
+from calibration.plane import Chain
+from calibration.points import Seen
+from calibration.wire_fits import free_fits, rigid_fits
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
@@ -41,30 +41,25 @@ _BEYOND_MM = 5.0
 """How far beyond a wire's stated ends it may be seen: ends are where it is fastened, roughly."""
 
 
-class LabelSettings(BaseModel):
-    """How dots are assigned to wires."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    collinear_mm: float = Field(0.8, gt=0, description="How far a dot may be off the line of the outer two.")
-    residual_mm: float = Field(0.5, gt=0, description="Largest root mean square misfit of a frame's dots.")
-    pixel_tolerance: float = Field(
-        0.05, gt=0, description="Relative standard deviation of the pixel size that is given."
-    )
-    gate_mm: float = Field(
-        1.5, gt=0, description="How far from where a calibration says it is a wire's dot may be."
-    )
+_COLLINEAR_MM = 0.8
+"""How far a dot may be off the line of the outer two."""
+_RESIDUAL_MM = 0.5
+"""Largest root mean square misfit of a frame's dots."""
+_PIXEL_TOLERANCE = 0.05
+"""Relative standard deviation of the pixel size that is given."""
+_GATE_MM = 1.5
+"""How far from where a calibration says it is a wire's dot may be."""
+_WIDTHS, _GAPS = (0.9, 1.1 * _STEEPEST), (0.85, 1.1 * _STEEPEST)
+"""Distances in the image over the phantom's: of a layer's outer wires, and between layers."""
 
 
-def label_dots(
-    dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike, settings: LabelSettings | None = None
-) -> Seen:
+def label_dots(dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> Seen:
     """Assign dots to the wires of an N-wire phantom, each frame by itself.
 
     Parameters
     ----------
     pixel_mm : array_like, shape (2,)
-        Distance between columns and between rows, mm, known to `LabelSettings.pixel_tolerance`.
+        Distance between columns and between rows, mm, known to 5 %.
 
     Returns
     -------
@@ -77,14 +72,14 @@ def label_dots(
     InvalidInputError
         If the phantom has fewer than two N, or they are not parallel.
     """
-    s, layers, size = settings or LabelSettings(), _layers(phantom), np.asarray(pixel_mm, dtype=float)
+    layers, size = _layers(phantom), np.asarray(pixel_mm, dtype=float)
     wires = np.concatenate([layer.wires for layer in layers])
     found: dict[int, FloatArray] = {}
     dropped = dict(dots.dropped)
     for frame in np.unique(dots.frame):
         here = dots.frame == frame
         try:
-            chosen = _label(dots.pixels[here] * size, dots.score[here], layers, phantom, s)
+            chosen = _label(dots.pixels[here] * size, dots.score[here], layers, phantom)
             found[int(frame)] = dots.pixels[here][chosen]
         except InsufficientDataError as error:
             dropped[int(frame)] = str(error)
@@ -101,7 +96,6 @@ def label_by_calibration(
     phantom: WirePhantom,
     chain: Chain,
     world_from_sensor: RigidTransform,
-    settings: LabelSettings | None = None,
 ) -> Seen:
     """Assign to each wire the dot nearest to where a calibration predicts it.
 
@@ -117,14 +111,13 @@ def label_by_calibration(
     Seen
         The wires found in each frame.
     """
-    s = settings or LabelSettings()
     image_from_phantom = (chain.target_from_world * world_from_sensor * chain.sensor_from_image).inv()
     kept: list[tuple[int, int, int]] = []
     dropped = dict(dots.dropped)
     for frame in np.unique(dots.frame):
         here = np.flatnonzero(dots.frame == frame)
         expected_mm = _seen_at(phantom, image_from_phantom[int(frame)])
-        pairs = _nearest(dots.pixels[here] * chain.pixel_mm, dots.score[here], expected_mm, s.gate_mm)
+        pairs = _nearest(dots.pixels[here] * chain.pixel_mm, dots.score[here], expected_mm)
         kept += [(int(frame), int(here[dot]), wire) for dot, wire in pairs]
         if not pairs:
             dropped[int(frame)] = "no dot where the calibration expects a wire"
@@ -165,24 +158,34 @@ def _layers(phantom: WirePhantom) -> list[_Layer]:
     return layers
 
 
-def _label(
-    dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom: WirePhantom, s: LabelSettings
-) -> IntArray:
-    """Which dot shows each wire of the layers, shape (3 layers,), of one frame."""
-    triples = [_triples(dots_mm, layer, phantom, s) for layer in layers]
-    missing = [i for i, found in enumerate(triples) if len(found) == 0]
-    if missing:
-        raise InsufficientDataError(f"no three dots in a line for layer {missing[0]}")
-    chosen = _combined(triples, dots_mm, score, layers)
-    if len(chosen) == 0:
-        raise InsufficientDataError("no parallel lines of dots at the layers' distances")
+def _label(dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom: WirePhantom) -> IntArray:
+    """Which dot shows each wire of the layers, shape (3 layers,), of one frame.
+
+    Raises
+    ------
+    InsufficientDataError
+        Saying which rule failed, and by how much.
+    """
     wires = np.concatenate([layer.wires for layer in layers])
+    few = f" ({len(dots_mm)} dots for {wires.size} wires)" if len(dots_mm) < wires.size else ""
+    triples = [_triples(dots_mm, layer, phantom) for layer in layers]
+    for number, (layer, (found, nearest)) in enumerate(zip(layers, triples, strict=True)):
+        if len(found) == 0:
+            names = "-".join(phantom.names[k] for k in layer.wires)
+            raise InsufficientDataError(
+                f"no three dots in a line for layer {number} ({names}): {nearest}{few}"
+            )
+    chosen, nearest = _combined([found for found, _ in triples], dots_mm, score, layers)
+    if len(chosen) == 0:
+        raise InsufficientDataError(f"no parallel lines of dots at the layers' distances: {nearest}{few}")
     loose = free_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
     chosen = chosen[np.argsort(loose)[:_REFINED]]
-    _, _, rms_mm = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, s.pixel_tolerance)
+    _, _, rms_mm = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, _PIXEL_TOLERANCE)
     best = float(rms_mm.min())
-    if best > s.residual_mm:
-        raise InsufficientDataError("no dots fit the wires")
+    if best > _RESIDUAL_MM:
+        raise InsufficientDataError(
+            f"no dots fit the wires: the nearest miss them by {best:.2f} mm RMS, {_RESIDUAL_MM:g} allowed"
+        )
     like = np.flatnonzero(rms_mm <= best + _LIKE_MM)
     # Rounded, so that where the same dots fit either way round, the usual one is chosen.
     strength = np.round(score[chosen[like]].sum(axis=1) / score.max(), 6)
@@ -196,8 +199,8 @@ def _unusual(labelled_mm: FloatArray) -> int:
     return int(layers[0, 0, 0] < layers[0, 2, 0]) + int(layers[0, :, 1].mean() > layers[-1, :, 1].mean())
 
 
-def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom, s: LabelSettings) -> IntArray:
-    """Dots that may be a layer's first, middle and last wire, shape (t, 3)."""
+def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> tuple[IntArray, str]:
+    """Dots that may be a layer's first, middle and last wire, shape (t, 3); and how near others come."""
     between = dots_mm[None, :] - dots_mm[:, None]
     length = np.linalg.norm(between, axis=2)
     # Axes: first, last and middle dot.
@@ -205,11 +208,30 @@ def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom, s: LabelS
     to_middle = between[:, None]
     reach = x[..., None] * to_middle[..., 0] + y[..., None] * to_middle[..., 1]
     off = np.abs(x[..., None] * to_middle[..., 1] - y[..., None] * to_middle[..., 0])
-    long = (length > 0.9 * layer.width_mm) & (length < 1.1 * _STEEPEST * layer.width_mm)
+    ratio = length / layer.width_mm
+    long = (ratio > _WIDTHS[0]) & (ratio < _WIDTHS[1])
     between_them = (reach > _LEAST_MM) & (reach < length[..., None] - _LEAST_MM)
-    first, last, middle = np.nonzero(long[..., None] & between_them & (off < s.collinear_mm))
+    first, last, middle = np.nonzero(long[..., None] & between_them & (off < _COLLINEAR_MM))
     inside = _within_ends(reach[first, last, middle] / length[first, last], layer, phantom)
-    return np.stack([first, middle, last], axis=1)[inside]
+    triples = np.stack([first, middle, last], axis=1)[inside]
+    if len(triples):
+        return triples, ""
+    if len(first):
+        return triples, "the middle one is beyond the ends of its wire"
+    if (long[..., None] & between_them).any():
+        nearest = off[long[..., None] & between_them].min()
+        return triples, f"the middle one is {nearest:.1f} mm off it, {_COLLINEAR_MM:g} allowed"
+    straight = between_them & (off < _COLLINEAR_MM)
+    return triples, _off_by(np.broadcast_to(ratio[..., None], straight.shape)[straight], _WIDTHS)
+
+
+def _off_by(ratio: FloatArray, limits: tuple[float, float]) -> str:
+    """How far the nearest of some distances is from what is allowed, in words."""
+    if ratio.size == 0:
+        return "none are in line"
+    nearest = ratio[np.argmin(np.maximum(limits[0] - ratio, ratio - limits[1]))]
+    side = "wider" if nearest > 1 else "narrower"
+    return f"spacing {100 * abs(nearest - 1.0):.0f} % {side} than the wires'"
 
 
 def _within_ends(share: FloatArray, layer: _Layer, phantom: WirePhantom) -> npt.NDArray[np.bool_]:
@@ -225,31 +247,40 @@ def _within_ends(share: FloatArray, layer: _Layer, phantom: WirePhantom) -> npt.
 
 def _combined(
     triples: list[IntArray], dots_mm: FloatArray, score: FloatArray, layers: list[_Layer]
-) -> IntArray:
-    """Hypotheses: a triple for each layer, parallel and at the layers' distances, shape (h, 3 layers)."""
+) -> tuple[IntArray, str]:
+    """Hypotheses: parallel triples at the layers' distances, shape (h, 3 layers); else what fails."""
     chosen = triples[0]
     for layer, found in zip(layers[1:], triples[1:], strict=True):
-        fits = _side_by_side(chosen[:, :3], found, dots_mm, layers[0], layer)
-        fits &= ~(chosen[:, None, :, None] == found[None, :, None, :]).any(axis=(2, 3))
-        one, other = np.nonzero(fits)
+        cosine, ratio = _side_by_side(chosen[:, :3], found, dots_mm, layers[0], layer)
+        shared = (chosen[:, None, :, None] == found[None, :, None, :]).any(axis=(2, 3))
+        parallel = (cosine > _PARALLEL_COSINE) & ~shared
+        one, other = np.nonzero(parallel & (ratio > _GAPS[0]) & (ratio < _GAPS[1]))
+        if len(one) == 0:
+            why = "the same row of dots would serve two layers"
+            if parallel.any():
+                why = _off_by(ratio[parallel], _GAPS)
+            elif not shared.all():
+                turn = np.rad2deg(np.arccos(cosine[~shared].max()))
+                allowed = np.rad2deg(np.arccos(_PARALLEL_COSINE))
+                why = f"the nearest are turned by {turn:.0f} degrees, {allowed:.0f} allowed"
+            return np.zeros((0, 3), np.int64), why
         chosen = np.concatenate([chosen[one], found[other]], axis=1)
         strongest = np.argsort(-score[chosen].sum(axis=1), kind="stable")
         chosen = chosen[strongest[:_MOST_HYPOTHESES]]
-    return chosen
+    return chosen, ""
 
 
 def _side_by_side(
     first: IntArray, other: IntArray, dots_mm: FloatArray, layer: _Layer, below: _Layer
-) -> npt.NDArray[np.bool_]:
-    """Which triples of one layer, (a, 3), and of another, (b, 3), may be in one image, shape (a, b)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Cosine between triples of two layers, (a, 3) and (b, 3), and their distance over the layers'."""
     along = [dots_mm[t[:, 2]] - dots_mm[t[:, 0]] for t in (first, other)]
     unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in along]
-    parallel = (unit[0] @ unit[1].T) * layer.turned * below.turned > _PARALLEL_COSINE
+    cosine = np.clip((unit[0] @ unit[1].T) * layer.turned * below.turned, -1.0, 1.0)
     middle = [dots_mm[t[:, [0, 2]]].mean(axis=1) for t in (first, other)]
     apart = middle[1][None] - middle[0][:, None]
     distance = np.abs(unit[0][:, None, 0] * apart[..., 1] - unit[0][:, None, 1] * apart[..., 0])
-    gap = abs(below.height_mm - layer.height_mm)
-    return np.asarray(parallel & (distance > 0.85 * gap) & (distance < 1.1 * _STEEPEST * gap))
+    return np.asarray(cosine), np.asarray(distance / abs(below.height_mm - layer.height_mm))
 
 
 def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatArray:
@@ -262,12 +293,10 @@ def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatA
     return np.asarray(place[:, :2] + steps[:, None] * along[:, :2])
 
 
-def _nearest(
-    dots_mm: FloatArray, score: FloatArray, expected_mm: FloatArray, gate_mm: float
-) -> list[tuple[int, int]]:
+def _nearest(dots_mm: FloatArray, score: FloatArray, expected_mm: FloatArray) -> list[tuple[int, int]]:
     """Pairs of dot and wire, each in one pair at most; a stronger dot may be farther away."""
     apart = np.linalg.norm(dots_mm[:, None] - expected_mm[None], axis=2)
-    worth = np.where(apart < gate_mm, score[:, None] * np.exp(-2.0 * (apart / gate_mm) ** 2), 0.0)
+    worth = np.where(apart < _GATE_MM, score[:, None] * np.exp(-2.0 * (apart / _GATE_MM) ** 2), 0.0)
     pairs = []
     while worth.size and worth.max() > 0:
         dot, wire = (int(i) for i in np.unravel_index(int(worth.argmax()), worth.shape))

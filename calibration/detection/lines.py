@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 
-from calibration.chain import Seen
-from calibration.detection.edges import Edges, Place, first_echoes, take_profiles, typical
+from calibration.detection.edges import Edges, first_echoes, take_profiles, typical
 from calibration.detection.region import (
     DENSELY,
     Columns,
@@ -24,6 +22,8 @@ from calibration.detection.region import (
     without_blank_sides,
     without_standing,
 )
+from calibration.points import Seen
+from calibration.settings import LineSettings
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import autocorrelation_time
@@ -41,41 +41,6 @@ _LEAST_SHARE = 0.25
 corner of the region, two or three noisy edges always agree."""
 _FINEST_ROWS = 0.1
 """Least scatter of an edge's place: the precision of interpolation between rows."""
-
-
-class LineSettings(BaseModel):
-    """How the line of a plane's echo is found, [1]_ appendix B.
-
-    References
-    ----------
-    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    columns: int = Field(60, ge=5, description="Columns sampled, at regular intervals.")
-    smoothing_mm: float = Field(
-        0.7, gt=0, description="Standard deviation of the Gaussian along a column whose slope shows edges."
-    )
-    threshold: float | None = Field(
-        None,
-        gt=0,
-        description="Least slope of an edge, grey levels per mm; by default echoes are judged by their "
-        "brightness instead, against several thresholds, and the first bright line is taken.",
-    )
-    tolerance_mm: float = Field(0.5, gt=0, description="How far above or below the line an edge agrees.")
-    consensus: float = Field(
-        0.7,
-        gt=0,
-        le=1,
-        description="Share that must agree of the columns in which the line is inside the region.",
-    )
-    place: Place = Field(
-        "peak",
-        description="Where on an echo the line is put: where it has risen half way (front), where the "
-        "smoothed image is steepest (slope; up to smoothing_mm above a thin echo), or where it is brightest "
-        "(peak; of a thick beam that meets a wall at an angle, the middle; the front is its nearer edge).",
-    )
 
 
 class NoLineError(InsufficientDataError):

@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import eigh
 
 from calibration.images.similarity import Comparison, Estimate, Similarity
 from speckle3d.core.arrays import FloatArray
@@ -30,14 +29,6 @@ LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])
 
 SETTLED = 2e-3
 """Step of the image's edge, mm, at which the fit has converged: a hundredth of speckle's error."""
-
-APART_MM = 0.3
-"""Displacement of the image's edge, mm, for central differences of the slopes: less than speckle's blur."""
-
-LEAST_CURVATURE = 0.02
-"""Least curvature in any direction, as a share of Gauss-Newton's: where the similarity hardly falls, or
-rises, it makes the standard errors so large that the direction is seen to be undetermined. Scenes that
-determine all parameters have shares of 0.1 to 0.7."""
 
 _MOST_STEPS, _LONGEST_MM, _SHORTER = 8, 1.0, 3
 """Steps, how far one may move the image's edge, mm, since over speckle's blur the curvature changes, and how
@@ -68,8 +59,8 @@ class Refined:
     comparison: Comparison
     pivot_mm: FloatArray
     free: tuple[int, ...]
-    evaluations: int
-    converged: bool
+    evaluations: int = 0
+    converged: bool = False
 
     @property
     def places_mm(self) -> FloatArray:
@@ -159,52 +150,27 @@ def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
     return bool(base @ loss[1] < base @ loss[0])
 
 
-def settle(refined: Refined, share: bool = False) -> tuple[Refined, FloatArray]:
-    """Take Newton steps from where Gauss-Newton stopped, all with the curvature there; return that, too."""
-    bend = curvature(refined, share)
+def settle(refined: Refined, curvature: FloatArray, share: bool = False) -> Refined:
+    """Take Newton steps from where Gauss-Newton stopped, all with one curvature, shape (f, f)."""
     now, converged = refined, False
     for _ in range(_MOST_STEPS):
         step = np.zeros(len(LEVERS_MM))
-        try:
-            step[list(now.free)] = np.linalg.solve(bend, now.system[1])
-        except np.linalg.LinAlgError:
-            # Some motion changes nothing at all; whether enough is determined is asked later.
-            break
+        step[list(now.free)] = np.linalg.solve(curvature, now.system[1])
         size = float(np.abs(step * LEVERS_MM).max())
         step *= min(1.0, _LONGEST_MM / size) if size > 0.0 else 1.0
-        moved = now
         for _ in range(_SHORTER):
-            converged = float(np.abs(step * LEVERS_MM).max()) < SETTLED
-            if converged:
-                break
             moved = _stepped(now, step, share)
-            if better(now.similarity, moved.similarity, now.weight):
+            if size < SETTLED or better(now.similarity, moved.similarity, now.weight):
                 break
             step /= 4.0
         else:
             converged = size < 10.0 * SETTLED  # no better within rounding
             break
-        if converged:
-            break
         now = moved
-    return replace(now, converged=converged), bend
-
-
-def curvature(refined: Refined, share: bool = False) -> FloatArray:
-    """Curvature of the similarity by central differences of its exact slope, shape (f, f)."""
-    chosen, base = list(refined.free), about_pivot(refined.pivot_mm)
-    found = np.empty((len(chosen), len(chosen)))
-    for column, parameter in enumerate(chosen):
-        slopes = []
-        for sign in (1.0, -1.0):
-            step = np.zeros(len(LEVERS_MM))
-            step[parameter] = sign * APART_MM / LEVERS_MM[parameter]
-            there = refined.estimate.stepped(step, refined.pivot_mm)
-            seen = refined.comparison.at(there, True, share)
-            weight = np.where(seen.valid, refined.weight, 0.0)
-            slopes.append((base.T @ (weight @ seen.gradient))[chosen])
-        found[:, column] = (slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM)
-    return positive(found, refined.system[0])
+        if size < SETTLED:
+            converged = True
+            break
+    return replace(now, converged=converged)
 
 
 def _stepped(refined: Refined, step: FloatArray, share: bool) -> Refined:
@@ -212,11 +178,3 @@ def _stepped(refined: Refined, step: FloatArray, share: bool) -> Refined:
     seen = refined.comparison.at(estimate, True, share)
     count = refined.evaluations + 1
     return replace(refined, estimate=estimate, similarity=seen, weight=weights(seen), evaluations=count)
-
-
-def positive(found: FloatArray, normal: FloatArray, least: float = LEAST_CURVATURE) -> FloatArray:
-    """Symmetrise, and raise to at least a share of a positive matrix in every direction."""
-    firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
-    part, axes = eigh((found + found.T) / 2.0, firm)
-    back = firm @ axes
-    return np.asarray((back * np.maximum(part, least)) @ back.T)

@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation
-from calibration.images.search import incremented
 from calibration.images.similarity import Comparison, Estimate
 from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration, Improvement
 from calibration.images.stacks import TrackedImages
@@ -35,15 +34,14 @@ _UNSEEN = "#33415c"
 _REACH_MM = 1.5
 
 IMAGES, SIGMA_MM = 10, 1.0
-"""Images of each sweep, and their blur, in the similarity curves and maps."""
+"""Images of each sweep, and their blur, in the similarity curves."""
 
-CURVES_TO, CURVE_POINTS, MAP_POINTS = 6.0, 25, 13
-"""Reach of the similarity curves and maps in mm and degrees, and how finely they are drawn."""
+CURVES_TO, CURVE_POINTS = 6.0, 25
+"""Reach of the similarity curves in mm and degrees, and how finely they are drawn."""
 
 WEAK_SCALE = 0.01
 """Relative standard error of an estimated pixel size above which the scanner's own value is better."""
 
-MAPS = (("x", "y"), ("z", "tilt"), ("yaw", "roll"))
 _WORSE = 0.02
 """Most that the correlation of held-out frames may fall below that at the start: twice what it varies between
 answers from different starts."""
@@ -91,7 +89,7 @@ def notes_of(result: ImageCalibration, angulation: Angulation) -> list[str]:
         "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
         f"claimed errors allow for a tracker that displaces one sweep against the other by "
         f"{result.settings.tracker_mm:g} mm and {result.settings.tracker_deg:g} degrees",
-        f"{result.evaluations} comparisons by {result.settings.method}",
+        f"{result.evaluations} comparisons",
     ]
 
 
@@ -103,62 +101,47 @@ def _told(gained: Improvement) -> str:
 def figure_of(
     result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
 ) -> Figure:
-    """One page: images beside reslices before and after, similarity about the answer, what errors would do.
-
-    The maps are Figure 4 of [1]_.
-
-    References
-    ----------
-    .. [1] Wein and Khamene, SPIE Medical Imaging 6920, 2008.
-    """
-    figure = Figure(figsize=(12.0, 14.4), layout="constrained")
+    """One page: images beside reslices before and after, similarity about the answer, effect of errors."""
+    figure = Figure(figsize=(12.0, 10.8), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(4, 3, height_ratios=[1.3, 1.3, 1.0, 1.0])
+    panels = figure.subplots(3, 3, height_ratios=[1.3, 1.3, 1.0])
     for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
         held = result.sweeps.frames_held_out[k]
         _draw_images(panels[k], result, one, other, int(held[len(held) // 2]))
-    comparison = result.sweeps.whole(SIGMA_MM, IMAGES, result.sensor_from_image)
+    comparison = result.sweeps.whole(SIGMA_MM, result.sensor_from_image, IMAGES)
     about = Estimate(result.sensor_from_image, result.scales)
     offset = np.linspace(-CURVES_TO, CURVES_TO, CURVE_POINTS)
     for axes, names in ((panels[2, 0], PARAMETERS[3:]), (panels[2, 1], PARAMETERS[:3])):
         for name, colour in zip(names, _COLOURS, strict=True):
-            axes.plot(offset, similarities(comparison, about, (name,), offset), color=colour, label=name)
+            axes.plot(offset, similarities(comparison, about, name, offset), color=colour, label=name)
         axes.set(xlabel=f"off the answer / {_unit_of(names[0])}", ylabel="mean correlation")
         axes.legend(fontsize=8)
     _draw_strength(panels[2, 2], angulation)
-    offset = np.linspace(-CURVES_TO, CURVES_TO, MAP_POINTS)
-    for axes, pair in zip(panels[3], MAPS, strict=True):
-        _draw_map(axes, pair, offset, similarities(comparison, about, pair, offset))
     for axes in panels[2:].flat:
         axes.grid(alpha=0.3)
     figure.suptitle(f"verdict: {_verdict(result, angulation)}", fontsize=10)
     return figure
 
 
-def similarities(
-    comparison: Comparison, about: Estimate, names: tuple[str, ...], offset: FloatArray
-) -> FloatArray:
-    """Mean correlation of images with cuts of the other sweep, with some of `PARAMETERS` moved at once.
+def similarities(comparison: Comparison, about: Estimate, name: str, offset: FloatArray) -> FloatArray:
+    """Mean correlation of images with cuts of the other sweep, with one of `PARAMETERS` moved, shape (k,).
 
     Parameters
     ----------
-    names : tuple of str, length d
-        They move the image at its origin, not about its centre.
     offset : ndarray, shape (k,)
-        Degrees for turns, mm for displacements.
+        Degrees about, or mm along, an axis of the image through its origin.
 
     Returns
     -------
-    ndarray, shape (k, ...) with d axes
+    ndarray, shape (k,)
         NaN where no image overlaps the other sweep by three tenths.
     """
-    units = np.eye(6)[[PARAMETERS.index(name) for name in names]]
-    steps = np.stack(np.meshgrid(*[offset] * len(names), indexing="ij"), axis=-1) @ units
+    unit = np.eye(8)[PARAMETERS.index(name)] * (np.deg2rad(1.0) if name in PARAMETERS[:3] else 1.0)
 
-    def at(step: FloatArray) -> float:
-        return comparison.at(incremented(about, step)).mean
+    def at(step: float) -> float:
+        return comparison.at(about.stepped(step * unit, np.zeros(3))).mean
 
-    return np.reshape(list(ahead(at, steps.reshape(-1, 6))), steps.shape[:-1])
+    return np.array(list(ahead(at, offset.tolist())))
 
 
 def cut_of(
@@ -197,15 +180,6 @@ def _reach_mm(poses: RigidTransform) -> float:
     """A little more than the distance between frames deep in a fan."""
     steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
     return max(_REACH_MM, 1.5 * float(np.percentile(steps, 98))) if len(steps) else _REACH_MM
-
-
-def _draw_map(axes: Axes, names: tuple[str, str], offset: FloatArray, similarity: FloatArray) -> None:
-    drawn = axes.contourf(offset, offset, similarity.T, 16, cmap="viridis")
-    axes.figure.colorbar(drawn, ax=axes, label="mean correlation")
-    axes.plot(0.0, 0.0, "+", color="white")
-    axes.set_title("about the answer (cross)", fontsize=8)
-    across, up = (f"{name} / {_unit_of(name)}" for name in names)
-    axes.set(xlabel=across, ylabel=up)
 
 
 def _unit_of(name: str) -> str:

@@ -1,12 +1,7 @@
-"""Two ways from a rough start to a calibration: a search of a whole box, and the published Nelder-Mead.
+"""From a rough start to where the fit takes over: a box of calibrations searched from coarse to fine.
 
-The search looks at many places at a coarse resolution, and follows the best of them up with Gauss-Newton at
-finer and finer ones.
-
-References
-----------
-.. [1] W. Wein and A. Khamene, "Image-based method for in-vivo freehand ultrasound calibration", SPIE Medical
-   Imaging, 2008, section 2.2 (Nelder-Mead).
+Many places are looked at at a coarse resolution, and the best of them followed up by Gauss-Newton at finer
+and finer ones.
 """
 
 from __future__ import annotations
@@ -15,7 +10,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import qmc
 
@@ -45,15 +39,6 @@ _FOLLOWED, _COMPARED, _HOPPED, _DECIDED = 20, 5, 3, 3
 _STEPS = 12
 
 _SAME_MM = 1.5
-
-PUBLISHED_IMAGES = 8
-"""Images of each sweep that Nelder-Mead compares; published: 5 to 10."""
-
-MAX_EVALUATIONS = 1500
-"""Limit of Nelder-Mead."""
-
-_SIMPLEX_EDGE = 10.0
-"""Edges of the first simplex, mm and degrees: half of the displacements it is to recover from."""
 
 
 def search(
@@ -100,49 +85,6 @@ def search(
     looks += _BESIDE * len(compared[:_HOPPED])
     looks += sum(one.evaluations for one in followed + compared + hopped + again + decided)
     return _distinct(decided, crossing), looks
-
-
-def climb(
-    crossing: CrossingSweeps,
-    start: Estimate,
-    scales: bool,
-    progress: Progress | None = None,
-) -> tuple[Estimate, int, bool]:
-    """Maximise the mean correlation by Nelder-Mead over increments of the start (`incremented`).
-
-    Returns
-    -------
-    tuple of Estimate, int and bool
-        The answer, how many were compared, and whether the simplex converged.
-    """
-    comparison = crossing.published(PUBLISHED_IMAGES)
-    count = 0
-
-    def unlike(increment: FloatArray) -> float:
-        nonlocal count
-        count += 1
-        if progress:
-            progress("simplex", count, MAX_EVALUATIONS)
-        mean = comparison.at(incremented(start, increment), share=True).mean
-        return 1.0 - mean if np.isfinite(mean) else 2.0
-
-    size = 8 if scales else 6
-    corners = np.vstack([np.zeros(size), np.diag([_SIMPLEX_EDGE] * 6 + [2.0] * (size - 6))])
-    found = minimize(
-        unlike,
-        np.zeros(size),
-        method="Nelder-Mead",
-        options={"initial_simplex": corners, "xatol": 0.02, "fatol": 1e-5, "maxfev": MAX_EVALUATIONS},
-    )
-    return incremented(start, found.x), int(found.nfev), bool(found.success)
-
-
-def incremented(start: Estimate, increment: FloatArray) -> Estimate:
-    """Right-multiply by Euler angles about x, y, z in degrees and mm; scale pixels by per cent, if given."""
-    turn = Rotation.from_euler("xyz", increment[:3], degrees=True)
-    moved = start.sensor_from_image * RigidTransform.from_components(increment[3:6], turn)
-    scales = start.scales * (1.0 + 0.01 * increment[6:8]) if len(increment) > 6 else start.scales
-    return Estimate(moved, scales)
 
 
 @dataclass(frozen=True)

@@ -258,28 +258,21 @@ class CrossingSweeps:
         ]
         return Comparison(thin, (patches[0], patches[1]), self._gap(sigma, thin, sensor_from_image))
 
-    def whole(self, sigma_mm: float, images: int, sensor_from_image: RigidTransform) -> Comparison:
-        """Comparison of whole blurred images, as in the published method, near a calibration."""
+    def whole(
+        self, sigma_mm: float, sensor_from_image: RigidTransform, images: int | None = None
+    ) -> Comparison:
+        """Comparison of whole blurred images, near a calibration: of some used ones, or of those held out."""
         sigma = sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image)
-        a, b = (whole_images(stack, evenly(len(stack), images), sigma) for stack in thin)
+        shown = thin
+        if images is None:
+            shown = self._blurred(0, sigma, held_out=True), self._blurred(1, sigma, held_out=True)
+        a, b = (
+            whole_images(one, np.arange(len(one)) if images is None else evenly(len(one), images), sigma)
+            for one in shown
+        )
         gap = self._gap(sigma, thin, sensor_from_image)
-        return Comparison(thin, (a, b), gap, least_share=LEAST_OVERLAP)
-
-    def check(self, sigma_mm: float, sensor_from_image: RigidTransform) -> Comparison:
-        """Comparison of the held-out images with the other sweep's used ones, near a calibration."""
-        sigma = sigma_mm * self.unit
-        thin = self._thinned(sigma, sensor_from_image)
-        held = self._blurred(0, sigma, held_out=True), self._blurred(1, sigma, held_out=True)
-        a, b = (whole_images(stack, np.arange(len(stack)), sigma) for stack in held)
-        gap = self._gap(sigma, thin, sensor_from_image)
-        return Comparison(held, (a, b), gap, sources=thin, least_share=LEAST_OVERLAP)
-
-    def published(self, images: int) -> Comparison:
-        """Comparison of whole images, not thinned, with all of the other sweep's: the published method."""
-        fine = self._blurred(0, 0.5 * self.unit), self._blurred(1, 0.5 * self.unit)
-        a, b = (whole_images(stack, evenly(len(stack), images), 0.7 * self.unit) for stack in fine)
-        return Comparison(fine, (a, b), max(2.0 * self.unit, 2.0), least_share=LEAST_OVERLAP)
+        return Comparison(shown, (a, b), gap, sources=thin, least_share=LEAST_OVERLAP)
 
     def _thinned(
         self, sigma_mm: float, sensor_from_image: RigidTransform, least_weight: float = WHOLE

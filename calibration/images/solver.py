@@ -11,30 +11,29 @@ References
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import Angulation, angulation, point_motion
-from calibration.images.certainty import (
+from calibration.images.errors import (
     LEAST_SIMILARITY,
     RESTARTED,
-    certainty,
+    claimed,
+    curvature_of,
     require_known,
     require_one_answer,
 )
 from calibration.images.fit import refine, settle
-from calibration.images.search import DECIDED, climb, search
+from calibration.images.search import DECIDED, search
 from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress, prepare
 from calibration.images.stacks import TrackedImages
+from calibration.settings import ImageFit
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.leastsquares import condition_number
 from speckle3d.core.shown import shown
-from speckle3d.core.threads import on_one_thread
 
 FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
 """Resolutions at which the search's answer is refined. The last is still coarser than speckle; there many
@@ -46,38 +45,6 @@ SHOWN_SIGMA_MM = 1.0
 SPECKLED_SIMILARITY = 0.45
 """Correlation below which the verdict warns: shadows and reflections that the sweeps do not share
 displaced such answers by up to a millimetre and two degrees, more than the covariance says."""
-
-
-class ImageSettings(BaseModel):
-    """How to calibrate from two crossing sweeps.
-
-    Parameters
-    ----------
-    method : str
-        ``"gauss-newton"``, or ``"nelder-mead"`` as published.
-    scales : bool
-        Estimate the two pixel sizes too. Sweeps that both turn about one point, as two that fan alike while
-        they slide do, cannot tell a larger image from one farther off: their standard errors say so. The size
-        along the beams is always the weaker one, and takes the place of a displacement along them.
-    capture_mm, capture_deg : float
-        How far each parameter of the start may be off; with zero both, the start is only refined.
-        The published method has no such range.
-    tracker_mm, tracker_deg : float
-        Standard deviations, on each axis, of what the tracker displaces and turns one sweep against the
-        other by. No comparison of the images shows it; it is part of the claimed errors.
-    threads : int
-        One: on the calling thread alone. More: on all cores that this process may use.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    method: Literal["gauss-newton", "nelder-mead"] = "gauss-newton"
-    scales: bool = False
-    capture_mm: float = Field(20.0, ge=0, le=100)
-    capture_deg: float = Field(20.0, ge=0, le=90)
-    tracker_mm: float = Field(0.15, ge=0, le=10)
-    tracker_deg: float = Field(0.1, ge=0, le=10)
-    threads: int = Field(2, ge=1)
 
 
 @dataclass(frozen=True)
@@ -98,7 +65,7 @@ class ImageCalibration:
 
     Attributes
     ----------
-    settings : ImageSettings
+    settings : ImageFit
     sensor_from_image : RigidTransform
     scales, scale_errors : ndarray, shape (2,)
         Factors on the pixel sizes across and along the beams, and their standard errors; one and zero
@@ -110,12 +77,8 @@ class ImageCalibration:
         against the other by, and from the scatter of fits that start beside the answer. It does not know of
         an uncorrected delay of the sensor or a wrong speed of sound.
     condition_number : float
-        Of the normal matrix's root with columns scaled to unit norm; a large one means that the sweeps leave
-        some motion of the image undetermined.
-    weakest : str
-        The parameter that makes up most of the least determined direction.
-    stiffness : ndarray, shape (3,)
-        See `Certainty`.
+        Of the similarity's curvature with scaled columns, as a root; a large one means that the sweeps
+        leave some motion of the image undetermined.
     alike : float
         Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
         support; see `LEAST_SIMILARITY`.
@@ -127,7 +90,7 @@ class ImageCalibration:
         What was compared, with the numbers of the frames used and held out.
     """
 
-    settings: ImageSettings
+    settings: ImageFit
     start: RigidTransform
     sensor_from_image: RigidTransform
     scales: FloatArray
@@ -135,8 +98,6 @@ class ImageCalibration:
     pixel_mm: FloatArray
     covariance: FloatArray
     condition_number: float
-    weakest: str
-    stiffness: FloatArray
     alike: float
     similarity: Improvement
     held_out: Improvement
@@ -154,7 +115,7 @@ def calibrate_images(
     first: TrackedImages,
     second: TrackedImages,
     start: RigidTransform,
-    settings: ImageSettings | None = None,
+    settings: ImageFit | None = None,
     progress: Progress | None = None,
 ) -> ImageCalibration:
     """Find where the image is on the sensor from two crossing sweeps.
@@ -180,44 +141,35 @@ def calibrate_images(
 def calibrate_from_sweeps(
     crossing: CrossingSweeps,
     start: RigidTransform,
-    settings: ImageSettings | None = None,
+    settings: ImageFit | None = None,
     progress: Progress | None = None,
 ) -> ImageCalibration:
     """Calibrate as `calibrate_images`, from sweeps that are prepared already: for many starts."""
     if not start.single:
         raise InvalidInputError("start: expected a single transform, got a row of them")
-    chosen = settings or ImageSettings()
+    chosen = settings or ImageFit()
     first = found = Estimate(start, np.ones(2))
     free, looks, rivals = tuple(range(8 if chosen.scales else 6)), 0, list[Estimate]()
-    with on_one_thread() if chosen.threads == 1 else nullcontext():
-        if chosen.method == "nelder-mead":
-            found, looks, converged = climb(crossing, first, chosen.scales, progress)
-            # The simplex knows no derivatives; the covariance needs them.
-            comparison = crossing.level(FINE[-1], found.sensor_from_image)
-            refined = refine(comparison, found, free, max_steps=1, share=True)
-            alike = _require_alike(crossing, found)
-        else:
-            if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
-                reach = float(np.deg2rad(chosen.capture_deg))
-                (found, *rivals), looks = search(crossing, first, chosen.capture_mm, reach, progress)
-            for number, level in enumerate(FINE):
-                refined = refine(crossing.level(level, found.sensor_from_image), found, free, share=True)
-                found, looks = refined.estimate, looks + refined.evaluations
-                if progress:
-                    progress("refining", number + 1, len(FINE))
-            alike = _require_alike(crossing, found)
-            refined, _ = settle(refined, share=True)
-            found, converged = refined.estimate, refined.converged
-        near = found.sensor_from_image
-        angles = _angulation(crossing, near)
-        angles.require()
-        tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
-        restarted = crossing.level(RESTARTED, near)
-        known = certainty(refined, restarted, angles, crossing.unit, tracker, share=True)
-        if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
-            require_known(known, angles, crossing.centre_mm)
-        require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, share=True)
-    covariance = known.covariance
+    if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
+        reach = float(np.deg2rad(chosen.capture_deg))
+        (found, *rivals), looks = search(crossing, first, chosen.capture_mm, reach, progress)
+    for number, level in enumerate(FINE):
+        refined = refine(crossing.level(level, found.sensor_from_image), found, free, share=True)
+        found, looks = refined.estimate, looks + refined.evaluations
+        if progress:
+            progress("refining", number + 1, len(FINE))
+    alike = _require_alike(crossing, found)
+    angles = _angulation(crossing, found.sensor_from_image)
+    angles.require()
+    bends, curvature = curvature_of(refined, angles, crossing.unit, share=True)
+    refined = settle(refined, curvature, share=True)
+    found, near = refined.estimate, refined.estimate.sensor_from_image
+    tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
+    restarted = crossing.level(RESTARTED, near)
+    covariance = claimed(refined, bends, curvature, restarted, crossing.unit, tracker, share=True)
+    if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
+        require_known(covariance, angles, crossing.centre_mm)
+    require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, share=True)
     return ImageCalibration(
         settings=chosen,
         start=start,
@@ -226,14 +178,12 @@ def calibrate_from_sweeps(
         scale_errors=np.sqrt(np.diag(covariance)[6:8]),
         pixel_mm=crossing.pixel_mm * found.scales,
         covariance=covariance[:6, :6],
-        condition_number=known.condition_number,
-        weakest=known.weakest,
-        stiffness=known.stiffness,
+        condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, np.float64)),
         alike=alike,
-        similarity=_improvement(crossing.whole(SHOWN_SIGMA_MM, 10, near), first, found),
-        held_out=_improvement(crossing.check(SHOWN_SIGMA_MM, near), first, found),
+        similarity=_improvement(crossing.whole(SHOWN_SIGMA_MM, near, 10), first, found),
+        held_out=_improvement(crossing.whole(SHOWN_SIGMA_MM, near), first, found),
         evaluations=looks,
-        converged=converged,
+        converged=refined.converged,
         sweeps=crossing,
     )
 

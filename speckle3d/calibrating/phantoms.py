@@ -6,24 +6,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calibration.chain import ImagePoints, Seen
+import numpy.typing as npt
+
+from calibration.beam import predict_bias
+from calibration.clock.offset import covered, delays_around
+from calibration.detection.crossings import crossings_in_frames
+from calibration.detection.dots import dots_in_frames
+from calibration.detection.labelling import label_dots
 from calibration.detection.lines import detect_lines
-from calibration.job import (
-    JobSettings,
+from calibration.nwires import label_and_start, nwire_errors_mm, pixel_matrix, trimmed_mean_mm
+from calibration.orientation import calibrate_orientation
+from calibration.plane import Solution, calibrate_plane
+from calibration.points import ImagePoints, Seen
+from calibration.recording import (
+    CHOICE_STEP_S,
+    SEARCH_S,
     Outcome,
     Recording,
+    calibrate_recording,
     choose_crossings,
-    find_crossings,
-    find_nwires,
-    orientation_job,
     paired,
-    plane_job,
-    wires_job,
 )
-from calibration.nwires import nwire_errors_mm, pixel_matrix, trimmed_mean_mm
+from calibration.registration import Choice, calibrate_registered
 from calibration.repeatability import validate
 from calibration.report import figure_report
-from calibration.wires import CrossWire, Wires
+from calibration.wires import CrossWire, Wires, calibrate_cross_wire, calibrate_wires
 from speckle3d.calibrating.recordings import open_recording
 from speckle3d.calibrating.settings import (
     OrientationSettings,
@@ -37,6 +44,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import readable
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.progress import Progress
+from speckle3d.core.streams import TimedPoses
 from speckle3d.core.wires import WirePhantom, three_wires
 from speckle3d.io.plus_config import read_wire_phantom
 from speckle3d.io.points import PickedPoints, read_points, write_points
@@ -115,9 +123,7 @@ def found(
         seen = _seen_wires(recording, settings, points, progress)
     else:
         assert isinstance(settings, PlaneSettings | OrientationSettings)
-        seen = detect_lines(
-            recording.images, recording.pixel_mm, settings.lines, settings.region_px, progress
-        )
+        seen = detect_lines(recording.images, recording.pixel_mm, settings, settings.region, progress)
     return seen.without(settings.leave_out, BY_HAND)
 
 
@@ -140,19 +146,67 @@ def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -
 
 
 def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
-    """Calibrate with what was found; for errors see `calibration.job`."""
-    recording, job = _timed(recording, settings)
-    if isinstance(settings, PlaneSettings):
-        widths = () if settings.reflector == "bar" else settings.beam_mm or _BEAM_MM
-        fit_pixels = not settings.fixed_pixels
-        return plane_job(recording, seen, job, fit_pixels, settings.stages, widths, settings.pixel_error)
+    """Calibrate with what was found; for errors see `calibrate_recording`."""
+    given, size = settings.time_offset_s, recording.pixel_mm
+    recording, clock = _timed(recording, settings), (given == "estimate", isinstance(given, float))
     if isinstance(settings, OrientationSettings):
-        return orientation_job(recording, seen, job, settings.level, settings.viewed_from)
+        return calibrate_recording(
+            recording,
+            seen,
+            "orientation",
+            lambda points: calibrate_orientation(points, size, settings),
+            *clock,
+        )
+    if not isinstance(recording.readings, TimedPoses):
+        raise InvalidInputError(
+            "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"
+        )
+    if isinstance(settings, PlaneSettings):
+        outcome = calibrate_recording(
+            recording, seen, "plane", lambda points: calibrate_plane(points, size, settings), *clock
+        )
+        widths = () if settings.reflector == "bar" else settings.beam_mm or _BEAM_MM
+        return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in widths))
     assert isinstance(settings, WireSettings)
     phantom = Wired.of(settings.phantom).phantom
-    return wires_job(
-        recording, seen, job, phantom, not settings.fixed_pixels, settings.registration, settings.beside_mm
+    if phantom is None:
+        return _with_crossings(recording, seen, settings, clock)
+    return _with_wires(recording, seen, settings, phantom, clock)
+
+
+def _with_crossings(
+    recording: Recording, seen: Seen, settings: WireSettings, clock: tuple[bool, bool]
+) -> Outcome:
+    """Choose among the candidates of each frame, and calibrate."""
+    around, size = recording.time_offset_s, recording.pixel_mm
+    offsets = delays_around(around, SEARCH_S, CHOICE_STEP_S).tolist() if clock[0] else [around]
+    chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
+    outcome = calibrate_recording(
+        recording, chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), *clock
     )
+    shots = [replace(s, candidates_px=seen.pixels[seen.frame == s.frame]) for s in outcome.shots]
+    return replace(outcome, shots=tuple(shots))
+
+
+def _with_wires(
+    recording: Recording, seen: Seen, settings: WireSettings, phantom: WirePhantom, clock: tuple[bool, bool]
+) -> Outcome:
+    """Calibrate, and choose how much of the phantom's stated place to believe."""
+    size, stated, choices = recording.pixel_mm, settings.registration, list[Choice]()
+    method = "n-wire" if phantom.n_shapes else "three-wire"
+
+    def calibrate(points: ImagePoints) -> Solution:
+        # The clock is sought with what depends least on the place and yet is determined.
+        return calibrate_wires(points, phantom, size, settings, "turned" if stated == "auto" else stated)
+
+    def choose(points: ImagePoints) -> Solution:
+        solution, choice = calibrate_registered(points, phantom, size, settings)
+        choices.append(choice)
+        return solution
+
+    settle = choose if stated == "auto" and phantom.world_from_phantom is not None else None
+    outcome = calibrate_recording(recording, seen, method, calibrate, *clock, settle)
+    return replace(outcome, choice=choices[-1] if choices else None)
 
 
 def remarks(outcome: Outcome) -> list[str]:
@@ -164,14 +218,15 @@ def remarks(outcome: Outcome) -> list[str]:
     return notes
 
 
-def validated(
-    outcome: Outcome, path: Path, settings: ScanSettings, points: Path | None, progress: Progress | None
-) -> list[str]:
-    """Check a calibration on another recording of the phantom, of which no frame is left out."""
+def validated(outcome: Outcome, settings: ScanSettings, progress: Progress | None) -> list[str]:
+    """Check a calibration on the settings' other recording, if any, of which no frame is left out."""
+    path = settings.validation
+    if path is None:
+        return []
     settings = settings.model_copy(update={"leave_out": ()})
-    other = _timed(opened(path, settings, None), settings)[0]
+    other = _timed(opened(path, settings, None), settings)
     with naming(str(path)):
-        seen = found(other, settings, points, progress)
+        seen = found(other, settings, getattr(settings, "validation_points", None), progress)
         seconds = outcome.calibration.time_offset_s
         offset_s = other.time_offset_s if seconds is None else seconds
         if isinstance(outcome.solution.phantom, CrossWire):
@@ -190,15 +245,8 @@ def write_outcome(
     images: Path,
     out: Path,
     notes: Sequence[str],
-    more: Sequence[str] = (),
 ) -> Written:
-    """Write a calibration with its report, the settings that made it, and the dots it was made from.
-
-    Parameters
-    ----------
-    more : sequence of str
-        Options of the command that are no settings of the calibration itself.
-    """
+    """Write a calibration with its report, the settings that made it, and the dots it was made from."""
     dots = outcome.seen
     names = Wired.of(settings.phantom).names if isinstance(settings, WireSettings) else ()
 
@@ -210,21 +258,17 @@ def write_outcome(
         [images],
         out,
         lambda calibration: figure_report(outcome.solution, calibration, outcome.shots),
-        [*notes, f"made by: {command_line(settings, images, out, more)}"],
+        [*notes, f"made by: {command_line(settings, images, out)}"],
         outcome.beam,
         None if dots.are_lines else write_dots,
         settings.model_dump_json(exclude_defaults=True),
     )
 
 
-def _timed(recording: Recording, settings: ScanSettings) -> tuple[Recording, JobSettings]:
-    given, outlier_sigma = settings.time_offset_s, settings.outlier_sigma
-    if given is None:
-        return recording, JobSettings(outlier_sigma=outlier_sigma)
-    if given == "estimate":
-        return recording, JobSettings(outlier_sigma=outlier_sigma, estimate_offset=True)
-    job = JobSettings(outlier_sigma=outlier_sigma, offset_given=True)
-    return replace(recording, time_offset_s=given), job
+def _timed(recording: Recording, settings: ScanSettings) -> Recording:
+    """The recording with the clock offset that was given, if one was."""
+    given = settings.time_offset_s
+    return replace(recording, time_offset_s=given) if isinstance(given, float) else recording
 
 
 def _seen_wires(
@@ -240,10 +284,16 @@ def _seen_wires(
             f"--phantom {settings.phantom}: expected --points (of --validation: --validation-points), a CSV "
             "that says on which wire each dot lies, got none"
         )
+    size, region = recording.pixel_mm, settings.region
     if wired.phantom is None:
-        return find_crossings(recording, settings.region_px, progress)
-    clip = wired.clip_px if settings.region is None else settings.region_px
-    return find_nwires(recording, wired.phantom, clip, progress, settings.leave_out)
+        return crossings_in_frames(recording.images, size, region, progress)
+    clip: npt.ArrayLike | None = wired.clip_px if region is None else region
+    dots = dots_in_frames(recording.images, size, clip, progress).without(settings.leave_out)
+    times, offset_s = recording.frame_time_s, recording.time_offset_s
+    if isinstance(recording.readings, TimedPoses) and covered(recording.readings, times, offset_s).all():
+        # A calibration from the frames that show all wires finds those of the other frames.
+        return label_and_start(dots, wired.phantom, recording.readings.at(times - offset_s), size)[0]
+    return label_dots(dots, wired.phantom, size)
 
 
 def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:

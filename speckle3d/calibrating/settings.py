@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic.fields import FieldInfo
 
-from calibration.detection.lines import LineSettings
-from calibration.plane import PIXEL_ERROR
-from calibration.solver import OUTLIER_SIGMA
-from calibration.wires import BESIDE_MM
-from speckle3d.core.arrays import FloatArray
+from calibration.settings import LineSettings, OrientationFit, PlaneFit, WireFit
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.text import numbers
 from speckle3d.io.toml import validated
 
 Model = TypeVar("Model", bound="ScanSettings")
@@ -27,149 +24,53 @@ _MOST_FRAMES = 2**31
 _MOST_LEFT_OUT = 10**6
 
 
-class ScanSettings(BaseModel):
-    """Which readings go with the images of a phantom, and what of them counts."""
+@dataclass(frozen=True)
+class AsText:
+    """How a setting is written as one word of a command."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    method: ClassVar[str]
-    """Name of the command."""
-
-    poses: Path | None = Field(None, description="File with the sensor's readings, if not with the images.")
-    transform: str | None = Field(None, description="Name of the poses in an image sequence.")
-    pixel_mm: tuple[float, float] | None = Field(
-        None, description="Distance between columns and rows, mm, if the recording does not say."
-    )
-    time_offset_s: float | Literal["estimate"] | None = Field(
-        None, description="Seconds to add to the sensor's clock; by default the recording's own."
-    )
-    outlier_sigma: float = Field(
-        OUTLIER_SIGMA, ge=1.0, description="Drop frames whose residual exceeds so many standard deviations."
-    )
-    region: Corners | None = Field(
-        None, description="Corners (column, row) of the polygon outside which nothing counts."
-    )
-    leave_out: tuple[int, ...] = Field((), description="Frames left out by hand, from 0.")
-
-    @property
-    def region_px(self) -> FloatArray | None:
-        """The region's corners, shape (k, 2)."""
-        return None if self.region is None else np.array(self.region)
+    write: Callable[[Any], str]
+    metavar: str = "TEXT"
 
 
-class _OfLines(ScanSettings, LineSettings):
-    """Settings of a calibration with a plane."""
-
-    @property
-    def lines(self) -> LineSettings:
-        """How lines are found."""
-        return LineSettings(**{name: getattr(self, name) for name in LineSettings.model_fields})
-
-
-class PlaneSettings(_OfLines):
-    """A position sensor with a plane."""
-
-    method: ClassVar[str] = "plane"
-
-    fixed_pixels: bool = Field(False, description="Keep the pixel size instead of estimating it.")
-    pixel_error: float = Field(
-        PIXEL_ERROR, ge=0.0, description="Standard error of the pixel size, as a share of it."
-    )
-    stages: Literal["three", "one"] = Field("three", description="Angles, distances, all; or all at once.")
-    reflector: Literal["wall", "bar"] = Field("wall", description="A bare wall, or a thin bar (Cambridge).")
-    beam_mm: tuple[float, ...] | None = Field(
-        None, description="Thicknesses of the beam for which the bias of a wall is predicted."
-    )
-
-
-class OrientationSettings(_OfLines):
-    """An orientation sensor with a plane."""
-
-    method: ClassVar[str] = "orientation"
-
-    level: bool = Field(False, description="The plane is level: three unknowns, not five.")
-    viewed_from: Literal["above", "below"] = Field(
-        "above", description="Whether the beam points down on average, or up."
-    )
-    sensor: Literal["orientation", "tracker"] = Field(
-        "orientation", description="tracker: use only what a tracker says of orientation."
-    )
-
-
-class WireSettings(ScanSettings):
-    """A position sensor with wires."""
-
-    method: ClassVar[str] = "wires"
-
-    phantom: str = Field("cross", description="cross, three, or a PLUS configuration of N-wires.")
-    points: Path | None = Field(None, description="CSV of points picked by hand.")
-    fixed_pixels: bool = Field(False, description="Keep the pixel size instead of estimating it.")
-    registration: Literal["auto", "held", "turned", "free"] = Field(
-        "auto", description="How much to believe of the place that a configuration says."
-    )
-    beside_mm: float = Field(
-        BESIDE_MM,
-        ge=0,
-        allow_inf_nan=False,
-        description="How far out of plane a hand misses a crossing, RMS, mm.",
-    )
-
-
-def with_values(settings: Model, values: Mapping[str, Any]) -> Model:
-    """The same settings with other values.
-
-    Raises
-    ------
-    InvalidInputError
-        Naming the first that is wrong.
-    """
-    return validated(settings.model_dump() | dict(values), settings.method, type(settings))
-
-
-def region_of(text: str | None) -> Corners | None:
-    """Parse the polygon "column,row column,row ...".
+def region_of(text: str) -> Corners | None:
+    """Parse the polygon "column,row column,row ..."; nothing is the whole image.
 
     Raises
     ------
     InvalidInputError
         If it is none.
     """
-    if text is None:
+    if not text:
         return None
     try:
-        corners = np.array([[float(x) for x in corner.split(",")] for corner in text.split()])
+        corners = [[float(x) for x in corner.split(",")] for corner in text.split()]
     except ValueError:
-        corners = np.empty(0)
-    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        corners = []
+    if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
         raise InvalidInputError(f'--region: expected at least three "column,row", got {text!r}')
-    return tuple((float(column), float(row)) for column, row in corners)
+    return tuple((column, row) for column, row in corners)
 
 
-def region_text(corners: Corners) -> str:
-    """The polygon as `region_of` reads it."""
-    return " ".join(f"{_number(column)},{_number(row)}" for column, row in corners)
-
-
-def offset_of(text: str | None) -> float | Literal["estimate"] | None:
-    """Parse a clock offset: seconds, or ``estimate``.
+def offset_of(text: str) -> float | Literal["estimate"] | None:
+    """Parse a clock offset: seconds, or ``estimate``; nothing is the recording's own.
 
     Raises
     ------
     InvalidInputError
         If it is neither.
     """
-    if text is None:
-        return None
-    if text == "estimate":
-        return "estimate"
+    if text in ("", "estimate"):
+        return "estimate" if text else None
     try:
-        (seconds,) = numbers(text, 1, "--time-offset-s")
-    except InvalidInputError:
-        raise InvalidInputError(f"--time-offset-s: expected seconds or `estimate`, got {text!r}") from None
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not math.isfinite(seconds):
+        raise InvalidInputError(f"--time-offset-s: expected seconds or `estimate`, got {text!r}")
     return seconds
 
 
-def frames_of(text: str | None) -> tuple[int, ...]:
+def frames_of(text: str) -> tuple[int, ...]:
     """Parse numbers of frames and ranges of them, as ``3,17-20``; ascending, each once.
 
     Raises
@@ -178,10 +79,8 @@ def frames_of(text: str | None) -> tuple[int, ...]:
         If they are none.
     """
     found: set[int] = set()
-    for part in (text or "").split(","):
+    for part in filter(str.strip, text.split(",")):
         first, dash, last = (word.strip() for word in part.partition("-"))
-        if not part.strip():
-            continue
         ends = (first, last if dash else first)
         if not all(end.isascii() and end.isdigit() and len(end) < 11 for end in ends):
             raise InvalidInputError(f"--leave-out: expected frames as 3,17-20, got {text!r}")
@@ -203,31 +102,122 @@ def frames_text(frames: Iterable[int]) -> str:
     return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
 
 
-def command_line(settings: ScanSettings, images: Path, out: Path, more: Sequence[str] = ()) -> str:
+def number_text(value: float) -> str:
+    """A number in the fewest digits that read as the same."""
+    return repr(float(value)).removesuffix(".0") if isinstance(value, float) else str(value)
+
+
+def region_text(corners: Corners) -> str:
+    """The polygon as `region_of` reads it."""
+    return " ".join(f"{number_text(column)},{number_text(row)}" for column, row in corners)
+
+
+def _parsed(parse: Callable[[str], Any]) -> BeforeValidator:
+    """Take text, as in a command, or the value itself."""
+    return BeforeValidator(lambda value: parse(value) if isinstance(value, str) else value)
+
+
+class ScanSettings(BaseModel):
+    """Which readings go with the images of a phantom, and what of them counts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    method: ClassVar[str]
+    """Name of the command."""
+
+    poses: Path | None = Field(None, description="File with the sensor's readings, if not in IMAGES.")
+    transform: str | None = Field(
+        None,
+        description="Poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).",
+    )
+    pixel_mm: tuple[float, float] | None = Field(
+        None, description="Distance between columns and rows, mm, if IMAGES does not say."
+    )
+    time_offset_s: Annotated[float | Literal["estimate"] | None, _parsed(offset_of), AsText(number_text)] = (
+        Field(None, description="Seconds to add to the sensor's clock, or `estimate`.")
+    )
+    region: Annotated[Corners | None, _parsed(region_of), AsText(region_text)] = Field(
+        None, description='Polygon "column,row column,row ..." outside which nothing counts.'
+    )
+    leave_out: Annotated[tuple[int, ...], _parsed(frames_of), AsText(frames_text, "FRAMES")] = Field(
+        (), description="Frames to leave out, from 0, as 3,17-20."
+    )
+    validation: Path | None = Field(
+        None, description="Another recording of the phantom, on which the calibration is checked."
+    )
+
+
+class PlaneSettings(PlaneFit, LineSettings, ScanSettings):
+    """A position sensor with a plane."""
+
+    method: ClassVar[str] = "plane"
+
+    reflector: Literal["wall", "bar"] = Field(
+        "wall", description="A bare wall, whose bias is predicted, or a thin bar (Cambridge)."
+    )
+    beam_mm: list[float] | None = Field(
+        None, description="Thickness of the beam for that prediction; may be repeated."
+    )
+
+
+class OrientationSettings(OrientationFit, LineSettings, ScanSettings):
+    """An orientation sensor with a plane."""
+
+    method: ClassVar[str] = "orientation"
+
+    sensor: Literal["orientation", "tracker"] = Field(
+        "orientation", description="orientation, or tracker: use only what a tracker says of orientation."
+    )
+
+
+class WireSettings(WireFit, ScanSettings):
+    """A position sensor with wires."""
+
+    method: ClassVar[str] = "wires"
+
+    phantom: str = Field("cross", description="cross, three, or a PLUS configuration of N-wires.")
+    points: Path | None = Field(
+        None, description="CSV of points picked by hand: frame,column_px,row_px[,wire]."
+    )
+    validation_points: Path | None = Field(
+        None, description="CSV of points picked by hand in that other recording."
+    )
+
+
+def model_of(method: str) -> type[ScanSettings]:
+    """The settings of a method, as ``plane``."""
+    return {one.method: one for one in (PlaneSettings, OrientationSettings, WireSettings)}[method]
+
+
+def with_values(settings: Model, values: Mapping[str, Any]) -> Model:
+    """The same settings with other values.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the first that is wrong.
+    """
+    return validated(settings.model_dump() | dict(values), settings.method, type(settings))
+
+
+def written_as(field: FieldInfo) -> AsText | None:
+    """How a setting is written as one word, if it has a way of its own."""
+    return next((one for one in field.metadata if isinstance(one, AsText)), None)
+
+
+def command_line(settings: ScanSettings, images: Path, out: Path) -> str:
     """The command that calibrates with these settings, as a shell takes it."""
     words = ["speckle3d", "calibrate", settings.method, str(images), "-o", str(out)]
     for name, field in type(settings).model_fields.items():
-        value = getattr(settings, name)
-        if value != field.default or name == "phantom":
-            words += _option(name, value)
-    return shlex.join([*words, *more])
-
-
-def _option(name: str, value: Any) -> list[str]:
-    option = f"--{name.replace('_', '-')}"
-    if value is True:
-        return [option]
-    if name == "region":
-        return [option, region_text(value)]
-    if name == "leave_out":
-        return [option, frames_text(value)]
-    if name == "beam_mm":
-        return [word for width in value for word in (option, _number(width))]
-    if isinstance(value, tuple):
-        return [option, *map(_number, value)]
-    return [option, _number(value) if isinstance(value, float) else str(value)]
-
-
-def _number(value: float) -> str:
-    """A number in the fewest digits that read as the same."""
-    return repr(float(value)).removesuffix(".0")
+        value, option, text = getattr(settings, name), f"--{name.replace('_', '-')}", written_as(field)
+        if value == field.default and name != "phantom":
+            continue
+        if value is True:
+            words.append(option)
+        elif text is not None:
+            words += [option, text.write(value)]
+        elif isinstance(value, list):
+            words += [word for one in value for word in (option, number_text(one))]
+        else:
+            words += [option, *map(number_text, value if isinstance(value, tuple) else (value,))]
+    return shlex.join(words)

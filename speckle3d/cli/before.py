@@ -53,7 +53,11 @@ def require_before_work(command: str, values: Mapping[str, Any], options: Mappin
         for name, known in _CHOICES.items():
             for value in _listed(values.get(name)):
                 if value not in known:
+                    from speckle3d.core.reconstruction import REMOVED_MODES
+
                     where = _typed(name, options)
+                    if value in REMOVED_MODES:
+                        raise InvalidInputError(f"{where}{value} was removed: {REMOVED_MODES[value]}")
                     raise InvalidInputError(f"{where}expected one of {', '.join(known)}, got {value!r}")
 
 
@@ -83,6 +87,6 @@ def _require_writable(path: Path) -> None:
         raise FileError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-_MODES = ("orientation", "pose", "crossed", "inertial", "fused", "consistent-subset")
+_MODES = ("orientation", "pose", "crossed", "fused", "consistent-subset")
 _CHOICES = {"drift": _MODES, "reference": _REFERENCES}
 _CORRECTING = ("reconstruct", "compare")

@@ -98,7 +98,7 @@ PosedFile = Annotated[
     ),
 ]
 _MODE_HELP = (
-    "Which poses to use: image (default), orientation, pose, crossed, inertial, fused of a reconstruction; "
+    "Which poses to use: image (default), orientation, pose, crossed, fused of a reconstruction; "
     "tracker, truth of a recording."
 )
 Mode = Annotated[str | None, typer.Option(help=_MODE_HELP)]

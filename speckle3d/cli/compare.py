@@ -29,8 +29,8 @@ def compare(
     drift: Annotated[
         list[str] | None,
         typer.Option(
-            help="consistent-subset, orientation, pose, fused, inertial, or crossed with SWEEP-crossing "
-            "beside each sweep; may be repeated. By default all but the last two that are possible."
+            help="consistent-subset, orientation, pose, fused, or crossed with SWEEP-crossing beside each "
+            "sweep; may be repeated. By default all but the last that are possible."
         ),
     ] = None,
     reference: Annotated[str | None, typer.Option(help="What to compare with: tracker or truth.")] = None,

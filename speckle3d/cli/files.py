@@ -74,8 +74,13 @@ def convert(
     reference_transform: ReferenceTransform = None,
     calibration: CalibrationFiles = None,
     compression: Annotated[
-        str, typer.Option(help="gzip; lzf, faster to unpack and larger; or none, as fast as the disk.")
-    ] = "gzip",
+        str | None,
+        typer.Option(
+            "--compression",
+            "--compress",
+            help="gzip, some 0.65 of the size; lzf, faster and larger; or none: of a sweep file by default.",
+        ),
+    ] = None,
     mode: Annotated[
         str | None,
         typer.Option(help="IN a reconstruction: write its grey images with the poses of a mode (image)."),
@@ -91,7 +96,7 @@ def convert(
     unless options give it.
     """
     from speckle3d.io.calibrations import fitted_pixels, resized
-    from speckle3d.io.load import import_notes, load_sweep
+    from speckle3d.io.load import open_recording
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
     from speckle3d.io.voxels.volume_writer import LABELS_ALONE
@@ -111,18 +116,18 @@ def convert(
     for name, value in (("--mode", mode), ("--sweep", sweep_file)):
         if value is not None:
             raise InvalidInputError(f"{name} {value}: is of a reconstruction, got {source.name}")
-    if compression not in COMPRESSIONS:
+    if compression not in (None, *COMPRESSIONS):
         raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
     given = given_settings(source, options)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
     settings = given.model_copy(update=fitted)
-    sweep = resized(load_sweep(source, settings), fitted)
-    sweep = mount(sweep, calibration or ())
-    for each in import_notes(source, settings):
+    recording = open_recording(source, settings)
+    sweep = mount(resized(recording.sweep, fitted), calibration or ())
+    for each in recording.notes:
         note(each)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
-            write_sweep(out, sweep, progress, COMPRESSIONS[compression])
+            write_sweep(out, sweep, progress, COMPRESSIONS[compression or "none"])
             return
         left_out = write_sequence(out, sweep, progress, compression != "none")
     for each in left_out:

@@ -62,7 +62,6 @@ COMMON: dict[str, Sequence[str]] = {
         "as_json",
     ),
     "wires": ("out", "phantom", "points", "poses", "transform", "pixel_mm", "time_offset_s", "as_json"),
-    "inertial": ("wobble_mm", "wobble_hz", "length_mm", "duration_s", "lever_mm", "as_json"),
     "orient": ("into", "out", "method", "magnetometer", "time_offset_s", "calibration"),
     "accuracy": ("reference", "optical", "calibrations", "method", "figure", "as_json"),
 }

@@ -34,8 +34,7 @@ def reconstruct(
     drift: Annotated[
         list[str] | None,
         typer.Option(
-            help="Correction mode: orientation, pose, fused, inertial, crossed or consistent-subset; may be "
-            "repeated."
+            help="Correction mode: orientation, pose, fused, crossed or consistent-subset; may be repeated."
         ),
     ] = None,
     crossing_file: Annotated[
@@ -69,8 +68,8 @@ def reconstruct(
     volume_mode: Annotated[
         str | None,
         typer.Option(
-            help="Poses of the volume; by default the first there is of fused, crossed, pose, inertial, "
-            "orientation, image."
+            help="Poses of the volume; by default the first there is of fused, crossed, pose, orientation, "
+            "image."
         ),
     ] = None,
     calibration: CalibrationFiles = None,

@@ -43,7 +43,7 @@ def export(
         typer.Option("-o", "--output", help="Text file to write; ITK transform if it ends in .tfm or .h5."),
     ],
     mode: Annotated[
-        str, typer.Option(help="Which poses to use: image, orientation, pose, crossed, inertial, fused.")
+        str, typer.Option(help="Which poses to use: image, orientation, pose, crossed, fused.")
     ] = "image",
     length_unit: Unit = "m",
     frame: Annotated[

@@ -19,17 +19,14 @@ EDGE_FRACTION = 0.1
 
 Origin = Literal["phantom", "tracked", "data sheet", "crossing"]
 """What curves' distances come from: exact steps, a tracker, diffraction, or a sweep that crosses another."""
-STRUCTURE_SIGMA = 0.022
-"""Relative error of all distances, standard deviation, from structure in tissue that the adaptation to
-coherent echoes leaves: simulated muscle full of fibres reads 5.5 % shorter than a phantom; tissue that is
-read and tissue that curves come from lie anywhere between."""
-TISSUE_SIGMA = 0.027
-"""`STRUCTURE_SIGMA`, and what tissue does that attenuates otherwise than what the curves were measured in:
-0.3 dB/cm/MHz more make 2.3 to 3.4 % on simulated sweeps, and soft tissues differ by 0.15."""
+ATTENUATION_SIGMA = 0.03
+"""Relative standard deviation of all distances from tissue that attenuates otherwise than what the curves
+were measured in: soft tissues lie within 0.3 dB/cm/MHz of a phantom, taken as uniform (a deviation of 0.17),
+and 0.1 dB/cm/MHz widens the beam by 1.6 to 2 % by diffraction."""
 PROBE_SIGMA = 0.08
-"""The same from a probe that is not the one the curves were measured on, tissue included. Lenses of one model
-focus within 10 %, apertures are as high within 5 %, either way: 8 to 13 and 5 % of length at those bounds on
-simulated sweeps, taken as evenly spread between them (over the root of 3), and `TISSUE_SIGMA`."""
+"""The same from a probe that is not the one the curves were measured on, attenuation included. Lenses of one
+model focus within 10 %, apertures are as high within 5 %, either way: 8 to 13 and 5 % of length at those
+bounds on simulated sweeps, taken as evenly spread between them (over the root of 3)."""
 
 BAND_ADVICE = (
     " (where a recording does not say its band, it is measured, and never twice the same: give bandwidth_hz)"
@@ -120,6 +117,44 @@ class SpeckleSize:
 
 
 @dataclass(frozen=True)
+class EchoSpectra:
+    """Power spectrum of echoes by depth; attenuation and the pulse's true frequency are in it.
+
+    Attributes
+    ----------
+    depth_mm : ndarray, shape (y,)
+        Increasing.
+    frequency_hz : ndarray, shape (f,)
+        Increasing.
+    power : ndarray, shape (y, f)
+        In any unit, which may differ from depth to depth.
+    """
+
+    depth_mm: FloatArray
+    frequency_hz: FloatArray
+    power: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("depth_mm", "frequency_hz"):
+            values = getattr(self, name)
+            if not values.size or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
+                raise InvalidInputError(f"spectrum, {name}: expected values that increase, got others")
+        if self.power.shape != (self.depth_mm.size, self.frequency_hz.size):
+            raise InvalidInputError(
+                f"spectrum, power: expected shape ({self.depth_mm.size}, {self.frequency_hz.size}), "
+                f"got {self.power.shape}"
+            )
+        if not (np.isfinite(self.power) & (self.power >= 0)).all():
+            raise InvalidInputError("spectrum, power: expected finite values of zero or above, got others")
+
+    def at(self, depth_mm: FloatArray, frequency_hz: FloatArray) -> FloatArray:
+        """Power at depths of any shape and at other frequencies, shape (..., f)."""
+        known = np.stack([np.interp(frequency_hz, self.frequency_hz, row) for row in self.power])
+        flat = [np.interp(depth_mm.ravel(), self.depth_mm, column) for column in known.T]
+        return np.stack(flat, axis=-1).reshape(*depth_mm.shape, -1)
+
+
+@dataclass(frozen=True)
 class NominalProbe:
     """Probe and tissue that curves were calculated for.
 
@@ -176,6 +211,9 @@ class DecorrelationCurves:
     origin : {"phantom", "tracked", "data sheet", "crossing"}
     nominal : NominalProbe or None
         Of curves from a data sheet.
+    spectrum : EchoSpectra or None
+        Of the phantom's echoes, by which `speckle3d.motion.attenuation` tells tissue that attenuates
+        otherwise; None for B-mode, other origins and files that older versions wrote.
     key : CurveKey
         Signal, vector pitch and patches that the curves are for.
     pairs_used : int
@@ -193,6 +231,7 @@ class DecorrelationCurves:
     scale_sigma: float = PROBE_SIGMA
     origin: Origin = "phantom"
     nominal: NominalProbe | None = None
+    spectrum: EchoSpectra | None = None
 
     def __post_init__(self) -> None:
         if self.origin not in get_args(Origin):
@@ -240,17 +279,23 @@ class DecorrelationCurves:
             self.scale_sigma,
             self.origin,
             self.nominal,
+            self.spectrum,
         )
 
-    def mismatch(self, same_probe: bool) -> float:
+    def mismatch(self, same_probe: bool, attenuation_sigma: float = ATTENUATION_SIGMA) -> float:
         """Relative standard deviation of what the curves' mismatch does to all distances of a sweep.
 
         Parameters
         ----------
         same_probe : bool
             Whether a phantom's curves were measured with the very probe of the sweep.
+        attenuation_sigma : float
+            What tissue that attenuates otherwise than the phantom leaves of it.
         """
-        return TISSUE_SIGMA if same_probe and self.origin == "phantom" else self.scale_sigma
+        if self.origin != "phantom":
+            return self.scale_sigma
+        lens = 0.0 if same_probe else self.scale_sigma**2 - ATTENUATION_SIGMA**2
+        return float(np.sqrt(max(lens, 0.0) + attenuation_sigma**2))
 
 
 def _settings(key: CurveKey) -> dict[str, Any]:

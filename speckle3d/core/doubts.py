@@ -18,9 +18,10 @@ class Doubt:
     Attributes
     ----------
     about : str
-        What is doubted: "tracker", "orientation sensor", "curves" or "images".
+        What is doubted: "tracker", "orientation sensor", "curves" or "images"; "images and
+        tracker" where these disagree.
     suspect : str
-        The likely cause in a word or two: "units", "handedness", "clock", ...
+        The likely cause in a word or two: "units", "handedness", ...; empty where either may be wrong.
     evidence : str
         What was expected and what was seen, one line with figures.
     refuted : bool
@@ -40,7 +41,8 @@ class Doubt:
         object.__setattr__(self, "frames", tuple((int(first), int(last)) for first, last in self.frames))
 
     def __str__(self) -> str:
-        return f"{self.about}: {self.evidence} (suspect: {self.suspect})"
+        cause = f" (suspect: {self.suspect})" if self.suspect else ""
+        return f"{self.about}: {self.evidence}{cause}"
 
     @property
     def consequence(self) -> str:

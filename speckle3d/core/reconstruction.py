@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MODES = ("image", "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused")
 """Drift-correction modes a reconstruction may hold; `image` is uncorrected and always there."""
+REMOVED_MODES = {"inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first"}
+"""Modes that only older files hold, and what is there instead."""
 
 
 @shown

@@ -14,6 +14,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import require_increasing
 from speckle3d.core.handover.tables import frames_array
+from speckle3d.core.images import ImageFrames, Images, require_all
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
 
@@ -242,6 +243,8 @@ class _Sensor(Generic[Samples]):
     sensor_from_image: Samples | None = None
     time_offset_s: float = 0.0
 
+    label: ClassVar[str]
+    """What messages call the sensor."""
     uncalibrated: ClassVar[str]
     """Message that the sensor's mounting is missing, which names the attribute of a sweep file."""
 
@@ -268,6 +271,7 @@ class _Sensor(Generic[Samples]):
 class OrientationSensor(_Sensor[Rotation]):
     """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
 
+    label: ClassVar[str] = "orientation sensor"
     uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/orientation", "sensor_from_image_wxyz")
 
     readings: TimedRotations
@@ -289,6 +293,7 @@ class Tracker(_Sensor[RigidTransform]):
         volumes and pictures of the tracker's poses look at it.
     """
 
+    label: ClassVar[str] = "tracker"
     uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/tracker", "sensor_from_image")
 
     readings: TimedPoses
@@ -358,6 +363,64 @@ class Sweep:
 
     def __len__(self) -> int:
         return int(self.frames.shape[0])
+
+    @classmethod
+    def from_arrays(
+        cls,
+        frames: Images | npt.ArrayLike,
+        *,
+        pitch_mm: float | tuple[float, float] | None = None,
+        frame_rate_hz: float | None = None,
+        frame_time_s: npt.ArrayLike | None = None,
+        dynamic_range_db: float | None = None,
+        signal: RFSettings | None = None,
+        first_row_depth_mm: float = 0.0,
+        **others: Any,
+    ) -> Sweep:
+        """Make a sweep of images that a machine gives without a word about them.
+
+        Parameters
+        ----------
+        frames : array_like, shape (n, row, column)
+            Grey levels as uint8, also in colour, or echoes whose samples run down the rows; read when asked.
+        pitch_mm : float or tuple of float
+            Distance between columns and between rows; one number of square pixels. Rows of echoes lie as
+            `signal` says.
+        frame_rate_hz : float
+            Or `frame_time_s`, shape (n,).
+        dynamic_range_db : float
+            Of grey levels, from black to white.
+        signal : RFSettings
+            Of echoes: how they were sampled.
+        first_row_depth_mm : float
+        **others
+            Fields of `Sweep`: orientation, tracker, truth, name, probe.
+
+        Raises
+        ------
+        InvalidInputError
+            Naming all that is missing, or what cannot be.
+
+        Examples
+        --------
+        >>> images = np.zeros((5, 40, 8), np.uint8)
+        >>> sweep = Sweep.from_arrays(images, pitch_mm=0.2, frame_rate_hz=25.0, dynamic_range_db=60.0)
+        >>> sweep.frames[0].shape, sweep.grid.vector_pitch_mm, float(sweep.frame_time_s[-1])
+        ((8, 40), 0.2, 0.16)
+        """
+        read = ImageFrames(frames if hasattr(frames, "shape") else np.asarray(frames))  # type: ignore[arg-type]
+        n, columns, rows = read.shape
+        is_grey = read.dtype == np.uint8 and signal is None
+        of_kind = {"dynamic_range_db": dynamic_range_db} if is_grey else {"signal": signal}
+        rate = frame_rate_hz if frame_time_s is None else 1.0
+        require_all(pitch_mm=pitch_mm, frame_rate_hz=rate, **of_kind)
+        across, down = np.broadcast_to(np.asarray(pitch_mm, dtype=float), (2,)).tolist()
+        held = signal or BModeSettings(float(dynamic_range_db or 0.0))
+        if isinstance(held, RFSettings):
+            down = held.sample_spacing_mm
+        times = np.arange(n) / float(rate or 1.0) if frame_time_s is None else np.asarray(frame_time_s)
+        grid = ImageGrid(columns, rows, across, down, first_row_depth_mm)
+        return cls(read, grid, held, times, **others)
 
     def facts(self) -> list[tuple[str, object]]:
         """What the sweep shows of itself."""

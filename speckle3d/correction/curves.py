@@ -81,8 +81,8 @@ class CorrectedChain:
         The first pose, then every frame's pose in the frame before it.
     axes : tuple of str
         Which of `AXES` are corrected.
-    basis : ndarray, shape (n, len(axes), 5)
-        From `curve_basis`.
+    basis : ndarray, shape (n, len(axes), k)
+        Weights of k coefficients for each axis: of cubics from `curve_basis`.
 
     References
     ----------
@@ -111,7 +111,7 @@ class CorrectedChain:
         """Every frame's correction in the order of `AXES`, shape (n, 6), mm and rad."""
         values = np.zeros((len(self.steps), len(AXES)))
         columns = [AXES.index(axis) for axis in self.axes]
-        per_axis = coefficients.reshape(len(self.axes), COEFFICIENTS)
+        per_axis = coefficients.reshape(len(self.axes), -1)
         values[:, columns] = np.einsum("faj,aj->fa", self.basis, per_axis)
         return values
 
@@ -135,6 +135,25 @@ class CorrectedChain:
         columns = [AXES.index(axis) for axis in self.axes]
         turning, moving = _world_axes(poses, self.values(coefficients))
         return self._accumulate(turning[:, :, columns]), self._accumulate(moving[:, :, columns])
+
+    def frame_errors(self, coefficients: FloatArray, poses: FloatArray, centre_mm: FloatArray) -> FloatArray:
+        """How every frame moves against the first with every coefficient, along the first frame's axes.
+
+        Parameters
+        ----------
+        centre_mm : ndarray, shape (3,)
+            Of the image, in its frame.
+
+        Returns
+        -------
+        ndarray, shape (n, 6, n_coefficients)
+            (x, y, z, tilt, yaw, roll) of the image's centre, mm and rad per unit coefficient.
+        """
+        turn, shift = (part - part[:1] for part in self.twists(coefficients, poses))
+        centres = poses[:, :3, :3] @ centre_mm + poses[:, :3, 3]
+        moved = shift - skew(centres) @ turn
+        to_first = poses[0, :3, :3].T
+        return np.concatenate([to_first @ moved, to_first @ turn], axis=1)
 
     def _accumulate(self, per_frame: FloatArray) -> FloatArray:
         weighted = per_frame[:, :, :, None] * self.basis[:, None, :, :]

@@ -18,6 +18,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt, skew
 from speckle3d.core.leastsquares import Fit, levenberg_marquardt
 from speckle3d.core.shown import shown
+from speckle3d.correction.claims import curve_errors, length_sigma
 from speckle3d.correction.curves import (
     AXES,
     COEFFICIENTS,
@@ -80,6 +81,11 @@ class DriftCorrection:
         image centre.
     coverage : float
         Share of the frames that had a sensor reading and so took part in the cost.
+    covariance : ndarray, shape (n, 6, 6)
+        Of (x, y, z, tilt, yaw, roll) about the image's centre, along the first frame's axes, mm and rad: by
+        the readings' scatter about the curves, and in `correct_mode` by what is known of the sensor, too.
+    length_sigma : float
+        Relative standard deviation of the length.
     """
 
     poses: RigidTransform
@@ -87,6 +93,8 @@ class DriftCorrection:
     curves: FloatArray
     coverage: float
     settings: DriftSettings
+    covariance: FloatArray
+    length_sigma: float
 
 
 def correct_pose(
@@ -136,8 +144,15 @@ def correct_pose(
     chain = _chain(world_from_image, corners.mean(axis=0), AXES, settings)
     problem = _CornerProblem(chain, used, corners, target, settings.loss_epsilon_mm)
     fit = _solve(problem, chain, settings)
-    poses = sensor_from_start * RigidTransform.from_matrix(chain.poses(fit.parameters))
-    return DriftCorrection(poses, fit, chain.values(fit.parameters), float(used.mean()), settings)
+    bent = chain.poses(fit.parameters)
+    poses = sensor_from_start * RigidTransform.from_matrix(bent)
+    centre = corners.mean(axis=0)
+    left = poses[used].inv() * reference
+    error = np.hstack([left.apply(centre) - centre, left.rotation.as_rotvec()])
+    covariance = curve_errors(error, len(poses))
+    sigma = length_sigma(poses, covariance, centre)
+    values = chain.values(fit.parameters)
+    return DriftCorrection(poses, fit, values, float(used.mean()), settings, covariance, sigma)
 
 
 def correct_orientation(
@@ -183,10 +198,14 @@ def correct_orientation(
     image_from_centred = RigidTransform.from_translation(centre)
     chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
     fit = _solve(_OrientationProblem(chain, used, target), chain, settings)
-    centred = RigidTransform.from_matrix(chain.poses(fit.parameters))
+    bent = chain.poses(fit.parameters)
+    angles = fit.residuals.reshape(-1, 3)[:, ::-1]
+    covariance = curve_errors(np.hstack([np.zeros_like(angles), angles]), len(world_from_image))
+    centred = RigidTransform.from_matrix(bent)
     turned = RigidTransform.from_rotation(sensor_from_start) * centred * image_from_centred.inv()
     poses = RigidTransform.from_translation(-turned[0].translation) * turned
-    return DriftCorrection(poses, fit, chain.values(fit.parameters), float(used.mean()), settings)
+    sigma, values = length_sigma(poses, covariance, centre), chain.values(fit.parameters)
+    return DriftCorrection(poses, fit, values, float(used.mean()), settings, covariance, sigma)
 
 
 @dataclass(frozen=True)

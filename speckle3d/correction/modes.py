@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.reconstruction import REMOVED_MODES
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
+from speckle3d.correction.claims import length_sigma, orientation_errors, tracker_errors
 from speckle3d.correction.drift import DriftCorrection, DriftSettings, correct_orientation, correct_pose
+from speckle3d.correction.settings import FusedSettings
 
 PUBLISHED = ("orientation", "pose")
 """The modes of Housden et al. 2008, which fit cubics."""
-DRIFT_MODES = (*PUBLISHED, "crossed", "inertial", "fused")
+DRIFT_MODES = (*PUBLISHED, "crossed", "fused")
 
 
 def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) -> None:
@@ -31,6 +36,8 @@ def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) ->
         If what it needs is missing, not calibrated to the image, or covers no frame.
     """
     for mode in modes:
+        if mode in REMOVED_MODES:
+            raise InvalidInputError(f"drift mode {mode} was removed: {REMOVED_MODES[mode]}")
         if mode not in DRIFT_MODES:
             raise InvalidInputError(f"expected a drift mode among {', '.join(DRIFT_MODES)}; got {mode!r}")
         where = f"{sweep.name}: drift mode {mode}"
@@ -49,14 +56,11 @@ def require_modes(sweep: Sweep, modes: Sequence[str], crossing: bool = False) ->
             raise InsufficientDataError(f"{where}: {sensor.uncalibrated}")
         if not sensor.covers(sweep.frame_time_s).any():
             raise InsufficientDataError(f"{where}: expected readings over the frames, got none")
-        if mode == "inertial":
-            _require_inertial(sensor, where)
 
 
 _WANTED = {
     "pose": "a tracker in /tracker",
     "orientation": "an orientation sensor in /orientation",
-    "inertial": "an orientation sensor with accelerometer and gyroscope in /orientation",
     "fused": "a sensor in /orientation or /tracker, or a crossing sweep",
 }
 
@@ -65,19 +69,16 @@ def sensor_of(sweep: Sweep, mode: str) -> OrientationSensor | Tracker | None:
     """The sensor that a drift mode needs; None for those that need none."""
     if mode == "crossed":
         return None
-    if mode == "inertial":
-        return sweep.orientation
     return sweep.tracker if mode == "pose" else sweep.orientation_source
 
 
-def _require_inertial(sensor: OrientationSensor | Tracker, where: str) -> None:
-    for name in ("accelerometer_m_s2", "gyroscope_rad_s"):
-        if getattr(sensor, name, None) is None:
-            raise InsufficientDataError(f"{where}: expected {name} in /orientation, got none")
-
-
 def correct_mode(
-    mode: str, world_from_image: RigidTransform, sweep: Sweep, settings: DriftSettings
+    mode: str,
+    world_from_image: RigidTransform,
+    sweep: Sweep,
+    settings: DriftSettings,
+    image_covariance: FloatArray,
+    known: FusedSettings,
 ) -> DriftCorrection:
     """Correct image-based poses by the sensor that a mode stands for; see `require_modes`.
 
@@ -87,14 +88,26 @@ def correct_mode(
         ``"pose"`` or ``"orientation"``.
     world_from_image : RigidTransform, length n
         Of every frame of `sweep`.
+    image_covariance : ndarray, shape (n, 6, 6)
+        Claimed for the image-based poses; `orientation` leaves their errors of place as they are.
+    known : FusedSettings
+        Errors of the sensors that their readings do not show.
     """
     sensor = sensor_of(sweep, mode)
     assert sensor is not None
-    covered = sensor.covers(sweep.frame_time_s)
-    times = sweep.frame_time_s[covered]
+    time_s, centre_mm = sweep.frame_time_s, sweep.grid.centre_mm
+    covered = sensor.covers(time_s)
     with naming(sweep.name):
         if isinstance(sensor, Tracker) and mode == "pose":
-            poses = sensor.world_from_image(times)
-            return correct_pose(world_from_image, poses, covered, sweep.grid.corners_mm, settings)
-        rotation = image_orientation(sensor, times)
-        return correct_orientation(world_from_image, rotation, covered, sweep.grid.centre_mm, settings)
+            measured = sensor.world_from_image(time_s[covered])
+            found = correct_pose(world_from_image, measured, covered, sweep.grid.corners_mm, settings)
+            covariance = found.covariance + tracker_errors(found.poses, centre_mm, time_s, known)
+        else:
+            rotation = image_orientation(sensor, time_s[covered])
+            found = correct_orientation(world_from_image, rotation, covered, centre_mm, settings)
+            covariance = found.covariance.copy()
+            covariance[:, :3, :3] += image_covariance[:, :3, :3]
+            if isinstance(sensor, OrientationSensor):
+                covariance += orientation_errors(found.poses, centre_mm, time_s, known)
+    sigma = length_sigma(found.poses, covariance, centre_mm)
+    return replace(found, covariance=covariance, length_sigma=sigma)

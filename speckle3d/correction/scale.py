@@ -1,4 +1,4 @@
-"""What one source, a crossing sweep or an inertial sensor, says of the scale of the images' distances."""
+"""Poses whose length another source than the images has set, and what such a source says of their scale."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.doubts import Doubt
 from speckle3d.core.shown import shown
 
 TERMS = ("log_scale", "tilt_per_mm", "yaw_per_mm")
@@ -23,7 +22,7 @@ class ScaleEvidence:
     Attributes
     ----------
     source : str
-        "crossing" or "inertial".
+        "crossing".
     values : ndarray, shape (3,)
         Most likely `TERMS`, means over the sweep.
     information : ndarray, shape (3, 3)
@@ -63,6 +62,11 @@ class ScaledPoses:
     details: dict[str, float | str] = field(default_factory=dict)
 
     @property
+    def length_sigma(self) -> float:
+        """Relative standard deviation of the length."""
+        return self.log_scale_sigma
+
+    @property
     def scale(self) -> float:
         """Corrected length over the images' own."""
         return float(np.exp(self.log_scale))
@@ -76,14 +80,10 @@ class FusedPoses(ScaledPoses):
     Attributes
     ----------
     used : tuple of str
-        "images" and what else took part: "orientation sensor", "tracker", "crossing", "inertial".
-    contradictions : tuple of Doubt
-        Sensors that differ from the images by more than the errors of both; poses then allow for either.
+        "images" and what else took part: "tracker", "orientation sensor", "crossing".
     sizes : dict of str to float
-        Standard deviations found of the sensors' errors: ``tracker_jitter_mm``, ``tracker_jitter_deg``,
-        ``tracker_wander_mm``, ``orientation_jitter_deg``, ``inclination_wander_deg``, ``heading_wander_deg``.
+        Jitter found of the sensors: "tracker jitter" in mm, "orientation sensor jitter" in rad.
     """
 
     used: tuple[str, ...] = ()
-    contradictions: tuple[Doubt, ...] = ()
     sizes: dict[str, float] | None = None

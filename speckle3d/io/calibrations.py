@@ -15,37 +15,30 @@ from dataclasses import replace
 
 import h5py
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source, calibrated
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
+from speckle3d.core.geometry import require_finite, rotations_from_quaternions
 from speckle3d.core.reconstruction import CalibrationFile
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.hdf5 import (
     PathLike,
-    atomic_hdf5,
     has_member,
     locate,
     opened,
+    plain_attribute,
     read_attribute,
-    read_attributes,
     read_checked,
     read_texts,
+    read_transforms,
     require_group,
     sha256_of,
-    write_attributes,
 )
-from speckle3d.io.hdf5_guard import plain_attribute
+from speckle3d.io.records import HDF5Writer, read_record
 
 FORMAT = "speckle3d.calibration"
-
-_TEXT = h5py.string_dtype()
-_ATTRIBUTES = dict.fromkeys(("method", "sensor", "rms_unit", "verdict"), str) | {"rms": float}
-_PARAMETER = {"name": _TEXT, "value": np.float64, "standard_error": np.float64, "unit": _TEXT}
-"""Data sets of /parameters."""
-_SOURCE = dict.fromkeys(("input_path", "input_sha256", "package_version", "settings_json"), str)
 
 
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
@@ -62,26 +55,25 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
     FileError
         If the file cannot be written.
     """
-    with atomic_hdf5(path, FORMAT) as file:
-        write_attributes(file, calibration, (*_ATTRIBUTES, "condition_number"))
-        if calibration.time_offset_s is not None:
-            file.attrs["time_offset_s"] = calibration.time_offset_s
-        if calibration.translation_mm is None:
-            file["sensor_from_image_wxyz"] = calibration.rotation.as_quat(scalar_first=True)
-        else:
-            file["sensor_from_image"] = calibration.sensor_from_image.as_matrix()
-        if calibration.pixel_mm is not None:
-            file["pixel_mm"] = calibration.pixel_mm
-        file["covariance"] = calibration.covariance
-        for name, dtype in _PARAMETER.items():
-            values = [getattr(one, name) for one in calibration.parameters]
-            file.create_dataset(f"parameters/{name}", data=values, dtype=dtype)
+    with HDF5Writer(path, FORMAT) as writer:
+        root, apart = writer.file, ("rotation", "translation_mm", "parameters", "frames")
+        writer.put_fields(root, calibration, skip=apart)
+        is_turn = calibration.translation_mm is None
+        writer.put(
+            root, "sensor_from_image", calibration.rotation if is_turn else calibration.sensor_from_image
+        )
+        rows = calibration.parameters
+        group = root.create_group("parameters")
+        for name in ("name", "unit"):
+            writer.put_text(group, name, [getattr(row, name) for row in rows])
+        for name in ("value", "standard_error"):
+            writer.put(group, name, np.array([getattr(row, name) for row in rows], dtype=float))
         frames = calibration.frames
-        file["frames/used"] = np.array(frames.used, dtype=np.int64)
-        file["frames/dropped"] = np.array(list(frames.dropped), dtype=np.int64)
-        file.create_dataset("frames/reason", data=list(frames.dropped.values()), dtype=_TEXT)
-        file["frames"].attrs["given"] = frames.given
-        write_attributes(file.create_group("source"), calibration.source, _SOURCE)
+        group = root.create_group("frames")
+        writer.put(group, "given", frames.given)
+        writer.put(group, "used", np.array(frames.used, dtype=np.int64))
+        writer.put(group, "dropped", np.array(list(frames.dropped), dtype=np.int64))
+        writer.put_text(group, "reason", list(frames.dropped.values()))
 
 
 def read_calibration(path: PathLike) -> Calibration:
@@ -119,18 +111,25 @@ def read_calibration(path: PathLike) -> Calibration:
     """
     with opened(path, FORMAT) as file, naming(str(path)):
         rotation, translation = _read_pose(file)
-        return Calibration(
-            **read_attributes(file, _ATTRIBUTES),
+        condition = np.asarray(plain_attribute(file, "condition_number"))
+        # Infinite where the motion leaves something undetermined, unlike all other attributes.
+        if condition.dtype.kind not in "fiu" or condition.size != 1 or np.isnan(condition).any():
+            raise InvalidInputError("attribute condition_number: expected a number, got another value")
+        calibration = read_record(
+            file,
+            Calibration,
             rotation=rotation,
             translation_mm=translation,
             pixel_mm=read_checked(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
-            covariance=_read_covariance(file, 3 if translation is None else 6),
             parameters=_read_parameters(require_group(file, "parameters")),
-            condition_number=_read_condition(file),
+            condition_number=float(condition.ravel()[0]),
             frames=_read_frames(require_group(file, "frames")),
-            time_offset_s=read_attribute(file, "time_offset_s") if "time_offset_s" in file.attrs else None,
-            source=Source(**read_attributes(require_group(file, "source"), _SOURCE)),
         )
+        where = locate(file, "covariance")
+        _require_spread(np.diag(calibration.covariance), where)
+        if np.isnan(calibration.covariance).any():
+            raise InvalidInputError(f"{where}: expected numbers, got NaN")
+        return calibration
 
 
 def apply_calibrations(sweep: Sweep, paths: Sequence[PathLike]) -> tuple[Sweep, tuple[CalibrationFile, ...]]:
@@ -204,19 +203,10 @@ def _read_frames(group: h5py.Group) -> FramesUsed:
 
 def _read_pose(file: h5py.File) -> tuple[Rotation, FloatArray | None]:
     if has_member(file, "sensor_from_image"):
-        matrix = read_checked(file, "sensor_from_image", (4, 4))
-        pose: RigidTransform = transforms_from_matrices(matrix[None], "/sensor_from_image")[0]
+        pose = read_transforms(file, "sensor_from_image")
         return pose.rotation, np.asarray(pose.translation)
     quaternion = read_checked(file, "sensor_from_image_wxyz", (4,))
-    return rotations_from_quaternions(quaternion[None], "/sensor_from_image_wxyz")[0], None
-
-
-def _read_covariance(file: h5py.File, size: int) -> FloatArray:
-    covariance = read_checked(file, "covariance", (size, size))
-    _require_spread(np.diag(covariance), locate(file, "covariance"))
-    if np.isnan(covariance).any():
-        raise InvalidInputError("/covariance: expected numbers, got NaN")
-    return covariance
+    return rotations_from_quaternions(quaternion[None], locate(file, "sensor_from_image_wxyz"))[0], None
 
 
 def _require_spread(values: FloatArray, where: str) -> None:
@@ -224,14 +214,6 @@ def _require_spread(values: FloatArray, where: str) -> None:
     bad = np.flatnonzero(~(values >= 0))
     if bad.size:
         raise InvalidInputError(f"{where}[{bad[0]}]: expected zero or a value above it, got {values[bad[0]]}")
-
-
-def _read_condition(file: h5py.File) -> float:
-    """Read the condition number, which may be infinite, unlike other attributes."""
-    raw = np.asarray(plain_attribute(file, "condition_number"))
-    if raw.dtype.kind not in "fiu" or raw.size != 1 or np.isnan(raw).any():
-        raise InvalidInputError("attribute condition_number: expected a number, got none")
-    return float(raw.ravel()[0])
 
 
 load_calibration = read_calibration

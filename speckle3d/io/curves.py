@@ -1,39 +1,16 @@
-"""Decorrelation curves on disk (format ``speckle3d.curves``, version 1)."""
+"""Decorrelation curves on disk (format ``speckle3d.curves``, version 1; 2 with a spectrum)."""
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import cast, get_args
-
 import numpy as np
 
-from speckle3d.core.curves import (
-    EDGE_FRACTION,
-    PATCH_NUMBERS,
-    PROBE_SIGMA,
-    CurveKey,
-    DecorrelationCurves,
-    NominalProbe,
-    Origin,
-    SpeckleSize,
-    TiltResponse,
-)
+from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import RFSettings
-from speckle3d.io.hdf5 import (
-    PathLike,
-    atomic_hdf5,
-    find_group,
-    has_member,
-    opened,
-    read_attribute,
-    read_attributes,
-    read_checked,
-    read_text,
-    write_attributes,
-)
-from speckle3d.io.sweeps import read_signal, signal_attributes
+from speckle3d.io.hdf5 import PathLike, opened, read_text
+from speckle3d.io.records import HDF5Writer, read_record
+from speckle3d.io.sweeps import SIGNALS
 
 FORMAT = "speckle3d.curves"
 
@@ -52,19 +29,12 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     FileError
         If the file cannot be written.
     """
-    with atomic_hdf5(path, FORMAT) as file:
-        for name in ("depth_mm", "distance_mm", "correlation", "cells"):
-            file[name] = getattr(curves, name)
-        for group, part in (("tilt", curves.tilt), ("speckle", curves.speckle)):
-            for name, values in vars(part).items() if part is not None else ():
-                file[f"{group}/{name}"] = values
-        for name in ("pairs_used", "scale_sigma", "origin"):
-            file.attrs[name] = getattr(curves, name)
-        write_attributes(file, curves.key, (*PATCH_NUMBERS, "correlation_of", "edge_fraction", "probe"))
-        if curves.nominal is not None:
-            file.create_group("nominal").attrs.update(vars(curves.nominal))
-        file.attrs["signal"] = "rf" if isinstance(curves.key.signal, RFSettings) else "bmode"
-        file.attrs.update(signal_attributes(curves.key.signal))
+    with HDF5Writer(path, FORMAT, 1 if curves.spectrum is None else 2) as writer:
+        root, signal = writer.file, curves.key.signal
+        writer.put_fields(root, curves, skip=["key"])
+        writer.put_fields(root, curves.key, skip=["signal"])
+        writer.put_fields(root, signal)
+        writer.put(root, "signal", "rf" if isinstance(signal, RFSettings) else "bmode")
 
 
 def read_curves(path: PathLike) -> DecorrelationCurves:
@@ -94,46 +64,16 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
     >>> curves.key.correlation_of
     'echo'
     """
-    with opened(path, FORMAT) as file, naming(str(path)):
-        depth = read_checked(file, "depth_mm", ("r",))
-        require_finite(depth, "/depth_mm")
-        if not depth.size or (np.diff(depth) <= 0).any():
-            raise InvalidInputError("/depth_mm: expected depths that increase, got others")
-        distance = read_checked(file, "distance_mm", ("k",))
-        require_finite(distance, "/distance_mm")
-        correlation = read_checked(file, "correlation", (depth.size, distance.size))
-        cells = read_checked(file, "cells", (depth.size,))
-        numbers = read_attributes(file, dict.fromkeys(PATCH_NUMBERS, float))
-        of = read_text(file, "correlation_of") if "correlation_of" in file.attrs else "intensity"
+    with opened(path, FORMAT, (1, 2)) as file, naming(str(path)):
         kind = read_text(file, "signal")
         if kind not in ("rf", "bmode"):
             raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-        edge = read_attribute(file, "edge_fraction", EDGE_FRACTION)
-        probe = read_text(file, "probe") if "probe" in file.attrs else ""
-        key = CurveKey(read_signal(file, kind), **numbers, correlation_of=of, edge_fraction=edge, probe=probe)
-        pairs = int(read_attribute(file, "pairs_used", 0))
-        sigma = read_attribute(file, "scale_sigma", PROBE_SIGMA)
-        origin = _origin(read_text(file, "origin")) if "origin" in file.attrs else "phantom"
-        tilt = speckle = None
-        if has_member(file, "tilt"):
-            names = ("tilt/pivot_mm", "tilt/spread_mm")
-            tilt = TiltResponse(*(read_checked(file, name, (depth.size,)) for name in names))
-        if has_member(file, "speckle"):
-            names = ("speckle/lateral_mm", "speckle/axial_mm")
-            speckle = SpeckleSize(*(read_checked(file, name, (depth.size,)) for name in names))
-        nominal = None
-        if (group := find_group(file, "nominal")) is not None:
-            kinds = dict.fromkeys((field.name for field in fields(NominalProbe)), float)
-            nominal = NominalProbe(**read_attributes(group, kinds))
-        parts = tilt, speckle, sigma, origin, nominal
-        return DecorrelationCurves(key, depth, distance, correlation, cells, pairs, *parts)
-
-
-def _origin(name: str) -> Origin:
-    for known in get_args(Origin):
-        if name == known:
-            return cast(Origin, known)
-    raise InvalidInputError(f"attribute origin: expected one of {get_args(Origin)}, got {name!r}")
+        key = read_record(file, CurveKey, signal=read_record(file, SIGNALS[kind]))
+        curves = read_record(file, DecorrelationCurves, key=key)
+        require_finite(curves.depth_mm, "/depth_mm")
+        if not curves.depth_mm.size or (np.diff(curves.depth_mm) <= 0).any():
+            raise InvalidInputError("/depth_mm: expected depths that increase, got others")
+        return curves
 
 
 load_curves = read_curves

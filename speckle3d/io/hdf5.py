@@ -1,16 +1,17 @@
-"""HDF5 files of this package: written whole or not at all, read with errors that name the place."""
+"""HDF5 files: written whole or not at all, read with errors that name the place."""
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import os
+import re
+import struct
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
@@ -20,23 +21,14 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import PathLike as PathLike
-from speckle3d.core.files import open_regular
+from speckle3d.core.files import open_regular, plausible_bytes
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.parts import DiskFile, cannot_write, clear_parts, marked, part_beside
-from speckle3d.io.hdf5_beside import CHUNK_CACHE_BYTES, has_writer, open_beside_writer
-from speckle3d.io.hdf5_beside import SIGNATURE as SIGNATURE
-from speckle3d.io.hdf5_guard import (
-    follow,
-    plain_attribute,
-    require_held,
-    require_plausible_rows,
-    require_readable,
-    require_sound_heaps,
-    require_texts,
-)
-from speckle3d.io.meanings import label
+from speckle3d.core.parts import cannot_write, clear_parts, marked, part_beside
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""First bytes of an HDF5 file without a user block."""
 
 _READ_FAILURES = (
     OSError,
@@ -46,9 +38,24 @@ _READ_FAILURES = (
     TypeError,
     MemoryError,
     OverflowError,
+    EOFError,
     zlib.error,
 )
-"""What h5py and zlib raise, by place, when the bytes of a file do not make sense."""
+"""What h5py, NumPy and zlib raise when the bytes of a file do not make sense."""
+
+_HAS_WRITER = ("already open for write", "unable to lock file")
+"""HDF5's words for a file that is being written, or whose writer was killed."""
+
+_HEAPS_BYTES = 2**22
+
+_READ_ATTEMPTS = 20
+"""Of what may be half written: a millisecond in all."""
+
+_MOST_TIMES_THE_FILE = 1032
+"""Deflate packs a byte into no less than 1/1032 of one [RFC 1951: 258 bytes in 2 bits]."""
+
+_CHUNK_CACHE_BYTES = 32 * 2**20
+"""Room for files whose chunks span several frames."""
 
 _ACCEPTED_KINDS = {"f": "fiu", "i": "iu", "b": "biu"}
 """Stored kinds that may become the kind asked for."""
@@ -111,58 +118,10 @@ def make_folder(path: PathLike) -> None:
         raise cannot_write(path, error, "cannot be made a folder") from error
 
 
-@contextmanager
-def atomic_hdf5(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
-    """Open an HDF5 file of the family for writing; `path` appears whole or not at all (`atomic_path`)."""
-    with atomic_path(path) as part, DiskFile(part) as disk, h5py.File(disk, "w") as file:
-        file.attrs["format"] = format_name
-        file.attrs["version"] = version
-        yield file
-        label(file)
-
-
-class HDF5Writer:
-    """Write a file of the family in a block; it appears whole when the block ends, or not at all."""
-
-    def __init__(self, path: PathLike, format_name: str, version: int) -> None:
-        self._path, self._format = path, (format_name, version)
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            part = stack.enter_context(atomic_path(self._path))
-            self._disk = stack.enter_context(DiskFile(part))
-            self._file = stack.enter_context(h5py.File(self._disk, "w"))
-            for name, value in zip(("format", "version"), self._format, strict=True):
-                self._file.attrs[name] = value
-            stack.push(self._finish_unless)
-            self._begin()
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.__exit__(kind, error, trace)
-
-    def _require_room(self) -> None:
-        """Raise if what was written so far does not fit on the disk; to be called after every piece."""
-        self._disk.check()
-
-    def _begin(self) -> None:
-        """Write what is known before the block."""
-
-    def _finish(self) -> None:
-        """Write what is known when the block has ended without an error."""
-
-    def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
-        if error is None:
-            self._finish()
-            label(self._file)
-
-
 def open_hdf5(path: PathLike) -> h5py.File:
-    """Open an HDF5 file for reading.
+    """Open an HDF5 file for reading, also one that is being written or whose writer was killed.
+
+    Such a file is open in ``swmr_mode``, as by a reader beside a writer.
 
     Raises
     ------
@@ -173,17 +132,53 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
-        held = os.stat(path)
-        _require_sound_once(os.fspath(path), held.st_ino, held.st_size, held.st_mtime_ns)
-        if has_writer(path):
-            return open_beside_writer(path)
-        return h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE_BYTES)
+        _require_sound_texts(path)
+        try:
+            return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
+        except OSError as error:
+            if not any(words in str(error) for words in _HAS_WRITER):
+                raise
+            return _opened_beside_writer(path)
 
 
-@lru_cache(maxsize=16)
-def _require_sound_once(path: str, *_: int) -> None:
-    """Look through a file's heaps, unless that was done and it is as it was: each reader opens it anew."""
-    require_sound_heaps(path)
+def _require_sound_texts(path: PathLike) -> None:
+    """Refuse a file whose texts have zeros over them, as a broken copy leaves: HDF5 would search without end.
+
+    Texts lie in heaps, which begin with GCOL and go on from length to length [1]_; HDF5 2.0 does not check
+    that a length is above zero. Looked at are those near both ends of a file, where attributes are.
+
+    References
+    ----------
+    .. [1] HDF5 File Format Specification 3.0, III.E.
+    """
+    with open_regular(path) as stream:
+        size = stream.seek(0, os.SEEK_END)
+        for start in {0, max(0, size - _HEAPS_BYTES)}:
+            stream.seek(start)
+            content = stream.read(_HEAPS_BYTES)
+            for heap in re.finditer(rb"GCOL\x01\x00{3}", content):
+                at = heap.start() + 16
+                stop = heap.start() + int.from_bytes(content[heap.end() : heap.end() + 8], "little")
+                while at + 16 <= min(stop, len(content)):
+                    index, length = struct.unpack_from("<H6xQ", content, at)
+                    step = 16 + -(-length // 8) * 8 if index else length
+                    if step < 16:
+                        raise FileError(f"{path}: cannot be read: damaged texts at byte {start + at}")
+                    at += step
+
+
+def _opened_beside_writer(path: PathLike) -> h5py.File:
+    """Open a file as a reader beside its writer.
+
+    What is half written HDF5 reads a hundred times, each after twice the time: for ever in a file that was
+    copied while it grew. h5py has no word for fewer, so HDF5 itself is told.
+    """
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    with suppress(OSError, AttributeError):  # Windows does not give away what a library loads
+        tell = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
+        tell(ctypes.c_int64(access.id), ctypes.c_uint(_READ_ATTEMPTS))
+    flags = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
+    return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
 
 
 def require_file(path: PathLike) -> None:
@@ -208,13 +203,13 @@ def reading(where: PathLike) -> Iterator[None]:
 def opened(path: PathLike, format_name: str, versions: Sequence[int] = (1,)) -> Iterator[h5py.File]:
     """Open an HDF5 file of the family for reading and require its format and one of the versions."""
     with reading(path), open_hdf5(path) as file:
-        found = file_format(file)
-        if found != format_name:
-            raise InvalidInputError(f"{path}: expected format {format_name!r}, got {found!r}")
-        got = read_attribute(file, "version")
-        if got not in versions:
+        got_format = file_format(file)
+        if got_format != format_name:
+            raise InvalidInputError(f"{path}: expected format {format_name!r}, got {got_format!r}")
+        version = read_attribute(file, "version")
+        if version not in versions:
             known = " or ".join(map(str, versions))
-            raise InvalidInputError(f"{path}: expected {format_name} version {known}, got {got:g}")
+            raise InvalidInputError(f"{path}: expected {format_name} version {known}, got {version:g}")
         yield file
 
 
@@ -231,7 +226,15 @@ def hdf5_claim(is_ours: Callable[[h5py.File], bool]) -> Callable[[Path, bytes], 
 
 
 def file_format(file: h5py.File) -> str:
-    """Return the attribute ``format`` of an open file."""
+    """Return the attribute ``format`` of an open file.
+
+    Raises
+    ------
+    InvalidInputError
+        If it has none, as another program's.
+    """
+    if "format" not in file.attrs:
+        raise InvalidInputError(f"{file.filename}: HDF5, but none of ours: it has no attribute format")
     return read_text(file, "format")
 
 
@@ -246,69 +249,26 @@ def locate(node: Node, name: str = "") -> str:
     return f"{node.file.filename}: {inside}"
 
 
-def read_checked(
-    group: h5py.Group, name: str, shape: tuple[int | str, ...], dtype: npt.DTypeLike = np.float64
-) -> npt.NDArray[Any]:
-    """Read a data set whose shape and kind are known.
-
-    Parameters
-    ----------
-    shape : tuple of int or str
-        Lengths; a word stands for a length that is free, and shows in the message.
-    dtype : dtype
-        What to return. Integers are accepted where floats are asked for, not the other way round.
+def find_member(group: h5py.Group, name: str) -> Any:
+    """Return what `group` holds under a name or path, None if there is none; never of another file.
 
     Raises
     ------
     InvalidInputError
-        If the data set is missing or of another shape or kind.
-    FileError
-        If its bytes cannot be read.
+        If the name is a link to another file, or to nothing.
     """
-    node = require_dataset(group, name)
-    where, wanted = locate(group, name), np.dtype(dtype)
-    if node.dtype.kind not in _ACCEPTED_KINDS[wanted.kind]:
-        raise InvalidInputError(f"{where}: expected numbers of type {wanted}, got {node.dtype}")
-    if not _fits(node.shape, shape):
-        expected = ", ".join(str(n) for n in shape) + ("," if len(shape) == 1 else "")
-        raise InvalidInputError(f"{where}: expected shape ({expected}), got {node.shape}")
-    with reading(where), naming(where):
-        require_readable(node)
-        return np.asarray(node[()], dtype=wanted)
-
-
-def read_rows(group: h5py.Group, name: str, shape: tuple[int | str, ...]) -> npt.NDArray[Any]:
-    """Read the first rows of a data set of finite numbers that grows and may be longer.
-
-    Parameters
-    ----------
-    shape : tuple of int or str
-        The first one says how many rows; a word, that all up to the first unwritten one, NaN, are wanted.
-    """
-    rows = shape[0] if isinstance(shape[0], int) else 0
-    node = require_dataset(group, name, rows)
-    where = locate(group, name)
-    if node.dtype.kind not in "fb" or not _fits(node.shape[1:], shape[1:]) or node.shape[0] < rows:
-        raise InvalidInputError(f"{where}: expected shape {shape} or more, got {node.shape} {node.dtype}")
-    with reading(where), naming(where):
-        require_plausible_rows(node)
-        values = np.asarray(node[()], dtype=np.float64 if node.dtype.kind == "f" else np.bool_)
-    if isinstance(shape[0], int):
-        return values[:rows]
-    unwritten = np.flatnonzero(np.isnan(values))
-    return values[: unwritten[0]] if unwritten.size else values
-
-
-def require_dataset(group: h5py.Group, name: str, rows: int | None = None) -> h5py.Dataset:
-    """Return a data set of `group` that the file holds whole, or raise `InvalidInputError`.
-
-    Of one that grows, `rows` are to be there.
-    """
-    node, where = find_member(group, name), locate(group, name)
-    if not isinstance(node, h5py.Dataset):
-        raise InvalidInputError(f"{where}: expected a data set, got {_kind_of(node)}")
-    with reading(where), naming(where):
-        require_held(node, rows)
+    node: Any = group
+    with reading(locate(group, name)), naming(locate(group, name)):
+        for step in name.strip("/").split("/"):
+            link = node.get(step, getlink=True) if isinstance(node, h5py.Group) else None
+            if link is None:
+                return None
+            node = None if isinstance(link, h5py.ExternalLink) else node.get(step)
+            # A soft link may lead to a link to another file.
+            if node is None or node.file.filename != group.file.filename:
+                raise InvalidInputError(
+                    "expected a member of the file itself, got a link to nothing or to another file"
+                )
     return node
 
 
@@ -324,42 +284,98 @@ def find_group(group: h5py.Group, name: str) -> h5py.Group | None:
 
 def require_group(group: h5py.Group, name: str) -> h5py.Group:
     """Return a group inside `group`, or raise `InvalidInputError` naming what is there instead."""
-    node = find_member(group, name)
-    if not isinstance(node, h5py.Group):
-        raise InvalidInputError(f"{locate(group, name)}: expected a group, got {_kind_of(node)}")
+    return _require_kind(group, name, h5py.Group, "a group")
+
+
+def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
+    """Return a data set of `group`, or raise `InvalidInputError` if it is none or its data are elsewhere."""
+    node = _require_kind(group, name, h5py.Dataset, "a data set")
+    if node.is_virtual or node.external:
+        raise InvalidInputError(f"{locate(group, name)}: expected its data in the file, got them in others")
     return node
 
 
-def read_transforms(group: h5py.Group, name: str, count: int) -> RigidTransform:
-    """Read a data set of rigid 4x4 matrices."""
+def _require_kind(group: h5py.Group, name: str, kind: type[Node], words: str) -> Any:
+    node = find_member(group, name)
+    if not isinstance(node, kind):
+        got = "none" if node is None else type(node).__name__.lower()
+        raise InvalidInputError(f"{locate(group, name)}: expected {words}, got {got}")
+    return node
+
+
+def require_readable(node: h5py.Dataset) -> None:
+    """Refuse a data set that would take far more memory than the file is long."""
+    most = plausible_bytes(node.file.id.get_filesize(), _MOST_TIMES_THE_FILE)
+    if node.nbytes > most:
+        raise InvalidInputError(f"{locate(node)}: expected at most {most} bytes of data, got {node.nbytes}")
+
+
+def read_checked(
+    group: h5py.Group, name: str, shape: tuple[int | str, ...] | None, dtype: npt.DTypeLike = np.float64
+) -> npt.NDArray[Any]:
+    """Read a data set whose shape and kind are known.
+
+    Parameters
+    ----------
+    shape : tuple of int or str, or None
+        Lengths; a word stands for a length that is free, and shows in the message. None for any shape.
+    dtype : dtype
+        What to return. Integers are accepted where floats are asked for, not the other way round.
+
+    Raises
+    ------
+    InvalidInputError
+        If the data set is missing or of another shape or kind.
+    FileError
+        If its bytes cannot be read.
+    """
+    node = require_dataset(group, name)
+    where, wanted = locate(group, name), np.dtype(dtype)
+    if node.dtype.kind not in _ACCEPTED_KINDS[wanted.kind]:
+        raise InvalidInputError(f"{where}: expected numbers of type {wanted}, got {node.dtype}")
+    _require_shape(node, shape, where)
+    with reading(where):
+        require_readable(node)
+        return np.asarray(node[()], dtype=wanted)
+
+
+def _require_shape(node: h5py.Dataset, shape: tuple[int | str, ...] | None, where: str) -> None:
+    got = node.shape
+    if shape is None and got is not None:
+        return
+    if (
+        got is None
+        or len(got) != len(shape or ())
+        or any(n != wanted for n, wanted in zip(got, shape or (), strict=True) if not isinstance(wanted, str))
+    ):
+        expected = str(shape).replace("'", "")
+        raise InvalidInputError(f"{where}: expected shape {expected}, got {got}")
+
+
+def read_transforms(group: h5py.Group, name: str, count: int | None = None) -> RigidTransform:
+    """Read a data set of so many rigid 4x4 matrices, or of a single one."""
+    if count is None:
+        pose: RigidTransform = transforms_from_matrices(
+            read_checked(group, name, (4, 4))[None], locate(group, name)
+        )[0]
+        return pose
     return transforms_from_matrices(read_checked(group, name, (count, 4, 4)), locate(group, name))
 
 
 def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
     """Read a data set of texts of a known shape, as nested lists."""
-    node = require_dataset(group, name)
-    if h5py.check_string_dtype(node.dtype) is None or node.shape != shape:
-        where = locate(group, name)
-        raise InvalidInputError(f"{where}: expected texts of shape {shape}, got {node.shape} {node.dtype}")
-    with reading(locate(group, name)), naming(locate(group, name)):
-        require_readable(node)
-        require_texts(node)
+    node, where = require_dataset(group, name), locate(group, name)
+    if h5py.check_string_dtype(node.dtype) is None:
+        raise InvalidInputError(f"{where}: expected texts, got {node.dtype}")
+    _require_shape(node, shape, where)
+    with reading(where):
         return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 
-def write_attributes(node: Node, values: object, names: Iterable[str]) -> None:
-    """Write attributes of an object by name; of a path that is no Unicode, what can be written."""
-    for name in names:
-        value = getattr(values, name)
-        node.attrs[name] = value.encode("utf-8", "backslashreplace").decode() if type(value) is str else value
-
-
-def read_attributes(node: Node, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """Read attributes into values by name: each a number (`float` or `int`) or a text (`str`)."""
-    return {
-        name: read_text(node, name) if kind is str else kind(read_attribute(node, name))
-        for name, kind in kinds.items()
-    }
+def plain_attribute(node: Node, name: str) -> Any:
+    """Value of an attribute, None if there is none."""
+    with reading(f"{locate(node)} attribute {name}"):
+        return node.attrs.get(name)
 
 
 def read_attribute(node: Node, name: str, default: float | None = None) -> float:
@@ -371,24 +387,21 @@ def read_attribute(node: Node, name: str, default: float | None = None) -> float
 
 def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
     """Read an attribute of `size` finite numbers as a flat array."""
-    where = f"{locate(node)} attribute {name}"
-    with reading(where), naming(where):
-        raw = plain_attribute(node, name)
+    raw = plain_attribute(node, name)
     value = np.asarray(raw)
     if value.dtype.kind not in "fiu" or value.size != size or not np.isfinite(value).all():
+        where = f"{locate(node)} attribute {name}"
         raise InvalidInputError(f"{where}: expected {size} finite number(s), got {_shown(raw)}")
     return value.astype(np.float64).ravel()
 
 
 def read_text(node: Node, name: str) -> str:
     """Read a text attribute."""
-    where = f"{locate(node)} attribute {name}"
-    with reading(where), naming(where):
-        raw = plain_attribute(node, name)
+    raw = plain_attribute(node, name)
     if isinstance(raw, bytes):
         raw = raw.decode("utf-8", errors="replace")
     if not isinstance(raw, str):
-        raise InvalidInputError(f"{where}: expected a text, got {_shown(raw)}")
+        raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {_shown(raw)}")
     return str(raw)
 
 
@@ -402,23 +415,6 @@ def one_line(error: BaseException) -> str:
     """Return the first line of an error's own words."""
     text = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return (text.strip() or type(error).__name__).splitlines()[0]
-
-
-def find_member(group: h5py.Group, name: str) -> Any:
-    """Return what `group` holds under a name, None if there is none; never of another file."""
-    where = locate(group, name)
-    with reading(where), naming(where):
-        return follow(group, name)
-
-
-def _fits(shape: tuple[int, ...] | None, expected: tuple[int | str, ...]) -> bool:
-    if shape is None or len(shape) != len(expected):
-        return False
-    return all(isinstance(want, str) or got == want for got, want in zip(shape, expected, strict=True))
-
-
-def _kind_of(node: object) -> str:
-    return "none" if node is None else type(node).__name__.lower()
 
 
 def _shown(raw: object) -> str:

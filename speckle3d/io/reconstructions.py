@@ -1,4 +1,4 @@
-"""The reconstruction file, version 1: frame pairs are written as they come, and the file is read whole."""
+"""The reconstruction file, version 1."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
 from speckle3d.core.reconstruction import (
@@ -26,44 +25,40 @@ from speckle3d.core.reconstruction import (
 )
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import (
-    HDF5Writer,
     PathLike,
     find_group,
     has_member,
     locate,
     opened,
-    read_attributes,
+    read_attribute,
     read_checked,
     read_text,
     read_texts,
     read_transforms,
     read_vector_attribute,
+    require_dataset,
     require_group,
-    write_attributes,
 )
+from speckle3d.io.records import HDF5Writer, put, read_record
 
 FORMAT = "speckle3d.reconstruction"
-VERSION = 1
 
-_PAIR_FIELDS: dict[str, tuple[tuple[int | str, ...], npt.DTypeLike]] = {
-    "first": ((), np.int64),
-    "second": ((), np.int64),
-    "first_from_second": ((4, 4), np.float64),
-    "covariance": ((6, 6), np.float64),
-    "distance_mm": (("patch",), np.float32),
-    "sigma_mm": (("patch",), np.float32),
-    "used": (("patch",), np.bool_),
+_PAIR_ROWS: dict[str, tuple[int, ...]] = {
+    "first": (),
+    "second": (),
+    "first_from_second": (4, 4),
+    "covariance": (6, 6),
+    "distance_mm": (-1,),
+    "sigma_mm": (-1,),
+    "used": (-1,),
 }
-"""Shape behind the pair axis, and type, of every data set of /pairs but ``patch_centre_mm``."""
+"""Shape of a pair's row, -1 for the patches, in every data set of /pairs but ``patch_centre_mm``."""
 
-_GRID = dict.fromkeys(("vectors", "samples"), int) | dict.fromkeys(
-    ("vector_pitch_mm", "sample_spacing_mm", "first_sample_depth_mm"), float
-)
-_PROVENANCE = dict.fromkeys(("input_path", "input_sha256", "package_version"), str)
-_SOURCE = dict.fromkeys(("path", "sha256"), str)
-_SHARED = dict.fromkeys(("scale_sigma", "curves_sigma"), float)
-_TURN = "turn_sigma_per_mm"
-_CHUNK_BYTES = 2**18
+_SHARED = ("scale_sigma", "curves_sigma", "turn_sigma_per_mm")
+"""Attributes of the covariance of `image`, by the fields of `SharedErrors`."""
+
+_EARLIER = {"consistent-subset": "image+subset"}
+"""Names of modes in older files."""
 
 
 class ReconstructionWriter(HDF5Writer):
@@ -81,18 +76,25 @@ class ReconstructionWriter(HDF5Writer):
     """
 
     def __init__(self, path: PathLike, frame_time_s: npt.ArrayLike, grid: ImageGrid) -> None:
-        super().__init__(path, FORMAT, VERSION)
+        super().__init__(path, FORMAT)
         self._grid = grid
         self._times = require_increasing(frame_time_s, f"{path}: /frame_time_s")
-        self._finished = False
+        self._pairs: list[FramePairs] = []
+        self._is_finished = False
 
     def _begin(self) -> None:
-        self._file["frame_time_s"] = self._times
-        write_attributes(self._file, self._grid, _GRID)
+        self.put(self.file, "frame_time_s", self._times)
+        self.put_fields(self.file, self._grid)
 
     def _finish(self) -> None:
-        if not self._finished:
-            raise InvalidInputError(f"{self._path}: expected finish() before the end, got none")
+        if not self._is_finished:
+            raise InvalidInputError(f"{self.path}: expected finish() before the end, got none")
+        if self._pairs:
+            group = self.file.create_group("pairs")
+            self.put(group, "patch_centre_mm", self._pairs[0].patch_centre_mm)
+            for name in _PAIR_ROWS:
+                rows = np.concatenate([getattr(pairs, name) for pairs in self._pairs])
+                put(group, name, rows, self.room, compression="lzf", shuffle=True)
 
     def append_pairs(self, pairs: FramePairs) -> None:
         """Append frame pairs; their patches must be those of the pairs before.
@@ -102,18 +104,11 @@ class ReconstructionWriter(HDF5Writer):
         InvalidInputError
             If a field has another shape or a frame index is out of range.
         """
-        where = f"{self._path}: /pairs"
+        where = f"{self.path}: /pairs"
         _check_pairs(pairs, self._times.size, where)
-        group = self._file.require_group("pairs")
-        if "first" not in group:
-            _create_pairs(group, pairs)
-        elif not np.array_equal(group["patch_centre_mm"], pairs.patch_centre_mm):
+        if self._pairs and not np.array_equal(self._pairs[0].patch_centre_mm, pairs.patch_centre_mm):
             raise InvalidInputError(f"{where}/patch_centre_mm: expected the patches of the pairs before")
-        start = len(group["first"])
-        for name in _PAIR_FIELDS:
-            group[name].resize(start + len(pairs), axis=0)
-            group[name][start:] = getattr(pairs, name)
-        self._require_room()
+        self._pairs.append(pairs)
 
     def finish(
         self,
@@ -123,36 +118,28 @@ class ReconstructionWriter(HDF5Writer):
         trust: Trust | None = None,
     ) -> None:
         """Write the poses by mode, where they came from, the configuration and how far to trust them."""
-        group = self._file.create_group("poses")
-        with naming(str(self._path)):
+        file = self.file
+        with naming(str(self.path)):
             # Checked by the container before anything is written.
             Reconstruction(self._times, self._grid, dict(poses), provenance, config_toml, None, trust)
-        for mode, world_from_image in poses.items():
-            group[mode] = world_from_image.as_matrix()
+        self.put(file, "poses", poses)
         if trust is not None:
-            self._write_trust(trust)
-        write_attributes(self._file, provenance, _PROVENANCE)
+            modes = {"image": trust.covariance} | {mode: of.covariance for mode, of in trust.modes.items()}
+            self.put(file, "pose_covariance", modes)
+            self.put(file, "frame_flags", trust.flags)
+            if trust.shared is not None:
+                file["pose_covariance/image"].attrs.update(vars(trust.shared))
+            for mode, errors in trust.modes.items():
+                file[f"pose_covariance/{mode}"].attrs["length_sigma"] = errors.length_sigma
+        self.put_fields(file, provenance, skip=["calibrations", "imported"])
         for used in provenance.calibrations:
-            write_attributes(self._file.require_group(f"calibrations/{used.sensor}"), used, _SOURCE)
-        if provenance.crossing is not None:
-            write_attributes(self._file.require_group("crossing"), provenance.crossing, _SOURCE)
+            self.put(file, f"calibrations/{used.sensor}", SourceFile(used.path, used.sha256))
         if provenance.imported is not None:
-            group = self._file.create_group("import")
-            write_attributes(group, provenance.imported, ("name",))
-            # A mapping of arrays may be more than an attribute holds.
-            group["settings_json"] = provenance.imported.settings_json
-        self._file["config_toml"] = config_toml
-        self._finished = True
-
-    def _write_trust(self, trust: Trust) -> None:
-        group = self._file.create_group("pose_covariance")
-        group["image"] = trust.covariance
-        if trust.shared is not None:
-            write_attributes(group["image"], trust.shared, (*_SHARED, _TURN))
-        for mode, claimed in trust.modes.items():
-            group[mode] = claimed.covariance
-            write_attributes(group[mode], claimed, ("length_sigma",))
-        self._file["frame_flags"] = trust.flags
+            group = file.create_group("import")
+            self.put(group, "name", provenance.imported.name)
+            self.put_text(group, "settings_json", provenance.imported.settings_json)
+        self.put_text(file, "config_toml", config_toml)
+        self._is_finished = True
 
 
 def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstruction:
@@ -176,12 +163,12 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
     InvalidInputError
         Naming the file, the data set and the first bad index.
     """
-    with opened(path, FORMAT, (VERSION,)) as file:
+    with opened(path, FORMAT) as file:
         times = read_checked(file, "frame_time_s", ("frame",))
         with naming(str(path)):
             return Reconstruction(
                 frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
-                grid=ImageGrid(**read_attributes(file, _GRID)),
+                grid=read_record(file, ImageGrid),
                 poses=_read_poses(file, times.size),
                 provenance=_read_provenance(file),
                 config_toml=read_texts(file, "config_toml", ()),
@@ -190,28 +177,14 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
             )
 
 
-def _create_pairs(group: h5py.Group, pairs: FramePairs) -> None:
-    group["patch_centre_mm"] = pairs.patch_centre_mm
-    for name, (_, dtype) in _PAIR_FIELDS.items():
-        values = np.asarray(getattr(pairs, name), dtype=dtype)
-        row = values.shape[1:]
-        row_bytes = max(int(np.prod(row, dtype=int)) * values.dtype.itemsize, 1)
-        chunks = (max(_CHUNK_BYTES // row_bytes, 1), *(max(n, 1) for n in row))
-        group.create_dataset(
-            name,
-            shape=(0, *row),
-            maxshape=(None, *row),
-            chunks=chunks,
-            dtype=dtype,
-            compression="lzf",
-            shuffle=True,
-        )
+load_reconstruction = read_reconstruction
+"""Its public name, `speckle3d.load_reconstruction`."""
 
 
 def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
     patches = len(pairs.patch_centre_mm)
-    for name, (row, _) in _PAIR_FIELDS.items():
-        expected = (len(pairs), *(patches if n == "patch" else n for n in row))
+    for name, row in _PAIR_ROWS.items():
+        expected = (len(pairs), *(patches if n < 0 else n for n in row))
         got = np.shape(getattr(pairs, name))
         if got != expected:
             raise InvalidInputError(f"{where}/{name}: expected shape {expected}, got {got}")
@@ -225,27 +198,13 @@ def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
 
 
 def _read_provenance(file: h5py.File) -> Provenance:
-    # Older files have no such group.
+    """Where a reconstruction came from; files of versions before 0.1 lack some groups."""
     held = find_group(file, "calibrations") or {}
-    calibrations = [
-        CalibrationFile(sensor, **read_attributes(require_group(held, sensor), _SOURCE)) for sensor in held
-    ]
-    crossed = find_group(file, "crossing")
-    crossing = None if crossed is None else SourceFile(**read_attributes(crossed, _SOURCE))
-    held = find_group(file, "import")
-    imported = None
-    if held is not None:
-        imported = ImportRecord(read_text(held, "name"), read_texts(held, "settings_json", ()))
-    return Provenance(
-        **read_attributes(file, _PROVENANCE),
-        calibrations=tuple(calibrations),
-        crossing=crossing,
-        imported=imported,
-    )
-
-
-_EARLIER = {"consistent-subset": "image+subset"}
-"""Names of modes in older files."""
+    used = [read_record(require_group(held, sensor), CalibrationFile, sensor=sensor) for sensor in held]
+    imported, group = None, find_group(file, "import")
+    if group is not None:
+        imported = ImportRecord(read_text(group, "name"), read_texts(group, "settings_json", ()))
+    return read_record(file, Provenance, calibrations=tuple(used), imported=imported)
 
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
@@ -257,41 +216,35 @@ def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
-    if not (has_member(file, "pose_covariance") and has_member(file, "frame_flags")):
+    group = find_group(file, "pose_covariance")
+    if group is None or not has_member(file, "frame_flags"):
         return None
-    group = require_group(file, "pose_covariance")
-    modes = {}
-    for mode in MODES[1:]:
-        if has_member(group, mode):
-            modes[mode] = ModeErrors(
-                _read_covariance(group, mode, frames), **read_attributes(group[mode], {"length_sigma": float})
-            )
+    covariances = {
+        mode: read_checked(group, mode, (frames, 6, 6))
+        for mode in MODES
+        if mode == "image" or has_member(group, mode)
+    }
+    for mode, values in covariances.items():
+        require_finite(values, locate(group, mode))
+    image, shared = require_dataset(group, "image"), None
+    if _SHARED[2] in image.attrs:
+        turn = read_vector_attribute(image, _SHARED[2], 2)
+        scale, curves = (read_attribute(image, name) for name in _SHARED[:2])
+        shared = SharedErrors(scale, curves, turn)
+    modes = {
+        mode: ModeErrors(values, read_attribute(group[mode], "length_sigma"))
+        for mode, values in covariances.items()
+        if mode != "image"
+    }
     flags = read_checked(file, "frame_flags", (frames,), np.int64)
-    return Trust(_read_covariance(group, "image", frames), flags, _read_shared(group["image"]), modes)
-
-
-def _read_covariance(group: h5py.Group, mode: str, frames: int) -> FloatArray:
-    covariance = read_checked(group, mode, (frames, 6, 6))
-    require_finite(covariance, locate(group, mode))
-    return covariance
-
-
-def _read_shared(covariance: h5py.Dataset) -> SharedErrors | None:
-    """What the image's poses have wrong together; older files do not say."""
-    if _TURN not in covariance.attrs:
-        return None
-    turn = read_vector_attribute(covariance, _TURN, 2)
-    return SharedErrors(**read_attributes(covariance, _SHARED), turn_sigma_per_mm=turn)
+    return Trust(covariances["image"], flags, shared, modes)
 
 
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:
     group = find_group(file, "pairs")
     if group is None:
         return None
-    values = {
-        name: read_checked(group, name, ("pair", *row), dtype) for name, (row, dtype) in _PAIR_FIELDS.items()
-    }
-    pairs = FramePairs(patch_centre_mm=read_checked(group, "patch_centre_mm", ("patch", 2)), **values)
+    pairs = read_record(group, FramePairs)
     _check_pairs(pairs, frames, locate(group))
     transforms_from_matrices(pairs.first_from_second, locate(group, "first_from_second"))
     return pairs

@@ -8,9 +8,8 @@ from typing import Any
 import h5py
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import (
     require_finite,
@@ -40,7 +39,6 @@ from speckle3d.io.hdf5 import (
     opened,
     read_attribute,
     read_checked,
-    read_rows,
     read_text,
     read_transforms,
     read_vector_attribute,
@@ -48,8 +46,9 @@ from speckle3d.io.hdf5 import (
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.lazy import HDF5Slices, Slices
+from speckle3d.io.lazy import HDF5Slices
 from speckle3d.io.readers import Reader
+from speckle3d.io.records import read_record
 
 FORMAT = "speckle3d.sweep"
 VERSION, IQ_VERSION = 1, 2
@@ -68,8 +67,12 @@ SAMPLE_TYPES: dict[str, tuple[np.dtype[Any], ...]] = {
 }
 """Types that the samples of each kind may have in the file; int16 of I/Q in pairs, I first."""
 
-RF_NUMBERS = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz")
-"""Attributes of /rf that are a number each of `RFSettings`."""
+SIGNALS: dict[str, type[RFSettings] | type[BModeSettings]] = {
+    "rf": RFSettings,
+    "iq": RFSettings,
+    "bmode": BModeSettings,
+}
+"""What tells how the samples of each kind were made."""
 
 
 class HDF5Frames(HDF5Slices):
@@ -80,20 +83,15 @@ class HDF5Frames(HDF5Slices):
     ) -> None:
         in_pairs = len(shape) == 4
         n, vectors, samples = shape[:3]
-        turn = complex_of_pairs if in_pairs else as_stored
+        turn = from_pairs if in_pairs else as_stored
         kind = np.complex64 if in_pairs else dtype
-        super().__init__(path, [name], 0, turn, (n, vectors, samples), kind, grows)
+        super().__init__(path, name, turn, (n, vectors, samples), kind, grows)
         self.stored_dtype = dtype
 
 
-def as_stored(slices: Slices) -> npt.NDArray[Any]:
+def as_stored(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Frame as the file has it."""
-    return slices[0]
-
-
-def complex_of_pairs(slices: Slices) -> npt.NDArray[Any]:
-    """Frame of I and Q in pairs, the last axis."""
-    return from_pairs(slices[0])
+    return values
 
 
 def read_sweep(path: PathLike) -> Sweep:
@@ -107,17 +105,11 @@ def read_sweep(path: PathLike) -> Sweep:
         Naming the file, the data set and the first bad index.
     """
     with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
-        grows = is_growing(file)
-        times, n = None, None
-        if grows:
-            times = read_rows(file, "frame_time_s", ("frame",))
-            n = times.size
-            if not n:
-                raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
-        frames, grid, signal = _read_image(file, n)
-        n = frames.shape[0]
-        if times is None:
-            times = read_checked(file, "frame_time_s", (n,))
+        times = _read_rows(file, "frame_time_s", ("frame",))
+        if not times.size:
+            raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
+        frames, grid, signal = _read_image(file, times.size)
+        truth = find_group(file, "truth")
         return Sweep(
             frames=frames,
             grid=grid,
@@ -125,7 +117,7 @@ def read_sweep(path: PathLike) -> Sweep:
             frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
             orientation=_read_orientation(file),
             tracker=_read_tracker(file),
-            truth=_read_truth(file, n),
+            truth=None if truth is None else read_transforms(truth, "world_from_image", times.size),
             name=printable(Path(path).stem),
             probe=read_text(file, "probe") if "probe" in file.attrs else "",
         )
@@ -133,43 +125,56 @@ def read_sweep(path: PathLike) -> Sweep:
 
 def is_growing(file: h5py.File) -> bool:
     """Whether an open file's recording goes on, or has ended without being closed."""
-    if file.swmr_mode:
-        return True
-    return has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_))
+    return file.swmr_mode or (has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_)))
 
 
-def _read_image(
-    file: h5py.File, rows: int | None
-) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
-    """Frames of a file; of one that grows, as many as it has times for."""
-    name = _name_of_image(file)
-    node = require_dataset(file, name, rows)
-    where = locate(file, name)
-    dtype = node.dtype.newbyteorder("=")
+def _read_rows(group: h5py.Group, name: str, shape: tuple[int | str, ...]) -> npt.NDArray[Any]:
+    """Read a data set; of one that grows the rows that are whole, as many as there are times before NaN."""
+    if not is_growing(group.file):
+        return read_checked(group, name, shape)
+    values = read_checked(group, name, ("row", *shape[1:]))
+    count = shape[0]
+    if isinstance(count, str):
+        unwritten = np.flatnonzero(np.isnan(values))
+        return values[: unwritten[0]] if unwritten.size else values
+    if len(values) < count:
+        raise InvalidInputError(f"{locate(group, name)}: expected {count} rows or more, got {len(values)}")
+    return values[:count]
+
+
+def _read_image(file: h5py.File, count: int) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
+    """Frames of a file, as many as it has times for."""
+    known = ("rf", "bmode") if read_attribute(file, "version") == VERSION else ("rf", "iq", "bmode")
+    names = [name for name in known if has_member(file, name)]
+    if not names or ("iq" in names and len(names) > 1):
+        raise InvalidInputError(
+            f"{locate(file)}: expected a data set {', '.join(known[:-1])} or {known[-1]}, got "
+            f"{' and '.join(names) or 'none of them'}"
+        )
+    name = names[0]
+    node, where = require_dataset(file, name), locate(file, name)
+    dtype, grows = node.dtype.newbyteorder("="), is_growing(file)
     require_sample_type(name, dtype, where)
     pairs = (2,) if name == "iq" and dtype == np.int16 else ()
     if node.ndim != 3 + len(pairs) or node.shape[3:] != pairs or 0 in node.shape:
         expected = f"(frame, vector, sample{', 2' if pairs else ''})"
         raise InvalidInputError(f"{where}: expected shape {expected}, got {node.shape}")
-    shape = node.shape if rows is None else (rows, *node.shape[1:])
-    if not shape[0] <= node.shape[0]:
-        raise InvalidInputError(f"{where}: expected {rows} frames or more, got {node.shape[0]}")
-    frames = HDF5Frames(file.filename, name, shape, dtype, rows is not None)
+    if not (node.shape[0] == count or (grows and node.shape[0] > count)):
+        raise InvalidInputError(f"{where}: expected {count} frames, one for each time, got {node.shape[0]}")
+    frames = HDF5Frames(file.filename, name, (count, *node.shape[1:]), dtype, grows)
     with naming(where):
-        signal = read_signal(node, name)
-        return frames, _read_grid(node, signal), signal
-
-
-def _name_of_image(file: h5py.File) -> str:
-    """Name of the data set that holds the frames."""
-    known = ("rf", "bmode") if read_attribute(file, "version") == VERSION else ("rf", "iq", "bmode")
-    held = [name for name in known if has_member(file, name)]
-    if not held or ("iq" in held and len(held) > 1):
-        raise InvalidInputError(
-            f"{locate(file)}: expected a data set {', '.join(known[:-1])} or {known[-1]}, got "
-            f"{' and '.join(held) or 'none of them'}"
-        )
-    return held[0]
+        if name == "iq":
+            read_attribute(node, "demodulation_frequency_hz")
+        signal: RFSettings | BModeSettings = read_record(node, SIGNALS[name])
+        first_mm = read_attribute(node, "first_sample_depth_mm")
+        if isinstance(signal, RFSettings):
+            pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
+        else:
+            pitch_mm, spacing_mm = (
+                read_attribute(node, each) for each in ("column_pitch_mm", "row_spacing_mm")
+            )
+        vectors, samples = node.shape[1:3]
+        return frames, ImageGrid(vectors, samples, pitch_mm, spacing_mm, first_mm), signal
 
 
 def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
@@ -184,43 +189,17 @@ def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
         raise InvalidInputError(f"{where}: expected samples of type {expected}, got {dtype}")
 
 
-def read_signal(node: h5py.Group | h5py.Dataset, kind: str) -> RFSettings | BModeSettings:
-    """Read how the samples were made from attributes; `kind` is ``"rf"``, ``"iq"`` or ``"bmode"``."""
-    if kind == "bmode":
-        dynamic_range_db = read_attribute(node, "dynamic_range_db")
-        return BModeSettings(dynamic_range_db, read_attribute(node, "full_scale", default=255.0))
-    low, high = read_vector_attribute(node, "bandwidth_hz", 2).tolist()
-    numbers = {name: read_attribute(node, name) for name in RF_NUMBERS}
-    name = "demodulation_frequency_hz"
-    middle = read_attribute(node, name) if kind == "iq" or name in node.attrs else None
-    return RFSettings(**numbers, bandwidth_hz=(low, high), demodulation_frequency_hz=middle)
-
-
-def signal_attributes(signal: RFSettings | BModeSettings) -> dict[str, Any]:
-    """Attributes that `read_signal` reads back."""
-    return {name: value for name, value in vars(signal).items() if value is not None}
-
-
-def _read_grid(node: h5py.Dataset, signal: RFSettings | BModeSettings) -> ImageGrid:
-    vectors, samples = node.shape[1:3]
-    first_mm = read_attribute(node, "first_sample_depth_mm")
-    if isinstance(signal, RFSettings):
-        pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
-    else:
-        pitch_mm, spacing_mm = (read_attribute(node, name) for name in ("column_pitch_mm", "row_spacing_mm"))
-    return ImageGrid(vectors, samples, pitch_mm, spacing_mm, first_mm)
-
-
 def _read_orientation(file: h5py.File) -> OrientationSensor | None:
-    group = find_group(file, "orientation")
-    if group is None:
+    group, time_s = _read_times(file, "orientation")
+    if group is None or time_s is None:
         return None
-    time_s = _read_times(group)
-    if time_s is None:
-        return None
-    quaternions = _read_values(group, "quaternion_wxyz", (time_s.size, 4))
+    quaternions = _read_rows(group, "quaternion_wxyz", (time_s.size, 4))
     rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
-    vectors = {name: _read_vectors(group, name, time_s.size) for name in INERTIAL if has_member(group, name)}
+    vectors = {
+        name: _read_rows(group, name, (time_s.size, 3)) for name in INERTIAL if has_member(group, name)
+    }
+    for vector, values in vectors.items():
+        require_finite(values, locate(group, vector))
     mounting, name = None, "sensor_from_image_wxyz"
     if name in group.attrs:
         wxyz = read_vector_attribute(group, name, 4)
@@ -230,32 +209,31 @@ def _read_orientation(file: h5py.File) -> OrientationSensor | None:
         return OrientationSensor(TimedRotations(time_s, rotations), mounting, offset_s, **vectors)
 
 
-def _read_times(group: h5py.Group) -> FloatArray | None:
-    """Times of a sensor's readings; None of one that sent nothing during a recording."""
-    if is_growing(group.file):
-        times = read_rows(group, "time_s", ("sample",))
-    else:
-        times = read_checked(group, "time_s", ("sample",))
-    if not times.size and has_member(group.file, GROWING):
-        return None
-    return require_increasing(times, locate(group, "time_s"))
-
-
-def _read_values(group: h5py.Group, name: str, shape: tuple[int, ...]) -> FloatArray:
-    return (read_rows if is_growing(group.file) else read_checked)(group, name, shape)
+def _read_times(file: h5py.File, name: str) -> tuple[h5py.Group | None, FloatArray | None]:
+    """A sensor's group and the times of its readings; none of one that sent nothing during a recording."""
+    group = find_group(file, name)
+    if group is None:
+        return None, None
+    times = _read_rows(group, "time_s", ("sample",))
+    if not times.size and has_member(file, GROWING):
+        return group, None
+    return group, require_increasing(times, locate(group, "time_s"))
 
 
 def _read_tracker(file: h5py.File) -> Tracker | None:
-    group = find_group(file, "tracker")
-    if group is None:
+    group, time_s = _read_times(file, "tracker")
+    if group is None or time_s is None:
         return None
-    time_s = _read_times(group)
-    if time_s is None:
-        return None
-    valid = _read_valid(group, time_s.size)
+    valid = np.ones(time_s.size, dtype=bool)
+    if has_member(group, "valid"):
+        valid = read_checked(group, "valid", ("sample",), np.bool_)
+        valid = valid[: time_s.size] if is_growing(file) else valid
+    if valid.size != time_s.size or (valid.size and not valid.any() and not has_member(file, GROWING)):
+        expected = f"shape ({time_s.size},) with a valid sample"
+        raise InvalidInputError(f"{locate(group, 'valid')}: expected {expected}, got {valid.shape}")
     if not valid.any():
         return None
-    matrices = _read_values(group, "world_from_sensor", (time_s.size, 4, 4))
+    matrices = _read_rows(group, "world_from_sensor", (time_s.size, 4, 4))
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
     poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
@@ -269,30 +247,6 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
         return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
 
 
-def _read_truth(file: h5py.File, frames: int) -> RigidTransform | None:
-    group = find_group(file, "truth")
-    return None if group is None else read_transforms(group, "world_from_image", frames)
-
-
-def _read_vectors(group: h5py.Group, name: str, samples: int) -> FloatArray:
-    values = read_checked(group, name, (samples, 3))
-    require_finite(values, locate(group, name))
-    return values
-
-
-def _read_valid(group: h5py.Group, samples: int) -> BoolArray:
-    if not has_member(group, "valid"):
-        return np.ones(samples, dtype=bool)
-    valid: BoolArray
-    if is_growing(group.file):
-        valid = read_rows(group, "valid", (samples,)).astype(np.bool_)
-    else:
-        valid = read_checked(group, "valid", (samples,), np.bool_)
-    if samples and not valid.any() and not has_member(group.file, GROWING):
-        raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
-    return valid
-
-
 def unfinished_note(path: PathLike) -> str | None:
     """Words for a sweep file whose recording goes on or was not closed; None for any other file."""
     if not Path(path).is_file() or not h5py.is_hdf5(path):
@@ -300,8 +254,11 @@ def unfinished_note(path: PathLike) -> str | None:
     with reading(path), open_hdf5(path) as file:
         if not has_format(file, FORMAT) or not is_growing(file):
             return None
-        times = read_rows(file, "frame_time_s", ("frame",))
-    return f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far"
+        times = _read_rows(file, "frame_time_s", ("frame",))
+    return (
+        f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far, of "
+        "which speckle3d convert makes a whole file"
+    )
 
 
 def _notes(path: Path, _: ImportSettings) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -41,3 +42,8 @@ def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
         shown = text if len(text) <= 40 else f"{text[:37]}..."
         raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
     return values
+
+
+def unescaped(text: str) -> str:
+    r"""Text with the line breaks and backslashes that NRRD's fields have as ``\n`` and ``\\``."""
+    return re.sub(r"\\([n\\])", lambda match: "\n" if match[1] == "n" else "\\", text)

@@ -29,6 +29,19 @@ def load_toml(model: type[Model], path: Path) -> Model:
     InvalidInputError
         Naming the setting that is unknown or out of range.
     """
+    return validated(parsed(read_toml(path), str(path)), str(path), model)
+
+
+def read_toml(path: Path) -> str:
+    """Read the text of a TOML file.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it is no UTF-8.
+    """
     try:
         with open_regular(path) as stream:
             content = stream.read(_MOST_BYTES + 1)
@@ -37,7 +50,7 @@ def load_toml(model: type[Model], path: Path) -> Model:
         raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
     if len(content) > _MOST_BYTES:
         raise FileError(f"{path}: expected at most {_MOST_BYTES} bytes of TOML, got more")
-    return validated(parsed(text, str(path)), str(path), model)
+    return text
 
 
 def parsed(text: str, where: str) -> dict[str, Any]:

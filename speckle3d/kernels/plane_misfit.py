@@ -19,9 +19,7 @@ flags."""
 _LEAST_MM = 0.05
 """Distance below which correlation is flat: sensitivities are not taken to be less than here."""
 _LEAST_SENSITIVITY = 1e-6
-_RHO, LATERAL, _LEVER, _SPREAD, _STAYING, _MOVING, _GAIN, _STRETCH, _STAYING_SD, _STRETCH_SD, _CELLS = range(
-    11
-)
+_RHO, LATERAL, _LEVER, _SPREAD, _SHARE, _GAIN, _SHARE_SD, _CELLS = range(8)
 """Rows of the table of a pair's patches that take part."""
 
 
@@ -30,18 +28,15 @@ class EchoModels(NamedTuple):
 
     Attributes
     ----------
-    staying, moving, gain, stretch : float64, shape (e, p) or (1, p)
+    share, gain : float64, shape (e, p) or (1, p)
         With one row, it is that of all pairs.
-    staying_error, stretch_error : float
-        Relative standard deviations, the second of stretches beyond one.
+    share_error : float
+        Relative standard deviation.
     """
 
-    staying: FloatArray
-    moving: FloatArray
+    share: FloatArray
     gain: FloatArray
-    stretch: FloatArray
-    staying_error: float
-    stretch_error: float
+    share_error: float
 
 
 class Levers(NamedTuple):
@@ -85,7 +80,7 @@ class PairPatches(NamedTuple):
 
     Attributes
     ----------
-    table : float64, shape (11, p)
+    table : float64, shape (8, p)
     start : int64, shape (p,)
         Of each patch's curve in `amplitude`.
     patch : int64, shape (p,)
@@ -114,12 +109,9 @@ def predict_correlation(
     first: int,
     last: float,
     step_mm: float,
-    stretch: float,
-    staying: float,
-    moving: float,
+    share: float,
     gain: float,
-    staying_sd: float,
-    stretch_sd: float,
+    share_sd: float,
     cells: float,
     of_echo: bool,
 ) -> tuple[float, float, float]:
@@ -129,27 +121,24 @@ def predict_correlation(
     ----------
     amplitude : float64
         sqrt(rho_F) on a grid, from `first` on; read up to the position `last` in it.
-    step_mm, stretch : float
-        Of the grid, and what its distances are multiplied by.
-    staying, moving, gain : float
-        Shares of the amplitude, and gain.
-    staying_sd, stretch_sd : float
-        Standard deviations of the staying share and of the stretch, the latter relative.
+    step_mm : float
+        Of the grid.
+    share, share_sd, gain : float
+        Share of the amplitude that stays, its standard deviation, and gain.
     """
-    at = distance_mm / stretch / step_mm
+    at = distance_mm / step_mm
     at = at if at < last else last
     k = int(at)
     low = amplitude[first + k]
     rise = amplitude[first + k + 1] - low
     g = low + (at - k) * rise
-    field = staying + moving * g
+    field = share + (1.0 - share) * g
     model = gain * field * field
-    derivative = 2.0 * gain * field * moving * (rise / step_mm / stretch)
+    derivative = 2.0 * gain * field * (1.0 - share) * (rise / step_mm)
     limited = model if model < 0.999 else 0.999
-    share_error = staying_sd * (1.0 - g) * 2.0 * field * gain
-    stretch_error = stretch_sd * derivative * distance_mm
+    share_error = share_sd * (1.0 - g) * 2.0 * field * gain
     variance = _variance(limited, cells, of_echo) + INTERPOLATION**2
-    return model, derivative, variance + share_error * share_error + stretch_error * stretch_error
+    return model, derivative, variance + share_error * share_error
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -171,12 +160,9 @@ def _predict(d: float, i: int, patches: PairPatches) -> tuple[float, float, floa
         patches.start[i],
         patches.last,
         patches.step_mm,
-        t[_STRETCH, i],
-        t[_STAYING, i],
-        t[_MOVING, i],
+        t[_SHARE, i],
         t[_GAIN, i],
-        t[_STAYING_SD, i],
-        t[_STRETCH_SD, i],
+        t[_SHARE_SD, i],
         t[_CELLS, i],
         patches.of_echo,
     )
@@ -332,24 +318,20 @@ def gather(
 ) -> int:
     """Fill in the patches of pair `e` that take part; returns how many they are."""
     table = patches.table
-    row = e if models.staying.shape[0] > 1 else 0
+    row = e if models.share.shape[0] > 1 else 0
     size = 0
     for p in range(used.shape[1]):
         if not used[e, p]:
             continue
-        stretch = models.stretch[row, p]
         patches.patch[size] = p
         patches.start[size] = p * curves.amplitude.shape[1]
         table[_RHO, size] = rho[e, p]
         table[LATERAL, size] = levers.lateral_mm[p] - moved_mm[e, 0]
         table[_LEVER, size] = levers.lever_mm[p] - moved_mm[e, 1]
         table[_SPREAD, size] = levers.spread_mm[p]
-        table[_STAYING, size] = models.staying[row, p]
-        table[_MOVING, size] = models.moving[row, p]
+        table[_SHARE, size] = models.share[row, p]
         table[_GAIN, size] = models.gain[row, p]
-        table[_STRETCH, size] = stretch
-        table[_STAYING_SD, size] = models.staying_error * models.staying[row, p]
-        table[_STRETCH_SD, size] = models.stretch_error if stretch > 1.0 + 1e-9 else 0.0
+        table[_SHARE_SD, size] = models.share_error * models.share[row, p]
         table[_CELLS, size] = curves.cells[p]
         size += 1
     return size

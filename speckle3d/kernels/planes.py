@@ -48,48 +48,6 @@ class FittedPlanes(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _sum_by_eights(values: FloatArray, first: int, size: int) -> float:
-    total, start = 0.0, 0
-    if size >= 8:
-        r0, r1, r2, r3 = values[first], values[first + 1], values[first + 2], values[first + 3]
-        r4, r5, r6, r7 = values[first + 4], values[first + 5], values[first + 6], values[first + 7]
-        start = size - size % 8
-        for i in range(first + 8, first + start, 8):
-            r0, r1, r2, r3 = r0 + values[i], r1 + values[i + 1], r2 + values[i + 2], r3 + values[i + 3]
-            r4, r5, r6, r7 = r4 + values[i + 4], r5 + values[i + 5], r6 + values[i + 6], r7 + values[i + 7]
-        total = ((r0 + r1) + (r2 + r3)) + ((r4 + r5) + (r6 + r7))
-    for i in range(first + start, first + size):
-        total += values[i]
-    return total
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def sum_by_halves(values: FloatArray, size: int) -> float:
-    """Sum of the first `size` values, rounded as `numpy.sum` does: by halves down to 128, those by eights."""
-    first, length = np.zeros(64, np.int64), np.zeros(64, np.int64)
-    sums = np.zeros(64)
-    length[0] = size
-    waiting, done = 1, 0
-    while waiting:
-        waiting -= 1
-        start, count = first[waiting], length[waiting]
-        if count < 0:
-            # Both halves are summed.
-            done -= 1
-            sums[done - 1] += sums[done]
-        elif count > 128:
-            half = count // 2 - count // 2 % 8
-            length[waiting] = -1
-            first[waiting + 1], length[waiting + 1] = start + half, count - half
-            first[waiting + 2], length[waiting + 2] = start, half
-            waiting += 3
-        else:
-            sums[done] = _sum_by_eights(values, start, count)
-            done += 1
-    return float(sums[0])
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _list_starts(
     middle_mm: float,
     slopes: FloatArray,
@@ -97,7 +55,6 @@ def _list_starts(
     size: int,
     lateral: FloatArray,
     rules: FitRules,
-    off: FloatArray,
     starts: FloatArray,
 ) -> int:
     """Fill the planes that fits start from: all patches on one side, then frames that cross in the image."""
@@ -105,18 +62,14 @@ def _list_starts(
     if rules.sensed:
         starts[1, 0], starts[1, 1], starts[1, 2] = -middle_mm, slopes[0], slopes[1]
         return 2 if either_side else 1
-    low, high, mean = np.inf, -np.inf, sum_by_halves(lateral, size) / size
-    for i in range(size):
-        low, high = min(low, lateral[i]), max(high, lateral[i])
-    half = (high - low) / 2.0
+    at = lateral[:size]
+    half, mean = (at.max() - at.min()) / 2.0, at.mean()
     if not (half > 0.0 and middle_mm < rules.widest_slope * half):
         return 1
     # V-shaped distances, which no plane on one side explains, fall towards the crossing.
     for k in range(3):
         centre = mean + 0.5 * (k - 1) * half
-        for i in range(size):
-            off[i] = abs(lateral[i] - centre)
-        slope = middle_mm / (sum_by_halves(off, size) / size)
+        slope = middle_mm / np.abs(at - centre).mean()
         starts[k + 1, 0], starts[k + 1, 1], starts[k + 1, 2] = -slope * centre, slope, 0.0
     return _STARTS
 
@@ -159,7 +112,7 @@ def fit_planes(
     """
     most = rho.shape[1]
     patches = PairPatches(
-        np.empty((11, most)),
+        np.empty((8, most)),
         np.empty(most, np.int64),
         np.empty(most, np.int64),
         curves.amplitude.reshape(curves.amplitude.size),
@@ -167,7 +120,7 @@ def fit_planes(
         curves.step_mm,
         curves.of_echo,
     )
-    off, starts = np.empty(most), np.zeros((_STARTS, 3))
+    starts = np.zeros((_STARTS, 3))
     plane, expected, precision = np.empty(3), np.zeros(3), np.empty(3)
     precision[0] = 1e-6
     precision[1] = precision[2] = 1.0 / (rules.slope_sd * rules.slope_sd)
@@ -177,7 +130,7 @@ def fit_planes(
             continue
         expected[1], expected[2] = slopes[e, 0], slopes[e, 1]
         lateral = patches.table[LATERAL]
-        count = _list_starts(middle_mm[e], slopes[e], either_side[e], size, lateral, rules, off, starts)
+        count = _list_starts(middle_mm[e], slopes[e], either_side[e], size, lateral, rules, starts)
         least = np.inf
         for n in range(count):
             for k in range(3):

@@ -7,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.volume import Volume
-from speckle3d.io.igtl.packing import packed_image, packed_status, packed_text, packed_transform
+from speckle3d.io.igtl.messages import packed_image, packed_status, packed_text, packed_transform
 
 POSE, VOLUME, ADVICE = "ImageToReference", "Volume_Reference", "SweepAdvice"
 """Devices: pixels of the received images to the first image's mm, as PLUS names it; the growing volume in the

@@ -1,9 +1,9 @@
 """A sweep tracked as it is made: each frame matched and placed when it comes, poses revised as more is known.
 
 A frame is matched by the functions that match recordings, in one block however long the sweep becomes, and
-placed with the coherence that is known so far. Meanwhile, in another thread, coherence is learnt anew from
-the latest frames, and everything from all frames each time the sweep has grown by half: the cost per frame
-stays bounded. Poses of a revision take the place of earlier ones.
+placed by its planes against the frames it was matched with. Meanwhile, in another thread, the motion of the
+latest frames is estimated anew from their rows of the table by the function that serves recordings; its poses
+take the place of earlier ones.
 
 Two things of a recording's reconstruction have to wait for its end: ties between visits of the same tissue,
 and the sign of the motion, which sensors tell.
@@ -12,7 +12,7 @@ and the sign of the motion, which sensors tell.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -21,27 +21,38 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import mirrored
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import on_one_thread
-from speckle3d.live.placing import OPEN, place_latest
-from speckle3d.live.revising import LATEST, Growing, Reviser, Revision
-from speckle3d.live.window import FramePlanes, Known
-from speckle3d.matching.blocks import FrameByFrame, FrameMaker, ImageSink
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
+from speckle3d.matching.frames import FrameByFrame, FrameMaker, ImageSink
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, sound_pairs
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.planes import PairPlanes
-from speckle3d.motion.uncertainty import SlopeEvidence
-from speckle3d.stages import matcher_for
+from speckle3d.motion.coherence import Coherence
+from speckle3d.motion.estimate import (
+    Motion,
+    alike_pairs,
+    edges_of,
+    elevation_of,
+    estimate_motion,
+    planes_of,
+    signed_path,
+)
+from speckle3d.motion.signs import pair_signs
+from speckle3d.motion.trajectory import fixed, joined, solve_trajectory
+from speckle3d.pipeline import matcher_for, motion_problem
 
 ANEW = 4
 """Frames up to which everything is estimated anew with each."""
-GROWTH = 1.5
-"""Factor of a sweep's length after which everything is estimated anew."""
+LATEST = 150
+"""Frames whose motion is estimated anew while a sweep is longer, some ten millimetres; the first third
+stay."""
+BEFORE = 10
+"""Frames just before the latest that tell which way the probe goes."""
 EVERY = 8
-"""Frames after which coherence is learnt anew, if nothing is done in the background."""
+"""Frames after which motion is estimated anew, if nothing is done in the background."""
 LONGEST_HURRY_S = 1.0
 """For which nothing is revised, however many frames wait."""
 COMPARED = 400
@@ -123,16 +134,13 @@ class LiveTracker:
         self.image_grid = matcher.grid
         self._maker = FrameMaker(example.signal, matcher, self._config.quality)
         self._matched = FrameByFrame(matcher, self._config.trajectory)
-        self._reviser = Reviser(matcher, curves, self._config)
+        self._problem = motion_problem(curves, matcher, 1, self._config)
         self._features: list[FrameFeatures] = []
         self._tables: list[CorrelationTable] = []
-        self._planes: list[FramePlanes] = []
         self._flags = np.zeros(0, dtype=np.int64)
         self._poses = RigidTransform.identity(0)
-        self._known: Known | None = None
-        self._given = Known(self._reviser.reader, None, SlopeEvidence(np.ones(2), np.zeros(2)))
-        self._last_straightened = 0
-        self._revision, self._last_whole, self._looked_at = 0, 0, 0
+        self._motion: Motion | None = None
+        self._revision = 0
         self._lock, self._grown = threading.Lock(), threading.Condition()
         self._ended = False
         self._failure: Exception | None = None
@@ -212,8 +220,7 @@ class LiveTracker:
 
     def revise(self) -> None:
         """Estimate everything anew from all frames, and wait for it."""
-        if len(self) > 1:
-            self._take(self._reviser.whole(self._growing()))
+        self._revise(len(self))
 
     def _keep(self, features: FrameFeatures, table: CorrelationTable) -> None:
         """Take a frame's features and pairs; it stands where the last one was."""
@@ -226,77 +233,80 @@ class LiveTracker:
             flag |= FrameFlag.UNMATCHED
         self._flags = np.append(self._flags, flag)
         self._poses = self._poses[[*range(number), number - 1]] if number else RigidTransform.identity(1)
-        none = np.zeros(0, dtype=np.int64)
-        self._planes.append(FramePlanes(none, none, PairPlanes.none(self._patches)))
-        self._planes[: -2 * OPEN] = []
 
     def _place(self) -> None:
-        """Place the latest frame, if enough is known to do so."""
-        if self._known is None:
+        """Place the latest frame against those it was matched with, if enough is known to do so."""
+        motion, number = self._motion, len(self._tables) - 1
+        if motion is None or not len(self._tables[number]):
             return
-        bad = (self._flags & ~int(FrameFlag.UNMATCHED)) != 0
-        placed = place_latest(self._tables, self._planes, bad, self._poses, self._known)
-        self._poses = RigidTransform.concatenate([self._poses[: placed.first], placed.poses])
-        self._planes[-1] = placed.planes
-
-    def _growing(self) -> Growing:
-        with self._lock:
-            return Growing(tuple(self._tables), self._flags, self._poses)
+        frames = np.unique([*range(max(0, number - BEFORE), number + 1), *self._tables[number].first])
+        table = replace(
+            self._tables[number],
+            first=np.searchsorted(frames, self._tables[number].first),
+            second=np.full(len(self._tables[number]), frames.size - 1),
+        )
+        problem, known = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
+        pairs = planes_of(problem, table, alike_pairs(problem, table), latest_of(motion.coherence))
+        if not len(pairs):
+            return
+        pairs = replace(pairs, planes=pairs.planes.scaled(motion.scale))
+        earlier = elevation_of(known, problem.centre_mm)[:, :2]
+        path = signed_path(problem, table, np.ones(len(table), dtype=bool), pairs, known=earlier)
+        pairs = pairs.with_signs(pair_signs(path, *pairs.signless))
+        edges = edges_of(table, pairs, motion.slopes.applied(pairs.planes))
+        held = joined(fixed(known, problem.centre_mm), edges) if len(known) > 1 else edges
+        placed = solve_trajectory(held, frames.size, problem.centre_mm, problem.trajectory).poses
+        self._poses = RigidTransform.concatenate([self._poses[:-1], known[0] * placed[-1:]])
 
     def _revise_now(self) -> None:
         """Revise if it is time to, without help of another thread."""
         frames = len(self)
         if frames <= ANEW or frames % EVERY == 0:
-            self._revised(self._growing())
+            self._revise(LATEST)
 
-    def _revised(self, sweep: Growing) -> None:
-        """Learn what frames tell: all of them, or the latest if all were asked a short while ago."""
-        if len(sweep) < 2:
+    def _revise(self, latest: int) -> None:
+        """Estimate the motion of the latest frames anew; later frames go along with the last of them."""
+        with self._lock:
+            tables, flags, before = tuple(self._tables), self._flags, self._poses
+        count = len(tables)
+        begin = max(0, count - latest)
+        if count - begin < 2:
             return
-        known = self._known
+        every = CorrelationTable.joined(tables[begin + 1 :])
+        table = every.where(every.first >= begin, -begin)
+        sound = sound_pairs(table, flags[begin:])
+        if not sound.any():
+            return
+        problem = replace(self._problem, frames=count - begin)
         try:
-            if known is None or len(sweep) <= LATEST or len(sweep) >= GROWTH * self._last_whole:
-                revision = self._reviser.whole(sweep, self._curves_for(len(sweep)))
-                self._last_whole = len(sweep)
-            else:
-                revision = self._reviser.latest(sweep, known)
+            motion = estimate_motion(problem, table, sound)
+            edges = edges_of(table, motion.pairs, motion.slopes.applied(motion.pairs.planes))
+            poses = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory).poses
         except (InsufficientDataError, np.linalg.LinAlgError):
             # Frames that come later may tell.
             return
-        self._take(revision)
-
-    def _curves_for(self, frames: int) -> Known | None:
-        """With whose curves to read: None if it is time to straighten them by what is seen now."""
-        if self._known is None or frames <= ANEW:
-            return self._given
-        if frames >= GROWTH * self._last_straightened:
-            self._last_straightened = frames
-            return None
-        return self._known
-
-    def _take(self, revision: Revision) -> None:
-        """Put a revision's poses in place of earlier ones; later frames go along with its last."""
-        first, stop = revision.first, revision.stop
+        # The first of them stay: what is seen of structure ends there, and what was told of them before
+        # holds.
+        stay = latest // 3 if begin else 0
+        if begin and _against(poses, before[begin:], problem.centre_mm):
+            poses = mirrored(poses)
         with self._lock:
-            parts = [self._poses[:first], revision.poses]
-            if stop < len(self._poses):
-                parts.append(revision.poses[-1] * self._poses[stop - 1].inv() * self._poses[stop:])
-            self._poses = RigidTransform.concatenate(parts)
-            begin = len(self._tables) - len(self._planes)
-            for frame, planes in enumerate(revision.planes, start=first):
-                if frame >= begin:
-                    self._planes[frame - begin] = planes
-            self._known = revision.known
+            anchor, last = self._poses[begin + stay], self._poses[count - 1]
+            revised = anchor * poses[stay].inv() * poses[stay:] if stay else before[begin] * poses
+            parts = [self._poses[: begin + stay], revised]
+            if count < len(self._poses):
+                parts.append(revised[-1] * last.inv() * self._poses[count:])
+            self._poses, self._motion = RigidTransform.concatenate(parts), motion
             self._revision += 1
 
     def _keep_revising(self) -> None:
         """Revise as often as there are new frames, on this thread alone: matching needs the others."""
         try:
             with on_one_thread():
-                while self._awaited(self._looked_at):
-                    sweep = self._growing()
-                    self._revised(sweep)
-                    self._looked_at = len(sweep)
+                seen = 0
+                while self._awaited(seen):
+                    seen = len(self)
+                    self._revise(LATEST)
         except Exception as error:  # noqa: BLE001 (raised with the next frame)
             self._failure = error
 
@@ -306,3 +316,18 @@ class LiveTracker:
             self._grown.wait_for(lambda: self._ended or len(self) > max(frames, ANEW))
             self._grown.wait_for(lambda: self._ended or not self.hurried, LONGEST_HURRY_S)
             return not self._ended
+
+
+def latest_of(coherence: Coherence | None) -> Coherence | None:
+    """Coherence at the latest frames alone, for whatever frame is asked."""
+    if coherence is None:
+        return None
+    return replace(
+        coherence, frame=coherence.frame[-1:], share=coherence.share[-1:], gain=coherence.gain[-1:]
+    )
+
+
+def _against(poses: RigidTransform, others: RigidTransform, centre_mm: FloatArray) -> bool:
+    """Whether two trajectories of the same frames go opposite ways along the image's normal."""
+    steps = [(each[:-1].inv() * each[1:]).apply(centre_mm)[:, 2] - centre_mm[2] for each in (poses, others)]
+    return bool(steps[0] @ steps[1] < 0)

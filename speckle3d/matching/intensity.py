@@ -18,7 +18,6 @@ from scipy import fft
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.memory import borrowed
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
 from speckle3d.kernels.intensity import (
     equalise_echo,
@@ -161,7 +160,7 @@ class IntensityExtractor:
         if self.settings.equalise_mm == 0:
             return intensity, np.stack([analytic.real, analytic.imag])
         mean, floor = self._local_mean(intensity)
-        image, parts = borrowed(mean.shape, np.float32), borrowed((2, *mean.shape), np.float32)
+        image, parts = np.empty(mean.shape, np.float32), np.empty((2, *mean.shape), np.float32)
         equalise_echo(_in_turn(analytic), np.ascontiguousarray(intensity), mean, floor, image, parts)
         return image, parts
 
@@ -169,7 +168,7 @@ class IntensityExtractor:
         """Mean over the window about each sample, and the least to divide by."""
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
         half = np.array([int(self.settings.equalise_mm / 2 / side) for side in sides])
-        mean = borrowed(intensity.shape, np.float32)
+        mean = np.empty(intensity.shape, np.float32)
         return mean, local_mean(np.ascontiguousarray(intensity, dtype=np.float32), half, mean)
 
     def _check(self, frame: npt.NDArray[Any]) -> None:
@@ -179,7 +178,7 @@ class IntensityExtractor:
 
 def intensity_of(analytic: Complex64Array) -> Float32Array:
     """Squared magnitude."""
-    out = borrowed(analytic.shape, np.float32)
+    out = np.empty(analytic.shape, np.float32)
     squared_magnitude(_in_turn(analytic), out)
     return out
 
@@ -241,17 +240,17 @@ def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -
 def _resample(frame: npt.NDArray[Any], plan: _Resampling, samples: int) -> Complex64Array:
     rows, given = frame.shape
     kind = np.float32 if plan.mirrored is not None else np.complex64
-    padded = borrowed((rows, plan.length), kind)
+    padded = np.empty((rows, plan.length), kind)
     padded[:, :given] = frame
     padded[:, given:] = 0
     spectrum = np.asarray(fft.fft(padded.view(np.complex64), axis=1, overwrite_x=True), dtype=np.complex64)
-    band: Complex64Array = borrowed((rows, plan.out_length), np.complex64)
+    band: Complex64Array = np.empty((rows, plan.out_length), np.complex64)
     if plan.mirrored is None:
         place_band(_in_turn(spectrum), _in_turn(plan.weights), plan.runs, _in_turn(band))
     else:
         factors = _in_turn(plan.weights), _in_turn(plan.mirrored)
         place_band_of_real(_in_turn(spectrum), *factors, plan.runs, _in_turn(band))
-    analytic = borrowed((rows, samples), np.complex64)
+    analytic = np.empty((rows, samples), np.complex64)
     analytic[:] = fft.ifft(band, axis=1, overwrite_x=True)[:, :samples]
     return analytic
 
@@ -265,6 +264,6 @@ def _decompress(frame: npt.NDArray[Any], signal: BModeSettings) -> Float32Array:
     """Invert log compression: full scale is 0 dB, zero is the bottom of the dynamic range."""
     if frame.dtype == np.uint8 and frame.size > 256:
         table = _decompress(np.arange(256, dtype=np.float32), signal)
-        return np.take(table, frame, out=borrowed(frame.shape, np.float32), mode="clip")
+        return np.take(table, frame, out=np.empty(frame.shape, np.float32), mode="clip")
     decibel = (frame.astype(np.float32) / np.float32(signal.full_scale) - 1) * signal.dynamic_range_db
     return np.asarray(10 ** (decibel / 10), dtype=np.float32)

@@ -44,12 +44,6 @@ class TrajectorySettings(BaseModel):
         description="Travel between the frames of a sweep that comes back at which they are matched with "
         "those of its way there; 0: never.",
     )
-    block_frames: int = Field(
-        500,
-        ge=10,
-        description="Most frames of a sweep that are matched in one go; longer sweeps are matched in blocks, "
-        "which may run at the same time.",
-    )
     join: Literal["graph", "chain"] = Field(
         "graph",
         description="graph: least squares over all pairs. chain: each frame by the one earlier frame that "
@@ -68,10 +62,6 @@ class PairSchedule:
         self.settings = settings or TrajectorySettings()
         self._keys: list[int] = []
         self._sound: list[int] = []
-
-    def begin(self, keys: list[int], sound: int) -> None:
-        """Begin in the middle of a sweep, with the key frames before it, latest last, and a sound frame."""
-        self._keys, self._sound = list(keys), [sound]
 
     def references(self, frame: int) -> list[int]:
         """Earlier frames to measure `frame` against: the last sound one, then latest first."""

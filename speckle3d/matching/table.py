@@ -74,14 +74,15 @@ class CorrelationTable:
     def __len__(self) -> int:
         return int(self.first.size)
 
-    def part(self, begin: int) -> CorrelationTable:
-        """The pairs from a row on."""
+    def where(self, kept: BoolArray, shift: int = 0) -> CorrelationTable:
+        """Some of the pairs, their frames numbered `shift` higher."""
+        rows = np.flatnonzero(kept)
         return CorrelationTable(
-            self.first[begin:],
-            self.second[begin:],
-            self.correlation[begin:],
-            self.median[begin:],
-            self.motion[begin:],
+            self.first[rows] + shift,
+            self.second[rows] + shift,
+            self.correlation[rows],
+            self.median[rows],
+            tuple(self.motion[row] for row in rows.tolist()),
         )
 
     @classmethod

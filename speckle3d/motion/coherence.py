@@ -1,146 +1,287 @@
-"""Coherent scattering and noise, patch by patch, from the sweep's own correlations.
+"""Scale of all distances, and how the echo of each patch departs from fully developed speckle's.
 
-Tissue holds structures longer than the beam is thick. Their echoes stay while speckle decorrelates, so that
-correlation falls to a plateau instead of to nothing, and read with a phantom's curve it says that the probe
-hardly moved. Pairs of frames far apart show the plateau directly; pairs close together show what
-electronic noise takes away. With a patch's echo the sum of a part that stays (share c of the amplitude) and
-fully developed speckle, both Gaussian,
+Tissue holds structure that stays correlated longer than speckle. Read with a phantom's curve, its echoes say
+that the probe hardly moved. With r the amplitude correlation of fully developed speckle, sqrt(rho_F), a patch
+whose echo is speckle and a share c of structure has
 
-    rho(d) = gain (c h(d) + (1 - c) sqrt(rho_F(d / stretch)))^2,
+    rho(d) = gain ((1 - c) r(s d) + c r(s d)^a)^2,    0 <= c < 1, 0 <= a < 1,
 
-where h falls slowly, over the structures' own length. Where scatterers are few it is the beam's width and no
-longer its curved wavefront that decorrelates them: the curve is stretched. Nothing scatters faster than
-fully developed speckle, so a stretch is never below one.
-
-The distances of the pairs are known from fully developed curves only up to a scale that varies slowly along
-the sweep; it is the one at which all patches together are explained best, a departure from fully developed
-speckle being granted only where it pays for itself.
+where the gain is what electronic noise leaves, a = 0 stands for structure that does not change and a near 1
+for structure hardly longer than speckle, and s is what the distances of the path are still to be multiplied
+by. Each patch is fitted over the whole sweep, and s is the median over all patches: no patch is judged to
+hold structure or not. Its standard deviation comes from the scatter of the rows of patches, since structure
+lies in layers. Near d = 0 only s^2 (1 - c (1 - a)) is observable, and structure and scale part by the shape
+where r < 0.5 alone: over tissue some 2 % of the scale stay open.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.stats import theilslopes
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.shown import shown
-from speckle3d.core.threads import in_parallel
-from speckle3d.kernels.coherence import NO_GAIN, bin_by_distance, fit_echo_models
-from speckle3d.kernels.statistics import PatchCurves
+from speckle3d.kernels.plane_misfit import Levers
+from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.motion.distances import WELL_FALLEN, EchoModel
 
-COARSE_SCALES = np.geomspace(0.4, 3.0, 16)
-FINE_SCALES = np.geomspace(0.85, 1.18, 7)
-FINEST_SCALES = np.geomspace(0.95, 1.053, 5)
-LEAST_DEPARTING = 0.02
-STRETCHES = np.array([1.0, 1.2, 1.4, 1.7])
-"""Of the curve where scatterers are few; beyond, a beam hardly differs from one that stays."""
-LENGTHS_MM = np.array([NO_GAIN, 0.0, 4.0, 10.0, 40.0])
-"""Of coherent structure; zero for none, and for neither structure nor noise."""
-GAIN_PRECISION = 40.0
-"""Of the prior about gain one: a deviation of 0.16, noise some 10 dB below the echo."""
 CURVES_SIGMA = 0.002
 """Relative error of all distances that curves from some twenty independent blocks of phantom have."""
-DEPARTURE_ERROR = 0.165
-"""Part of an adaptation - mean share and lost gain - that may be wrong as an error of all distances; measured
-on sweeps over simulated tissue and noise, from 3 to 6 % of length."""
-_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
-"""Bins of distance: fine where the curves fall, coarse where only what stays is left."""
-_GRAIN = 16
-"""Patches whose models are fitted at a time: with all kinds and scales some 0.1 ms each."""
+PIECE_MM = 10.0
+"""Travel over which a patch's echo is taken as alike: less does not part structure from scale (12 mm of
+tissue fitted in halves read 1 % longer), more would outlast the tissue's layers."""
+NOISY_GAIN = 0.9
+"""Part of the correlation that noise leaves, below which a row is noisy: speckle looks finer, structure
+unsure."""
+LEAST_SHARE = 1e-4
+"""Root mean square share that stands for none."""
+ROW_SIGMA, PRIOR_ROWS = 0.06, 10
+"""Scatter of the scales that rows of patches ask for over tissue, and how many rows of the sweep's own it
+counts: simulated tissue of two physics has 0.04 to 0.09, the scatter of 13 rows is known to a third."""
+NO_STRUCTURE = 0.02
+"""Mean share, over rows of patches, below which all speckle is taken as fully developed: simulated phantoms
+have 0.000 to 0.006, tissue 0.05 to 0.14."""
+_BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
+"""Fine where the curves fall, coarse where only structure is left."""
+MOST_SHARE, MOST_POWER = {"echo": 0.5, "intensity": 0.95}, 0.9
+"""Bounds of c, by what is correlated, and of a. An echo that is structure for the most part is r^a alone, a
+curve of another width, and tells no scale; of intensity, structure's share is larger, because its phase does
+not count."""
 
 
 class CoherenceSettings(BaseModel):
-    """How coherent scattering is found."""
+    """Whether structure and noise are adapted to."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     adapt: bool = Field(True, description="Adapt to coherent echoes and noise; false: phantom curves alone.")
-    block_frames: int = Field(30, ge=8, description="Frames over which a patch's echo is taken as alike.")
-    evidence: float = Field(
-        1.5, ge=0, description="Gain in twice the log-likelihood that grants a patch a share or a stretch."
-    )
-    redundancy: float = Field(
-        20.0, ge=1, description="Frame pairs per independent piece of information: pairs share frames."
-    )
 
 
 @shown
 @dataclass(frozen=True)
 class Coherence:
-    """How the echoes of every patch depart from fully developed speckle, by frame.
+    """Share of structure and gain of every patch, by frame, and the error of the scale of all distances.
 
     Attributes
     ----------
     frame : ndarray, shape (b,)
         Frames at which they are given; linear between them.
-    share, gain, stretch : ndarray, shape (b, p)
-    decay_per_mm : ndarray, shape (b, p)
-        One over the length of coherent structure.
-    scale : ndarray, shape (b,)
-        True over fully developed distance.
+    share, gain : ndarray, shape (b, p)
     scale_sigma : float
-        Standard deviation of the scale's logarithm over the whole sweep: from the likelihood, the curves, and
-        what the models may lack.
+        Standard deviation of the logarithm of the scale of all distances.
     """
 
     frame: FloatArray
     share: FloatArray
     gain: FloatArray
-    stretch: FloatArray
-    decay_per_mm: FloatArray
-    scale: FloatArray
     scale_sigma: float
 
-    def models(self, frame: FloatArray, distance_mm: FloatArray) -> EchoModel:
-        """Echo models of pairs about given frames and so far apart, both of shape (e,)."""
-        at = np.clip(frame, self.frame[0], self.frame[-1])
-        before = np.searchsorted(self.frame, at, side="right") - 1
-        after, width = (at - self.frame[before])[:, None], np.diff(self.frame)[:, None]
-        flat = np.zeros((1, self.share.shape[1]))
-        share, gain, stretch, decay = (
-            np.concatenate([np.diff(values, axis=0) / width, flat])[before] * after + values[before]
-            for values in (self.share, self.gain, self.stretch, self.decay_per_mm)
+    def models(self, frame: FloatArray | IntArray) -> EchoModel:
+        """Echo models of pairs about frames of shape (e,)."""
+        at = np.clip(np.asarray(frame, dtype=float), self.frame[0], self.frame[-1])
+        before = np.clip(np.searchsorted(self.frame, at, side="right") - 1, 0, max(self.frame.size - 2, 0))
+        after = np.minimum(before + 1, self.frame.size - 1)
+        width = np.maximum(self.frame[after] - self.frame[before], 1.0)
+        part = ((at - self.frame[before]) / width)[:, None]
+        share, gain = (
+            np.asarray((1 - part) * v[before] + part * v[after], dtype=float) for v in (self.share, self.gain)
         )
-        staying = share * np.exp(-np.abs(distance_mm)[:, None] * decay)
-        return EchoModel(staying, 1 - share, gain, stretch)
+        return EchoModel(share, gain)
 
 
 @dataclass(frozen=True)
-class PairEchoes:
-    """Echo models of frame pairs, made when they are asked for: for all pairs of a long sweep they are large.
+class RowScales:
+    """Scale that each row of patches asks for, over that of the path.
 
     Attributes
     ----------
-    frame : ndarray, shape (e,)
-        About which each pair's echoes are taken.
-    distance_mm : ndarray, shape (e,)
-        How far apart its frames are.
+    depth_mm, logarithm, gain, share : ndarray, shape (r,)
+        Medians over the patches of a row.
     """
 
-    coherence: Coherence
-    frame: FloatArray
-    distance_mm: FloatArray
+    depth_mm: FloatArray
+    logarithm: FloatArray
+    gain: FloatArray
+    share: FloatArray
 
-    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> PairEchoes:
-        """Those of some of the pairs."""
-        return PairEchoes(self.coherence, self.frame[pairs], self.distance_mm[pairs])
 
-    def followed_by(self, others: PairEchoes) -> PairEchoes:
-        """Those of these pairs and of others, by one coherence."""
-        return PairEchoes(
-            self.coherence,
-            np.concatenate([self.frame, others.frame]),
-            np.concatenate([self.distance_mm, others.distance_mm]),
+class PatchCorrelations:
+    """Correlations of each patch, averaged over pairs of like distance, and the curves they are read with.
+
+    Parameters
+    ----------
+    first, second : ndarray, shape (e,)
+        Frames of each pair.
+    correlation : ndarray, shape (e, p)
+        NaN where a patch has none.
+    path : ndarray, shape (n, 2) or (n, 3)
+        Elevational position of each frame's centre, and its slopes along x and, if known, y.
+    levers : Levers
+        What slopes are multiplied by at each patch.
+    """
+
+    def __init__(
+        self,
+        first: IntArray,
+        second: IntArray,
+        correlation: Float32Array,
+        path: FloatArray,
+        curves: DecorrelationCurves,
+        patches: PatchGrid,
+        levers: Levers,
+    ) -> None:
+        self._first, self._second, self._correlation = first, second, correlation
+        self._levers, self._patches = levers, patches
+        at = curves.at(patches.centre_mm[:, 1])
+        end = at.correlation[:, -1]
+        self._floor = np.where(end > WELL_FALLEN, 0.0, end)
+        self._amplitude = np.sqrt(np.clip((at.correlation.T - self._floor) / (1 - self._floor), 0.0, 1.0)).T
+        self._step_mm = float(curves.distance_mm[1])
+        self._cells, self.of_echo = at.cells, curves.key.correlation_of == "echo"
+        self._reach_mm = float(curves.distance_mm[-1]) if end.max() > WELL_FALLEN else np.inf
+        travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path[:, 0])))])
+        count = max(1, int(travel[-1] / PIECE_MM))
+        edges = np.searchsorted(travel, np.linspace(0, travel[-1], count + 1)[1:-1])
+        self._piece = np.searchsorted(edges, (first + second) / 2, side="right")
+        self.centres = (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
+        self._patch = np.tile(np.arange(len(patches)), count)
+        self._bin(path)
+
+    def _bin(self, path: FloatArray) -> None:
+        """Average correlations over pairs of like distance, for every piece of the sweep and patch."""
+        moved = np.zeros((self._first.size, 3))
+        moved[:, : path.shape[1]] = path[self._second] - path[self._first]
+        z, yaw, tilt = moved.T[:, :, None]
+        distance = np.hypot(
+            z + yaw * self._levers.lateral_mm + tilt * self._levers.lever_mm, tilt * self._levers.spread_mm
         )
+        usable = np.isfinite(self._correlation) & (distance <= self._reach_mm)
+        bins = _BIN_EDGES_MM.size - 1
+        at = np.minimum(np.searchsorted(_BIN_EDGES_MM, distance, side="right") - 1, bins - 1)
+        at += bins * (np.arange(len(self._patches)) + len(self._patches) * self._piece[:, None])
+        at, shape = at[usable], (self._patch.size, bins)
+        sums = [
+            np.bincount(at, weights, minlength=self._patch.size * bins).reshape(shape)
+            for weights in (None, distance[usable], self._correlation[usable])
+        ]
+        count = np.maximum(sums[0], 1)
+        self._distance, mean = sums[1] / count, sums[2] / count
+        floor, cells = self._floor[self._patch, None], self._cells[self._patch, None]
+        variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, self.of_echo) + INTERPOLATION**2
+        self._mean = (mean - floor) / (1 - floor)
+        self._weight = (1 - floor) * np.sqrt(sums[0] / variance)
 
-    def models(self) -> EchoModel:
-        """Models of all of these pairs."""
-        return self.coherence.models(self.frame, self.distance_mm)
+    def _speckle(self, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Amplitude of speckle at scaled distances, and its derivative by ln scale."""
+        position = self._distance * scale / self._step_mm
+        cell = np.minimum(position, self._amplitude.shape[1] - 2).astype(int)
+        at = cell + self._amplitude.shape[1] * self._patch[:, None]
+        low, high = self._amplitude.take(at), self._amplitude.take(at + 1)
+        inside = position <= self._amplitude.shape[1] - 1
+        value = np.where(inside, low + (position - cell) * (high - low), high)
+        return np.maximum(value, 1e-6), np.where(inside, (high - low) * position, 0.0)
+
+    def fit(
+        self,
+        log_scale: float | None = None,
+        most_share: float | None = None,
+        most_power: float = 0.0,
+        share_sigma: float = np.inf,
+    ) -> FloatArray:
+        """Fit ln s, gain, c and a of every patch of every piece, shape (q, 4).
+
+        Parameters
+        ----------
+        log_scale : float, optional
+            To which ln s is held; by default each patch tells its own.
+        most_share, most_power : float
+            Upper bounds of c (`MOST_SHARE` by default) and a.
+        share_sigma : float
+            Standard deviation of a normal prior of c about zero.
+        """
+        most_share = MOST_SHARE["echo" if self.of_echo else "intensity"] if most_share is None else most_share
+        lowest = np.array([-1.0 if log_scale is None else log_scale, 0.05, 0.0, 0.0])
+        highest = np.array([1.0 if log_scale is None else log_scale, 1.2, most_share, most_power])
+
+        def misfit(v: FloatArray) -> tuple[FloatArray, FloatArray]:
+            r, slope = self._speckle(np.exp(v[:, :1]))
+            gain, share, power = v[:, 1:2], v[:, 2:3], v[:, 3:4]
+            long = r**power
+            echo = (1 - share) * r + share * long
+            by_echo = 2 * gain * echo
+            by_scale = by_echo * (1 - share + share * power * long / r) * slope
+            by_share, by_power = by_echo * (long - r), by_echo * share * long * np.log(r)
+            jacobian = np.stack([by_scale, echo**2, by_share, by_power], axis=-1) * self._weight[..., None]
+            left = self._weight * (gain * echo**2 - self._mean)
+            prior = np.broadcast_to(np.array([0.0, 0.0, 1 / share_sigma, 0.0]), (len(v), 1, 4))
+            return np.append(left, share / share_sigma, axis=1), np.concatenate([jacobian, prior], axis=1)
+
+        start = np.clip([0.0, 0.95, 0.05, 0.1], lowest, highest)
+        return bounded_least_squares(misfit, np.tile(start, (self._patch.size, 1)), lowest, highest)
+
+    @property
+    def row_depth_mm(self) -> FloatArray:
+        """Depth of each row of patches, shape (r,)."""
+        return self._patches.row_depth_mm
+
+    def row_medians(self, values: FloatArray) -> FloatArray:
+        """Medians of patches' values of shape (q,) over the row and the pieces, shape (r,)."""
+        by_piece = values.reshape(-1, len(self._patches))
+        return np.asarray(np.median([np.median(self._patches.rows_of(v), axis=-1) for v in by_piece], axis=0))
+
+
+def bounded_least_squares(
+    misfit: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    start: FloatArray,
+    lowest: FloatArray,
+    highest: FloatArray,
+    rounds: int = 30,
+    settled: float = 1e-3,
+) -> FloatArray:
+    """Solve many small bounded least-squares problems at once by Levenberg-Marquardt.
+
+    Parameters
+    ----------
+    misfit : callable
+        From parameters, shape (k, n), to residuals, shape (k, m), and their derivatives, shape (k, m, n).
+    start : ndarray, shape (k, n)
+    lowest, highest : ndarray, shape (n,)
+        Bounds; parameters that press against one stay there.
+    rounds, settled : int, float
+        Most rounds, and the step that ends them.
+
+    Returns
+    -------
+    ndarray, shape (k, n)
+    """
+    x, damping = start.copy(), np.full(len(start), 1e-2)
+    left, jacobian = misfit(x)
+    cost = (left**2).sum(axis=1)
+    diagonal = np.arange(start.shape[1])
+    for _ in range(rounds):
+        gradient = np.einsum("kmn,km->kn", jacobian, left)
+        free = ~(((x <= lowest) & (gradient > 0)) | ((x >= highest) & (gradient < 0)))
+        normal = np.einsum("kmn,kmo->kno", jacobian, jacobian) * (free[:, :, None] & free[:, None, :])
+        normal[:, diagonal, diagonal] *= 1 + damping[:, None]
+        normal[:, diagonal, diagonal] += np.where(free, 1e-12, 1.0)
+        step = -np.linalg.solve(normal, np.where(free, gradient, 0.0)[:, :, None])[:, :, 0]
+        trial = np.clip(x + step, lowest, highest)
+        trial_left, trial_jacobian = misfit(trial)
+        trial_cost = (trial_left**2).sum(axis=1)
+        better = trial_cost <= cost
+        moved = np.abs(trial - x).max(axis=1)
+        x[better], cost[better] = trial[better], trial_cost[better]
+        left[better], jacobian[better] = trial_left[better], trial_jacobian[better]
+        damping = np.where(better, damping / 5, damping * 4)
+        if (moved < settled).all():
+            break
+    return x
 
 
 def scale_sigma(coherence: Coherence | None) -> float:
@@ -148,189 +289,48 @@ def scale_sigma(coherence: Coherence | None) -> float:
     return CURVES_SIGMA if coherence is None else coherence.scale_sigma
 
 
-def estimate_coherence(
-    first: IntArray,
-    second: IntArray,
-    correlation: Float32Array,
-    path: FloatArray,
-    curves: DecorrelationCurves,
-    patches: PatchGrid,
-    lateral_mm: FloatArray,
-    settings: CoherenceSettings | None = None,
-    known_scale: bool = False,
-) -> tuple[Coherence, FloatArray]:
-    """Fit shares, gains, stretches and the scale of distances.
+def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, float, RowScales]:
+    """Estimate shares of structure, gains, and the factor that distances along the path are still to get.
 
-    Parameters
-    ----------
-    first, second : ndarray, shape (e,)
-        Frames of each pair; pairs sorted by the second.
-    correlation : ndarray, shape (e, p)
-    path : ndarray, shape (n, 2)
-        Elevational position of each frame's centre and its slope along x.
-    lateral_mm : ndarray, shape (p,)
-        Of the patches, from the image's centre.
-    known_scale : bool
-        Whether the path has about the right scale already, so that only its neighbourhood is searched.
+    Structure of an echo turns its phase, so that it decays with some power of speckle's coherence; of
+    intensity, which has no phase, shapes with and without decay fit alike: the mean of both scales is taken,
+    and what lies between them is claimed.
 
     Returns
     -------
     Coherence
-    ndarray, shape (n, 2)
-        The path, rescaled.
+    float
+        True distances over those of the path, median over the patches.
+    RowScales
     """
-    s = settings or CoherenceSettings()
-    problem = EchoProblem(first, second, correlation, curves, patches, lateral_mm, s)
-    path = np.asarray(path, dtype=float)
-    scale, sigma = np.ones(problem.centres.size), 0.0
-    every, some = (STRETCHES, LENGTHS_MM), (STRETCHES[:1], LENGTHS_MM[[0, 1, 3]])
-    evidence = s.evidence
-    stages = [(FINE_SCALES, *every), (FINEST_SCALES, *every)]
-    for scales, stretches, lengths in stages[:1] if known_scale else [(COARSE_SCALES, *some), *stages]:
-        cost, _ = problem.fit(path, scales, stretches, lengths, evidence)
-        found, sigma = _best_scale(cost.reshape(*cost.shape[:3], -1).min(axis=-1), scales)
-        path = _rescale(path, problem.centres, found)
-        scale = scale * found
-        evidence = s.evidence + _rarity(cost[:, np.argmin(np.abs(np.log(scales / found.mean())))])
-    cost, fitted = problem.fit(path, np.ones(1), *every, evidence)
-    return _chosen(problem.centres, cost[:, 0], fitted[:, 0], scale, sigma), path
-
-
-def _rarity(cost: FloatArray) -> float:
-    """Further evidence to ask for where few patches depart, so that some of a phantom's do not by chance.
-
-    Twice the logarithm of the odds against a departure, `cost` being of shape (b, p, k, l).
-    """
-    departs = cost.reshape(*cost.shape[:2], -1).argmin(axis=-1) > 0
-    share = float(np.clip(departs.mean(), LEAST_DEPARTING, 0.5))
-    return 2.0 * float(np.log((1.0 - share) / share))
-
-
-def _chosen(
-    centres: FloatArray, cost: FloatArray, fitted: FloatArray, scale: FloatArray, sigma: float
-) -> Coherence:
-    """Best model of each block and patch; `cost` of shape (b, p, k, l)."""
-    blocks, patches = cost.shape[:2]
-    k, j = np.unravel_index(cost.reshape(blocks, patches, -1).argmin(axis=-1), cost.shape[2:])
-    b, p = np.ogrid[:blocks, :patches]
-    share, gain = np.moveaxis(fitted[b, p, k, j], -1, 0)
-    length = LENGTHS_MM[j]
-    decay = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)
-    departure = DEPARTURE_ERROR * (share.mean() + max(1.0 - gain.mean(), 0.0))
-    sigma = float(np.sqrt(sigma**2 + CURVES_SIGMA**2 + departure**2))
-    return Coherence(centres, share, gain, STRETCHES[k], decay, scale, sigma)
-
-
-class EchoProblem:
-    """Pairs by block of frames, and the curves' amplitudes at the patches."""
-
-    def __init__(
-        self,
-        first: IntArray,
-        second: IntArray,
-        correlation: Float32Array,
-        curves: DecorrelationCurves,
-        patches: PatchGrid,
-        lateral_mm: FloatArray,
-        settings: CoherenceSettings,
-    ) -> None:
-        self._first, self._second, self._rho = first, second, correlation
-        self._settings, self._lateral = settings, lateral_mm
-        here = curves.at(patches.centre_mm[:, 1])
-        self._curves = PatchCurves(
-            np.ascontiguousarray(np.sqrt(here.correlation)),
-            float(curves.distance_mm[1]),
-            here.cells,
-            curves.key.correlation_of == "echo",
-        )
-        ends = here.correlation[:, -1].max() > WELL_FALLEN
-        self._reach_mm = float(curves.distance_mm[-1]) if ends else np.inf
-        frames = int(second.max()) + 1
-        half = settings.block_frames / 2
-        count = max(1, round(frames / half) - 1)
-        self.centres = np.linspace(min(half, frames / 2), max(frames - half, frames / 2), count)
-        self._half = half
-
-    def fit(
-        self,
-        path: FloatArray,
-        scales: FloatArray,
-        stretches: FloatArray,
-        lengths_mm: FloatArray,
-        evidence: float,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Costs of every block, shape (b, s, p, k, l), penalties included, and shares and gains fitted."""
-        bins = self._bins(path)
-        shape = (len(bins), scales.size, stretches.size, lengths_mm.size)
-        cost, found = np.empty(shape), np.empty((*shape, 2))
-
-        def some(first: int, stop: int) -> None:
-            fit_echo_models(
-                bins,
-                scales,
-                stretches,
-                lengths_mm,
-                self._curves,
-                self._settings.redundancy,
-                GAIN_PRECISION,
-                first,
-                stop,
-                cost,
-                found,
-            )
-
-        in_parallel(some, len(bins), _GRAIN)
-        cost += evidence * (1.0 * (stretches > 1)[:, None] + (lengths_mm != NO_GAIN))
-        blocks = self.centres.size
-        cost, found = (each.reshape(blocks, -1, *each.shape[1:]).swapaxes(1, 2) for each in (cost, found))
-        return cost, found
-
-    def _bins(self, path: FloatArray) -> FloatArray:
-        """Sums over pairs of like distance, patch by patch within each block, shape (b p, bins, 4)."""
-        moved = path[self._second] - path[self._first]
-        middle = (self._first + self._second) / 2
-        bins = np.empty((self.centres.size, self._rho.shape[1], _EDGES_MM.size - 1, 4))
-        for block, centre in enumerate(self.centres):
-            inside = (np.abs(middle - centre) <= self._half) & (np.abs(moved[:, 0]) <= self._reach_mm)
-            offset, slope = moved[inside].T.copy()
-            bin_by_distance(self._rho[inside], offset, slope, self._lateral, _EDGES_MM, bins[block])
-        return bins.reshape(-1, *bins.shape[2:])
-
-    def cost_of_scales(self, path: FloatArray, scales: FloatArray) -> FloatArray:
-        """Twice the negative log-likelihood of each scale for each patch, shape (s, p), whatever stays."""
-        cost, _ = self.fit(path, scales, STRETCHES[:1], LENGTHS_MM, self._settings.evidence)
-        # Blocks overlap by half, so their costs count twice.
-        return np.asarray(cost.min(axis=(-2, -1)).sum(axis=0) / 2)
-
-
-def _best_scale(cost: FloatArray, scales: FloatArray) -> tuple[FloatArray, float]:
-    """Scale of each block from the likelihood profile, neighbours helping, and its overall deviation."""
-    cost = cost.sum(axis=2)
-    padded = np.pad(cost, ((2, 2), (0, 0)), mode="edge")
-    smooth = sum(w * padded[k : k + len(cost)] for k, w in enumerate((1.0, 2.0, 3.0, 2.0, 1.0))) / 3.0
-    best = np.array([vertex(np.log(scales), row) for row in np.asarray(smooth)])
-    # Blocks overlap by half, so their costs count twice.
-    total = cost.sum(axis=0) / 2
-    k = int(np.clip(np.argmin(total), 1, scales.size - 2))
-    width = np.log(scales[1] / scales[0])
-    curvature = (total[k - 1] - 2 * total[k] + total[k + 1]) / width**2
-    # A likelihood without curvature leaves the scale anywhere in the range that is searched first.
-    anywhere = np.log(COARSE_SCALES[-1] / COARSE_SCALES[0]) / np.sqrt(12.0)
-    return np.exp(best), float(min(np.sqrt(2 / max(curvature, 1e-6)), anywhere))
-
-
-def vertex(x: FloatArray, cost: FloatArray) -> float:
-    """Place of the least cost, by a parabola through the least value and its neighbours."""
-    k = int(np.argmin(cost))
-    if k in (0, len(x) - 1):
-        return float(x[k])
-    before, at, after = cost[k - 1 : k + 2]
-    return float(x[k] + (x[1] - x[0]) * (before - after) / (2 * (before - 2 * at + after)))
-
-
-def _rescale(path: FloatArray, centres: FloatArray, scale: FloatArray) -> FloatArray:
-    """Multiply the steps between frames by a scale that varies along the sweep."""
-    steps = np.diff(path, axis=0)
-    middle = np.arange(len(steps)) + 0.5
-    scaled = steps * np.interp(middle, centres, scale)[:, None]
-    return np.concatenate([path[:1], path[0] + np.cumsum(scaled, axis=0)])
+    frozen = correlations.fit()
+    typical = float(np.mean(correlations.row_medians(frozen[:, 2])))
+    if typical < NO_STRUCTURE:
+        fits = [correlations.fit(most_share=0.0)]
+    elif correlations.of_echo:
+        fits = [correlations.fit(most_power=MOST_POWER)]
+    else:
+        fits = [frozen, correlations.fit(most_power=MOST_POWER)]
+    medians = [float(np.median(fit[:, 0])) for fit in fits]
+    log_scale, pieces = float(np.mean(medians)), correlations.centres.size
+    share_gain = correlations.fit(log_scale, share_sigma=max(typical, LEAST_SHARE))[:, [2, 1]]
+    share, gain = share_gain.T
+    rows = RowScales(
+        correlations.row_depth_mm,
+        correlations.row_medians(np.mean(fits, axis=0)[:, 0]) - log_scale,
+        correlations.row_medians(gain),
+        correlations.row_medians(share),
+    )
+    # Standard error of a median of rows, by their median absolute deviation from a line: tilt makes one.
+    line = theilslopes(rows.logarithm, rows.depth_mm)
+    spread = 1.4826 * float(np.median(np.abs(rows.logarithm - line.intercept - line.slope * rows.depth_mm)))
+    if typical >= NO_STRUCTURE:
+        count = rows.logarithm.size
+        spread = np.sqrt((count * spread**2 + PRIOR_ROWS * ROW_SIGMA**2) / (count + PRIOR_ROWS))
+    errors = 1.2533 * spread / np.sqrt(rows.logarithm.size), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
+    sigma = float(np.linalg.norm(errors))
+    return (
+        Coherence(correlations.centres, share.reshape(pieces, -1), gain.reshape(pieces, -1), sigma),
+        float(np.exp(log_scale)),
+        rows,
+    )

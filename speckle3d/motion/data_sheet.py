@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import STRUCTURE_SIGMA, CurveKey, DecorrelationCurves, NominalProbe, TiltResponse
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra, NominalProbe, TiltResponse
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
@@ -106,28 +104,6 @@ class ProbeSheet(BaseModel):
         )
 
 
-@dataclass(frozen=True)
-class EchoSpectra:
-    """Power spectrum of a sweep's echoes by depth: attenuation and the pulse's true frequency are in it.
-
-    Attributes
-    ----------
-    depth_mm : ndarray, shape (y,)
-    frequency_hz : ndarray, shape (f,)
-    power : ndarray, shape (y, f)
-    """
-
-    depth_mm: FloatArray
-    frequency_hz: FloatArray
-    power: FloatArray
-
-    def at(self, depth_mm: FloatArray, frequency_hz: FloatArray) -> FloatArray:
-        """Power at depths of any shape and at other frequencies, shape (..., f)."""
-        known = np.stack([np.interp(frequency_hz, self.frequency_hz, row) for row in self.power])
-        flat = [np.interp(depth_mm.ravel(), self.depth_mm, column) for column in known.T]
-        return np.stack(flat, axis=-1).reshape(*depth_mm.shape, -1)
-
-
 def sheet_curves(
     sheet: ProbeSheet,
     key: CurveKey,
@@ -212,7 +188,7 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -
         ]
     )
     common = sensitivity(nominal, depth_mm).mean(axis=0)
-    return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2 + STRUCTURE_SIGMA**2))
+    return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2))
 
 
 def _band(sheet: ProbeSheet) -> tuple[float, float]:

@@ -42,11 +42,6 @@ class CurveSettings(BaseModel):
         description="The curves were measured on a phantom with the very probe that the sweep was made with, "
         "not only with one of its model: claimed errors of length then leave out what probes differ by.",
     )
-    straighten: bool = Field(
-        True,
-        description="Correct the curves where the depths of a sweep's images disagree as another lens would "
-        "have them.",
-    )
 
 
 @dataclass(frozen=True)

@@ -204,8 +204,8 @@ SMALL = 0.02
 
 
 def half_distance(distance_mm: FloatArray, correlation: FloatArray) -> float:
-    """Distance at which a falling curve is first at one half."""
-    after = max(1, int(np.argmax(correlation < 0.5)))
+    """Distance at which a falling curve is first at one half; one that ends above goes on as it ends."""
+    after = max(1, int(np.argmax(correlation < 0.5)) if correlation[-1] < 0.5 else correlation.size - 1)
     high, low = correlation[after - 1], correlation[after]
     part = (high - 0.5) / max(high - low, 1e-12)
     return float(distance_mm[after - 1] + part * (distance_mm[after] - distance_mm[after - 1]))

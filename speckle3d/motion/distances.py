@@ -20,8 +20,6 @@ WELL_FALLEN = 0.1
 TABLE_STEPS = 400
 SHARE_ERROR = 0.35
 """Relative error of a coherent share: structure is neither quite frozen nor quite Gaussian."""
-STRETCH_ERROR = 0.1
-"""Relative error of a stretch, which is chosen from steps of a sixth."""
 
 
 @dataclass(frozen=True)
@@ -37,44 +35,38 @@ class PatchDistances:
     distance_mm: FloatArray
     sigma_mm: FloatArray
 
+    def scaled(self, factor: float) -> PatchDistances:
+        """Return the same distances multiplied by a factor."""
+        return PatchDistances(factor * self.distance_mm, factor * self.sigma_mm)
+
 
 @dataclass(frozen=True)
 class EchoModel:
     """How patches' correlations depart from fully developed speckle's, rho_F, in each pair.
 
-    rho(d) = gain (staying + moving sqrt(rho_F(d / stretch)))^2; see `speckle3d.motion.coherence`.
+    rho(d) = gain (share + (1 - share) sqrt(rho_F(d)))^2; see `speckle3d.motion.coherence`.
 
     Attributes
     ----------
-    staying, moving, gain, stretch : ndarray, shape (e, p)
+    share, gain : ndarray, shape (e, p)
         Or (1, p), if it is the same for all pairs.
     """
 
-    staying: FloatArray
-    moving: FloatArray
+    share: FloatArray
     gain: FloatArray
-    stretch: FloatArray
 
     @classmethod
     def fully_developed(cls, patches: int) -> EchoModel:
         """Return the model of a phantom's speckle, for all pairs."""
-        one = np.ones((1, patches))
-        return cls(np.zeros((1, patches)), one, one, one)
+        return cls(np.zeros((1, patches)), np.ones((1, patches)))
 
     def __getitem__(self, pairs: IntArray | BoolArray | slice) -> EchoModel:
         """Return the model of some of the pairs."""
-        if len(self.gain) == 1:
-            return self
-        return EchoModel(self.staying[pairs], self.moving[pairs], self.gain[pairs], self.stretch[pairs])
-
-    def followed_by(self, others: EchoModel) -> EchoModel:
-        """Return the model of these pairs and of others."""
-        mine, theirs = vars(self), vars(others)
-        return EchoModel(**{name: np.concatenate([mine[name], theirs[name]]) for name in mine})
+        return self if len(self.gain) == 1 else EchoModel(self.share[pairs], self.gain[pairs])
 
     def for_kernels(self) -> EchoModels:
-        """Return the same with the errors of shares and stretches, as kernels take it."""
-        return EchoModels(self.staying, self.moving, self.gain, self.stretch, SHARE_ERROR, STRETCH_ERROR)
+        """Return the same with the errors of shares, as kernels take it."""
+        return EchoModels(self.share, self.gain, SHARE_ERROR)
 
 
 class DistanceEstimator:
@@ -121,7 +113,7 @@ class DistanceEstimator:
         """Distance and standard deviation for one correlation per pair and patch, shape (e, p)."""
         if model is not None:
             echo = np.sqrt(np.maximum(correlation, 0.0) / model.gain)
-            correlation = np.maximum((echo - model.staying) / model.moving, 0.0) ** 2
+            correlation = np.maximum((echo - model.share) / (1 - model.share), 0.0) ** 2
         known = correlation > self._least
         rho = np.where(known, np.minimum(correlation, 0.9999), 1.0).astype(float)
         position = np.sqrt(-np.log(rho)) / self._root_step
@@ -129,8 +121,6 @@ class DistanceEstimator:
         at = cell + TABLE_STEPS * np.arange(rho.shape[-1])
         low, high = self._distance.take(at), self._distance.take(at + 1)
         distance = low + np.minimum(position - cell, 1.0) * (high - low)
-        if model is not None:
-            distance = distance * model.stretch
         sigma = self.sigma(distance, model)
         return PatchDistances(np.where(known, distance, np.nan), np.where(known, sigma, np.nan))
 
@@ -152,20 +142,19 @@ class DistanceEstimator:
         From the correlation's variance over N independent cells and the curve's slope. Near zero the slope
         vanishes; there it is the squared distance whose deviation stays finite.
         """
-        staying, moving, gain, stretch = (0.0, 1.0, 1.0, 1.0) if model is None else vars(model).values()
-        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3) / stretch
+        share, gain = (0.0, 1.0) if model is None else (model.share, model.gain)
+        d = np.maximum(np.abs(np.nan_to_num(distance_mm)), 1e-3)
         position = np.minimum(d / self.step_mm, self._grid.size - 2.001)
         cell = position.astype(int)
         at, part = cell + self._grid.size * np.arange(cell.shape[-1]), position - cell
         rho, slope = ((1 - part) * t.take(at) + part * t.take(at + 1) for t in (self._rho, self._slope))
         g = np.sqrt(rho)
-        echo = staying + moving * g
-        seen = np.minimum(gain * echo**2, 0.999)
-        noise = correlation_variance(seen, self.cells, self.of_echo) + INTERPOLATION**2
-        misfit = SHARE_ERROR * staying * (1 - g) * 2 * echo * gain
-        sigma_rho = np.sqrt(noise + misfit**2) * g / np.maximum(gain * echo * moving, 1e-6)
-        d = np.minimum(d, self._grid[-1])
+        echo = share + (1 - share) * g
+        noise = (
+            correlation_variance(np.minimum(gain * echo**2, 0.999), self.cells, self.of_echo)
+            + INTERPOLATION**2
+        )
+        misfit = SHARE_ERROR * share * (1 - g) * 2 * echo * gain
+        sigma_rho = np.sqrt(noise + misfit**2) * g / np.maximum(gain * echo * (1 - share), 1e-6)
         direct = sigma_rho / np.maximum(slope, 1e-9)
-        sigma = np.minimum(direct, np.sqrt(2 * d * direct))
-        stretch_sd = np.where(stretch > 1.0 + 1e-9, STRETCH_ERROR, 0.0)
-        return np.asarray(np.sqrt(sigma**2 + (stretch_sd * d) ** 2) * stretch)
+        return np.asarray(np.minimum(direct, np.sqrt(2 * np.minimum(d, self._grid[-1]) * direct)))

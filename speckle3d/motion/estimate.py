@@ -1,12 +1,13 @@
-"""Pair correlations to signed planes, and signed planes to poses."""
+"""From correlations of frame pairs to signed planes and the path of the sweep."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
@@ -18,14 +19,14 @@ from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import (
     Coherence,
-    CoherenceSettings,
-    PairEchoes,
+    PatchCorrelations,
+    RowScales,
     estimate_coherence,
     scale_sigma,
 )
-from speckle3d.motion.curve_doubts import FLAT, DepthFactors, depth_factors, sum_ratios
-from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator, PatchDistances
-from speckle3d.motion.planes import PairPlanes, PlaneFitter, PlaneSettings, consistent_subset
+from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator
+from speckle3d.motion.lens import with_fitted_lens
+from speckle3d.motion.planes import PairPlanes, PlaneFitter, PlaneSettings
 from speckle3d.motion.signs import (
     ADAPTED_ERROR,
     PLAIN_ERROR,
@@ -34,340 +35,330 @@ from speckle3d.motion.signs import (
     pair_signs,
     settled_path,
 )
-from speckle3d.motion.trajectory import (
-    Trajectory,
-    fixed,
-    held,
-    joined,
-    relative_poses_of,
-    solve_trajectory,
-)
+from speckle3d.motion.trajectory import relative_poses_of, solve_trajectory
 from speckle3d.motion.uncertainty import SlopeEvidence, weigh_slopes
 
-ROWS_AT_ONCE = 1024
+ROUNDS = 2
+"""Rounds in which shares and scale, and the path that they are read from, are estimated in turn; a third
+moves lengths by less than 0.2 %."""
+LENS_ROUNDS = 4
+"""Fits of a data sheet's lens: a path read with a wrong lens bends the rows otherwise than the right one."""
 ENOUGH_PAIRS = 3
+"""Pairs to earlier frames from which a frame needs none that tells less."""
+PAIRS_AT_ONCE = 1024
+"""Pairs whose distances are held at once."""
 
 
-class PairReader:
-    """Reads the pair correlations of one sweep as planes, and planes as poses.
+@dataclass(frozen=True)
+class MotionProblem:
+    """What the correlations of one sweep are read with.
 
-    Parameters
+    Attributes
     ----------
+    curves : DecorrelationCurves
+    patches : PatchGrid
     centre_mm : ndarray, shape (3,)
         The image's centre.
     frames : int
         Of the sweep.
+    planes : PlaneSettings
+    trajectory : TrajectorySettings
+    adapt : bool
+        Whether structure and noise are adapted to.
     """
 
-    def __init__(
-        self,
-        curves: DecorrelationCurves,
-        patches: PatchGrid,
-        centre_mm: FloatArray,
-        frames: int,
-        planes: PlaneSettings,
-        trajectory: TrajectorySettings,
-    ) -> None:
-        self._curves, self._patches, self._centre, self._frames = curves, patches, centre_mm, frames
-        self._planes, self._settings = planes, trajectory
-        self._estimator = DistanceEstimator(curves, patches)
-        self.fitter = PlaneFitter(self._estimator, patches.centre_mm - centre_mm[:2], planes)
+    curves: DecorrelationCurves
+    patches: PatchGrid
+    centre_mm: FloatArray
+    frames: int
+    planes: PlaneSettings
+    trajectory: TrajectorySettings
+    adapt: bool = True
 
-    def with_curves(self, curves: DecorrelationCurves) -> PairReader:
-        """Return a reader of the same sweep with other curves."""
-        return PairReader(curves, self._patches, self._centre, self._frames, self._planes, self._settings)
+    def with_curves(self, curves: DecorrelationCurves) -> MotionProblem:
+        """Return the same problem with other curves."""
+        return replace(self, curves=curves)
 
-    def of_frames(self, frames: int) -> PairReader:
-        """Return a reader of the same images in another number."""
-        other = copy(self)
-        other._frames = frames
-        return other
+    @cached_property
+    def fitter(self) -> PlaneFitter:
+        """Fitter of planes to the patches of a pair."""
+        estimator = DistanceEstimator(self.curves, self.patches)
+        return PlaneFitter(estimator, self.patches.centre_mm - self.centre_mm[:2], self.planes)
 
-    def rough_path(self, table: CorrelationTable) -> FloatArray:
-        """Place each frame after the earlier ones it resembles, by a phantom's curves.
 
-        Returns
-        -------
-        ndarray, shape (n, 2)
-            Elevational position of each frame's centre, mm, and its slope along x.
-        """
-        rows = self._alike(table)
-        found, coefficients, covariance = [], [], []
-        for some in _slices(rows, ROWS_AT_ONCE):
-            planes = self.fitter.fit(table.correlation[some], table.inplane[some, :2])
-            found.append(some[planes.determined])
-            coefficients.append(planes.coefficients[planes.determined, :2])
-            covariance.append(planes.covariance[planes.determined, :2, :2])
-        rows = np.concatenate(found)
-        return settled_path(
-            self._frames,
-            table.first[rows],
-            table.second[rows],
-            np.concatenate(coefficients),
-            np.concatenate(covariance),
-            strangers=self._strangers(table, np.ones(len(table), dtype=bool)),
-            hold=True,
+@dataclass(frozen=True)
+class Motion:
+    """Signed planes of a sweep's frame pairs, and what they were read with.
+
+    Attributes
+    ----------
+    problem : MotionProblem
+        With the curves as they were read in the end.
+    pairs : SignedPairs
+    coherence : Coherence or None
+        Share of structure and gain of every patch; None if not adapted to.
+    rows : RowScales or None
+        Scales that rows of patches ask for; None if not adapted to.
+    path : ndarray, shape (n, 3)
+        Elevational position of the image's centre and slopes along x and y of every frame.
+    scale : float
+        Of all distances over those that planes fitted with `coherence` have; in `pairs` and `path`.
+    """
+
+    problem: MotionProblem
+    pairs: SignedPairs
+    coherence: Coherence | None
+    rows: RowScales | None
+    path: FloatArray
+    scale: float = 1.0
+
+    @property
+    def structure(self) -> float:
+        """Mean share of structure."""
+        return 0.0 if self.coherence is None else float(self.coherence.share.mean())
+
+    @property
+    def slopes(self) -> SlopeEvidence:
+        """Weight of the slopes that the planes have."""
+        return slope_evidence(self.problem, self.pairs, self.coherence)
+
+
+def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: BoolArray) -> Motion:
+    """Estimate shares of structure, the scale of distances and the path, each from the others, in turn.
+
+    Distances and their scale need the path, the path needs distances: both are repeated `ROUNDS` times. For
+    curves from a data sheet the lens is fitted to what depths then disagree on, and all is read again with
+    it.
+
+    Parameters
+    ----------
+    table : CorrelationTable
+    sound : ndarray of bool, shape (e,)
+        Pairs both of whose frames are to be trusted.
+
+    Raises
+    ------
+    InsufficientDataError
+        If no pair determines a plane.
+    """
+    path = rough_path(problem, table)
+    if problem.curves.origin == "data sheet" and problem.adapt:
+        # Tilt bends rows as a lens does: it is left out until the lens is known.
+        tilt, problem = problem.curves.tilt, problem.with_curves(replace(problem.curves, tilt=None))
+        for _ in range(LENS_ROUNDS):
+            motion = _in_turn(problem, table, sound, path)
+            assert motion.rows is not None
+            problem, path = problem.with_curves(with_fitted_lens(problem.curves, motion.rows)), motion.path
+        problem = problem.with_curves(replace(problem.curves, tilt=tilt))
+    return _in_turn(problem, table, sound, path)
+
+
+def _in_turn(problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray) -> Motion:
+    """Shares and scale from the path, the path from distances, in turn; at last the scale of all patches."""
+    if not problem.adapt:
+        pairs = _signed(
+            problem, table, sound, unsigned_planes(problem, table, path, sound, None), PLAIN_ERROR
+        )
+        return Motion(problem, pairs, None, None, path_of(problem, table, pairs, None))
+    coherence, scale, rows = coherence_of(problem, table, path, sound)
+    for _ in range(ROUNDS):
+        planes = unsigned_planes(problem, table, path * scale, sound, coherence)
+        pairs = _signed(problem, table, sound, planes, ADAPTED_ERROR)
+        path = path_of(problem, table, pairs, coherence)
+        coherence, scale, rows = coherence_of(problem, table, path, sound)
+    pairs = replace(pairs, planes=pairs.planes.scaled(scale))
+    return Motion(problem, pairs, coherence, rows, path_of(problem, table, pairs, coherence), scale)
+
+
+def rough_path(problem: MotionProblem, table: CorrelationTable) -> FloatArray:
+    """Place frames one after the other by the earlier ones that they resemble, by a phantom's curves.
+
+    Returns
+    -------
+    ndarray, shape (n, 2)
+        Elevational position of each frame's centre, mm, and its slope along x.
+    """
+    rows = alike_pairs(problem, table)
+    planes = problem.fitter.fit(table.correlation[rows], table.inplane[rows, :2])
+    rows, planes = rows[planes.determined], planes[planes.determined]
+    return settled_path(
+        problem.frames,
+        table.first[rows],
+        table.second[rows],
+        planes.coefficients[:, :2],
+        planes.covariance[:, :2, :2],
+        strangers=strangers(problem, table, np.ones(len(table), dtype=bool)),
+        hold=True,
+    )
+
+
+def unsigned_planes(
+    problem: MotionProblem,
+    table: CorrelationTable,
+    path: FloatArray,
+    sound: BoolArray,
+    coherence: Coherence | None,
+) -> SignedPairs:
+    """Planes of the pairs near enough on a path to tell a distance; all signs are +1."""
+    rows = _near_pairs(problem, table, path[:, 0], sound)
+    start = np.abs(path[table.second[rows], 0] - path[table.first[rows], 0])
+    return planes_of(problem, table, rows, coherence, start)
+
+
+def planes_of(
+    problem: MotionProblem,
+    table: CorrelationTable,
+    rows: IntArray,
+    coherence: Coherence | None,
+    start_mm: FloatArray | None = None,
+) -> SignedPairs:
+    """Planes of some rows of the table, as far as they are determined; all signs are +1."""
+    first, second = table.first[rows], table.second[rows]
+    planes = problem.fitter.fit(
+        table.correlation[rows], table.inplane[rows, :2], coherence, first, start_mm=start_mm
+    )
+    return SignedPairs(rows, first, second, planes, np.ones(rows.size))[planes.determined]
+
+
+def _signed(
+    problem: MotionProblem, table: CorrelationTable, sound: BoolArray, pairs: SignedPairs, error: float
+) -> SignedPairs:
+    """Pairs with the signs that belong together on the likeliest path."""
+    if not len(pairs):
+        raise InsufficientDataError(
+            f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
+            f"{table.correlation.shape[1]} patches: is the image wide enough, and do the curves fit it?"
+        )
+    path = signed_path(problem, table, sound, pairs, error)
+    return pairs.with_signs(pair_signs(path, *pairs.signless))
+
+
+def signed_path(
+    problem: MotionProblem,
+    table: CorrelationTable,
+    sound: BoolArray,
+    pairs: SignedPairs,
+    error: float = ADAPTED_ERROR,
+    known: FloatArray | None = None,
+) -> FloatArray:
+    """Likeliest path through unsigned planes, shape (n, 2).
+
+    Parameters
+    ----------
+    error : float
+        Relative, of distances, as for `settled_path`.
+    known : ndarray, shape (m, 2), optional
+        Path of the first m frames, which stays.
+    """
+    return settled_path(
+        problem.frames,
+        *pairs.signless,
+        error,
+        strangers(problem, table, sound),
+        hold=known is not None and len(known) > 0,
+        known=known,
+    )
+
+
+def coherence_of(
+    problem: MotionProblem, table: CorrelationTable, path: FloatArray, sound: BoolArray
+) -> tuple[Coherence, float, RowScales]:
+    """Fit what stays of the patches' echoes, and the scale of the path; see `estimate_coherence`."""
+    pairs = table.first[sound], table.second[sound], table.correlation[sound]
+    return estimate_coherence(
+        PatchCorrelations(*pairs, path, problem.curves, problem.patches, problem.fitter.levers)
+    )
+
+
+def slope_evidence(problem: MotionProblem, pairs: SignedPairs, coherence: Coherence | None) -> SlopeEvidence:
+    """Weight of the images' own yaw and tilt."""
+    expected = float(np.deg2rad(problem.planes.turn_deg_per_mm))
+    return weigh_slopes(problem.fitter.design(), pairs.planes, scale_sigma(coherence), expected)
+
+
+def edges_of(table: CorrelationTable, pairs: SignedPairs, planes: PairPlanes) -> RelativePoses:
+    """Relative poses of pairs, from `planes` in place of their own."""
+    inplane = table.inplane[pairs.row], table.inplane_covariance[pairs.row]
+    return relative_poses_of(pairs.first, pairs.second, *inplane, planes, pairs.sign)
+
+
+def path_of(
+    problem: MotionProblem, table: CorrelationTable, pairs: SignedPairs, coherence: Coherence | None
+) -> FloatArray:
+    """Position and slopes of every frame on the trajectory of some pairs, shape (n, 3)."""
+    slopes = slope_evidence(problem, pairs, coherence)
+    edges = edges_of(table, pairs, slopes.applied(pairs.planes))
+    poses = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory).poses
+    return elevation_of(poses, problem.centre_mm)
+
+
+def elevation_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """Elevational position of the image's centre, mm, and slopes along x and y, shape (n, 3)."""
+    return np.column_stack([poses.apply(centre_mm)[:, 2], poses.rotation.as_matrix()[:, 2, :2]])
+
+
+def frame_pairs(
+    motion: Motion,
+    table: CorrelationTable,
+    edges: RelativePoses,
+    used: BoolArray,
+    direction: int,
+    scale_sigma: float,
+) -> Iterator[FramePairs]:
+    """Yield the pairs for the reconstruction file, some at a time; deviations include that of the scale."""
+    problem, pairs = motion.problem, motion.pairs
+    centre = RigidTransform.from_translation(problem.centre_mm)
+    flip, turn = np.diag([1.0, 1.0, direction, 1.0]), MIRROR if direction < 0 else np.eye(6)
+    for start in range(0, max(len(pairs), 1), PAIRS_AT_ONCE):
+        some = slice(start, start + PAIRS_AT_ONCE)
+        d = problem.fitter.distances(table.correlation[pairs.row[some]], motion.coherence, pairs.first[some])
+        d = d.scaled(motion.scale)
+        yield FramePairs(
+            first=edges.first[some],
+            second=edges.second[some],
+            first_from_second=flip @ (centre * edges.poses[some] * centre.inv()).as_matrix() @ flip,
+            covariance=turn @ edges.covariance[some] @ turn,
+            distance_mm=d.distance_mm.astype(np.float32),
+            sigma_mm=np.hypot(d.sigma_mm, scale_sigma * d.distance_mm).astype(np.float32),
+            used=used[some],
+            patch_centre_mm=problem.patches.centre_mm,
         )
 
-    def measure(
-        self,
-        table: CorrelationTable,
-        path: FloatArray,
-        sound: BoolArray,
-        coherence: Coherence | None,
-        known: int = 0,
-    ) -> SignedPairs:
-        """Planes and signs of the pairs that are near enough on a path to tell a distance.
 
-        Parameters
-        ----------
-        path : ndarray, shape (n, 2)
-            Elevational position of each frame's centre and its slope along x.
-        sound : ndarray of bool, shape (e,)
-            Pairs both of whose frames are to be trusted.
-        coherence : Coherence or None
-            With which correlations are read; None for a phantom's curves as they are.
-        known : int
-            So many frames at the beginning are where the path has them.
-
-        Raises
-        ------
-        InsufficientDataError
-            If no pair determines a plane.
-        """
-        pairs = self.unsigned(table, path, sound, coherence)
-        if not len(pairs):
-            patches = table.correlation.shape[1]
-            raise InsufficientDataError(
-                f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
-                f"{patches} patches: is the image wide enough, and do the curves fit it?"
-            )
-        error = PLAIN_ERROR if coherence is None else ADAPTED_ERROR
-        return self.signed(table, pairs, sound, path[:known], error)[0]
-
-    def unsigned(
-        self, table: CorrelationTable, path: FloatArray, sound: BoolArray, coherence: Coherence | None
-    ) -> SignedPairs:
-        """Planes of the pairs as for `measure`, as far as they are determined; all signs are +1."""
-        chosen = self._choose(table, path[:, 0], sound)
-        first, second = table.first[chosen], table.second[chosen]
-        apart = path[second, 0] - path[first, 0]
-        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2, apart)
-        planes = self.fitter.fit(
-            table.correlation[chosen], table.inplane[chosen, :2], echoes, start_mm=np.abs(apart)
-        )
-        return SignedPairs(chosen, first, second, echoes, planes, np.ones(chosen.size))[planes.determined]
-
-    def roughly(
-        self, table: CorrelationTable, coherence: Coherence | None, apart_mm: FloatArray
-    ) -> SignedPairs:
-        """Planes of frames' pairs with earlier frames that they resemble, wherever they are; all signs +1.
-
-        Parameters
-        ----------
-        apart_mm : ndarray, shape (e,)
-            About how far apart the frames of each pair are, for structure that fades.
-        """
-        rows = self._alike(table)
-        first, second = table.first[rows], table.second[rows]
-        echoes = None if coherence is None else PairEchoes(coherence, (first + second) / 2, apart_mm[rows])
-        planes = self.fitter.fit(table.correlation[rows], table.inplane[rows, :2], echoes)
-        return SignedPairs(rows, first, second, echoes, planes, np.ones(rows.size))[planes.determined]
-
-    def signed(
-        self,
-        table: CorrelationTable,
-        pairs: SignedPairs,
-        sound: BoolArray,
-        known: FloatArray,
-        error: float = ADAPTED_ERROR,
-    ) -> tuple[SignedPairs, FloatArray]:
-        """Pairs with the signs that belong together, and the likeliest path, shape (n, 2).
-
-        Parameters
-        ----------
-        known : ndarray, shape (m, 2)
-            Path of the first m frames, which stays; of none, if the sweep begins with the table.
-        error : float
-            Of distances, as for `settled_path`.
-        """
-        moved, covariance = pairs.planes.coefficients[:, :2], pairs.planes.covariance[:, :2, :2]
-        signless = pairs.first, pairs.second, moved, covariance
-        settled = settled_path(
-            self._frames, *signless, error, self._strangers(table, sound), hold=len(known) > 0, known=known
-        )
-        return pairs.with_signs(pair_signs(settled, *signless)), settled
-
-    def coherence(
-        self,
-        table: CorrelationTable,
-        path: FloatArray,
-        sound: BoolArray,
-        settings: CoherenceSettings,
-        known_scale: bool,
-    ) -> tuple[Coherence, FloatArray]:
-        """Fit what stays of the patches' echoes and rescale the path; see `estimate_coherence`."""
-        return estimate_coherence(
-            table.first[sound],
-            table.second[sound],
-            table.correlation[sound],
-            path,
-            self._curves,
-            self._patches,
-            self._patches.centre_mm[:, 0] - self._centre[0],
-            settings,
-            known_scale,
-        )
-
-    def depth_factors(
-        self, table: CorrelationTable, path: FloatArray, sound: BoolArray, settings: CoherenceSettings
-    ) -> DepthFactors:
-        """Distances read at each depth over those of all depths; see `speckle3d.motion.curve_doubts`."""
-        lateral = self._patches.centre_mm[:, 0] - self._centre[0]
-        return depth_factors(table, sound, path, self._curves, self._patches, lateral, settings)
-
-    def sum_ratios(self, pairs: SignedPairs) -> FloatArray:
-        """Sums of two distances over the one that spans both; see `speckle3d.motion.curve_doubts`."""
-        least = FLAT * float(self._estimator.typical_distance(np.sqrt(0.5)))
-        return sum_ratios(pairs.first, pairs.second, pairs.sign * pairs.planes.offset_mm, least)
-
-    def slopes(self, pairs: SignedPairs, coherence: Coherence | None) -> SlopeEvidence:
-        """Weigh what the images see of yaw and tilt."""
-        expected = float(np.deg2rad(self._planes.turn_deg_per_mm))
-        return weigh_slopes(self.fitter.design(), pairs.planes, scale_sigma(coherence), expected)
-
-    def edges(self, table: CorrelationTable, pairs: SignedPairs, planes: PairPlanes) -> RelativePoses:
-        """Relative poses of pairs, from `planes` in place of their own."""
-        return relative_poses_of(
-            pairs.first,
-            pairs.second,
-            table.inplane[pairs.row],
-            table.inplane_covariance[pairs.row],
-            planes,
-            pairs.sign,
-        )
-
-    def solve(self, edges: RelativePoses, with_covariance: bool = False) -> Trajectory:
-        """Poses of all frames; those that no edge joins to earlier ones lie between their neighbours."""
-        lone = np.flatnonzero(self.unjoined(edges.second))
-        after = lone[lone + 1 < self._frames]
-        between = held(np.concatenate([lone - 1, after]), np.concatenate([lone, after + 1]))
-        return solve_trajectory(
-            joined(edges, between), self._frames, self._centre, self._settings, with_covariance
-        )
-
-    def solve_onto(self, edges: RelativePoses, known: RigidTransform) -> RigidTransform:
-        """Poses of all frames from edges and the poses of the first frames, one at least, which stay."""
-        if len(known) > 1:
-            edges = joined(fixed(known, self._centre), edges)
-        return RigidTransform.concatenate([known, (known[0] * self.solve(edges).poses)[len(known) :]])
-
-    def path_of(self, poses: RigidTransform) -> FloatArray:
-        """Elevational position of the image's centre and slope along x of every pose, shape (n, 2)."""
-        return np.column_stack([poses.apply(self._centre)[:, 2], poses.rotation.as_matrix()[:, 2, 0]])
-
-    def unjoined(self, second: IntArray) -> BoolArray:
-        """Frames after the first that are the second of no pair, shape (n,)."""
-        lone = np.ones(self._frames, dtype=bool)
-        lone[0] = False
-        lone[second] = False
-        return lone
-
-    def path(self, table: CorrelationTable, pairs: SignedPairs, coherence: Coherence | None) -> FloatArray:
-        """Elevational position of the image's centre and slope along x of every frame, shape (n, 2)."""
-        slopes = self.slopes(pairs, coherence)
-        return self.path_of(self.solve(self.edges(table, pairs, slopes.applied(pairs.planes))).poses)
-
-    def consistent(
-        self, table: CorrelationTable, pairs: SignedPairs, sensed: Rotation, direction: int
-    ) -> PairPlanes:
-        """Planes of the sensed orientation, through the patches that agree with it; their own if too few do.
-
-        Parameters
-        ----------
-        sensed : Rotation, length n
-            Orientation of every frame.
-        direction : int
-            Sign of the elevational motion, with which that of every pair is multiplied.
-        """
-        relative = (sensed[pairs.first].inv() * sensed[pairs.second]).as_matrix()[:, 2, :2]
-        moved, slopes = table.inplane[pairs.row, :2], direction * pairs.sign[:, None] * relative
-        offset, correlation = pairs.planes.offset_mm, table.correlation[pairs.row]
-        agreed = np.empty(correlation.shape, dtype=bool)
-        open_side = np.empty(len(pairs), dtype=bool)
-        for some in _slices(np.arange(len(pairs)), ROWS_AT_ONCE):
-            raised = self.fitter.raised(moved[some], slopes[some])
-            # Only frames that cross, or nearly, leave the side open.
-            open_side[some] = offset[some] < np.ptp(raised, axis=1)
-            distances = self._distances(table, pairs[some])
-            agreed[some] = consistent_subset(distances, raised, self._planes.support_sigma, open_side[some])
-        planes = self.fitter.fit(correlation, moved, pairs.echoes, agreed, slopes, offset, open_side)
-        return planes.where(planes.determined, pairs.planes)
-
-    def rows(
-        self,
-        table: CorrelationTable,
-        pairs: SignedPairs,
-        edges: RelativePoses,
-        used: BoolArray,
-        direction: int,
-        scale_sigma: float,
-    ) -> Iterator[FramePairs]:
-        """Pairs for the reconstruction file; deviations include that of the scale, which patches share."""
-        centre = RigidTransform.from_translation(self._centre)
-        flip = np.diag([1.0, 1.0, direction, 1.0])
-        turn = MIRROR if direction < 0 else np.eye(6)
-        for some in _slices(np.arange(len(pairs)), ROWS_AT_ONCE):
-            d = self._distances(table, pairs[some])
-            yield FramePairs(
-                first=edges.first[some],
-                second=edges.second[some],
-                first_from_second=flip @ (centre * edges.poses[some] * centre.inv()).as_matrix() @ flip,
-                covariance=turn @ edges.covariance[some] @ turn,
-                distance_mm=d.distance_mm.astype(np.float32),
-                sigma_mm=np.hypot(d.sigma_mm, scale_sigma * d.distance_mm).astype(np.float32),
-                used=used[some],
-                patch_centre_mm=self._patches.centre_mm,
-            )
-
-    def _alike(self, table: CorrelationTable) -> IntArray:
-        """Rows of frames' pairs with earlier frames that they resemble; without any, of their best pair."""
-        alike = table.median >= self._settings.least_correlation
-        best_first = np.lexsort((-table.median, table.second))
-        frame, best = np.unique(table.second[best_first], return_index=True)
-        without = ~np.isin(frame, table.second[alike])
-        alike[best_first[best[without]]] = True
-        return np.flatnonzero(alike)
-
-    def _choose(self, table: CorrelationTable, position_mm: FloatArray, sound: BoolArray) -> IntArray:
-        """Rows of pairs so near that fully developed speckle would keep enough correlation."""
-        distance = np.abs(position_mm[table.second] - position_mm[table.first])
-        left = self._estimator.typical_correlation(distance)
-        near = (left >= self._settings.clear_correlation) & sound
-        # Frames without enough of them take those that tell less, and if need be one that tells little.
-        pairs = np.bincount(table.second[near], minlength=self._frames)
-        near |= (left >= self._settings.least_correlation) & sound & (pairs[table.second] < ENOUGH_PAIRS)
-        for frame in np.setdiff1d(table.second[sound], table.second[near]):
-            rows = np.flatnonzero((table.second == frame) & sound)
-            best = rows[np.argmax(left[rows])]
-            near[best] = table.median[best] >= LEAST_CORRELATION
-        return np.flatnonzero(near)
-
-    def _strangers(self, table: CorrelationTable, sound: BoolArray) -> Strangers:
-        """Frames that were compared and do not resemble each other, and how far apart they are.
-
-        Speckle at half the distance at which it keeps `least_correlation` would keep two thirds of it: no
-        error of curves makes the one look like the other, and what stays of echoes only adds to it.
-        """
-        far = (table.median < self._settings.least_correlation) & sound
-        half = 0.5 * float(self._estimator.typical_distance(np.sqrt(self._settings.least_correlation)))
-        return Strangers(table.first[far], table.second[far], half)
-
-    def _distances(self, table: CorrelationTable, pairs: SignedPairs) -> PatchDistances:
-        model = None if pairs.echoes is None else pairs.echoes.models()
-        return self._estimator.distances(table.correlation[pairs.row].astype(float), model)
+def alike_pairs(problem: MotionProblem, table: CorrelationTable) -> IntArray:
+    """Rows of frames' pairs with earlier frames that they resemble; without any, of their best pair."""
+    alike = table.median >= problem.trajectory.least_correlation
+    best_first = np.lexsort((-table.median, table.second))
+    frame, best = np.unique(table.second[best_first], return_index=True)
+    alike[best_first[best[~np.isin(frame, table.second[alike])]]] = True
+    return np.flatnonzero(alike)
 
 
-def _slices(rows: IntArray, most: int) -> Iterator[IntArray]:
-    """Rows, some at a time: once at least."""
-    return (rows[start : start + most] for start in range(0, max(rows.size, 1), most))
+def _near_pairs(
+    problem: MotionProblem, table: CorrelationTable, position_mm: FloatArray, sound: BoolArray
+) -> IntArray:
+    """Rows of pairs so near that fully developed speckle would keep enough correlation."""
+    settings = problem.trajectory
+    distance = np.abs(position_mm[table.second] - position_mm[table.first])
+    left = problem.fitter.estimator.typical_correlation(distance)
+    near = (left >= settings.clear_correlation) & sound
+    # Frames without enough of them take those that tell less, and if need be one that tells little.
+    pairs = np.bincount(table.second[near], minlength=problem.frames)
+    near |= (left >= settings.least_correlation) & sound & (pairs[table.second] < ENOUGH_PAIRS)
+    for frame in np.setdiff1d(table.second[sound], table.second[near]):
+        rows = np.flatnonzero((table.second == frame) & sound)
+        best = rows[np.argmax(left[rows])]
+        near[best] = table.median[best] >= LEAST_CORRELATION
+    return np.flatnonzero(near)
+
+
+def strangers(problem: MotionProblem, table: CorrelationTable, sound: BoolArray) -> Strangers:
+    """Frames that were compared and do not resemble each other, and how far apart they are.
+
+    Speckle at half the distance at which it keeps `least_correlation` would keep two thirds of it: no
+    error of curves makes the one look like the other, and what stays of echoes only adds to it.
+    """
+    least = problem.trajectory.least_correlation
+    far = (table.median < least) & sound
+    half = 0.5 * float(problem.fitter.estimator.typical_distance(np.sqrt(least)))
+    return Strangers(table.first[far], table.second[far], half)

@@ -13,7 +13,7 @@ with depth as y does. The fit keeps what is seen; `speckle3d.motion.uncertainty`
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,9 +22,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.plane_misfit import FitRules, Levers
-from speckle3d.kernels.planes import FittedPlanes, agreeing_patches, fit_planes
+from speckle3d.kernels.planes import FittedPlanes, fit_planes
 from speckle3d.kernels.statistics import PatchCurves
-from speckle3d.motion.coherence import PairEchoes
+from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
 
 CROSSING_EVIDENCE = 6.0
@@ -127,6 +127,16 @@ class PairPlanes:
         """Offset a of each pair, shape (e,)."""
         return self.coefficients[:, 0]
 
+    def scaled(self, factor: float) -> PairPlanes:
+        """Return the same planes with all distances multiplied by a factor."""
+        return replace(
+            self,
+            coefficients=self.coefficients * factor,
+            covariance=self.covariance * factor**2,
+            excess_mm=self.excess_mm * np.float32(factor),
+            sigma_mm=self.sigma_mm * np.float32(factor),
+        )
+
     def where(self, mask: BoolArray, others: PairPlanes) -> PairPlanes:
         """These planes where the mask of pairs says so, and those of `others` elsewhere."""
         chosen = []
@@ -151,23 +161,30 @@ class PlaneFitter:
     def __init__(
         self, estimator: DistanceEstimator, at_mm: FloatArray, settings: PlaneSettings | None = None
     ) -> None:
-        self._estimator = estimator
+        self.estimator = estimator
         self.settings = settings or PlaneSettings()
         self._curves = PatchCurves(estimator.amplitude, estimator.step_mm, estimator.cells, estimator.of_echo)
         zero = np.zeros(len(at_mm))
         tilt = estimator.tilt
         # Where the curves know nothing of tilt, it is taken to turn about the focus, and the focus to be at
         # the image's centre: all depths then see the centre's distance.
-        self._levers = Levers(
+        self.levers = Levers(
             np.ascontiguousarray(at_mm[:, 0]),
             zero if tilt is None else at_mm[:, 1] - tilt.pivot_mm,
             zero if tilt is None else np.ascontiguousarray(tilt.spread_mm),
         )
         self._has_lever = tilt is not None
 
+    def distances(
+        self, correlation: Float32Array, coherence: Coherence | None, frame: IntArray
+    ) -> PatchDistances:
+        """Distances of the patches of some pairs, whose coherence is taken at a frame each."""
+        model = None if coherence is None else coherence.models(frame)
+        return self.estimator.distances(correlation.astype(float), model)
+
     def design(self) -> FloatArray:
         """What a, b and c are multiplied by for each patch, without in-plane motion, shape (p, 3)."""
-        lateral, lever, _ = self._levers
+        lateral, lever, _ = self.levers
         return np.column_stack([np.ones(len(lateral)), lateral, lever])
 
     def raised(self, moved_mm: FloatArray, slopes: FloatArray) -> FloatArray:
@@ -191,7 +208,8 @@ class PlaneFitter:
         self,
         correlation: Float32Array,
         moved_mm: FloatArray,
-        echoes: PairEchoes | None = None,
+        coherence: Coherence | None = None,
+        frame: IntArray | None = None,
         subset: BoolArray | None = None,
         slopes: FloatArray | None = None,
         start_mm: FloatArray | None = None,
@@ -207,8 +225,10 @@ class PlaneFitter:
         correlation : ndarray of float32, shape (e, p)
         moved_mm : ndarray, shape (e, 2)
             In-plane displacement of the second frame.
-        echoes : PairEchoes, optional
+        coherence : Coherence, optional
             With which the correlations are read; a phantom's, if not given.
+        frame : ndarray of int, shape (e,), optional
+            At which the coherence of each pair is taken.
         subset : ndarray of bool, shape (e, p), optional
             Patches allowed to take part.
         slopes : ndarray, shape (e, 2), optional
@@ -226,7 +246,7 @@ class PlaneFitter:
             some = slice(first, first + PAIRS_AT_ONCE)
             problem = self._problem(
                 correlation[some],
-                None if echoes is None else echoes[some].models(),
+                None if coherence is None or frame is None else coherence.models(frame[some]),
                 None if subset is None else subset[some],
                 None if start_mm is None else start_mm[some],
             )
@@ -267,7 +287,7 @@ class PlaneFitter:
                 problem.used[some],
                 lost[some],
                 problem.model[some].for_kernels(),
-                self._levers,
+                self.levers,
                 self._curves,
                 problem.middle_mm[some],
                 told[some],
@@ -277,7 +297,7 @@ class PlaneFitter:
             )
 
         in_parallel(work, pairs, GRAIN)
-        return self._concluded(fitted, problem.used, problem.model, turned=not rules.sensed)
+        return self._concluded(fitted, problem.used, turned=not rules.sensed)
 
     def _rules(self, sensed: bool) -> FitRules:
         return FitRules(
@@ -291,7 +311,7 @@ class PlaneFitter:
             ROUNDS,
         )
 
-    def _concluded(self, fitted: FittedPlanes, used: BoolArray, model: EchoModel, turned: bool) -> PairPlanes:
+    def _concluded(self, fitted: FittedPlanes, used: BoolArray, turned: bool) -> PairPlanes:
         """Planes with their covariances; those with a < 0 turned over if `turned`."""
         coefficients, information, cost, *residuals = fitted
         patches = used.sum(axis=1)
@@ -299,7 +319,7 @@ class PlaneFitter:
         covariance = np.linalg.inv(information) * scatter[:, None, None]
         covariance[:, 0, 0] += self.settings.bias_mm**2
         # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
-        reach = self._estimator.reach_mm * np.maximum(1.0, np.median(model.stretch, axis=1))
+        reach = self.estimator.reach_mm
         determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
         if turned:
             coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
@@ -308,10 +328,10 @@ class PlaneFitter:
 
     def _measured(self, correlation: Float32Array, model: EchoModel) -> BoolArray:
         """Patches that correlate more than at their curve's last distance."""
-        end = self._estimator.end_amplitude
+        end = self.estimator.end_amplitude
         if not end.any():
             return np.ones(correlation.shape, dtype=bool)
-        least = model.gain * (model.staying + model.moving * end) ** 2
+        least = model.gain * (model.share + (1 - model.share) * end) ** 2
         return np.asarray((end == 0.0) | (correlation > least))
 
     def _middle(self, correlation: Float32Array, used: BoolArray, model: EchoModel) -> FloatArray:
@@ -320,56 +340,8 @@ class PlaneFitter:
         count = np.maximum(used.sum(axis=1), 1)
         pair = np.arange(len(known))
         median = (known[pair, (count - 1) // 2].astype(float) + known[pair, count // 2]) / 2
-        share = model.staying.mean(axis=1)
+        share = model.share.mean(axis=1)
         left = (np.sqrt(np.maximum(np.where(np.isfinite(median), median, 0.0), 0.0)) - share) / np.maximum(
             1.0 - share, 0.1
         )
-        return self._estimator.typical_distance(left)
-
-
-def consistent_subset(
-    distances: PatchDistances,
-    raised_mm: FloatArray,
-    support_sigma: float = 1.0,
-    either_side: BoolArray | None = None,
-) -> BoolArray:
-    """Patches of each pair whose distances agree on one plane of the orientation that the sensor measured.
-
-    Every patch in turn places the plane, through +d and through -d; the placement that most others agree
-    with, in magnitude and within `support_sigma` of their own deviations, keeps its supporters.
-
-    Parameters
-    ----------
-    distances : PatchDistances
-        Of shape (e, p).
-    raised_mm : ndarray, shape (e, p)
-        How much farther each patch is than the image's centre, by the sensor's relative rotation.
-    either_side : ndarray of bool, shape (e,), optional
-        Whether the image's centre may lie on the other side of the first frame than `raised_mm` has it; it
-        may in all pairs, if not given.
-
-    Returns
-    -------
-    ndarray of bool, shape (e, p)
-
-    References
-    ----------
-    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, "Sensorless drift correction using
-       orientation measurements", figure 4.
-    """
-    support = np.zeros(raised_mm.shape, dtype=bool)
-    side = np.ones(len(support), dtype=bool) if either_side is None else either_side
-
-    def work(first: int, stop: int) -> None:
-        some = slice(first, stop)
-        agreeing_patches(
-            distances.distance_mm[some],
-            distances.sigma_mm[some],
-            raised_mm[some],
-            side[some],
-            support_sigma,
-            support[some],
-        )
-
-    in_parallel(work, len(support), GRAIN)
-    return support
+        return self.estimator.typical_distance(left)

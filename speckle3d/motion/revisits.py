@@ -7,14 +7,14 @@ earlier one however far the probe travelled between them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import Coherence, PairEchoes
-from speckle3d.motion.planes import PairPlanes, PlaneFitter
+from speckle3d.motion.estimate import Motion, planes_of
+from speckle3d.motion.planes import PairPlanes
 from speckle3d.motion.signs import SignedPairs
 
 AWAY_MM = 3.0
@@ -66,14 +66,7 @@ def find_returns(position_mm: FloatArray, every_mm: float) -> list[Return]:
     return found
 
 
-def tie_returns(
-    returns: Sequence[Return],
-    table: CorrelationTable,
-    position_mm: FloatArray,
-    fitter: PlaneFitter,
-    coherence: Coherence | None,
-    least_correlation: float,
-) -> SignedPairs:
+def tie_returns(returns: Sequence[Return], motion: Motion, table: CorrelationTable) -> SignedPairs:
     """Pairs of returns with the frames they came back to, where these agree on one place for the return.
 
     Parameters
@@ -81,14 +74,15 @@ def tie_returns(
     table : CorrelationTable
         Holds the pairs of the returns, among others; a pair below `least_correlation` shows that its frames
         are far apart.
-    position_mm : ndarray, shape (n,)
-        As for `find_returns`.
     """
+    problem, position_mm = motion.problem, motion.path[:, 0]
     wanted = {pair for each in returns for pair in each.pairs()}
     every = zip(table.first.tolist(), table.second.tolist(), strict=True)
     rows = {pair: row for row, pair in enumerate(every) if pair in wanted} if wanted else {}
-    alike = [row for row in rows.values() if table.median[row] >= least_correlation]
-    read = _read(np.array(alike, dtype=np.int64), table, position_mm, fitter, coherence)
+    alike = [row for row in rows.values() if table.median[row] >= problem.trajectory.least_correlation]
+    # Structure is taken as the earlier visit has it.
+    read = planes_of(problem, table, np.array(alike, dtype=np.int64), motion.coherence)
+    read = replace(read, planes=read.planes.scaled(motion.scale))
     at = {row: k for k, row in enumerate(read.row.tolist())}
     travel, sign = _travel(position_mm), np.zeros(len(read))
     for each in returns:
@@ -125,23 +119,6 @@ def _candidates(second: int, position_mm: FloatArray, travel: FloatArray) -> lis
     _, one = np.unique(np.round(position_mm[near] / SPACING_MM), return_index=True)
     thinned = near[one]
     return [int(i) for i in thinned[np.argsort(off[thinned])][:MOST_CANDIDATES]]
-
-
-def _read(
-    rows: IntArray,
-    table: CorrelationTable,
-    position_mm: FloatArray,
-    fitter: PlaneFitter,
-    coherence: Coherence | None,
-) -> SignedPairs:
-    """Planes of some pairs, as far as they are determined; their signs are not."""
-    first, second = table.first[rows], table.second[rows]
-    echoes = None
-    if coherence is not None:
-        # Structure is what the earlier visit saw of it.
-        echoes = PairEchoes(coherence, first.astype(float), position_mm[second] - position_mm[first])
-    planes = fitter.fit(table.correlation[rows], table.inplane[rows, :2], echoes)
-    return SignedPairs(rows, first, second, echoes, planes, np.ones(rows.size))[planes.determined]
 
 
 def _agreed(

@@ -13,7 +13,6 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.kernels.signs import PathRules, follow_paths
-from speckle3d.motion.coherence import PairEchoes
 from speckle3d.motion.planes import PairPlanes
 
 HYPOTHESES = 8
@@ -49,8 +48,6 @@ class SignedPairs:
         Of each pair in its `CorrelationTable`.
     first, second : ndarray of int, shape (e,)
         Its frames.
-    echoes : PairEchoes or None
-        With which correlations are read; None for a phantom's curves as they are.
     planes : PairPlanes
     sign : ndarray, shape (e,)
         +1 or -1.
@@ -59,7 +56,6 @@ class SignedPairs:
     row: IntArray
     first: IntArray
     second: IntArray
-    echoes: PairEchoes | None
     planes: PairPlanes
     sign: FloatArray
 
@@ -72,10 +68,15 @@ class SignedPairs:
             self.row[pairs],
             self.first[pairs],
             self.second[pairs],
-            None if self.echoes is None else self.echoes[pairs],
             self.planes[pairs],
             self.sign[pairs],
         )
+
+    @property
+    def signless(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """Frames, offset and slope along x of the planes, and their covariance, for `settled_path`."""
+        moved, covariance = self.planes.coefficients[:, :2], self.planes.covariance[:, :2, :2]
+        return self.first, self.second, moved, covariance
 
     def with_signs(self, sign: FloatArray) -> SignedPairs:
         """Return the same planes on other sides."""
@@ -89,7 +90,6 @@ class SignedPairs:
             np.concatenate([self.row, others.row]),
             np.concatenate([self.first, others.first]),
             np.concatenate([self.second, others.second]),
-            None if self.echoes is None or others.echoes is None else self.echoes.followed_by(others.echoes),
             self.planes.followed_by(others.planes),
             np.concatenate([self.sign, others.sign]),
         )

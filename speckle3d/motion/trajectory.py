@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.relative import RelativePoses
 from speckle3d.kernels.graph import PoseGraph, marginals, relax
@@ -122,13 +121,12 @@ def solve_trajectory(
 ) -> Trajectory:
     """Poses of all frames from all pairs: robust Gauss-Newton on the graph of relative poses.
 
-    Raises
-    ------
-    InsufficientDataError
-        If a frame is joined to no earlier one.
+    Frames that no pair joins to earlier ones lie between their neighbours.
     """
     s = settings or TrajectorySettings()
-    _require_connected(pairs.second, frames)
+    lone = np.flatnonzero(unjoined(pairs.second, frames))
+    after = lone[lone + 1 < frames]
+    pairs = joined(pairs, held(np.concatenate([lone - 1, after]), np.concatenate([lone, after + 1])))
     graph, poses = _graph(pairs, frames), _chain(pairs, frames, s.join == "chain")
     if s.join == "graph":
         relax(graph, poses, s.huber, ROUNDS, SETTLED)
@@ -137,16 +135,12 @@ def solve_trajectory(
     return Trajectory(centre * RigidTransform.from_matrix(poses) * centre.inv(), covariance)
 
 
-def _require_connected(second: IntArray, frames: int) -> None:
-    joined = np.zeros(frames, dtype=bool)
-    joined[0] = True
-    joined[second] = True
-    if not joined.all():
-        lost = int(np.flatnonzero(~joined)[0])
-        raise InsufficientDataError(
-            f"frame {lost}: expected speckle in common with an earlier frame, found none "
-            f"({int((~joined).sum())} of {frames} frames so)"
-        )
+def unjoined(second: IntArray, frames: int) -> BoolArray:
+    """Frames after the first that are the second of no pair, shape (n,)."""
+    lone = np.ones(frames, dtype=bool)
+    lone[0] = False
+    lone[second] = False
+    return lone
 
 
 def _chain(pairs: RelativePoses, frames: int, relative: bool) -> FloatArray:

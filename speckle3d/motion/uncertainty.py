@@ -13,13 +13,12 @@ from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHA
 from speckle3d.motion.planes import PairPlanes
 
 
-def pose_covariance(
+def claimed_covariance(
     poses: RigidTransform,
     independent: FloatArray,
     centre_mm: FloatArray,
-    scale_sigma: float,
-    slopes: SlopeEvidence,
-    share: float = 0.0,
+    shared: SharedErrors,
+    structure: float,
 ) -> FloatArray:
     """Covariance of every frame's pose against the first frame, shape (n, 6, 6).
 
@@ -32,32 +31,16 @@ def pose_covariance(
     poses : RigidTransform, length n
     independent : ndarray, shape (n, 6, 6)
         From `solve_trajectory`, in each frame's own axes.
-    scale_sigma : float
-        Relative standard deviation of the scale of distances.
-    share : float
+    shared : SharedErrors
+    structure : float
         Mean share of echoes that stay.
     """
     turn = np.zeros((len(poses), 6, 6))
     turn[:, :3, :3] = turn[:, 3:, 3:] = poses.rotation.as_matrix()
-    grown = SHARED * (1.0 + STRUCTURE * share)
+    grown = SHARED * (1.0 + STRUCTURE * structure)
     covariance = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
-    covariance += shared_covariance(poses, centre_mm, SharedErrors(scale_sigma, 0.0, slopes.deviation_per_mm))
+    covariance += shared_covariance(poses, centre_mm, shared)
     return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
-
-
-def with_common_scale(
-    covariance: FloatArray, poses: RigidTransform, centre_mm: FloatArray, sigma: float
-) -> FloatArray:
-    """Covariance of poses to which an error comes that stretches the whole sweep by one factor.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (n, 6, 6)
-        As from `pose_covariance`.
-    sigma : float
-        Relative standard deviation of the factor.
-    """
-    return covariance + shared_covariance(poses, centre_mm, SharedErrors(0.0, sigma, np.zeros(2)))
 
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:

@@ -1,7 +1,4 @@
-"""What the report shows: a study's numbers, and of each sweep its results, its own data and reslices.
-
-Reslices run along the sweep at the poses of every mode, with one detail of each enlarged.
-"""
+"""What the report shows: a study's numbers, and of each sweep its results and its patches."""
 
 from __future__ import annotations
 
@@ -14,33 +11,20 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ValidationError
-from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.core.doubts import Doubt
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import FramePairs, Reconstruction
-from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
-from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves
-from speckle3d.study.images import PIXEL_MM, cut_frames, grey_images, middle_planes, middle_vectors
+from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves, tracker_alone
+from speckle3d.study.results import VERSION, Summary, read_summary
 
 Record = Mapping[str, Any]
-
-DETAIL_PIXEL_MM = 0.04
-DETAIL_MM = 5.0
-"""Widest enlarged detail; four fifths as high."""
-
-_DETAIL_SHARE = 0.4
-"""Largest width of the detail as a share of the shortest reslice."""
-
-NEAR_FIELD_MM = 4.0
-_DYNAMIC_RANGE_DB = 55.0
 
 
 class StudyData(BaseModel, frozen=True):
@@ -61,7 +45,7 @@ class StudyData(BaseModel, frozen=True):
     """
 
     format: Literal["speckle3d.study"]
-    version: Literal[1]
+    version: Literal[2]
     sweeps: list[dict[str, Any]]
     doubts: list[dict[str, Any]] = []
     modes: list[str] = []
@@ -74,12 +58,12 @@ class StudyData(BaseModel, frozen=True):
     @property
     def done(self) -> list[dict[str, Any]]:
         """Entries of the sweeps with results."""
-        return [entry for entry in self.sweeps if entry.get("status") == "done"]
+        return [entry for entry in self.sweeps if entry["status"] == "done"]
 
     @property
     def broken(self) -> list[dict[str, Any]]:
         """Entries of the sweeps without results."""
-        return [entry for entry in self.sweeps if entry.get("status") != "done"]
+        return [entry for entry in self.sweeps if entry["status"] != "done"]
 
     @property
     def copies(self) -> dict[str, str]:
@@ -87,14 +71,10 @@ class StudyData(BaseModel, frozen=True):
         return {entry["name"]: entry["copy_of"] for entry in self.done if entry.get("copy_of")}
 
     @property
-    def single(self) -> list[dict[str, Any]]:
-        """Rows of all sweeps but copies."""
-        return [row for row in self.rows if row["sweep"] not in self.copies]
-
-    @property
-    def references(self) -> dict[str, str]:
-        """What each sweep was compared with, copies left out."""
-        return {row["sweep"]: row["reference"] for row in self.single if row.get("reference")}
+    def scored(self) -> list[dict[str, Any]]:
+        """Rows with an error of length, of all sweeps but copies."""
+        known = [row for row in self.rows if row.get("length_error_percent") is not None]
+        return [row for row in known if row["sweep"] not in self.copies]
 
 
 @dataclass(frozen=True)
@@ -122,18 +102,15 @@ class SweepView:
     Attributes
     ----------
     poses : dict of str to RigidTransform, each of length n
-        By mode, in their own worlds; the reference under its own name, if it covers every frame.
-    sweep : Sweep or None
-        None where the file is gone or changed; `notes` then says so.
+        By mode, in their own worlds; the tracker's and the reference's, too, if they cover every frame.
     """
 
     folder: Path
     reconstruction: Reconstruction
+    summary: Summary
     curves: SweepCurves
     poses: dict[str, RigidTransform]
     rejected: RejectedPatches | None
-    sweep: Sweep | None
-    details: Record
     notes: list[str] = field(default_factory=list)
 
 
@@ -143,7 +120,7 @@ def read_study(directory: Path) -> StudyData:
     Raises
     ------
     InvalidInputError
-        If there is none, or it is not a study's.
+        If there is none, or it is not a study's, or one of an older version.
     """
     path = directory / "study.json"
     if not path.is_file():
@@ -153,8 +130,11 @@ def read_study(directory: Path) -> StudyData:
     except ValidationError as error:
         first = error.errors()[0]
         name, got = ".".join(map(str, first["loc"])), repr(first["input"])[:60]
-        raise InvalidInputError(f"{path}: {name}: {first['msg']}, got {got}") from error
-    except (ValueError, RecursionError) as error:
+        raise InvalidInputError(
+            f"{path}: {name}: {first['msg']}, got {got}: a study of version {VERSION} is made by "
+            "`speckle3d compare`"
+        ) from error
+    except ValueError as error:
         raise InvalidInputError(f"{path}: expected JSON, got an error: {error}") from error
 
 
@@ -173,42 +153,35 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     Speckle3DError
         If its reconstruction cannot be read.
     """
-    folder = _inside(directory, str(entry["folder"]))
-    found = read_reconstruction(folder / "reconstruction.h5")
-    details = _read_details(folder)
-    notes = [Doubt(**each).consequence for each in details.get("doubts", ())]
-    notes += [f"Mode {mode} is left out." for mode in details.get("left_out", ())]
-    sweep = _open_sweep(directory, entry, found, notes)
-    reference = None
-    if sweep is not None and details.get("reference") != "none":
-        try:
-            reference = find_reference(sweep, details.get("reference"))
-        except Speckle3DError as error:
-            notes.append(f"The reference cannot be read: {error}")
-    own = dict(found.poses)
-    if reference is not None and reference.covered.all():
-        own[reference.name] = reference.world_from_image
-    covariance = None if found.trust is None else found.trust.covariance
-    if found.trust is not None:
-        notes += [f"{line}: poses there are guesses" for line in describe(found.trust.flags)]
-    return SweepView(
-        folder=folder,
-        reconstruction=found,
-        curves=sweep_curves(found.poses, found.grid.centre_mm, reference, covariance),
-        poses=own,
-        rejected=None if found.pairs is None else rejected_patches(found.pairs, found.frame_time_s.size),
-        sweep=sweep,
-        details=details,
-        notes=notes,
-    )
-
-
-def _inside(directory: Path, name: str) -> Path:
-    """Folder of a sweep's results, which is nowhere but in the study's."""
-    folder = directory / name
+    folder = directory / str(entry["folder"])
     if not folder.resolve().is_relative_to(directory.resolve()):
-        raise InvalidInputError(f"{directory}: expected a folder in the study's own, got {name!r}")
-    return folder
+        raise InvalidInputError(f"{directory}: expected a folder in the study's own, got {entry['folder']!r}")
+    made = read_reconstruction(folder / "reconstruction.h5")
+    summary, reference, poses = read_summary(folder, str(entry["name"])), None, dict(made.poses)
+    notes = list(summary.lines)
+    try:
+        sweep = _open_sweep(directory, str(entry["path"]), made)
+        alone = tracker_alone(sweep)
+        if alone is not None and any(row.mode == "tracker" for row in summary.rows):
+            poses["tracker"] = alone
+        reference = None if summary.reference == "none" else find_reference(sweep, summary.reference)
+        if reference is not None and reference.covered.all():
+            poses[reference.name] = reference.world_from_image
+    except Speckle3DError as error:
+        notes.append(f"{error}: neither the reference nor the tracker is in its curves")
+    covariance = None if made.trust is None else made.trust.covariance
+    if made.trust is not None:
+        notes += [f"{line}: poses there are guesses" for line in describe(made.trust.flags)]
+    own = poses if reference is None else {m: p for m, p in poses.items() if m != reference.name}
+    return SweepView(
+        folder,
+        made,
+        summary,
+        sweep_curves(own, made.grid.centre_mm, reference, covariance),
+        poses,
+        None if made.pairs is None else rejected_patches(made.pairs, made.frame_time_s.size),
+        notes,
+    )
 
 
 def rejected_patches(pairs: FramePairs, frames: int) -> RejectedPatches:
@@ -225,114 +198,11 @@ def _share(part: npt.ArrayLike, whole: npt.ArrayLike) -> FloatArray:
     return np.asarray(np.divide(part, counts, out=np.full(counts.shape, np.nan), where=counts > 0))
 
 
-def _read_details(folder: Path) -> Record:
-    """Read the sweep's summary as a mapping; empty where it is missing or cannot be read."""
-    try:
-        (summary,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return {}
-    return summary if isinstance(summary, dict) else {}
-
-
-def _open_sweep(directory: Path, entry: Record, found: Reconstruction, notes: list[str]) -> Sweep | None:
-    stored = Path(str(entry["path"]))
-    path = stored if stored.exists() else directory / stored
-    missing = "so there is no reference in its curves and there are no reslices"
+def _open_sweep(directory: Path, stored: str, made: Reconstruction) -> Sweep:
+    """Open the sweep that was reconstructed, where the study found it or from the study's folder."""
+    path = Path(stored) if Path(stored).exists() else directory / stored
     if not path.exists():
-        notes.append(f"The sweep is no longer at {stored}, {missing}.")
-        return None
-    try:
-        if recording_sha256(path) != found.provenance.input_sha256:
-            notes.append(f"The sweep at {stored} is no longer the one that was reconstructed, {missing}.")
-            return None
-        return apply_calibrations(load_sweep(path), [c.path for c in found.provenance.calibrations])[0]
-    except Speckle3DError as error:
-        notes.append(f"The sweep cannot be read ({error}), {missing}.")
-        return None
-
-
-@dataclass(frozen=True)
-class Cut:
-    """A reslice, its enlarged detail and where in the reslice that lies.
-
-    Attributes
-    ----------
-    image, detail : ndarray of float32, shape (rows, columns)
-        Grey levels 0 to 255, NaN where no frame reached.
-    extent_mm : (width, height)
-    corner_mm, size_mm : ndarray, shape (2,)
-        Top left of the detail, along the sweep and in depth from the reslice's own top left, and its sides.
-    """
-
-    image: Float32Array
-    extent_mm: tuple[float, float]
-    detail: Float32Array
-    corner_mm: FloatArray
-    size_mm: FloatArray
-
-
-@dataclass(frozen=True)
-class Cuts:
-    """The cuts of all modes, and one image of the sweep."""
-
-    by_mode: dict[str, Cut]
-    depth_mm: float
-    middle: Float32Array
-    grid: ImageGrid
-
-
-def cut_modes(view: SweepView) -> Cuts | None:
-    """Reslice the sweep at its middle vector in every mode; None where the sweep itself is gone.
-
-    The detail shows the place of most contrast in the most trusted trajectory (the reference, else the last
-    mode), and the same place of the same frame in all others.
-    """
-    if view.sweep is None:
-        return None
-    images = grey_images(view.sweep, _DYNAMIC_RANGE_DB, reconstruction=view.reconstruction)
-    first, grid = middle_vectors(images.grid)
-    left = RigidTransform.from_translation([first * grid.vector_pitch_mm, 0.0, 0.0])
-    # The middle vectors, made once for all modes: a sweep of a thousand whole images need not fit in memory.
-    chosen = slice(first, first + grid.vectors)
-    strip = [np.rint(images[i][chosen]).astype(np.uint8) for i in range(len(view.sweep))]
-    poses = {mode: each * left for mode, each in view.poses.items()}
-    planes = middle_planes(poses, grid)
-    whole = {mode: cut_frames(strip, grid, poses[mode], planes[mode]) for mode in poses}
-    width_mm = min(DETAIL_MM, _DETAIL_SHARE * min(plane.width_mm for plane in planes.values()))
-    size_mm = np.array([1.0, 0.8]) * max(width_mm, 10 * DETAIL_PIXEL_MM)
-    last = list(planes)[-1]
-    frame, depth_mm = _detail_place(poses[last], planes[last], whole[last], grid, size_mm)
-    by_mode = {}
-    for mode, plane in planes.items():
-        point = np.array([grid.width_mm / 2, depth_mm, 0.0])
-        centre = plane.world_from_plane.inv().apply(poses[mode][frame].apply(point))[:2]
-        corner = centre - size_mm / 2
-        placed = plane.world_from_plane * RigidTransform.from_translation([*corner, 0.0])
-        window = ReslicePlane(placed, float(size_mm[0]), float(size_mm[1]), DETAIL_PIXEL_MM)
-        detail = cut_frames(strip, grid, poses[mode], window)
-        by_mode[mode] = Cut(whole[mode], (plane.width_mm, plane.height_mm), detail, corner, size_mm)
-    return Cuts(by_mode, depth_mm, images[len(view.sweep) // 2], images.grid)
-
-
-def _detail_place(
-    poses: RigidTransform, plane: ReslicePlane, image: Float32Array, grid: ImageGrid, size_mm: FloatArray
-) -> tuple[int, float]:
-    """Frame and depth of the place with most contrast between its parts, speckle smoothed away."""
-    seen = np.isfinite(image)
-    if not seen.any():
-        return len(poses) // 2, float(grid.centre_mm[1])
-    # Where nothing was seen, the mean stands in, or the rim would have the greatest contrast.
-    smooth = gaussian_filter(np.where(seen, image, image[seen].mean()), 0.4 / PIXEL_MM)
-    size = [max(1, round(side / PIXEL_MM)) for side in size_mm[::-1]]
-    spread = uniform_filter(smooth**2, size) - uniform_filter(smooth, size) ** 2
-    # Only windows that lie wholly on images: the rim of the reslice has contrast but no content.
-    inside = uniform_filter(seen.astype(float), size, mode="constant") > 0.999
-    # The contrast of the near field is the probe's own.
-    inside[: int((NEAR_FIELD_MM + size_mm[1] / 2) / PIXEL_MM)] = False
-    if not inside.any():
-        return len(poses) // 2, float(grid.centre_mm[1])
-    row, column = np.unravel_index(int(np.argmax(np.where(inside, spread, -1.0))), image.shape)
-    point = plane.world_from_plane.apply([column * PIXEL_MM, row * PIXEL_MM, 0.0])
-    in_image = poses.inv().apply(point)
-    frame = int(np.argmin(np.abs(in_image[:, 2])))
-    return frame, float(np.clip(in_image[frame, 1], grid.first_sample_depth_mm, grid.depth_mm))
+        raise InvalidInputError(f"{stored}: expected the sweep, got no file")
+    if recording_sha256(path) != made.provenance.input_sha256:
+        raise InvalidInputError(f"{stored}: expected the sweep that was reconstructed, got another")
+    return apply_calibrations(load_sweep(path), [c.path for c in made.provenance.calibrations])[0]

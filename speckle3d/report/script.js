@@ -11,7 +11,7 @@
     const source = document.getElementById(figure.dataset.plot);
     if (figure.classList.contains("drawn") || !source) return;
     const plot = JSON.parse(source.textContent);
-    // Without WebGL the picture in space stays the printed one.
+    // Without WebGL there is no picture in space.
     if (plot.data.some((trace) => trace.type === "scatter3d") && !drawable) return;
     figure.classList.add("drawn");
     Plotly.newPlot(figure.querySelector(".plot"), plot.data, plot.layout, options);
@@ -54,6 +54,8 @@
     });
   });
   window.addEventListener("hashchange", fromAddress);
+  // On paper every sweep is shown.
+  window.addEventListener("beforeprint", () => document.querySelectorAll("figure[data-plot]").forEach(draw));
   document.querySelectorAll("main > figure[data-plot]").forEach(draw);
   if (sweeps.length) choose(sweeps[0].id);
   fromAddress();

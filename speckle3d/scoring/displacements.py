@@ -34,8 +34,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -47,49 +46,51 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.challenge import Landmarks
-from speckle3d.scoring.references import Reference
+
+MEANINGS = {
+    "FDR_percent": "final drift rate: drift of the image's centre at the end, in per cent of the path",
+    "ADR_percent": "average drift rate: mean over frames of the drift in per cent of the path so far",
+    "MD_mm": "maximum drift of the image's centre",
+    "SD_mm": "sum of the drift over the frames; it grows with their number",
+    "HD_mm": "Hausdorff distance of the two sets of image centres",
+    "EA_deg": "mean angle between estimated and true images",
+    "GPE_mm": "global pixel error: mean shift of the pixels, from the first frame on",
+    "GLE_mm": "global landmark error: the same at landmarks",
+    "LPE_mm": "local pixel error: mean shift of the pixels from one frame to the next",
+    "LLE_mm": "local landmark error: the same at landmarks",
+}
+"""What each error is, in a line, for the places where it is printed."""
 
 CHALLENGE_ERRORS = ("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm")
 
 
-class PointErrors(NamedTuple):
-    """Displacement errors, mm.
-
-    `global_mm` compares poses relative to the first frame (GPE, or GLE at landmarks), `local_mm` poses
-    relative to the frame before (LPE, LLE).
-    """
-
-    global_mm: float
-    local_mm: float
-
-
-def pixel_errors(world_from_image: RigidTransform, reference: RigidTransform, grid: ImageGrid) -> PointErrors:
-    """GPE and LPE: displacement errors over every pixel of the images."""
+def pixel_errors(
+    world_from_image: RigidTransform, reference: RigidTransform, grid: ImageGrid
+) -> tuple[float, float]:
+    """GPE and LPE, mm: displacement errors over every pixel of the images."""
     whole, steps = _differences(world_from_image, reference)
-    return PointErrors(_mean_over_pixels(whole, grid), _mean_over_pixels(steps, grid))
+    return _mean_over_pixels(whole, grid), _mean_over_pixels(steps, grid)
 
 
 def landmark_errors(
     world_from_image: RigidTransform, reference: RigidTransform, landmarks: Landmarks
-) -> PointErrors:
-    """GLE and LLE: displacement errors of landmarks, from frame 1 on: the first frame has no error.
+) -> tuple[float, float]:
+    """GLE and LLE, mm: displacement errors of landmarks, from frame 1 on: the first frame has no error.
 
     Raises
     ------
     InvalidInputError
         If there are no landmarks, or one is in no frame that has an error.
     """
-    at, points = landmarks.frame, landmarks.points_mm
-    whole, steps = _differences(world_from_image, reference)
+    at, points, last = landmarks.frame, landmarks.points_mm, len(reference) - 1
     if not at.size:
         raise InvalidInputError("landmarks: expected at least one, got none")
-    if (wrong := np.flatnonzero((at < 1) | (at > len(whole)))).size:
-        raise InvalidInputError(
-            f"landmark {wrong[0]}: expected a frame from 1 to {len(whole)}, got {at[wrong[0]]}"
-        )
-    errors = (each[at - 1, :, 3] + np.einsum("pij,pj->pi", each[at - 1, :, :3], points)
-              for each in (whole, steps))  # fmt: skip
-    return PointErrors(*(float(np.linalg.norm(each, axis=1).mean()) for each in errors))
+    if (wrong := np.flatnonzero((at < 1) | (at > last))).size:
+        raise InvalidInputError(f"landmark {wrong[0]}: expected a frame from 1 to {last}, got {at[wrong[0]]}")
+    whole, steps = (each[at - 1] for each in _differences(world_from_image, reference))
+    shifts = (each[:, :, 3] + np.einsum("pij,pj->pi", each[:, :, :3], points) for each in (whole, steps))
+    global_mm, local_mm = (float(np.linalg.norm(each, axis=1).mean()) for each in shifts)
+    return global_mm, local_mm
 
 
 def drift_rates(
@@ -116,14 +117,14 @@ def drift_rates(
     """
     centre = np.asarray(centre_mm, dtype=float)
     _require_comparable(world_from_image, reference)
-    found, true = (p[0].inv() * p for p in (world_from_image, reference))
-    path, estimated = true.apply(centre), found.apply(centre)
+    estimate, true = (p[0].inv() * p for p in (world_from_image, reference))
+    path, estimated = true.apply(centre), estimate.apply(centre)
     travelled = np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))
     if not travelled[-1] > 0:
         raise InsufficientDataError("drift rates: expected a reference that moves, got one that rests")
     drift = np.linalg.norm(estimated - path, axis=1)[1:]
     moved = travelled > 0
-    angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * found.rotation).magnitude())[1:])
+    angle = np.rad2deg(np.atleast_1d((true.rotation.inv() * estimate.rotation).magnitude())[1:])
     return {
         "FDR_percent": float(100.0 * drift[-1] / travelled[-1]),
         "ADR_percent": float(100.0 * np.mean(drift[moved] / travelled[moved])),
@@ -132,35 +133,6 @@ def drift_rates(
         "HD_mm": max(directed_hausdorff(a, b)[0] for a, b in ((estimated, path), (path, estimated))),
         "EA_deg": float(angle.mean()),
     }
-
-
-def drift_rows(
-    grid: ImageGrid,
-    poses: Mapping[str, RigidTransform],
-    reference: Reference,
-    landmarks: Landmarks | None = None,
-) -> list[dict[str, Any]]:
-    """Drift rates and displacement errors of every mode over the frames that have a reference.
-
-    Parameters
-    ----------
-    grid : ImageGrid
-    poses : mapping of str to RigidTransform, each of length n
-        ``world_from_image`` by mode.
-    reference : Reference
-    landmarks : Landmarks, optional
-        Left out where the reference has gaps that landmarks could fall into.
-
-    Returns
-    -------
-    list of dict
-        ``mode``, and what `score_row` gives.
-    """
-    marks = landmarks if reference.covered.all() else None
-    return [
-        {"mode": mode, **score_row(each[reference.covered], reference.world_from_image, grid, marks)}
-        for mode, each in poses.items()
-    ]
 
 
 def score_row(
@@ -199,25 +171,20 @@ def challenge_score(
     ----------
     .. [1] TUS-REC challenge 2025, assessment criteria, ranking method.
     """
-    found = _point_row(poses, true, grid, landmarks)
+    errors = _point_row(poses, true, grid, landmarks)
     resting = _point_row(RigidTransform.identity(len(true)), true, grid, landmarks)
     for key in CHALLENGE_ERRORS:
         if not resting[key] > 0:
             raise InsufficientDataError(f"{key}: expected a reference that moves, got one that rests")
-    return float(np.mean([(resting[key] - found[key]) / resting[key] for key in CHALLENGE_ERRORS]))
+    return float(np.mean([1 - errors[key] / resting[key] for key in CHALLENGE_ERRORS]))
 
 
 def _point_row(
     poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None
 ) -> dict[str, Any]:
-    pixels = None if grid is None else pixel_errors(poses, true, grid)
-    marks = None if landmarks is None else landmark_errors(poses, true, landmarks)
-    return {
-        "GPE_mm": pixels and pixels.global_mm,
-        "GLE_mm": marks and marks.global_mm,
-        "LPE_mm": pixels and pixels.local_mm,
-        "LLE_mm": marks and marks.local_mm,
-    }
+    pixels = (None, None) if grid is None else pixel_errors(poses, true, grid)
+    marks = (None, None) if landmarks is None else landmark_errors(poses, true, landmarks)
+    return dict(zip(CHALLENGE_ERRORS, (pixels[0], marks[0], pixels[1], marks[1]), strict=True))
 
 
 def _differences(
@@ -233,21 +200,15 @@ def _differences(
 
 def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:
     """Mean length of the differences over all pixels, a frame at a time."""
-    x, y = (
-        (np.arange(n) - (n - 1) / 2) * spacing
-        for n, spacing in ((grid.vectors, grid.vector_pitch_mm), (grid.samples, grid.sample_spacing_mm))
-    )
+    x = (np.arange(grid.vectors) - (grid.vectors - 1) / 2) * grid.vector_pitch_mm
+    y = (np.arange(grid.samples) - (grid.samples - 1) / 2) * grid.sample_spacing_mm
     at_centre = differences[:, :, :3] @ grid.centre_mm + differences[:, :, 3]
-    squares = np.empty((grid.vectors, grid.samples))
     total = 0.0
     for across, down, middle in zip(differences[:, :, 0], differences[:, :, 1], at_centre, strict=True):
         # |m + a x + d y|^2 in powers of y: three passes over the image in place of nine.
         along = middle + x[:, None] * across
-        np.add.outer(2.0 * along @ down, down @ down * y, out=squares)
-        squares *= y
-        squares += (along**2).sum(axis=1)[:, None]
-        np.sqrt(np.maximum(squares, 0.0, out=squares), out=squares)
-        total += float(squares.mean())
+        squares = ((along**2).sum(axis=1)[:, None] + 2.0 * (along @ down)[:, None] * y) + down @ down * y**2
+        total += float(np.sqrt(np.maximum(squares, 0.0)).mean())
     return total / len(differences)
 
 

@@ -5,14 +5,17 @@ before it, moves by a signed z; length is the running sum. Tilt, yaw and roll ar
 same relative poses' angles. They need no common world, so a reconstruction without any sensor can be
 compared, and they are the axes of figure 6 and of tables 3 and 4 of Housden et al. 2008.
 
-Because the steps are signed, a sensor's jitter does not add up: all but that of the first and the last frame
-cancels, and that is averaged away (see `compare_modes`).
+**How an end is read** (`read_end`), the same for every mode and for the reference: off a robust line through
+the frames there, at most a tenth of the part and at most `END_FRAMES`, *at* the end frame; against an exact
+reference, the end frame as it is. Mode `tracker`, the position sensor alone, is read off lines always, so
+that it has one length. Steps are signed, so of a tracker's jitter all but that of the two ends cancels, and
+the lines average that. No number of the reference depends on an estimate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +26,10 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import relative_poses, require_finite, roll_yaw_tilt
+from speckle3d.core.leastsquares import robust_sigma
+
+TRACKER = "tracker"
+"""Mode of the position sensor alone: no images, no correction."""
 
 JITTER_FRAMES = 9
 """Frames over which a sensor's jitter is averaged to find turning points: a third of a second."""
@@ -31,9 +38,18 @@ HYSTERESIS_MM = 0.5
 """How far the probe must come back for a turn to count."""
 
 END_FRAMES = 25
-"""Frames of the line that reads a jittery reference at the ends of a part. On simulated hand sweeps of 20 mm
-with a tracker's 0.15 mm and 0.1 degrees per axis, 1, 9, 25 and 51 frames leave 0.29, 0.16, 0.10 and 0.08 mm
-of scoring error; against an exact reference the same lines cost 0, 0.006, 0.03 and 0.05 mm."""
+"""Most frames of the line that reads an end. On 60 simulated hand sweeps of 400 frames and 20 mm, with a
+tracker's 0.15 mm and 0.1 degrees per axis, lines of at most 1, 9, 25 and 51 frames (and a tenth of the sweep)
+leave 0.34, 0.14, 0.09 and 0.13 mm RMS of error in the tracker's own length."""
+
+_THIRD_DIFFERENCES = np.sqrt(20.0)
+"""Of white noise of unit standard deviation: 1 + 9 + 9 + 1 under the root."""
+
+_FEWEST_READINGS = 8
+
+_LINE_EXCESS = 1.25
+"""Variance of a Theil-Sen line's end over that of least squares in white noise: 1.13 to 1.25 for 3 to 25
+samples, in 20,000 trials each."""
 
 
 class Accumulated(NamedTuple):
@@ -73,6 +89,9 @@ class ModeError:
     length_error_mm, length_error_percent : float
     tilt_error_deg, yaw_error_deg, roll_error_deg : float
         Of the turn over the part, about the image's x, y and z.
+    reference_sigma_mm : float
+        Standard deviation of the reference's length by its own jitter; 0 if it is exact. What a tracker's
+        calibration adds is not in it.
     """
 
     part: str
@@ -85,12 +104,18 @@ class ModeError:
     tilt_error_deg: float
     yaw_error_deg: float
     roll_error_deg: float
+    reference_sigma_mm: float = 0.0
 
     @classmethod
-    def of_estimate(cls, mode: str, frames: int, estimate_mm: float) -> ModeError:
-        """Row of a whole sweep without a reference: the estimate alone, errors NaN."""
+    def of_estimate(cls, part: str, mode: str, frames: int, estimate_mm: float) -> ModeError:
+        """Row without a reference: the estimate alone, errors NaN."""
         nan = float("nan")
-        return cls("all", mode, frames, nan, abs(estimate_mm), nan, nan, nan, nan, nan)
+        return cls(part, mode, frames, nan, abs(estimate_mm), nan, nan, nan, nan, nan)
+
+    def of_reference(self, mode: str) -> ModeError:
+        """Row of the reference itself under a mode's name: its length, errors NaN."""
+        row = ModeError.of_estimate(self.part, mode, self.frames, self.reference_mm)
+        return replace(row, reference_mm=self.reference_mm, reference_sigma_mm=self.reference_sigma_mm)
 
 
 def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> Accumulated:
@@ -132,8 +157,6 @@ def monotone_parts(length_mm: npt.ArrayLike, jitter_frames: int = JITTER_FRAMES)
     """
     length = np.asarray(length_mm, dtype=float)
     require_finite(length, "length_mm")
-    if length.ndim != 1 or length.size < 2:
-        raise InvalidInputError(f"length_mm: expected shape (n,) with n > 1, got {length.shape}")
     width = min(jitter_frames, length.size)
     smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
     edges = [0, *_turning_frames(smooth), length.size - 1]
@@ -150,23 +173,20 @@ def compare_modes(
 ) -> list[ModeError]:
     """Errors of length, tilt, yaw and roll of every mode in every monotone part.
 
-    The error of a part is the change of (estimate - reference) between its ends. Estimates are smooth from
-    frame to frame and so is their drift; a tracker is not. The difference at each end is therefore read off
-    a line through its last `end_frames` frames inside the part, by the median of pairwise slopes so that
-    single bad readings do no harm. The reference's length is the first mode's minus its error. For an
-    exact reference pass ``end_frames=1``: the end frames as they are.
+    Lengths and turns of a part are changes between its ends, read as the module says, of the estimate and of
+    the reference alike. For an exact reference pass ``end_frames=1``: the end frames as they are.
 
     Parameters
     ----------
     poses : mapping of str to RigidTransform, length n
-        ``world_from_image`` by mode, mm, in any world; put a jitter-free one (`image`) first.
+        ``world_from_image`` by mode, mm, in any world.
     reference : RigidTransform, length n or the number of covered frames
     centre_mm : array_like, shape (3,)
         Image centre in the image frame.
     covered : array_like of bool, shape (n,), optional
         Which frames have a reference; the others are left out of every sum.
     end_frames : int
-        Frames of the line at each end of a part; 1 for an exact reference.
+        Most frames of the line at each end of a part; 1 for an exact reference.
 
     Returns
     -------
@@ -206,20 +226,83 @@ def compare_modes(
     for mode, each in poses.items():
         if len(each) != frames:
             raise MismatchError(f"mode {mode}: expected {frames} poses, got {len(each)}")
-    if len(reference) == frames:
-        reference = reference[used]
-    if len(reference) != used.sum():
-        raise MismatchError(f"reference: expected {used.sum()} poses, got {len(reference)}")
-    true = accumulated(reference, centre_mm)
+    true_poses = reference[used] if len(reference) == frames else reference
+    if len(true_poses) != used.sum():
+        raise MismatchError(f"reference: expected {used.sum()} poses, got {len(true_poses)}")
+    true = accumulated(true_poses, centre_mm)
+    jitter = 0.0 if end_frames == 1 else jitter_mm(true.length_mm)
     estimates = {mode: accumulated(each[used], centre_mm) for mode, each in poses.items()}
-    carrier = next(iter(estimates.values())).length_mm
-    rows: list[ModeError] = []
+    rows = []
     for part in monotone_parts(true.length_mm):
-        reference_mm = _change(carrier, part, 1) + _change(true.length_mm - carrier, part, end_frames)
-        for mode, found in estimates.items():
-            errors = [_change(a - b, part, end_frames) for a, b in zip(found, true, strict=True)]
-            rows.append(_mode_error(part, mode, reference_mm, errors))
+        true_changes = _changes(true, part, end_frames)
+        sigma_mm = jitter * _end_factor(part.last - part.first + 1, end_frames)
+        for mode, estimate in estimates.items():
+            changes = _changes(estimate, part, END_FRAMES if mode == TRACKER else end_frames)
+            rows.append(_mode_error(part, mode, changes, true_changes, sigma_mm))
     return rows
+
+
+def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
+    """Last of some values, read off a Theil-Sen line through the last of them.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        Of a part of a sweep; a tenth of them lie on the line.
+    end_frames : int
+        Most values on the line.
+    """
+    end = values[-_width(values.size, end_frames) :]
+    # scipy.stats.theilslopes gives the same bits, but takes 200 microseconds in place of 40 (25 samples) and
+    # 0.5 s to import, which nothing else in a reconstruction needs.
+    if end.size < 3:
+        return float(end[-1])
+    i, j = np.triu_indices(end.size, 1)
+    slope = np.median((end[j] - end[i]) / (j - i))
+    return float(np.median(end - slope * (np.arange(end.size) - (end.size - 1))))
+
+
+def jitter_mm(length_mm: FloatArray) -> float:
+    """Standard deviation of a tracker's jitter along the sweep, mm; NaN for fewer than eight readings.
+
+    It is told from third differences: a hand is too smooth to have any at 25 frames/s, white noise of
+    standard deviation s gives them ``sqrt(20) s``.
+
+    Parameters
+    ----------
+    length_mm : ndarray, shape (n,)
+        Accumulated by the tracker; its steps telescope, so that one reading's jitter is in one value.
+    """
+    if length_mm.size < _FEWEST_READINGS:
+        return float("nan")
+    return robust_sigma(np.diff(length_mm, 3)) / float(_THIRD_DIFFERENCES)
+
+
+def _width(size: int, end_frames: int) -> int:
+    return max(1, min(end_frames, size // 10))
+
+
+def _end_factor(size: int, end_frames: int) -> float:
+    """Standard deviation of a part's change over that of a reading: of two ends of least-squares lines."""
+    width = _width(size, end_frames)
+    variance = _LINE_EXCESS * (4 * width - 2) / (width * (width + 1)) if width > 2 else 1.0
+    return float(np.sqrt(2.0 * variance))
+
+
+def _changes(motion: Accumulated, part: Part, end_frames: int) -> list[float]:
+    """Change of length, tilt, yaw and roll from the first to the last frame of a part."""
+    inside = [each[part.first : part.last + 1] for each in motion]
+    return [read_end(each, end_frames) - read_end(each[::-1], end_frames) for each in inside]
+
+
+def _mode_error(part: Part, mode: str, changes: list[float], true: list[float], sigma_mm: float) -> ModeError:
+    reference_mm, sign = abs(true[0]), -1.0 if true[0] < 0 else 1.0
+    error_mm = sign * (changes[0] - true[0])
+    percent = 100.0 * error_mm / reference_mm if reference_mm else float("nan")
+    lengths = reference_mm, reference_mm + error_mm, error_mm, percent
+    tilt, yaw, roll = np.rad2deg(np.subtract(changes[1:], true[1:])).tolist()
+    frames = part.last - part.first + 1
+    return ModeError(part.name, mode, frames, *lengths, tilt, yaw, roll, sigma_mm)
 
 
 def _turning_frames(length: FloatArray) -> list[int]:
@@ -237,32 +320,3 @@ def _turning_frames(length: FloatArray) -> list[int]:
             turns += [lowest] if direction else []
             direction, highest = 1, i
     return turns
-
-
-def _mode_error(part: Part, mode: str, reference_mm: float, errors: Sequence[float]) -> ModeError:
-    """Row of a part from its signed length and the errors of length (mm), tilt, yaw and roll (rad)."""
-    length_mm = abs(reference_mm)
-    error_mm = -errors[0] if reference_mm < 0 else errors[0]
-    percent = 100.0 * error_mm / length_mm if length_mm else float("nan")
-    frames = part.last - part.first + 1
-    turns_deg = np.rad2deg(errors[1:]).tolist()
-    return ModeError(part.name, mode, frames, length_mm, length_mm + error_mm, error_mm, percent, *turns_deg)
-
-
-def _change(values: FloatArray, part: Part, end_frames: int) -> float:
-    """Change of `values` from the first to the last frame of a part, each read off a robust line."""
-    inside = values[part.first : part.last + 1]
-    width = max(1, min(end_frames, inside.size // 2))
-    return _line_end(inside[-width:]) - _line_end(inside[:width][::-1])
-
-
-def _line_end(values: FloatArray) -> float:
-    """Value at the last sample of a Theil-Sen line through `values`."""
-    # scipy.stats.theilslopes gives the same bits, but takes 200 microseconds in place of 40 (25 samples) and
-    # 0.5 s to import, which nothing else in a reconstruction needs.
-    if values.size < 3:
-        return float(values[-1])
-    i, j = np.triu_indices(values.size, 1)
-    slope = np.median((values[j] - values[i]) / (j - i))
-    back = np.arange(values.size) - (values.size - 1)
-    return float(np.median(values - slope * back))

@@ -16,7 +16,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
-from speckle3d.scoring.lengths import JITTER_FRAMES, accumulated
+from speckle3d.scoring.lengths import END_FRAMES, accumulated, read_end
 
 REFERENCES = ("tracker", "truth")
 
@@ -38,6 +38,11 @@ class Reference:
     name: str
     world_from_image: RigidTransform
     covered: BoolArray
+
+    @property
+    def end_frames(self) -> int:
+        """Most frames of the line that reads an end of a part: 1 for the truth, which is exact."""
+        return 1 if self.name == "truth" else END_FRAMES
 
 
 @shown
@@ -102,6 +107,14 @@ def find_reference(sweep: Sweep, wanted: str | None = None) -> Reference | None:
     return None
 
 
+def tracker_alone(sweep: Sweep) -> RigidTransform | None:
+    """Poses by the position sensor alone, no images; None unless it is calibrated and covers every frame."""
+    tracker, times = sweep.tracker, sweep.frame_time_s
+    if tracker is None or tracker.sensor_from_image is None or not tracker.covers(times).all():
+        return None
+    return tracker.world_from_image(times)
+
+
 def sweep_curves(
     poses: Mapping[str, RigidTransform],
     centre_mm: npt.ArrayLike,
@@ -117,6 +130,8 @@ def sweep_curves(
     centre_mm : array_like, shape (3,)
         Image centre in the image frame.
     reference : Reference, optional
+        A tracker's curves begin where the line through its first readings does (`lengths.read_end`), not at
+        the first reading, whose jitter they would carry throughout.
     covariance : ndarray, shape (n, 6, 6), optional
         Of the poses of mode `image`: (x, y, z) in mm and (tilt, yaw, roll) in radians.
 
@@ -125,40 +140,30 @@ def sweep_curves(
     MismatchError
         If the reference is not of the same frames.
     """
-    modes = {mode: _accumulated(each, centre_mm) for mode, each in poses.items()}
+    modes = {mode: _curves(each, centre_mm) for mode, each in poses.items()}
     half_width = None
     if covariance is not None and "image" in modes:
         half_width = 1.96 * _in_degrees(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T[2:])
     if reference is None:
         return SweepCurves(modes, half_width=half_width)
-    shown = _reference_curves(reference, next(iter(modes.values())), centre_mm)
-    return SweepCurves(modes, shown, reference.name, half_width)
+    covered, frames = reference.covered, next(iter(modes.values())).shape[1]
+    if covered.shape != (frames,) or len(reference.world_from_image) != covered.sum():
+        raise MismatchError(
+            f"reference: expected {covered.sum()} poses for {frames} frames, "
+            f"got {len(reference.world_from_image)}"
+        )
+    curves = np.full((4, frames), np.nan)
+    curves[:, covered] = _curves(reference.world_from_image, centre_mm, reference.end_frames)
+    return SweepCurves(modes, curves, reference.name, half_width)
 
 
-def _accumulated(poses: RigidTransform, centre_mm: npt.ArrayLike) -> FloatArray:
-    return _in_degrees(np.stack(accumulated(poses, centre_mm)))
+def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int = 1) -> FloatArray:
+    """Length (mm), tilt, yaw and roll (degrees), shape (4, n), zero where the first end is read."""
+    curves = _in_degrees(np.stack(accumulated(poses, centre_mm)))
+    start = np.array([[read_end(each[::-1], end_frames)] for each in curves])
+    return np.asarray(curves - start)
 
 
 def _in_degrees(values: FloatArray) -> FloatArray:
     """Turn all rows but the first, which is a length, from radians to degrees."""
     return np.concatenate([values[:1], np.rad2deg(values[1:])])
-
-
-def _reference_curves(reference: Reference, estimate: FloatArray, centre_mm: npt.ArrayLike) -> FloatArray:
-    """Curves of the reference, NaN at frames without one.
-
-    Summed from the first reading on, a tracker's trace would carry that reading's jitter throughout, so it
-    starts at the estimate's level over the first few readings.
-    """
-    used, poses = reference.covered, reference.world_from_image
-    if used.shape != estimate.shape[1:] or len(poses) != used.sum():
-        raise MismatchError(
-            f"reference: expected {used.sum()} poses for {estimate.shape[1]} frames, got {len(poses)}"
-        )
-    curves = _accumulated(poses, centre_mm)
-    if reference.name != "truth":
-        start = (curves - estimate[:, used])[:, :JITTER_FRAMES]
-        curves -= np.median(start, axis=1, keepdims=True)
-    shown = np.full(estimate.shape, np.nan)
-    shown[:, used] = curves
-    return shown

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import InsufficientDataError
 
 FEWEST = 3
 """Sweeps that an interval needs: below, a bootstrap only repeats the values themselves."""
@@ -49,21 +48,18 @@ def mean_interval(values: npt.ArrayLike) -> MeanInterval:
     ----------
     .. [1] B. Efron and R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
     """
-    held = _present(np.asarray(values, dtype=float))
-    mean = float(held.mean())
-    if not _scatters(held):
-        return MeanInterval(held.size, mean, None, None)
-    from scipy import stats  # takes 0.3 s to import, which a single reconstruction does without
+    present = np.asarray(values, dtype=float)
+    present = present[np.isfinite(present)]
+    if not present.size:
+        raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
+    low = high = None
+    if present.size >= FEWEST and np.ptp(present) > 0:
+        from scipy import stats  # takes 0.3 s to import, which a single reconstruction does without
 
-    interval = stats.bootstrap(
-        (held,),
-        np.mean,
-        n_resamples=_RESAMPLES,
-        confidence_level=0.95,
-        method="percentile",
-        rng=np.random.default_rng(_SEED),
-    ).confidence_interval
-    return MeanInterval(held.size, mean, float(interval.low), float(interval.high))
+        rng = np.random.default_rng(_SEED)
+        bootstrap = stats.bootstrap((present,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=rng)
+        low, high = map(float, bootstrap.confidence_interval)
+    return MeanInterval(present.size, float(present.mean()), low, high)
 
 
 def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[MeanInterval, float | None]:
@@ -79,21 +75,16 @@ def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[Mean
 
     Raises
     ------
-    MismatchError
-        If the two are not of the same sweeps.
     InsufficientDataError
         If no sweep has both values.
     """
-    one, other = np.asarray(first, dtype=float), np.asarray(second, dtype=float)
-    if one.shape != other.shape:
-        raise MismatchError(f"second mode: expected values of shape {one.shape}, got {other.shape}")
-    differences = _present(one - other)
-    found = mean_interval(differences)
-    if not _scatters(differences):
-        return found, None
+    differences = np.asarray(first, dtype=float) - np.asarray(second, dtype=float)
+    mean = mean_interval(differences)
+    if mean.low is None:
+        return mean, None
     from scipy import stats
 
-    return found, float(stats.wilcoxon(differences).pvalue)
+    return mean, float(stats.wilcoxon(differences[np.isfinite(differences)]).pvalue)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -105,21 +96,9 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     ----------
     .. [1] S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statist. 6, 1979.
     """
-    made = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
+    tests = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     least = 0.0
-    for rank, (p, i) in enumerate(made):
-        least = max(least, min(1.0, (len(made) - rank) * p))
-        corrected[i] = least
+    for rank, (p, i) in enumerate(tests):
+        least = corrected[i] = max(least, min(1.0, (len(tests) - rank) * p))
     return corrected
-
-
-def _present(values: FloatArray) -> FloatArray:
-    held: FloatArray = values[np.isfinite(values)]
-    if not held.size:
-        raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
-    return held
-
-
-def _scatters(values: FloatArray) -> bool:
-    return values.size >= FEWEST and bool(np.ptp(values) > 0)

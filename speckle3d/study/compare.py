@@ -1,40 +1,74 @@
 """Compare modes over many sweeps, and write a study's folder: what ``speckle3d compare`` does.
 
 Every sweep is one job with a folder of its own, which appears whole or not at all under a name that holds a
-hash of everything that determines its content. Before a long sweep come jobs for blocks of its frames, whose
-results are kept in ``blocks/`` until the sweep is done. A study started again finds folders and blocks and
-skips what they hold; of a worker that is killed only the unfinished job is lost.
+hash of everything that determines its content. A study started again finds the folders that are there and
+does what is missing.
 """
 
 from __future__ import annotations
 
-import shutil
-from collections import defaultdict
+import hashlib
+import json
+import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
-from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.config import Config, config_from_toml
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Speckle3DError
+from speckle3d.core.printable import printable
 from speckle3d.correction.modes import DRIFT_MODES
+from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
-from speckle3d.io.hdf5 import make_folder
+from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
+from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.scoring.references import require_reference
-from speckle3d.study import sweepjob
-from speckle3d.study.folder import named, only_run
-from speckle3d.study.request import SUBSET
-from speckle3d.study.results import Study, SweepOutcome, require_own_study, write_study
+from speckle3d.study.job import RESULTS, run_job
+from speckle3d.study.request import SUBSET, available_modes
+from speckle3d.study.results import FILES, Study, SweepOutcome, is_study, require_own, write_study
 from speckle3d.study.schedulers import InProcess, Scheduler
-from speckle3d.study.sweepjob import BlockOutcome, SweepJob
-
-MATCHING_SHARE = 0.5
-"""Share of a sweep's time that matching its blocks takes: half with frames of 127 x 3818 samples, less with
-small ones."""
 
 KNOWN_MODES = ("image", SUBSET, *DRIFT_MODES)
+
+
+@dataclass(frozen=True)
+class SweepJob:
+    """One sweep to reconstruct, with everything that determines the result.
+
+    Attributes
+    ----------
+    planned : SweepOutcome
+        With the name, the input and the key: SHA-256 of the input's bytes, configuration, version, modes,
+        reference, curves and calibrations.
+    modes : tuple of str, or None
+        Beside `image`; None for all that the sweep has sensors for.
+    crossing : path, optional
+        The crossing sweep, if mode `crossed` is asked for.
+    """
+
+    planned: SweepOutcome
+    folder: Path
+    curves: Path
+    settings_toml: str
+    modes: tuple[str, ...] | None
+    reference: str | None
+    calibrations: tuple[Path, ...]
+    crossing: Path | None = None
+
+    def failed(self, reason: str) -> SweepOutcome:
+        """What became of it if it failed."""
+        return replace(self.planned, status="failed", reason=reason)
+
+    def done(self, skipped: bool = False) -> SweepOutcome:
+        """What became of it if its folder is there, which is whole then."""
+        (summary,) = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+        seconds, folder = float(summary["details"]["seconds"]), f"sweeps/{self.folder.name}"
+        return replace(self.planned, status="done", folder=folder, seconds=seconds, skipped=skipped)
 
 
 @dataclass
@@ -47,28 +81,19 @@ class StudyProgress:
     failed: int = 0
     done_frames: float = 0.0
     remaining_s: float | None = None
-    blocks: int = 0
     _rates: list[float] = field(default_factory=list)
-    _matched: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
-    def add(self, outcome: SweepOutcome | BlockOutcome, workers: int) -> None:
-        """Count a finished sweep or block; skipped and failed ones do not count for the time left."""
-        work = float(outcome.frames)
-        if isinstance(outcome, BlockOutcome):
-            work *= MATCHING_SHARE
-            self.blocks -= 1
-            self._matched[outcome.name] += work
-            self.done_frames += work
-        else:
-            self.done += 1
-            self.failed += outcome.status == "failed"
-            self.done_frames += work - self._matched.pop(outcome.name, 0.0)
-        if work > 0 and not (outcome.reason or outcome.skipped):
-            self._rates.append(outcome.seconds / work)
+    def add(self, outcome: SweepOutcome, workers: int) -> None:
+        """Count a finished sweep; skipped and failed ones do not count for the time left."""
+        self.done += 1
+        self.failed += outcome.status == "failed"
+        self.done_frames += outcome.frames
+        if outcome.status == "done" and not outcome.skipped and outcome.frames:
+            self._rates.append(outcome.seconds / outcome.frames)
         if self.done == self.sweeps:
             self.remaining_s = 0.0
         elif self._rates:
-            running = max(1, min(workers, self.sweeps - self.done + self.blocks))
+            running = max(1, min(workers, self.sweeps - self.done))
             self.remaining_s = float(np.median(self._rates)) * (self.frames - self.done_frames) / running
 
 
@@ -92,19 +117,19 @@ def compare_sweeps(
     Parameters
     ----------
     modes : sequence of str, optional
-        Beside `image`; by default all that each sweep has sensors for but "inertial". "crossed" takes
-        for the crossing sweep of ``SWEEP.h5`` the file ``SWEEP-crossing.h5`` beside it.
+        Beside `image`; by default all that each sweep has sensors for. "crossed" takes for the crossing
+        sweep of ``SWEEP.h5`` the file ``SWEEP-crossing.h5`` beside it.
     curves : path, optional
         Decorrelation curves; by default curves.h5 beside each sweep.
     progress : callable, optional
-        Called at the beginning and after each sweep, and each block of a long one.
+        Called at the beginning and after each sweep.
 
     Raises
     ------
     InvalidInputError, InsufficientDataError
         If a setting is wrong for all sweeps, or none can be compared.
     FileError
-        If the folder cannot be written, or another run is at work in it.
+        If the folder cannot be written.
     """
     if not paths:
         raise InvalidInputError("expected at least one sweep, got none")
@@ -114,87 +139,127 @@ def compare_sweeps(
         if mode not in KNOWN_MODES:
             raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
     require_reference(reference)
-    require_own_study(directory)
+    require_own(directory, FILES, is_study(directory), "a study to go on with or to replace")
     if curves is not None:
         read_curves(curves)
     where, settings = scheduler or InProcess(), (config or Config()).to_toml()
-    plan = [
-        sweepjob.plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
+    plan = {
+        name: plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
         for name, path in named(paths)
-    ]
-    jobs = [each for each in plan if isinstance(each, SweepJob)]
-    outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
-    if not jobs:
-        why = next(iter(outcomes.values()))
-        raise InsufficientDataError(
-            f"expected a sweep that can be compared, got none of {len(plan)}; {why.name}: {why.reason}"
-        )
-    with only_run(directory):
-        outcomes |= _run(jobs, where, directory, progress)
-        return write_study(directory, [outcomes[each.name] for each in plan], settings)
-
-
-def _run(
-    jobs: Sequence[SweepJob],
-    where: Scheduler,
-    directory: Path,
-    progress: Callable[[StudyProgress], None] | None,
-) -> dict[str, SweepOutcome]:
-    """Do all jobs; outcomes by name."""
-    outcomes: dict[str, SweepOutcome] = {}
-    folders = directory / "sweeps"
-    make_folder(folders)
-    # This process holds the study: none but a killed run has left these.
-    for part in folders.glob(".part-*"):
-        shutil.rmtree(part, ignore_errors=True)
-    by_name = {job.name: job for job in jobs}
+    }
+    outcomes = {name: each for name, each in plan.items() if isinstance(each, SweepOutcome)}
     # The longest first, so that no worker is left with it while the others have nothing to do.
-    tasks, after = _tasks(sorted(jobs, key=lambda job: job.frames, reverse=True))
-    so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs), blocks=len(tasks) - len(jobs))
+    jobs = sorted(
+        (each for each in plan.values() if isinstance(each, SweepJob)), key=lambda job: -job.planned.frames
+    )
+    if not jobs:
+        first = next(iter(outcomes.values()))
+        raise InsufficientDataError(
+            f"expected a sweep that can be compared, got none of {len(plan)}; {first.name}: {first.reason}"
+        )
+    make_folder(directory / "sweeps")
+    so_far = StudyProgress(len(jobs), sum(job.planned.frames for job in jobs))
     tell = progress or (lambda at: None)
     tell(so_far)
     try:
-        for _, outcome in where.run(sweepjob.run_task, tasks, sweepjob.lost_task, after):
-            if isinstance(outcome, SweepOutcome):
-                outcome = outcomes[outcome.name] = _require_here(outcome, by_name[outcome.name])
+        for outcome in where.run(run_sweep, jobs, SweepJob.failed):
+            outcomes[outcome.name] = outcome
             so_far.add(outcome, where.workers)
             tell(so_far)
-    except BaseException:
-        _clear(jobs)
-        with suppress(OSError):  # it holds finished sweeps
-            folders.rmdir()
-        raise
-    _clear(jobs)
-    return outcomes
+    finally:
+        for folder in (directory / "sweeps", directory):
+            with suppress(OSError):  # it holds finished sweeps
+                folder.rmdir()
+    return write_study(directory, [outcomes[name] for name in plan], settings)
 
 
-def _tasks(jobs: Sequence[SweepJob]) -> tuple[list[sweepjob.Task], dict[int, range]]:
-    """All jobs, and which come after which: a long sweep's job comes after those of its blocks."""
-    tasks: list[sweepjob.Task] = []
-    after: dict[int, range] = {}
-    for job in jobs:
-        blocks = sweepjob.plan_blocks(job)
-        after[len(tasks) + len(blocks)] = range(len(tasks), len(tasks) + len(blocks))
-        tasks += [*blocks, job]
-    return tasks, after
+def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
+    """Name each file once, by its stem; files of one stem with their folder, too, and a hash if need be.
+
+    Names depend on the files alone, not on their order: a study given again in another order is the same.
+    """
+    by_target: dict[Path, Path] = {}
+    for path in paths:
+        by_target.setdefault(path.resolve(), path.absolute())
+    files = list(by_target.values())
+    # What a terminal would obey is escaped, with % in place of the backslash.
+    stems = [printable(path.stem).replace("\\", "%") for path in files]
+    folders = [printable(path.parent.name).replace("\\", "%") for path in files]
+    marks = [hashlib.sha256(os.fsencode(path)).hexdigest()[:6] for path in files]
+    names = stems
+    for more in (folders, marks):
+        counts = Counter(names)
+        longer = [f"{word}-{stem}" for word, stem in zip(more, stems, strict=True)]
+        names = [name if counts[name] == 1 else other for name, other in zip(names, longer, strict=True)]
+    return list(zip(names, files, strict=True))
 
 
-def _require_here(outcome: SweepOutcome, job: SweepJob) -> SweepOutcome:
-    """Fail a sweep whose results a worker wrote to a disk that this process does not see."""
-    if outcome.status == "done" and sweepjob.finished(job) is None:
-        return sweepjob.lost(
-            job, f"{job.folder}: expected a folder that workers and the study share, got none here"
+def plan_sweep(
+    name: str,
+    path: Path,
+    directory: Path,
+    curves: Path | None,
+    settings_toml: str,
+    modes: tuple[str, ...] | None,
+    reference: str | None,
+    calibrations: tuple[Path, ...],
+) -> SweepJob | SweepOutcome:
+    """Find out what determines a sweep's results; an outcome at once if it cannot be opened."""
+    path = path.resolve()
+    curves_file = (curves or path.parent / "curves.h5").resolve()
+    mounted = tuple(each.resolve() for each in calibrations)
+    crossing = crossing_of(path) if "crossed" in (modes or ()) else None
+    try:
+        if crossing is not None and not crossing.exists():
+            raise InvalidInputError(f"mode crossed: expected a crossing sweep {crossing.name} beside it")
+        frames, sha256 = len(load_sweep(path)), recording_sha256(path)
+        used = [sha256_of(each) for each in (curves_file, *mounted)]
+        used += [] if crossing is None else [recording_sha256(crossing)]
+    except Exception as error:  # noqa: BLE001 - one row that says why
+        return SweepOutcome(name, path, "failed", _reason(error))
+    parts = [sha256, settings_toml, version("speckle3d"), modes, reference, used]
+    key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
+    planned = SweepOutcome(name, path, "planned", sha256=sha256, key=key, frames=frames)
+    return SweepJob(planned, folder, curves_file, settings_toml, modes, reference, mounted, crossing)
+
+
+def crossing_of(path: Path) -> Path:
+    """The crossing sweep of ``SWEEP.h5``: ``SWEEP-crossing.h5`` beside it, and the other way round."""
+    stem = path.stem.removesuffix("-crossing")
+    return path.with_name(f"{stem}{path.suffix}" if stem != path.stem else f"{stem}-crossing{path.suffix}")
+
+
+def run_sweep(job: SweepJob) -> SweepOutcome:
+    """Do a job unless it is done; whatever is wrong with the sweep becomes the outcome's reason."""
+    if (job.folder / RESULTS.primary).is_file():
+        return job.done(skipped=True)
+    path = job.planned.path
+    try:
+        if recording_sha256(path) != job.planned.sha256:
+            raise InvalidInputError(f"{path}: expected the file that the study began with, got another")
+        settings, sweep = config_from_toml(job.settings_toml), load_sweep(path)
+        mounted, _ = apply_calibrations(sweep, job.calibrations)
+        modes = available_modes(mounted, settings) if job.modes is None else job.modes
+        run_job(
+            sweep,
+            path,
+            read_curves(job.curves),
+            job.folder,
+            [mode for mode in modes if mode != "image"],
+            job.reference,
+            settings,
+            None,
+            job.calibrations,
+            None if job.crossing is None else (load_sweep(job.crossing), job.crossing),
         )
-    return outcome
+        return job.done()
+    except Exception as error:  # noqa: BLE001 - one broken sweep, or one bug that it reveals, stops no other
+        return job.failed(_reason(error))
 
 
-def _clear(jobs: Sequence[SweepJob]) -> None:
-    """Remove what killed workers left of this study's own sweeps."""
-    for job in jobs:
-        for part in job.folder.parent.glob(f".part-*-{job.folder.name}"):
-            shutil.rmtree(part, ignore_errors=True)
-        blocks = sweepjob.block_files(job).folder
-        for part in blocks.glob(".part-*"):
-            part.unlink(missing_ok=True)
-        with suppress(OSError):
-            blocks.parent.rmdir()
+def _reason(error: Exception) -> str:
+    words = " ".join(one_line(error).split())
+    if isinstance(error, OSError) and error.filename and not isinstance(error, Speckle3DError):
+        words = f"{error.filename}: {words}"
+    return words if isinstance(error, Speckle3DError) else f"{type(error).__name__}: {words}"

@@ -10,7 +10,7 @@ from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.crossing_sweeps import crossing_side, curves_from, require_pair, stack_for
-from speckle3d.matching.blocks import ImageSink
+from speckle3d.matching.frames import ImageSink
 from speckle3d.pipeline import Tracked, track
 
 

@@ -15,12 +15,10 @@ from speckle3d.core.reconstruction import ModeErrors, Provenance, Trust
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import sensor_of
-from speckle3d.correction.scale import ScaledPoses
-from speckle3d.correction.trust import name_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
-from speckle3d.scoring.references import SweepCurves
+from speckle3d.scoring.lengths import TRACKER
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
@@ -39,34 +37,34 @@ def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | N
         None if no summary of this reconstruction is there.
     """
     try:
-        (held,) = json.loads((path.parent / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-        made_from = held["details"]["provenance"]["input_sha256"]
-        doubts = tuple(Doubt(**each) for each in held["doubts"])
+        (summary,) = json.loads((path.parent / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+        made_from = summary["details"]["provenance"]["input_sha256"]
+        doubts = tuple(Doubt(**each) for each in summary["doubts"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return doubts if made_from == provenance.input_sha256 else None
 
 
 def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:
-    """What is suspected of the sensor that each mode rests on; images are under all of them."""
-    found = {}
+    """What is suspected of the sensor that each mode rests on; images are under all but the tracker alone."""
+    suspicions = {}
     for mode in modes:
-        sensor = None if mode == "image" else sensor_of(sweep, mode)
-        about = {"images", "curves", "" if sensor is None else name_of(sensor)}
+        sensor = None if mode == "image" else sensor_of(sweep, "pose" if mode == TRACKER else mode)
+        about = {"" if sensor is None else sensor.label}
+        if mode != TRACKER:
+            about |= {"images", "curves"}
         suspected = dict.fromkeys(doubt.suspect for doubt in doubts if doubt.about in about)
         if suspected:
-            found[mode] = ", ".join(suspected)
-    return found
+            suspicions[mode] = ", ".join(suspected)
+    return suspicions
 
 
 def details_of(
-    tracked: Tracked, corrections: Mapping[str, Correction], moved: SweepCurves, provenance: Provenance
+    tracked: Tracked, corrections: Mapping[str, Correction], provenance: Provenance
 ) -> dict[str, Any]:
     """Everything worth keeping of a reconstruction beside its errors, by name."""
-    names = ("length_mm", "tilt_deg", "yaw_deg", "roll_deg")
     return {
         "provenance": provenance,
-        "estimates": {m: dict(zip(names, c[:, -1].tolist(), strict=True)) for m, c in moved.modes.items()},
         "pairs": tracked.pairs,
         "flagged_frames": describe(tracked.flags),
         "rejected_patch_share": tracked.rejected_share,
@@ -79,58 +77,41 @@ def details_of(
 
 
 def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
-    found = tracked.coherence
-    if found is None:
+    coherence = tracked.coherence
+    if coherence is None:
         return None
     return {
-        "mean_share": float(found.share.mean()),
-        "mean_gain": float(found.gain.mean()),
-        "mean_stretch": float(found.stretch.mean()),
-        "length_over_phantom_reading": float(found.scale.mean()),
-        "scale_sigma": found.scale_sigma,
+        "mean_share": float(coherence.share.mean()),
+        "mean_gain": float(coherence.gain.mean()),
+        "scale_sigma": coherence.scale_sigma,
     }
 
 
 def claims_of(
     tracked: Tracked, centre_mm: FloatArray, corrections: Mapping[str, Correction]
 ) -> dict[str, float]:
-    """Relative standard deviation of the length that each mode claims, where it claims one."""
+    """Relative standard deviation of the length that each mode claims."""
     centre = tracked.image.apply(centre_mm)[:, 2]
     farthest = int(np.argmax(np.abs(centre - centre[0])))
     travelled = max(abs(float(centre[farthest] - centre[0])), 1e-9)
     claims = {"image": float(np.sqrt(tracked.covariance[farthest, 2, 2])) / travelled}
-    for mode, correction in corrections.items():
-        if isinstance(correction, DriftCorrection):
-            # Cubics about the image's centre leave the length, and its error, as the images have them.
-            if mode == "orientation":
-                claims[mode] = claims["image"]
-        else:
-            claims[mode] = correction.log_scale_sigma
-    return claims
+    return claims | {mode: correction.length_sigma for mode, correction in corrections.items()}
 
 
 def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:
     """What a reconstruction's file says of its poses' errors."""
-    modes = {
-        mode: ModeErrors(each.covariance, each.log_scale_sigma)
-        for mode, each in corrections.items()
-        if isinstance(each, ScaledPoses)
-    }
+    modes = {mode: ModeErrors(each.covariance, each.length_sigma) for mode, each in corrections.items()}
     return Trust(tracked.covariance, tracked.flags, tracked.shared, modes)
 
 
 def _correction_details(correction: Correction) -> dict[str, Any]:
-    if isinstance(correction, DriftCorrection):
-        return _fit_details(correction)
-    return {
-        "length_over_images": correction.scale,
-        "relative_sigma": correction.log_scale_sigma,
-        "rests_on": [each.source for each in correction.evidence],
-        **correction.details,
-    }
-
-
-def _fit_details(correction: DriftCorrection) -> dict[str, Any]:
+    if not isinstance(correction, DriftCorrection):
+        return {
+            "length_over_images": correction.scale,
+            "relative_sigma": correction.log_scale_sigma,
+            "rests_on": [each.source for each in correction.evidence],
+            **correction.details,
+        }
     fit = correction.fit
     return {
         "curves": correction.settings.curves,

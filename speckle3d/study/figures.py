@@ -1,11 +1,10 @@
-"""Figures of a reconstruction: what is drawn (series, labels, colours), and how matplotlib draws it.
+"""Figures of a reconstruction: what is drawn (series, labels, colours), and how matplotlib draws it in files.
 
-The report draws the same series by plotly as well. Nothing here needs pyplot or a window system.
+The report's page draws the same series by plotly. Nothing here needs pyplot or a window system.
 """
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,29 +16,32 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.scoring.references import REFERENCES, SweepCurves
+from speckle3d.scoring.references import SweepCurves
 
 DOTS_PER_INCH = 150
 CURVE_LABELS = ("length / mm", "tilt / °", "yaw / °", "roll / °")
 
-_MODES = {
-    "image": ("images alone", "#D55E00"),
-    "consistent-subset": ("consistent subset", "#E69F00"),
-    "orientation": ("with orientation sensor", "#0072B2"),
-    "pose": ("with position sensor", "#009E73"),
-    "crossed": ("with crossing sweep", "#CC79A7"),
-    "inertial": ("with accelerometer", "#56B4E9"),
-    "fused": ("all sensors, fused", "#882255"),
-}
-"""Label and colour of each mode, from Okabe and Ito's and Tol's palettes, told apart with any vision."""
+RANGE_DB = 50.0
+"""Grey scale of all pictures: from the maximum, white, down to black. Speckle scatters by 5.6 dB."""
 
-_INTERVAL = ("95 % interval of the image-based length", *["95 % interval of the image-based angle"] * 3)
-_SPARE_COLOURS = ("#F0E442", "#999999", "#44AA99")
-_REFERENCE_COLOUR = "#000000"
+_COLOURS = {
+    "truth": "#000000",
+    "tracker": "#808080",
+    "image": "#D55E00",
+    "consistent-subset": "#E69F00",
+    "orientation": "#0072B2",
+    "pose": "#009E73",
+    "crossed": "#CC79A7",
+    "fused": "#882255",
+}
+"""From Okabe and Ito's and Tol's palettes, told apart with any vision."""
+
+_SPARE_COLOURS = ("#F0E442", "#56B4E9", "#44AA99")
 UNSEEN = "#33415c"
 """Blue-grey of a reslice's pixels that no frame reached."""
 
@@ -55,12 +57,6 @@ _STYLES: Mapping[str, Mapping[str, Any]] = {
     "bar": {"linewidth": 6, "alpha": 0.25},
 }
 Style = Literal["line", "reference", "band", "points", "dotted", "bar"]
-
-_LETTER_IN = 0.085
-"""Width of a letter of medium size."""
-
-_FEWEST_LETTERS = 12
-"""Letters that a line of a title has at least: those of the longest word."""
 
 
 @dataclass(frozen=True)
@@ -109,18 +105,15 @@ class Panel:
 
 
 def label_of(mode: str) -> str:
-    """Words for a mode."""
-    return _MODES[mode][0] if mode in _MODES else mode
+    """Name of a mode in figures: its own."""
+    return "tracker alone" if mode == "tracker" else mode
 
 
 def colour_of(mode: str, modes: Sequence[str] = ()) -> str:
-    """Colour of a mode, the same in all figures; the reference is black."""
-    if mode in REFERENCES:
-        return _REFERENCE_COLOUR
-    if mode in _MODES:
-        return _MODES[mode][1]
-    others = [m for m in modes if m not in _MODES]
-    return _SPARE_COLOURS[others.index(mode) % len(_SPARE_COLOURS) if mode in others else 0]
+    """Colour of a mode, the same in all figures; the truth is black."""
+    others = [m for m in modes if m not in _COLOURS]
+    spare = _SPARE_COLOURS[others.index(mode) % len(_SPARE_COLOURS) if mode in others else 0]
+    return _COLOURS.get(mode, spare)
 
 
 def curve_panels(
@@ -145,73 +138,56 @@ def curve_panels(
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
     """
     at = np.arange(curves.frames) if frames is None else frames
-
-    def over_frames(values: FloatArray) -> FloatArray:
-        return np.column_stack([at, values[at]])
-
     panels = []
     for q in range(count):
         zero = np.zeros(curves.frames)
         if minus_reference and curves.reference is not None:
             zero = curves.reference[q]
+
+        def shown(values: FloatArray, zero: FloatArray = zero) -> FloatArray:
+            return np.column_stack([at, (values - zero)[at]])
+
         series = []
         if curves.reference is not None:
-            level = over_frames(curves.reference[q] - zero)
-            series.append(Series(curves.reference_name, _REFERENCE_COLOUR, level, "reference"))
+            name = curves.reference_name
+            series.append(Series(name, colour_of(name), shown(curves.reference[q]), "reference"))
         if curves.half_width is not None:
-            middle, half = curves.modes["image"][q] - zero, curves.half_width[q]
-            name = _INTERVAL[q]
-            band = over_frames(middle + half)
-            series.append(Series(name, colour_of("image"), band, "band", (middle - half)[at]))
+            middle, half = curves.modes["image"][q], curves.half_width[q]
+            low, high = shown(middle - half)[:, 1], shown(middle + half)
+            series.append(Series("95 % interval of image", colour_of("image"), high, "band", low))
         for i, (mode, values) in enumerate(curves.modes.items()):
             colour = colour_of(mode, list(curves.modes))
-            series.append(Series(label_of(mode), colour, over_frames(values[q] - zero), dash=i))
+            series.append(Series(label_of(mode), colour, shown(values[q]), dash=i))
         panels.append(Panel(series, ("frame", CURVE_LABELS[q])))
     return panels
 
 
 def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
     """Draw accumulated length and tilt over the frames, for every mode and the reference."""
-    figure = figure_panels(curve_panels(curves, 2), 2, (10.0, 4.2))
-    name_figure(figure, title)
-    return figure
+    return figure_panels(curve_panels(curves, 2), 2, (10.0, 4.2), title)
 
 
-def name_figure(figure: Figure, title: str) -> None:
-    """Put a name over a figure as it is: a dollar in the name of a file begins no formula."""
-    figure.suptitle(printable(title, kept="\n"), parse_math=False)
-
-
-def figure_panels(panels: Sequence[Panel], columns: int, size_in: tuple[float, float]) -> Figure:
+def figure_panels(
+    panels: Sequence[Panel], columns: int, size_in: tuple[float, float], title: str = ""
+) -> Figure:
     """Draw panels in rows of `columns`; panels below each other share the horizontal axis."""
     figure = new_figure(*size_in)
     rows = -(-len(panels) // columns)
     named = bool(panels[0].levels)
     places = figure.subplots(rows, columns, squeeze=False, sharex="col" if rows > 1 else False, sharey=named)
     for i, (panel, axes) in enumerate(zip(panels, places.ravel(), strict=True)):
-        draw_panel(axes, panel, i + columns >= len(panels))
+        _draw_panel(axes, panel, i + columns >= len(panels))
     if named:
         places[0, 0].set_yticks(range(len(panels[0].levels)), panels[0].levels)
         places[0, 0].invert_yaxis()
-    else:
-        places[0, 0].legend(frameon=False, fontsize="small")
+    name_figure(figure, title)
     return figure
 
 
-def draw_panel(axes: Axes, panel: Panel, named_below: bool = True) -> None:
-    """Draw one panel."""
-    if panel.levels:
-        axes.axvline(0.0, color="0.6", linewidth=0.8)
-    for each in panel.series:
-        look: dict[str, Any] = {"color": each.colour, "label": each.label, **_STYLES[each.style]}
-        if each.low is not None:
-            axes.fill_between(each.points[:, 0], each.low, each.points[:, 1], **look)
-        else:
-            axes.plot(*each.points.T, **{"linestyle": _DASHES[each.dash % len(_DASHES)], **look})
-    if panel.limits:
-        axes.set_ylim(*panel.limits)
-    label_axes(axes, panel.axes[0] if named_below else "", panel.axes[1])
-    axes.grid(visible=True, alpha=0.3)
+def name_figure(figure: Figure, title: str) -> None:
+    """Put a name over a figure as it is, on one line: a dollar in the name of a file begins no formula."""
+    letters = max(1.0, len(title) * 0.11 / figure.get_figwidth())
+    figure.suptitle(printable(title), parse_math=False, fontsize=12 / letters)
 
 
 def show_grey(
@@ -219,16 +195,11 @@ def show_grey(
     image: npt.NDArray[np.floating],
     extent_mm: tuple[float, float, float, float],
     levels: tuple[float, float],
-) -> None:
+) -> AxesImage:
     """Draw an image in grey from the first of the levels (black) to the second; blue-grey where it is NaN."""
     greys = colormaps["gray"].with_extremes(bad=UNSEEN)
-    axes.imshow(image, cmap=greys, vmin=levels[0], vmax=levels[1], aspect="equal", extent=extent_mm,
-                interpolation="nearest")  # fmt: skip
-
-
-def wrapped(title: str, width_in: float) -> str:
-    """Title in lines that fit above a panel, and do not run into its neighbour's."""
-    return textwrap.fill(title, max(_FEWEST_LETTERS, int(width_in / _LETTER_IN)), break_on_hyphens=False)
+    return axes.imshow(image, cmap=greys, vmin=levels[0], vmax=levels[1], aspect="equal", extent=extent_mm,
+                       interpolation="nearest")  # fmt: skip
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
@@ -247,17 +218,24 @@ def save_figure(figure: Figure, path: Path) -> Path:
     return path
 
 
-def new_figure(
-    width_in: float, height_in: float, layout: Literal["constrained", "compressed"] | None = "constrained"
-) -> Figure:
+def new_figure(width_in: float, height_in: float) -> Figure:
     """Make a figure that needs no window system."""
-    figure = Figure(figsize=(width_in, height_in), layout=layout)
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def label_axes(axes: Axes, x: str, y: str) -> None:
-    """Name the axes and leave out the frame at the top and the right."""
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
+def _draw_panel(axes: Axes, panel: Panel, named_below: bool) -> None:
+    if panel.levels:
+        axes.axvline(0.0, color="0.6", linewidth=0.8)
+    for each in panel.series:
+        look: dict[str, Any] = {"color": each.colour, "label": each.label, **_STYLES[each.style]}
+        if each.low is not None:
+            axes.fill_between(each.points[:, 0], each.low, each.points[:, 1], **look)
+        else:
+            axes.plot(*each.points.T, **{"linestyle": _DASHES[each.dash % len(_DASHES)], **look})
+    if not panel.levels:
+        axes.legend(frameon=False, fontsize="small")
+    axes.set(xlabel=panel.axes[0] if named_below else "", ylabel=panel.axes[1])
     axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True, alpha=0.3)

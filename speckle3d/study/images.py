@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.config import Config, config_from_toml
+from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
@@ -33,33 +32,30 @@ _GLANCES = 24
 """Frames looked at for the brightest echo; one between them may still be cut off by a few decibels."""
 
 
-class GreyFrames(Protocol):
-    """Grey images of a sweep by frame number, shape (vector, sample), where they lie and what they are."""
+class GreyFrames:
+    """Grey images of a sweep by frame number, made one at a time as they are asked for.
 
-    grid: ImageGrid
+    Attributes
+    ----------
+    grid : ImageGrid
+        Where their samples lie.
+    meaning : str
+        What the grey levels are, in words.
+    dtype : numpy.dtype
+        Of the grey levels.
+    """
 
-    @property
-    def meaning(self) -> str:
-        """What the grey levels are, in words."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape (frame, vector, sample)."""
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the grey levels."""
-
-    def __getitem__(self, index: int, /) -> npt.NDArray[Any]:
-        """Make one image."""
-
-
-class _Counted:
-    """Frames that tell how many of them were asked for."""
-
-    def __init__(self, sweep: Sweep, grid: ImageGrid, progress: Callable[[int, int], None] | None) -> None:
+    def __init__(
+        self,
+        sweep: Sweep,
+        progress: Callable[[int, int], None] | None = None,
+        settings: IntensitySettings | None = None,
+    ) -> None:
         self._sweep, self._progress = sweep, progress
-        self.grid = grid
+        self._extractor = IntensityExtractor.for_sweep(sweep, settings)
+        self.grid: ImageGrid = self._extractor.grid
+        self.meaning = ""
+        self.dtype: np.dtype[Any] = np.dtype(np.float32)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -71,13 +67,16 @@ class _Counted:
         """Whether images may be made by several threads at once: if nothing is to be told in between."""
         return self._progress is None
 
-    def _frame(self, index: int) -> npt.NDArray[Any]:
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
         if self._progress:
             self._progress(index + 1, len(self._sweep))
-        return read_frame(self._sweep.frames, index)
+        return self._levels(read_frame(self._sweep.frames, index))
+
+    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        raise NotImplementedError
 
 
-class StoredImages(_Counted):
+class StoredImages(GreyFrames):
     """B-mode images as they are stored, in their own type; arguments as for `GreyImages`.
 
     Raises
@@ -91,19 +90,15 @@ class StoredImages(_Counted):
             raise InvalidInputError(
                 f"{sweep.name}: expected B-mode for levels as stored, got RF or I/Q: take log or linear"
             )
-        super().__init__(sweep, sweep.grid, progress)
+        super().__init__(sweep, progress)
+        self.grid, self.dtype = sweep.grid, np.dtype(sweep.frames.dtype)
         self.meaning = f"B-mode as stored, 0 to {sweep.signal.full_scale:g}"
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the grey levels."""
-        return np.dtype(self._sweep.frames.dtype)
-
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return self._frame(index)
+    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return frame
 
 
-class AmplitudeImages(_Counted):
+class AmplitudeImages(GreyFrames):
     """Echo amplitude, on a linear scale; arguments as for `GreyImages`."""
 
     def __init__(
@@ -112,35 +107,23 @@ class AmplitudeImages(_Counted):
         progress: Callable[[int, int], None] | None = None,
         settings: IntensitySettings | None = None,
     ) -> None:
-        self._extractor = IntensityExtractor.for_sweep(sweep, settings)
-        super().__init__(sweep, self._extractor.grid, progress)
+        super().__init__(sweep, progress, settings)
         self.meaning = "echo amplitude, linear, in the units of the samples"
         if isinstance(sweep.signal, BModeSettings):
             range_db = sweep.signal.dynamic_range_db
             self.meaning = f"echo amplitude, linear, of B-mode over {range_db:g} dB; 1 is full scale"
 
-    @property
-    def dtype(self) -> np.dtype[np.float32]:
-        """Type of the amplitudes."""
-        return np.dtype(np.float32)
-
-    def __getitem__(self, index: int) -> Float32Array:
-        intensity = self._extractor.intensity(self._frame(index))
-        return np.asarray(np.sqrt(intensity), dtype=np.float32)
+    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return np.asarray(np.sqrt(self._extractor.intensity(frame)), dtype=np.float32)
 
 
-class GreyImages(_Counted):
+class GreyImages(GreyFrames):
     """Log-compressed images of a sweep, 0 to 255, by frame number.
 
     Parameters
     ----------
     clipped : bool
         Let the brightest echoes saturate, as on a screen.
-
-    Attributes
-    ----------
-    grid : ImageGrid
-        Where their samples lie.
     """
 
     def __init__(
@@ -153,33 +136,22 @@ class GreyImages(_Counted):
     ) -> None:
         if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
             raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
-        self._extractor = IntensityExtractor.for_sweep(sweep, settings)
-        super().__init__(sweep, self._extractor.grid, progress)
+        super().__init__(sweep, progress, settings)
         self._range_db = dynamic_range_db
         self.meaning = f"log-compressed, 0 to 255 over {dynamic_range_db:g} dB"
         # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo does
         # not darken it; for measuring an echo's place, the brightest, so that none is cut off.
-        if clipped:
-            self._brightest = float(np.percentile(self._decibel(len(sweep) // 2), 99.9))
-        else:
-            some = np.unique(np.linspace(0, len(sweep) - 1, _GLANCES).astype(int))
-            self._brightest = max(float(self._decibel(int(i)).max()) for i in some)
+        shown = [len(sweep) // 2] if clipped else np.linspace(0, len(sweep) - 1, _GLANCES).astype(int)
+        levels = [_decibel(self._extractor.intensity(read_frame(sweep.frames, int(i)))) for i in shown]
+        self._brightest = max(float(np.percentile(each, 99.9 if clipped else 100.0)) for each in levels)
 
-    @property
-    def dtype(self) -> np.dtype[np.float32]:
-        """Type of the grey levels."""
-        return np.dtype(np.float32)
-
-    def __getitem__(self, index: int) -> Float32Array:
-        level = 1 + (self._decibel_of(self._frame(index)) - self._brightest) / self._range_db
+    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        level = 1 + (_decibel(self._extractor.intensity(frame)) - self._brightest) / self._range_db
         return np.asarray(255 * np.clip(level, 0, 1), dtype=np.float32)
 
-    def _decibel(self, index: int) -> Float32Array:
-        return self._decibel_of(read_frame(self._sweep.frames, index))
 
-    def _decibel_of(self, frame: npt.NDArray[Any]) -> Float32Array:
-        intensity = self._extractor.intensity(frame)
-        return np.asarray(10 * np.log10(np.maximum(intensity, np.float32(1e-12))))
+def _decibel(intensity: Float32Array) -> Float32Array:
+    return np.asarray(10 * np.log10(np.maximum(intensity, np.float32(1e-12))))
 
 
 def grey_images(
@@ -225,7 +197,7 @@ def grey_images(
     """
     settings = None
     if reconstruction is not None and reconstruction.config_toml:
-        settings = config_from_toml(reconstruction.config_toml).intensity
+        settings = stored_config(reconstruction.config_toml).intensity
     if levels == "stored":
         return StoredImages(sweep, progress)
     if levels == "linear":
@@ -266,10 +238,10 @@ def part_at(sweep: Sweep, time_s: FloatArray) -> Sweep:
         If no frames in a row have these times.
     """
     first = int(np.searchsorted(sweep.frame_time_s, time_s[0]))
-    held = sweep.frame_time_s[first : first + len(time_s)]
-    if not np.array_equal(held, time_s):
+    times = sweep.frame_time_s[first : first + len(time_s)]
+    if not np.array_equal(times, time_s):
         raise MismatchError(f"{sweep.name}: expected frames at the times that were reconstructed, got others")
-    return sweep if len(held) == len(sweep) else sweep.part(first, first + len(held))
+    return sweep if len(times) == len(sweep) else sweep.part(first, first + len(times))
 
 
 class Strip:
@@ -284,10 +256,12 @@ class Strip:
     """
 
     def __init__(self, sweep: Sweep, config: Config) -> None:
-        self._first, grid = middle_vectors(IntensityExtractor.for_sweep(sweep, config.intensity).grid)
+        grid = IntensityExtractor.for_sweep(sweep, config.intensity).grid
+        width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
+        self._first = (grid.vectors - width) // 2
         self._pool = max(1, round(PIXEL_MM / grid.sample_spacing_mm))
         self.grid = ImageGrid(
-            grid.vectors,
+            width,
             grid.samples // self._pool,
             grid.vector_pitch_mm,
             grid.sample_spacing_mm * self._pool,
@@ -301,16 +275,7 @@ class Strip:
         part = intensity[self._first : self._first + self.grid.vectors, : self.grid.samples * self._pool]
         # NumPy's mean takes more than twice as long over so short an axis.
         pooled = np.einsum("vsp->vs", part.reshape(self.grid.vectors, self.grid.samples, -1)) / self._pool
-        decibel = 10 * np.log10(np.maximum(pooled, 1e-12))
-        self._images[index] = decibel.astype(np.float16)
-
-    def kept(self, first: int, stop: int) -> Float16Array:
-        """Strips of some frames as they are kept, shape (frame, vector, sample), dB."""
-        return np.stack([self._images[index] for index in range(first, stop)])
-
-    def take(self, first: int, images: Float16Array) -> None:
-        """Keep strips of the frames from `first` on that were made elsewhere."""
-        self._images.update(enumerate(images, start=first))
+        self._images[index] = _decibel(pooled).astype(np.float16)
 
     def __getitem__(self, index: int) -> Float32Array:
         return self._images[index].astype(np.float32)
@@ -319,12 +284,6 @@ class Strip:
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
         return len(self._images), self.grid.vectors, self.grid.samples
-
-
-def middle_vectors(grid: ImageGrid) -> tuple[int, ImageGrid]:
-    """First of the vectors `STRIP_MM` wide about the middle of the image, and their grid."""
-    width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
-    return (grid.vectors - width) // 2, replace(grid, vectors=width)
 
 
 def middle_planes(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> dict[str, ReslicePlane]:

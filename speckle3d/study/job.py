@@ -4,50 +4,46 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.progress import Progress, after
-from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.reconstruction import Provenance, SourceFile
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.modes import PUBLISHED
-from speckle3d.correction.scale import FusedPoses, ScaledPoses
-from speckle3d.correction.trust import believed, require_believed
 from speckle3d.corrections import Correction, correct
+from speckle3d.examine.disagreements import differing_lengths
+from speckle3d.examine.sensors import believed, require_believed
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.load import import_record, kind_of, recording_sha256
+from speckle3d.io.load import import_record, kind_of, load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Tracked, track
-from speckle3d.scoring.jitter import jitter_percent
-from speckle3d.scoring.lengths import END_FRAMES, ModeError, compare_modes
-from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves
+from speckle3d.scoring.displacements import score_row
+from speckle3d.scoring.lengths import TRACKER, ModeError, compare_modes
+from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves, tracker_alone
 from speckle3d.study.crossed import Companion
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
-from speckle3d.study.folder import BlockFiles
-from speckle3d.study.images import PIXEL_MM, Strip, cut_frames, middle_planes
-from speckle3d.study.request import SUBSET, Request, require_possible
-from speckle3d.study.reslices.cut_geometry import anchors_of
-from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
-from speckle3d.study.reslices.enlarged import save_enlarged
-from speckle3d.study.reslices.places import view_of
-from speckle3d.study.reslices.reslice_figures import save_reslices
-from speckle3d.study.results import Summary, is_study, summary_text, write_summary
+from speckle3d.study.images import Strip
+from speckle3d.study.request import SUBSET, require_possible
+from speckle3d.study.reslices.reslice_figures import draw_strip
+from speckle3d.study.results import SUMMARY_FILES, Summary, is_study, require_own, summary_text, write_summary
 
 
 @shown
@@ -79,10 +75,8 @@ class JobResult:
     curves: DecorrelationCurves | None = None
 
 
-RESULTS = FileSet(
-    "reconstruction.h5",
-    ("summary.json", "table.txt", "table.csv", "drift.png", "reslice.png", "enlarged.png"),
-)
+PICTURES = ("drift.png", "reslice.png", "enlarged.png")
+RESULTS = FileSet("reconstruction.h5", (*SUMMARY_FILES, *PICTURES))
 """What a job writes."""
 
 
@@ -113,7 +107,7 @@ def run_job(
     directory : path
         Made if need be.
     drift : sequence of str
-        Modes beside `image`: "consistent-subset", "orientation", "pose", "crossed", "inertial", "fused".
+        Modes beside `image`: "consistent-subset", "orientation", "pose", "crossed", "fused".
     reference : {"tracker", "truth"}, optional
         What to compare with; by default the truth if stored, else the tracker, else nothing.
     config : Config, optional
@@ -137,84 +131,65 @@ def run_job(
     FileError
         If the folder cannot be written, or another run is at work in it.
     """
+    began, settings = time.perf_counter(), config or Config()
     require_own_results(directory)
-    request = Request(
-        sweep, source, curves, tuple(drift), reference, config or Config(), tuple(calibrations), crossing
-    )
-    with RESULTS.replaced(directory) as part:
-        made = write_results(request, part, progress)
-    return replace(made, directory=directory, files=tuple(directory / each.name for each in made.files))
-
-
-def write_results(
-    request: Request, directory: Path, progress: Progress | None = None, blocks: BlockFiles | None = None
-) -> JobResult:
-    """Reconstruct a sweep into a folder that is there and that nobody reads yet; otherwise as `run_job`.
-
-    Parameters
-    ----------
-    blocks : BlockFiles, optional
-        Blocks of the sweep that have been matched already; not of one that is crossed.
-    """
-    settings, modes, source = request.config, request.modes, request.source
-    began = time.perf_counter()
-    sweep, mounted = apply_calibrations(request.sweep, request.calibrations)
-    crossing = None
-    if request.crossing is not None:
-        crossing, _ = apply_calibrations(request.crossing[0], request.calibrations)
-    compared = require_possible(sweep, modes, request.reference, settings, crossing is not None)
+    sweep, mounted = apply_calibrations(sweep, calibrations)
+    second, second_file = None, None
+    if crossing is not None:
+        second, _ = apply_calibrations(crossing[0], calibrations)
+        second_file = SourceFile(written_path(crossing[1]), recording_sha256(crossing[1]))
+    compared = require_possible(sweep, drift, reference, settings, second is not None)
     strip = Strip(sweep, settings)
-    side = None if crossing is None else Companion(sweep, crossing, request.curves, settings)
-    path = directory / RESULTS.primary
-    with ReconstructionWriter(path, sweep.frame_time_s, sweep.grid) as writer:
-        held = None if blocks is None else partial(blocks.read, strip=strip)
-        sink = strip.keep if side is None else side.beside(strip.keep)
-        shown = progress if side is None else after(progress, 0, side.frames)
-        tracked = track(sweep, request.curves, settings, shown, writer.append_pairs, sink, held)
-        crossed, refusal = None, ""
-        if side is not None:
-            crossed, refusal = side.cross(tracked, progress)
-        corrections, left_out = _corrected(tracked, sweep, modes, settings, crossed, refusal)
-        poses = {"image": tracked.image}
-        if tracked.subset is not None and SUBSET in modes:
-            poses[SUBSET] = tracked.subset
-        elif SUBSET in modes:
-            left_out[SUBSET] = _refusal_of_subset(sweep, tracked)
-        poses |= {mode: c.poses for mode, c in corrections.items()}
-        provenance = Provenance(
-            written_path(source),
-            recording_sha256(source),
-            version("speckle3d"),
-            mounted,
-            request.crossing_file,
-            import_record(source),
+    side = None if second is None else Companion(sweep, second, curves, settings)
+    with RESULTS.replaced(directory) as part:
+        with ReconstructionWriter(part / RESULTS.primary, sweep.frame_time_s, sweep.grid) as writer:
+            sink = strip.keep if side is None else side.beside(strip.keep)
+            shown = progress if side is None else after(progress, 0, side.frames)
+            tracked = track(sweep, curves, settings, shown, writer.append_pairs, sink)
+            crossed, refusal = (None, "") if side is None else side.cross(tracked, progress)
+            poses, corrections, left_out = _corrected(tracked, sweep, drift, settings, crossed, refusal)
+            provenance = Provenance(
+                written_path(source),
+                recording_sha256(source),
+                version("speckle3d"),
+                mounted,
+                second_file,
+                import_record(source),
+            )
+            writer.finish(poses, provenance, settings.to_toml(), trust_of(tracked, corrections))
+        if reference is None and compared is not None and compared.name == TRACKER:
+            compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
+        # The tracker alone is shown beside the modes, but is none of the reconstruction's.
+        alone = tracker_alone(believed(sweep, tracked.doubts))
+        every = poses if alone is None else {**poses, TRACKER: alone}
+        curves_of = poses if compared is None or compared.name == TRACKER else every
+        moved = sweep_curves(curves_of, sweep.grid.centre_mm, compared, tracked.covariance)
+        claims = claims_of(tracked, sweep.grid.centre_mm, corrections)
+        lengths = {mode: float(np.abs(curve[0, -1])) for mode, curve in moved.modes.items()}
+        claimed = {m: (lengths[m], lengths[m] * sigma) for m, sigma in claims.items() if m in lengths}
+        doubts = (*tracked.doubts, *differing_lengths(claimed))
+        rows = error_rows(every, moved, compared, sweep.grid.centre_mm)
+        summary = Summary(
+            sweep.name,
+            "none" if compared is None else compared.name,
+            len(sweep),
+            0.0 if compared is None else float(compared.covered.mean()),
+            rows,
+            details_of(tracked, corrections, provenance),
+            doubts,
+            doubted_modes(sweep, doubts, every),
+            left_out,
+            claims | _own_claim(alone, sweep.grid.centre_mm),
+            _drift(every, compared, sweep, source),
         )
-        writer.finish(poses, provenance, settings.to_toml(), trust_of(tracked, corrections))
-    if request.reference is None and compared is not None and compared.name == "tracker":
-        compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
-    moved = sweep_curves(poses, sweep.grid.centre_mm, compared, tracked.covariance)
-    name, share = ("none", 0.0) if compared is None else (compared.name, float(compared.covered.mean()))
-    doubts = (*tracked.doubts, *_contradictions(corrections))
-    summary = Summary(
-        sweep.name,
-        name,
-        len(sweep),
-        share,
-        _errors(sweep, poses, moved, compared),
-        details_of(tracked, corrections, moved, provenance),
-        doubts,
-        doubted_modes(sweep, doubts, poses),
-        left_out,
-        claims_of(tracked, sweep.grid.centre_mm, corrections),
-        _jitter(sweep),
-    )
-    files = [path, *write_summary(directory, summary)]
-    files += [save_figure(figure_drift(moved, _title(summary)), directory / "drift.png")]
-    files += [_draw_reslices(directory / "reslice.png", sweep.name, poses, compared, strip)]
-    files += [_draw_enlarged(directory / "enlarged.png", sweep, poses, strip)]
-    table, seconds = summary_text(summary), time.perf_counter() - began
-    curves = None if side is None or crossed is None else side.curves(tracked, crossed)
-    return JobResult(directory, summary, table, tuple(files), seconds, curves)
+        save_figure(figure_drift(moved, _title(summary)), part / PICTURES[0])
+        draw_strip(strip, every, compared, sweep.name, rows, (part / PICTURES[1], part / PICTURES[2]))
+        seconds = time.perf_counter() - began
+        summary.details["seconds"] = seconds
+        write_summary(part, summary)
+    corrected = None if side is None or crossed is None else side.curves(tracked, crossed)
+    files = tuple(directory / name for name in (RESULTS.primary, *RESULTS.others))
+    return JobResult(directory, summary, summary_text([summary]), files, seconds, corrected)
 
 
 def require_own_results(directory: Path) -> None:
@@ -226,20 +201,40 @@ def require_own_results(directory: Path) -> None:
         Naming the first such file.
     """
     primary = directory / RESULTS.primary
-    held = [name for name in RESULTS.names if (directory / name).exists()]
-    if not held or (primary.is_file() and not is_study(directory) and _is_reconstruction(primary)):
-        return
-    raise InvalidInputError(
-        f"{directory / held[0]}: expected a new folder or the results of `reconstruct` to replace, "
-        "got a file of another origin"
-    )
-
-
-def _is_reconstruction(path: Path) -> bool:
     try:
-        return kind_of(path) == RECONSTRUCTION
+        is_own = primary.is_file() and not is_study(directory) and kind_of(primary) == RECONSTRUCTION
     except (FileError, InvalidInputError):
-        return False
+        is_own = False
+    require_own(directory, RESULTS, is_own, "the results of `reconstruct` to replace")
+
+
+def error_rows(
+    poses: Mapping[str, RigidTransform],
+    moved: SweepCurves,
+    reference: Reference | None,
+    centre_mm: FloatArray,
+) -> list[ModeError]:
+    """Errors of every mode by part; of the reference under a mode's name, the length alone.
+
+    Parameters
+    ----------
+    poses : mapping of str to RigidTransform, length n
+        Of all modes, "tracker" among them.
+    moved : SweepCurves
+        Of the modes: their lengths where there is no reference.
+    """
+    if reference is None:
+        curves = moved.modes.items()
+        return [ModeError.of_estimate("all", mode, moved.frames, float(c[0, -1])) for mode, c in curves]
+    others = {mode: each for mode, each in poses.items() if mode != reference.name}
+    rows = compare_modes(
+        others, reference.world_from_image, centre_mm, reference.covered, reference.end_frames
+    )
+    if reference.name == TRACKER:
+        last = {row.part: row for row in rows}
+        for row in last.values():
+            rows.insert(rows.index(row) + 1, row.of_reference(TRACKER))
+    return rows
 
 
 def _corrected(
@@ -249,109 +244,65 @@ def _corrected(
     config: Config,
     crossed: CrossedPair | None,
     refusal: str,
-) -> tuple[dict[str, Correction], dict[str, str]]:
-    """Corrections by mode, and why modes are left out.
+) -> tuple[dict[str, RigidTransform], dict[str, Correction], dict[str, str]]:
+    """Poses by mode, corrections by mode, and why modes are left out.
 
     Parameters
     ----------
     refusal : str
         Why the sweeps could not be crossed; empty if they were, or need not be.
     """
-    corrections: dict[str, Correction] = {}
+    poses, corrections = {"image": tracked.image}, dict[str, Correction]()
     # Said even if only `fused` was to use it: it went without.
     left_out = {"crossed": refusal} if refusal else {}
     for mode in modes:
-        if mode == SUBSET:
-            continue
-        if mode in left_out:
-            continue
+        where = f"{sweep.name}: mode {mode}" if mode == SUBSET else f"{sweep.name}: drift mode {mode}"
         try:
-            corrections |= correct(tracked, sweep, [mode], config, crossed)
+            if mode == SUBSET and tracked.subset is not None:
+                poses[mode] = tracked.subset
+            elif mode == SUBSET:
+                require_believed(tracked.doubts, sweep.orientation_source, where)
+                left_out[mode] = (
+                    f"{where}: expected readings over every frame, got gaps where some are left out"
+                )
+            elif mode not in left_out:
+                corrections |= correct(tracked, sweep, [mode], config, crossed)
         except (MismatchError, InsufficientDataError) as error:
             if mode in PUBLISHED and isinstance(error, InsufficientDataError):
                 raise
-            where = f"{sweep.name}: drift mode {mode}"
             left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
-    return corrections, left_out
-
-
-def _contradictions(corrections: Mapping[str, Correction]) -> tuple[Doubt, ...]:
-    """What correcting found of sensors and images that checks before had not."""
-    fused = [each for each in corrections.values() if isinstance(each, FusedPoses)]
-    found = [doubt for each in fused for doubt in each.contradictions]
-    inertial = corrections.get("inertial")
-    if isinstance(inertial, ScaledPoses) and float(inertial.details["turned_steps"]) > 0:
-        steps = f"{inertial.details['turned_steps']:.0f} steps"
-        words = f"expected the direction that the accelerometer feels, got {steps} that go the other way"
-        found.append(Doubt("images", "direction of a stretch", words, False))
-    return tuple(found)
-
-
-def _refusal_of_subset(sweep: Sweep, tracked: Tracked) -> str:
-    """Why there are no poses from the consistent subset, though there is a sensor for them."""
-    try:
-        require_believed(tracked.doubts, sweep.orientation_source, f"{sweep.name}: mode {SUBSET}")
-    except MismatchError as error:
-        return str(error)
-    return (
-        f"{sweep.name}: mode {SUBSET}: expected readings over every frame, got gaps where some are left out"
-    )
+    return poses | {mode: each.poses for mode, each in corrections.items()}, corrections, left_out
 
 
 def _title(summary: Summary) -> str:
-    """Name of the sweep, and below it the modes in doubt, for figures."""
+    """Name of the sweep and the modes in doubt, for figures."""
     doubted = [f"{mode} in doubt: {why}" for mode, why in summary.doubted.items()]
-    left_out = [f"{mode} left out" for mode in summary.left_out]
-    return "\n".join([summary.sweep, "; ".join(doubted + left_out)]).strip()
+    return "; ".join([summary.sweep, *doubted, *(f"{mode} left out" for mode in summary.left_out)])
 
 
-def _errors(
-    sweep: Sweep, poses: dict[str, RigidTransform], moved: SweepCurves, reference: Reference | None
-) -> list[ModeError]:
+def _own_claim(alone: RigidTransform | None, centre_mm: FloatArray) -> dict[str, float]:
+    """Relative standard deviation of the tracker's own length, by its jitter alone, in the longest part."""
+    if alone is None:
+        return {}
+    row = max(compare_modes({TRACKER: alone}, alone, centre_mm), key=lambda row: row.reference_mm)
+    share = row.reference_sigma_mm / max(row.reference_mm, 1e-9)
+    return {TRACKER: share} if np.isfinite(share) else {}
+
+
+def _drift(
+    poses: Mapping[str, RigidTransform], reference: Reference | None, sweep: Sweep, source: Path
+) -> list[dict[str, Any]]:
+    """Drift and displacement of every mode over the frames that have a reference."""
     if reference is None:
-        return [ModeError.of_estimate(m, len(sweep), float(c[0, -1])) for m, c in moved.modes.items()]
-    true, ends = reference.world_from_image, 1 if reference.name == "truth" else END_FRAMES
-    return compare_modes(poses, true, sweep.grid.centre_mm, reference.covered, ends)
-
-
-def _jitter(sweep: Sweep) -> float:
-    """Per cent of the length that a tracker's jitter alone may be; 0 without one over all frames."""
-    tracker = sweep.tracker
-    if tracker is None or tracker.sensor_from_image is None or not tracker.covers(sweep.frame_time_s).all():
-        return 0.0
-    found = jitter_percent(tracker.world_from_image(sweep.frame_time_s), sweep.grid.centre_mm)
-    return found if np.isfinite(found) else 0.0
-
-
-def _draw_enlarged(path: Path, sweep: Sweep, poses: dict[str, RigidTransform], strip: Strip) -> Path:
-    """Part of the cut along the sweep: by the tracker alone, if it covers all frames, and in every mode."""
-    left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
-    shown, tracker = {}, sweep.tracker
-    mounted = tracker is not None and tracker.sensor_from_image is not None
-    if tracker is not None and mounted and tracker.covers(sweep.frame_time_s).all():
-        shown["tracker"] = tracker.world_from_image(sweep.frame_time_s) * left
-    shown |= {mode: each * left for mode, each in poses.items()}
-    planes = middle_planes(shown, strip.grid)
-    cuts = {mode: cut_frames(strip, strip.grid, each, planes[mode]) for mode, each in shown.items()}
-    return save_enlarged(cuts, PIXEL_MM, sweep.name, path)
-
-
-def _draw_reslices(
-    path: Path, name: str, poses: dict[str, RigidTransform], reference: Reference | None, strip: Strip
-) -> Path:
-    left = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0])
-    shown = {mode: each * left for mode, each in poses.items()}
-    compared = reference.name if reference is not None and reference.covered.all() else None
-    if reference is not None and compared:
-        shown[compared] = reference.world_from_image * left
-    planes = middle_planes(shown, strip.grid)
-    cuts = {}
-    for mode, world_from_image in shown.items():
-        image = cut_frames(strip, strip.grid, world_from_image, planes[mode])
-        cuts[mode] = DrawnCut.of_sweep(image, planes[mode], strip.grid, world_from_image)
-    first = next(iter(shown)) if len(shown) > 1 else None
-    view = view_of(planes[compared or "image"], shown[compared or "image"])
-    where = f"at lateral {strip.left_mm + strip.grid.width_mm / 2:.4g} mm, {view}".removesuffix(", ")
-    anchors = {mode: anchors_of(world_from_image) for mode, world_from_image in poses.items()}
-    picture = CutPicture(cuts, place=where, reference=compared or first, name=name, anchors=anchors)
-    return save_reslices(picture, path)
+        return []
+    true, covered = reference.world_from_image, reference.covered
+    # Landmarks could fall into gaps of the reference; of a part of a recording they have other numbers.
+    marks = load_landmarks(source) if covered.all() else None
+    marks = marks if marks is None or len(load_sweep(source)) == len(sweep) else None
+    with suppress(InsufficientDataError):  # a reference at rest
+        return [
+            {"mode": mode, **score_row(each[covered], true, sweep.grid, marks)}
+            for mode, each in poses.items()
+            if mode != reference.name
+        ]
+    return []

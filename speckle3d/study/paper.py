@@ -13,16 +13,17 @@ References
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
@@ -33,11 +34,11 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.scoring.lengths import ModeError, compare_modes
+from speckle3d.scoring.lengths import TRACKER, ModeError, compare_modes
+from speckle3d.scoring.references import tracker_alone
 from speckle3d.scoring.statistics import MeanInterval, mean_interval
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
-from speckle3d.study.folder import only_run
 from speckle3d.study.results import Study, json_text, write_texts
 from speckle3d.study.schedulers import InProcess, Scheduler
 
@@ -64,28 +65,6 @@ CURVE_SWEEPS: Mapping[str, SimulationSettings] = {
 MODES = ("image", "pose", "orientation")
 """In the order of the paper's tables 3 and 4: image-based, six DOF correction, orientation correction."""
 
-PUBLISHED: Mapping[tuple[str, str], tuple[tuple[float, float, float], tuple[float, float, float]]] = {
-    ("beef-1", "f"): ((13.1, 2.5, 12.5), (1.30, -0.06, -0.01)),
-    ("beef-2", "f"): ((30.5, -2.9, 31.6), (1.50, -0.07, -0.09)),
-    ("beef-3", "f"): ((26.3, 0.2, 26.5), (0.46, 0.03, 0.01)),
-    ("beef-4", "f"): ((-19.9, 1.9, -18.3), (1.35, 0.01, 0.00)),
-    ("beef-5", "f"): ((-6.8, 3.8, -8.0), (1.25, -0.09, -0.03)),
-    ("beef-6", "f"): ((14.6, 2.9, 12.7), (0.71, -0.03, -0.01)),
-    ("beef-6", "r"): ((15.6, 4.61, 16.0), (0.61, -0.01, -0.02)),
-    ("beef-7", "f"): ((8.01, 0.6, 4.9), (0.14, 0.05, 0.09)),
-    ("beef-7", "r"): ((29.0, -2.0, 26.7), (0.87, 0.11, 0.10)),
-    ("beef-8", "f"): ((2.7, 2.2, 2.0), (0.67, 0.01, -0.02)),
-    ("beef-8", "r"): ((-7.6, -1.0, -6.5), (0.53, -0.00, 0.01)),
-    ("beef-9", "f"): ((23.9, -1.0, 25.5), (1.14, 0.07, 0.05)),
-    ("beef-9", "r"): ((-21.7, 0.7, -23.4), (-0.05, 0.07, 0.07)),
-    ("beef-10", "f"): ((3.0, 1.4, -1.6), (1.50, -0.03, -0.02)),
-    ("beef-10", "r"): ((40.9, -0.1, 25.6), (2.21, 0.02, 0.03)),
-    ("phantom", "f"): ((6.5, -1.1, 4.2), (-8.02, 0.03, -0.11)),
-    ("phantom", "r"): ((6.1, -0.5, 4.7), (-0.43, -0.03, 0.00)),
-}
-"""By data set and part (f forward, r reverse): errors of length in per cent and of tilt in degrees, each for
-the modes of `MODES`."""
-
 Rows = Mapping[str, Mapping[str, Sequence[ModeError]]]
 
 
@@ -96,6 +75,20 @@ class _Input:
     path: Path
     settings: SimulationSettings
     as_published: bool
+
+
+def published() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
+    """Tables 3 and 4: by data set and part (f forward, r reverse), the errors of each mode of `MODES`.
+
+    An error is that of length, per cent, and of tilt, degrees.
+    """
+    text = files("speckle3d.study").joinpath("housden2008.csv").read_text(encoding="utf-8")
+    return {
+        (row["data_set"], row["part"]): {
+            mode: (float(row[f"{mode}_percent"]), float(row[f"{mode}_tilt_deg"])) for mode in MODES
+        }
+        for row in csv.DictReader(text.splitlines())
+    }
 
 
 def paper_study(
@@ -130,25 +123,24 @@ def paper_study(
         If a sweep cannot be simulated.
     """
     where = scheduler or InProcess()
-    with only_run(directory):
-        inputs = _inputs(directory, SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS})
-        _simulate(list(inputs.values()), where, simulated or (lambda done, total: None))
-        if curves is None:
-            curves = _measured([inputs[name].path for name in CURVE_SWEEPS])
-        paths = [inputs[name].path for name in SWEEPS]
-        study = compare_sweeps(paths, directory, None, "tracker", curves, scheduler=where, progress=progress)
-        ours = {each.sweep: each.rows for each in study.summaries}
-        rows: Rows = {"tracker": ours, "truth": _against_truth(study, directory)}
-        table = text_beside(rows)
-        held = [
-            {"reference": name, "sweep": sweep, **asdict(row)}
-            for name, found in rows.items()
-            for sweep, some in found.items()
-            for row in some
-        ]
-        numbers = json_text({"means": beside(rows), "rows": held})
-        write_texts(directory, {"paper.txt": table, "paper.json": numbers})
-        return study, table
+    inputs = _inputs(directory, SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS})
+    _simulate(list(inputs.values()), where, simulated or (lambda done, total: None))
+    if curves is None:
+        curves = _measured([inputs[name].path for name in CURVE_SWEEPS])
+    paths = [inputs[name].path for name in SWEEPS]
+    study = compare_sweeps(paths, directory, None, TRACKER, curves, scheduler=where, progress=progress)
+    ours = {each.sweep: each.rows for each in study.summaries}
+    rows: Rows = {TRACKER: ours, "truth": _against_truth(study, directory)}
+    table = text_beside(rows)
+    records = [
+        {"reference": name, "sweep": sweep, **asdict(row)}
+        for name, by_sweep in rows.items()
+        for sweep, some in by_sweep.items()
+        for row in some
+    ]
+    numbers = json_text({"means": beside(rows), "rows": records})
+    write_texts(directory, {"paper.txt": table, "paper.json": numbers})
+    return study, table
 
 
 def beside(rows: Rows) -> list[dict[str, Any]]:
@@ -166,14 +158,14 @@ def beside(rows: Rows) -> list[dict[str, Any]]:
         ``tilt_deg``, ours by reference, as `MeanInterval`. Parts, not sweeps, are the units, as there are 17
         in the tables.
     """
-    published = np.abs(list(PUBLISHED.values())).mean(axis=0).T.tolist()
-    found: list[dict[str, Any]] = []
-    for mode, (percent, deg) in zip(MODES, published, strict=True):
-        ours = {name: np.abs(_errors(some, mode)).T for name, some in rows.items()}
-        length, tilt = ({name: mean_interval(errors[k]) for name, errors in ours.items()} for k in (0, 1))
-        means = {"published_percent": percent, "published_deg": deg}
-        found.append({"mode": mode, **means, "length_percent": length, "tilt_deg": tilt})
-    return found
+    means: list[dict[str, Any]] = []
+    for mode in MODES:
+        theirs = np.abs([each[mode] for each in published().values()]).mean(axis=0).tolist()
+        sizes = {name: _sizes(some, mode) for name, some in rows.items()}
+        length, tilt = ({name: mean_interval(each[k]) for name, each in sizes.items()} for k in (0, 1))
+        row = {"mode": mode, "published_percent": theirs[0], "published_deg": theirs[1]}
+        means.append({**row, "length_percent": length, "tilt_deg": tilt})
+    return means
 
 
 def text_beside(rows: Rows) -> str:
@@ -186,15 +178,15 @@ def text_beside(rows: Rows) -> str:
     """
     first = next(iter(rows))
     lines = [["data set", *(f"length % {mode}" for mode in MODES), *(f"tilt deg {mode}" for mode in MODES)]]
-    for (name, part), (length, tilt) in PUBLISHED.items():
+    for (name, part), theirs in published().items():
         ours = {row.mode: row for row in rows[first].get(name, ()) if row.part == part}
-        cells = [_pair(p, ours.get(m), "length_error_percent", 1) for m, p in zip(MODES, length, strict=True)]
-        cells += [_pair(p, ours.get(m), "tilt_error_deg", 2) for m, p in zip(MODES, tilt, strict=True)]
+        cells = [_pair(theirs[m][0], ours.get(m), "length_error_percent", 1) for m in MODES]
+        cells += [_pair(theirs[m][1], ours.get(m), "tilt_error_deg", 2) for m in MODES]
         lines.append([f"{name} {part}", *cells])
     means = [["mean absolute error of all parts", "", "length %", "tilt deg"]]
     for each in beside(rows):
-        published = [f"{each['published_percent']:.1f}", f"{each['published_deg']:.3f}"]
-        means.append([each["mode"], "published", *published])
+        printed = f"{each['published_percent']:.1f}", f"{each['published_deg']:.3f}"
+        means.append([each["mode"], "published", *printed])
         length, tilt = each["length_percent"], each["tilt_deg"]
         means += [["", name, _interval(length[name], 2), _interval(tilt[name], 3)] for name in rows]
     return (
@@ -217,7 +209,7 @@ def _simulate(inputs: Sequence[_Input], where: Scheduler, simulated: Callable[[i
     missing = [each for each in inputs if not each.path.is_file()]
     done = len(inputs) - len(missing)
     simulated(done, len(inputs))
-    for _, failure in where.run(_write_input, missing, _failed):
+    for failure in where.run(_write_input, missing, _failed):
         if failure:
             raise InvalidInputError(failure)
         done += 1
@@ -257,21 +249,23 @@ def _measured(phantoms: Sequence[Path]) -> Path:
 
 
 def _against_truth(study: Study, directory: Path) -> dict[str, list[ModeError]]:
-    """Errors of the same poses against the truth, by data set."""
-    found = {}
+    """Errors of the same poses, and of the tracker alone, against the truth, by data set."""
+    rows = {}
     for outcome in study.outcomes:
         if outcome.status == "done":
             sweep = load_sweep(outcome.path)
-            held = read_reconstruction(directory / outcome.folder / "reconstruction.h5", with_pairs=False)
+            made = read_reconstruction(directory / outcome.folder / "reconstruction.h5", with_pairs=False)
+            alone = tracker_alone(sweep)
+            poses = made.poses if alone is None else {**made.poses, TRACKER: alone}
             assert sweep.truth is not None
-            found[outcome.name] = compare_modes(held.poses, sweep.truth, sweep.grid.centre_mm, end_frames=1)
-    return found
+            rows[outcome.name] = compare_modes(poses, sweep.truth, sweep.grid.centre_mm, end_frames=1)
+    return rows
 
 
-def _interval(found: MeanInterval, digits: int) -> str:
-    if found.low is None or found.high is None:
-        return f"{found.mean:.{digits}f}"
-    return f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+def _interval(mean: MeanInterval, digits: int) -> str:
+    if mean.low is None or mean.high is None:
+        return f"{mean.mean:.{digits}f}"
+    return f"{mean.mean:.{digits}f} [{mean.low:.{digits}f}, {mean.high:.{digits}f}]"
 
 
 def _pair(published: float, ours: ModeError | None, name: str, digits: int) -> str:
@@ -279,8 +273,7 @@ def _pair(published: float, ours: ModeError | None, name: str, digits: int) -> s
     return f"{published:+.{digits}f} | {value}"
 
 
-def _errors(found: Mapping[str, Sequence[ModeError]], mode: str) -> FloatArray:
-    """Length (per cent) and tilt (degrees) of a mode's rows, shape (n, 2)."""
-    rows = [row for some in found.values() for row in some if row.mode == mode]
-    errors = [(row.length_error_percent, row.tilt_error_deg) for row in rows]
-    return np.array(errors, dtype=float).reshape(-1, 2)
+def _sizes(rows: Mapping[str, Sequence[ModeError]], mode: str) -> list[list[float]]:
+    """Magnitudes of a mode's errors of length (per cent), and of tilt (degrees)."""
+    own = [row for some in rows.values() for row in some if row.mode == mode]
+    return [[abs(row.length_error_percent) for row in own], [abs(row.tilt_error_deg) for row in own]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.config import Config, config_from_toml
+from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
@@ -75,11 +75,9 @@ def posed_errors_of(reconstruction: Reconstruction, mode: str = "image") -> Pose
 def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors:
     """Joint errors of the poses of one mode.
 
-    `image`: what the file holds. `crossed`, `inertial`, `fused`: their own claims; the claimed error of the
-    length stretches the whole sweep, and what the covariances have beyond it has grown from frame to frame.
-    `orientation`: the images' error of length, with the angles' errors of the sensor, which bend the path.
-    `pose` and `consistent-subset` claim nothing and are taken to be no better than the images; in `pose` the
-    sweep's direction is further as uncertain as the image's place on the tracker is.
+    `image`: what the file holds. Other modes: their own claims; the claimed error of the length stretches the
+    whole sweep, and what the covariances have beyond it has grown from frame to frame. `consistent-subset`,
+    and `orientation` and `pose` of older files, claim nothing and are taken to be no better than the images.
 
     Parameters
     ----------
@@ -106,7 +104,7 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
         stretched = SharedErrors(0.0, own.length_sigma, np.zeros(2))
         return joint_errors(own.covariance, poses, centre, stretched)
     image = joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
-    config = config_from_toml(reconstruction.config_toml) if reconstruction.config_toml else Config()
+    config = stored_config(reconstruction.config_toml) if reconstruction.config_toml else Config()
     if mode == "orientation":
         return _sensed(image, poses, centre, reconstruction.frame_time_s, config)
     return _tracked(image, poses, centre, config) if mode == "pose" else image

@@ -1,6 +1,7 @@
 """Results of a comparison on file: of one sweep (``summary.json``) and of a whole study (``study.json``).
 
-Beside each lie ``table.txt`` for people and ``table.csv``.
+Beside each lie ``table.txt`` for people and ``table.csv``. JSON and CSV hold standard deviations; where
+people read, ``+-`` is the half width of a 95 % interval, and says so.
 """
 
 from __future__ import annotations
@@ -24,35 +25,21 @@ from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.overall import FITTED_TO_TRACKER, over_sweeps, overall_text, shared_means
+from speckle3d.study.overall import FITTED_TO_TRACKER, number, over_sweeps, overall_text
 
 FORMAT = "speckle3d.study"
-VERSION = 1
+VERSION = 2
+"""Version 1 had its statistics from one sweep on, and the modes' drift in files of their own."""
 
 FILES = FileSet(
-    "study.json",
-    ("table.txt", "table.csv"),
-    ("report.html", "figures/overview.png", "figures/overview.svg", "paper.txt", "paper.json"),
+    "study.json", ("table.txt", "table.csv"), ("report.html", "overview.png", "paper.txt", "paper.json")
 )
 """What a study writes, and what is made from it afterwards."""
 
-_COLUMNS = (
-    ("sweep", "sweep", "{}"),
-    ("part", "part", "{}"),
-    ("mode", "mode", "{}"),
-    ("reference", "reference", "{}"),
-    ("reference_mm", "reference mm", "{:.2f}"),
-    ("estimate_mm", "estimate mm", "{:.2f}"),
-    ("length_error_mm", "length error mm", "{:+.2f}"),
-    ("length_error_percent", "length error %", "{:+.1f}"),
-    ("tilt_error_deg", "tilt error deg", "{:+.2f}"),
-    ("yaw_error_deg", "yaw error deg", "{:+.2f}"),
-    ("roll_error_deg", "roll error deg", "{:+.2f}"),
-    ("remark", "remark", "{}"),
-)
-TOLD_JITTER_PERCENT = 1.0
-"""From here on a length that rests on the tracker says what its jitter does."""
-_TO_THE_LEFT = (0, 1, 2, 3, 11)
+SUMMARY_FILES = ("summary.json", "table.txt", "table.csv")
+
+_HEADS = ("sweep", "part", "mode", "length / mm", "+- 95 %", "reference / mm", "error / %",
+          "tilt / °", "yaw / °", "roll / °")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -66,6 +53,9 @@ class Summary:
     coverage : float
         Share of the frames that have a reference.
     rows : sequence of ModeError
+        Of every mode, "tracker" among them: the sensor alone, no images.
+    drift : sequence of mapping
+        Drift and displacement by ``mode``, as `speckle3d.scoring.displacements.score_row` has them.
     doubts : sequence of Doubt
         About the recording.
     doubted : mapping of str to str
@@ -73,9 +63,8 @@ class Summary:
     left_out : mapping of str to str
         Modes that were asked for and refused, and why.
     claims : mapping of str to float
-        Relative standard deviation of the length that a mode claims, where it claims one.
-    jitter_percent : float
-        What the tracker's jitter alone leaves of error in a length that rests on it; 0 without a tracker.
+        Relative standard deviation of the length that a mode claims, where it claims one; of `tracker` what
+        its jitter alone leaves.
     details : dict
         Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
     """
@@ -90,13 +79,56 @@ class Summary:
     doubted: Mapping[str, str] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     claims: Mapping[str, float] = field(default_factory=dict)
-    jitter_percent: float = 0.0
+    drift: Sequence[Mapping[str, Any]] = ()
 
     @property
     def doubt_lines(self) -> list[str]:
         """What a reader must know of the recording, a line each."""
         lines = [f"{self.sweep}: {doubt.consequence}" for doubt in self.doubts]
         return lines + [f"{self.sweep}: mode {mode} is left out" for mode in self.left_out]
+
+    @property
+    def lines(self) -> list[str]:
+        """What stands below the table: doubts, remarks on rows, and where a tracker made a length worse."""
+        remarks = {f"{row.mode}: {self.remark(row)}": None for row in self.rows if self.remark(row)}
+        return [*self.doubt_lines, *(f"{self.sweep}: {each}" for each in [*remarks, *self._made_worse()])]
+
+    def remark(self, row: ModeError) -> str:
+        """What a reader of a row must know beside its numbers; empty for nothing."""
+        words = []
+        if row.mode == self.reference:
+            words.append("the reference itself")
+        if row.mode in FITTED_TO_TRACKER and self.reference == "tracker":
+            words.append("fitted to this tracker")
+        if row.mode in self.doubted:
+            words.append(f"in doubt: {self.doubted[row.mode]}")
+        return "; ".join(words)
+
+    def _made_worse(self) -> list[str]:
+        if self.reference != "truth":
+            return []
+        errors = {(row.part, row.mode): row.length_error_percent for row in self.rows}
+        jitter = 196 * self.claims.get("tracker", 0.0)
+        return [
+            f"part {part}: {mode} is farther from the truth ({error:+.1f} %) than image "
+            f"({errors[part, 'image']:+.1f} %); the tracker's jitter is +- {jitter:.1f} % of its length "
+            "(95 %)"
+            for (part, mode), error in errors.items()
+            if mode in FITTED_TO_TRACKER and jitter and abs(error) > abs(errors[part, "image"])
+        ]
+
+    def records(self) -> list[dict[str, Any]]:
+        """Rows with what is known beside their errors: ``sweep``, ``reference``, ``sigma_mm``, ``remark``."""
+        return [
+            {
+                "sweep": self.sweep,
+                "reference": self.reference,
+                **asdict(row),
+                "sigma_mm": self.claims.get(row.mode, math.nan) * row.estimate_mm,
+                "remark": self.remark(row),
+            }
+            for row in self.rows
+        ]
 
 
 @dataclass(frozen=True)
@@ -141,14 +173,43 @@ def write_summary(directory: Path, summary: Summary) -> list[Path]:
     FileError
         If the directory cannot be written.
     """
-    rows = rows_of([summary])
-    texts = {"summary.json": json_text({"sweeps": [summary]}), "table.txt": summary_text(summary)}
-    return write_texts(directory, texts | {"table.csv": csv_text(rows)})
+    texts = json_text({"sweeps": [summary]}), summary_text([summary]), csv_text(summary.records())
+    return write_texts(directory, dict(zip(SUMMARY_FILES, texts, strict=True)))
 
 
-def summary_text(summary: Summary) -> str:
-    """Table of one sweep, and below it what is in doubt."""
-    return table_text(rows_of([summary])) + "".join(f"{line}\n" for line in summary.doubt_lines)
+def summary_text(summaries: Sequence[Summary], more: Sequence[str] = ()) -> str:
+    """Table of some sweeps, below it what its columns are and what is in doubt, then more lines."""
+    records = [record for each in summaries for record in each.records()]
+    names = dict.fromkeys(each.reference for each in summaries)
+    lines = ["+- 95 %: of the length, mm, as the mode claims it; of tracker by its jitter alone"]
+    if set(names) - {"none"}:
+        lines.append(f"reference: {', '.join(names)}; errors are estimate minus reference")
+    lines += [*(line for each in summaries for line in each.lines), *more]
+    return table_text(records) + "".join(f"{line}\n" for line in lines)
+
+
+def table_text(records: Sequence[Mapping[str, Any]]) -> str:
+    """Aligned table of `Summary.records` for reading, under 100 columns for names of usual length."""
+    lines: list[Sequence[str]] = [_HEADS]
+    for row in records:
+        half = None if row["sigma_mm"] is None else 1.96 * row["sigma_mm"]
+        signed = [
+            number(key, row[key], signed=True)
+            for key in ("length_error_percent", "tilt_error_deg", "yaw_error_deg", "roll_error_deg")
+        ]
+        lengths = [number("mm", value) for value in (row["estimate_mm"], half, row["reference_mm"])]
+        lines.append([row["sweep"], row["part"], row["mode"], *lengths, *signed])
+    return text_table(lines, (0, 1, 2))
+
+
+def csv_text(records: Sequence[Mapping[str, Any]], *more: str) -> str:
+    """`Summary.records` with full precision, and `more` columns behind."""
+    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "sigma_mm", "remark", *more]
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    return text.getvalue()
 
 
 def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
@@ -161,40 +222,31 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
     FileError
         If the folder cannot be written.
     """
-    summaries: list[Summary] = []
-    drift: list[dict[str, Any]] = []
-    for outcome in outcomes:
-        if outcome.status == "done":
-            folder = directory / outcome.folder
-            summaries.append(_read_summary(folder, outcome.name))
-            found = json.loads((folder / "drift.json").read_text(encoding="utf-8"))
-            drift += [{"sweep": outcome.name} | row for row in found]
-    rows, copies = rows_of(summaries), copies_among(outcomes)
+    done = [each for each in outcomes if each.status == "done"]
+    failed = [each for each in outcomes if each.status == "failed"]
+    summaries = [read_summary(directory / each.folder, each.name) for each in done]
+    rows = [record for each in summaries for record in each.records()]
+    drift = [{"sweep": each.sweep, **row} for each in summaries for row in each.drift]
+    copies = copies_among(outcomes)
     single = [[row for row in some if row["sweep"] not in copies] for some in (rows, drift)]
     intervals, paired = over_sweeps(*single)
-    shared = shared_means(*single)
     references = {each.sweep: each.reference for each in summaries if each.sweep not in copies}
-    overall = overall_text(intervals, paired, shared, references)
-    failed = [each for each in outcomes if each.status == "failed"]
     remarks = [f"{each.name}  failed: {each.reason}" for each in failed] + copy_lines(copies)
-    remarks += [line for each in summaries for line in each.doubt_lines]
-    table = table_text(rows) + "".join(f"{line}\n" for line in remarks)
-    table += f"\n{overall}" if overall else ""
+    overall = overall_text(intervals, paired, references)
+    table = summary_text(summaries, remarks) + (f"\n{overall}" if overall else "")
+    sweeps = [asdict(each) | {"copy_of": copies.get(each.name, "")} for each in outcomes]
+    for each in sweeps:
+        del each["skipped"]
     contents = {
         "format": FORMAT,
         "version": VERSION,
         "settings_toml": settings_toml,
         "modes": list(dict.fromkeys(row["mode"] for row in rows)),
-        "sweeps": [
-            {name: value for name, value in asdict(each).items() if name != "skipped"}
-            | {"copy_of": copies.get(each.name, "")}
-            for each in outcomes
-        ],
+        "sweeps": sweeps,
         "rows": rows,
         "doubts": [{"sweep": each.sweep, **asdict(doubt)} for each in summaries for doubt in each.doubts],
         "drift": drift,
         "intervals": intervals,
-        "shared": shared,
         "paired": paired,
     }
     paths = {each.name: each.path for each in outcomes}
@@ -214,63 +266,19 @@ def is_study(directory: Path) -> bool:
         return False
 
 
-def require_own_study(directory: Path) -> None:
-    """Refuse a folder in which a study's names stand for something else.
+def require_own(directory: Path, files: FileSet, is_own: bool, what: str) -> None:
+    """Refuse a folder in which names of a result stand for something else.
 
     Raises
     ------
     InvalidInputError
         Naming the first such file.
     """
-    held = [name for name in FILES.names if (directory / name).exists()]
-    if held and not is_study(directory):
+    taken = [name for name in files.names if (directory / name).exists()]
+    if taken and not is_own:
         raise InvalidInputError(
-            f"{directory / held[0]}: expected a new folder or a study to go on with or to replace, "
-            "got a file of another origin"
+            f"{directory / taken[0]}: expected a new folder or {what}, got a file of another origin"
         )
-
-
-def rows_of(summaries: Sequence[Summary]) -> list[dict[str, Any]]:
-    """One record per sweep, part and mode."""
-    return [
-        {"sweep": each.sweep, "reference": each.reference, **asdict(row), "remark": remark_on(each, row)}
-        for each in summaries
-        for row in each.rows
-    ]
-
-
-def remark_on(summary: Summary, row: ModeError) -> str:
-    """What a reader of a row must know beside its numbers; empty for nothing."""
-    words = []
-    if row.mode in summary.claims:
-        words.append(f"length +- {100 * summary.claims[row.mode]:.1f} %")
-    rests_on_tracker = row.mode in FITTED_TO_TRACKER or summary.reference == "tracker"
-    if rests_on_tracker and summary.jitter_percent >= TOLD_JITTER_PERCENT:
-        words.append(f"tracker's jitter alone +- {summary.jitter_percent:.1f} %")
-    if row.mode in FITTED_TO_TRACKER and summary.reference == "tracker":
-        words.append("fitted to this tracker")
-    if row.mode in summary.doubted:
-        words.append(f"in doubt: {summary.doubted[row.mode]}")
-    return "; ".join(words)
-
-
-def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Aligned table of `rows_of` for reading; angles and lengths are estimate minus reference."""
-    lines = [[heading for _, heading, _ in _COLUMNS]]
-    lines += [[_cell(row[key], form) for key, _, form in _COLUMNS] for row in rows]
-    if not any(line[-1] for line in lines[1:]):
-        lines = [line[:-1] for line in lines]
-    return text_table(lines, _TO_THE_LEFT)
-
-
-def csv_text(rows: Sequence[Mapping[str, Any]], *more: str) -> str:
-    """`rows_of` with full precision, under the names of `ModeError`, and `more` columns behind."""
-    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "remark", *more]
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def json_text(value: Any) -> str:
@@ -294,11 +302,12 @@ def json_text(value: Any) -> str:
 def copies_among(outcomes: Sequence[SweepOutcome]) -> dict[str, str]:
     """Sweeps whose bytes are those of an earlier one, and that one's name."""
     first: dict[str, str] = {}
-    copies: dict[str, str] = {}
-    for each in outcomes:
-        if each.status == "done" and first.setdefault(each.sha256, each.name) != each.name:
-            copies[each.name] = first[each.sha256]
-    return copies
+    done = [each for each in outcomes if each.status == "done"]
+    return {
+        each.name: original
+        for each in done
+        if (original := first.setdefault(each.sha256, each.name)) != each.name
+    }
 
 
 def copy_lines(copies: Mapping[str, str]) -> list[str]:
@@ -306,28 +315,15 @@ def copy_lines(copies: Mapping[str, str]) -> list[str]:
     return [f"{name} is a copy of {first}: counted once" for name, first in copies.items()]
 
 
-def _read_summary(folder: Path, name: str) -> Summary:
-    """Read a sweep's rows back; a number that was not finite is NaN again."""
-    held: dict[str, Any]
-    (held,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-    names = [f.name for f in fields(ModeError)]
-    rows: list[list[Any]] = [[math.nan if row[n] is None else row[n] for n in names] for row in held["rows"]]
-    summary = held["reference"], held["frames"], held["coverage"]
-    doubts = [Doubt(**each) for each in held.get("doubts", ())]
-    told: dict[str, Any] = {key: held.get(key, {}) for key in ("doubted", "left_out", "claims")}
-    told["jitter_percent"] = held.get("jitter_percent") or 0.0
-    return Summary(name, *summary, [ModeError(*values) for values in rows], doubts=doubts, **told)
-
-
-def _cell(value: Any, form: str) -> str:
-    return "-" if isinstance(value, float) and math.isnan(value) else form.format(value)
-
-
-def _listed(value: Any) -> Any:
-    """Arrays and NumPy scalars as lists and numbers of Python's own, for `to_json`."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise ValueError(f"got {type(value)}")
+def read_summary(folder: Path, name: str) -> Summary:
+    """Read a sweep's summary back, without its details; a number that was not finite is NaN again."""
+    (stored,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+    records: list[dict[str, Any]] = [
+        {key: math.nan if value is None else value for key, value in row.items()} for row in stored["rows"]
+    ]
+    rows = [ModeError(**row) for row in records]
+    doubts = [Doubt(**each) for each in stored["doubts"]]
+    return Summary(**stored | {"sweep": name, "rows": rows, "doubts": doubts, "details": {}})
 
 
 def write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
@@ -337,3 +333,10 @@ def write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
         with atomic_path(directory / name) as part:
             part.write_text(text, encoding="utf-8")
     return [directory / name for name in texts]
+
+
+def _listed(value: Any) -> Any:
+    """Arrays and NumPy scalars as lists and numbers of Python's own, for `to_json`."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise ValueError(f"got {type(value)}")

@@ -52,7 +52,7 @@ CURVE_SWEEPS = (
     {**TURNING, "seed": 16, "turn_deg": 20.0, "length_mm": 2.0, "frames": 160},
 )
 """What curves are calibrated on, as data/README.md has it."""
-MODES = ("image", "orientation", "pose")
+MODES = ("image", "orientation", "pose", "fused")
 PARTS = ("x", "y", "z", "tilt", "yaw", "roll")
 
 PLAIN = {
@@ -102,15 +102,11 @@ CASES = (
         "tissue, one way",
         "tissue",
         ONE_WAY,
-        {"image": (8.0, 1.5), "orientation": (6.0, 0.2)},
+        {"image": (2.0, 1.5), "orientation": (3.0, 0.2)},
         ("ours", "plain", "chained"),
     ),
-    Case(
-        "tissue, forward and back",
-        "reversal",
-        ONE_WAY,
-        {"image": (8.0, 1.5), "orientation": (6.0, 0.2)},
-    ),
+    Case("tissue, 8 mm", "tissue", {"length_mm": 8.0}, {"image": (3.0, 1.5)}),
+    Case("tissue, forward and back", "reversal", ONE_WAY, {"image": (2.0, 1.5), "orientation": (3.0, 0.2)}),
 )
 RETURN_MM = 0.5
 """Target for how near a sweep that comes back ends to where it began."""

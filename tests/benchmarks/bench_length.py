@@ -1,7 +1,7 @@
 """Whether lengths hold when the curves do not: RF sweeps through the command, cheaper cases for statistics.
 
 ``python tests/benchmarks/bench_length.py [PART ...] [--seeds N] [--first-seed N]``; parts are sweeps,
-crossing, inertial, curves and fused. RF sweeps are simulated once (an hour and a half on two cores) and kept.
+crossing and fused. RF sweeps are simulated once (an hour and a half on two cores) and kept.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from cache import DEFAULT
 from length.rows import show
 from length.scenes import FIRST_SEED
 
-STATISTICS = ("crossing", "inertial", "curves", "fused")
+STATISTICS = ("crossing", "fused")
 
 
 def main() -> None:

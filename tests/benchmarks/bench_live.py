@@ -16,8 +16,7 @@ import numpy as np
 
 import speckle3d as s3
 from speckle3d.io.igtl.connection import Connection
-from speckle3d.io.igtl.messages import TransformReceived
-from speckle3d.io.igtl.packing import packed_image
+from speckle3d.io.igtl.messages import TransformReceived, packed_image
 from speckle3d.io.igtl.server import Server
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.session import Session, SessionSettings

@@ -16,11 +16,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
-from speckle3d.config import Config
 from speckle3d.core.geometry import mirrored
 from speckle3d.live.tracking import LiveTracker
-from speckle3d.matching.blocks import Block, MatchedBlock, match_block
-from speckle3d.stages import matcher_for
 
 
 def apart_mm(poses, others, centre_mm):
@@ -34,13 +31,10 @@ def row(path, curves, step):
     """The figures of one sweep."""
     # Sensors would settle the sign.
     sweep = dataclasses.replace(s3.load_sweep(path), orientation=None, tracker=None)
-    config, centre = Config(), sweep.grid.centre_mm
-    matcher = matcher_for(sweep, curves, config)
-    known = list(match_block(sweep, matcher, config.trajectory, config.quality, Block(0, len(sweep))))
+    centre = sweep.grid.centre_mm
 
     def tracked(frames):
-        some = sweep.part(0, frames)
-        return s3.track(some, curves, matched=lambda b: MatchedBlock(known[b.first : b.stop], {})).image
+        return s3.track(sweep.part(0, frames), curves).image
 
     whole = tracked(len(sweep))
     asked = [*range(2, len(sweep), step), len(sweep) - 1]

@@ -54,7 +54,7 @@ from speckle3d.study.details import trust_of
 from speckle3d.study.pose_errors import posed_errors_of
 
 FIRST_SEED = 41001
-MODES = ("orientation", "pose", "inertial", "fused")
+MODES = ("orientation", "pose", "fused")
 _ESTIMATORS = ("matching", "motion", "correction")
 STEP_MM = 0.25
 PAIRS, LEAST_APART_MM, VOXEL_MM = 60, 1.0, 0.3

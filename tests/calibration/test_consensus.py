@@ -4,17 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_examples import PIXEL_MM, TRIAL_1, scan_wires
+from calibration_examples import PIXEL_MM, scan_wires
 from crossing_images import crossing_world
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints, Seen
 from calibration.consensus import find_consensus
 from calibration.detection.crossings import crossings_in_frames
-from calibration.job import JobSettings, Recording, wires_job
+from calibration.points import ImagePoints
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.streams import TimedPoses
 
 CROSSING_MM = np.array([10.0, -20.0, 30.0])
 
@@ -30,10 +27,9 @@ def anywhere(rng, points, count):
     return rng.uniform(points.pixels.min(axis=0), points.pixels.max(axis=0), (count, 2))
 
 
-@pytest.mark.parametrize("wrong_share", [0.5, 0.65])
-def test_picks_of_which_most_are_wrong_give_the_calibration_of_the_right_ones(wrong_share):
+def test_picks_of_which_most_are_wrong_give_the_calibration_of_the_right_ones():
     points, rng = scan(0), np.random.default_rng(1)
-    wrong = rng.permutation(52) < wrong_share * 52
+    wrong = rng.permutation(52) < 0.65 * 52
     pixels = np.where(wrong[:, None], anywhere(rng, points, 52), points.pixels)
     far = wrong & (np.hypot(*((pixels - points.pixels) * PIXEL_MM).T) > 5.0)
     solution = calibrate_cross_wire(replace(points, pixels=pixels), PIXEL_MM)
@@ -80,12 +76,6 @@ def test_chance_candidates_are_refused_and_the_statistic_told(frames, each):
         assert "chance gives" in str(refused.value)
 
 
-def test_a_wrong_pixel_size_does_not_hide_the_consensus():
-    points = scan(6)
-    solution = calibrate_cross_wire(points, np.array([1.0, 1.0]))
-    np.testing.assert_allclose(solution.chain.pixel_mm, PIXEL_MM, rtol=0.02)
-
-
 @pytest.mark.slow
 def test_images_of_crossing_wires_calibrate():
     found = []
@@ -104,38 +94,3 @@ def test_images_of_crossing_wires_calibrate():
         with pytest.raises(InsufficientDataError, match="chance"):
             calibrate_cross_wire(seen.points(world.world_from_sensor[other[seen.frame]]), world.pixel_mm)
     assert min(found) >= 0.8
-
-
-@pytest.mark.slow
-def test_forty_recordings_of_nothing_give_no_consensus():
-    for seed in range(40):
-        rng = np.random.default_rng([seed, 7])
-        frames, each = int(rng.integers(8, 40)), (1, 6)[seed % 2]
-        points = scan(seed, frames)
-        frame = np.repeat(np.arange(frames), each)
-        chance = ImagePoints(anywhere(rng, points, len(frame)), frame, points.world_from_sensor[frame])
-        assert not find_consensus(chance, PIXEL_MM).believed
-
-
-@pytest.mark.slow
-def test_candidates_are_chosen_although_the_clock_is_off():
-    times, rng = np.arange(0.0, 24.0, 0.2), np.random.default_rng(8)
-    wave = np.sin(2 * np.pi * np.outer(times, [0.11, 0.17, 0.07, 0.13, 0.09]) + [0, 1, 2, 3, 4])
-    turns = Rotation.from_euler("yxz", 0.5 * wave[:, :3])
-    pixels = np.array([220.0, 240.0]) + wave[:, 3:] * [150.0, 160.0]
-    flat = np.column_stack([pixels * PIXEL_MM, 0.3 * rng.standard_normal(len(times))])
-    world_from_image = RigidTransform.from_components(CROSSING_MM - turns.apply(flat), turns)
-    readings = TimedPoses(times - 0.21, world_from_image * TRIAL_1.inv(), max_gap_s=1.0)
-    candidates = np.stack([pixels, *rng.uniform(50, 430, (4, *pixels.shape))], axis=1)
-    for one in candidates:
-        rng.shuffle(one)
-    seen = Seen(np.repeat(np.arange(len(times)), 5), candidates.reshape(-1, 2))
-    recording = Recording(np.zeros((len(times), 8, 8), np.uint8), PIXEL_MM, 0.0, times, readings)
-    outcome = wires_job(recording, seen, JobSettings(estimate_offset=True), None)
-    # A reading is 0.3 mm off its place at 100 mm/s.
-    assert outcome.offset.seconds == pytest.approx(0.21, abs=0.01)
-    # Between readings 0.2 s apart lines are drawn where the hand turns: a third of the frames contradict.
-    assert len(outcome.solution.points_used.frames) > 0.6 * len(outcome.seen)
-    right = np.abs(outcome.seen.pixels - pixels[outcome.seen.frame]).max(axis=1) < 1.0
-    assert right.mean() > 0.9
-    assert outcome.shots[0].candidates_px.shape == (5, 2)

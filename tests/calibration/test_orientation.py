@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from calibration_examples import line_directions
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.orientation import calibrate_orientation
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from calibration.points import ImagePoints
+from calibration.settings import OrientationFit
+from speckle3d.core.errors import InsufficientDataError
 
 SQUARE = np.ones(2)
 
@@ -19,24 +21,8 @@ def tilt_yaw_roll_deg(found, mounting):
 
 
 def calibrate(directions, readings, **options):
-    return calibrate_orientation(directions, np.arange(len(directions)), readings, SQUARE, **options)
-
-
-def bound_rad(directions, readings, mounting, noise_rad, level):
-    """Cramer-Rao bound of tilt, yaw and roll from the residuals' own definition, by differences."""
-
-    def sines(step):
-        turn = readings * mounting * Rotation.from_rotvec(step[:3])
-        normal = Rotation.from_rotvec([*step[3:], 0.0]).apply([0.0, 0.0, 1.0]) if not level else [0, 0, 1.0]
-        along = np.column_stack([directions, np.zeros(len(directions))])
-        return turn.apply(along) @ normal
-
-    size = 3 if level else 5
-    full = np.eye(5)[:size]
-    columns = [(sines(1e-5 * one) - sines(-1e-5 * one)) / 2e-5 for one in full]
-    # A line's own angle moves the sine by its slope in the plane's frame, the sensor's noise by as much.
-    information = np.array(columns) @ np.array(columns).T / noise_rad**2
-    return np.sqrt(np.diag(np.linalg.inv(information)))[:3]
+    lines = ImagePoints(directions, np.arange(len(directions)), RigidTransform.from_rotation(readings))
+    return calibrate_orientation(lines, SQUARE, OrientationFit(**options))
 
 
 @pytest.mark.slow
@@ -55,23 +41,6 @@ def test_twenty_five_remounted_calibrations_are_as_precise_as_they_must_be(level
     assert yaw <= 0.6
     # A plane whose slope is not known costs roll: the bound below is 0.26 degrees.
     assert roll <= (0.08 if level else 0.35)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("level", [True, False])
-def test_the_estimator_reaches_the_cramer_rao_bound(level):
-    scores = []
-    for trial in range(80):
-        rng = np.random.default_rng([trial, 7])
-        directions, readings, mounting = line_directions(
-            rng, 100, noise_deg=0.1, sensor_noise_deg=0.0, roll_deg=25.0
-        )
-        bound = bound_rad(directions, readings, mounting, np.deg2rad(0.1), level)
-        scores.append(
-            np.deg2rad(tilt_yaw_roll_deg(calibrate(directions, readings, level=level), mounting)) / bound
-        )
-    # 80 trials know a standard deviation to 8 %; a tenth is what is asked for.
-    np.testing.assert_allclose(np.std(scores, axis=0), 1.0, atol=0.10 + 0.08)
 
 
 @pytest.mark.parametrize("level", [True, False])
@@ -102,27 +71,18 @@ def test_the_mirror_is_never_wrong(trials):
 
 def test_a_plane_seen_from_below_is_the_mirror_unless_said():
     directions, readings, mounting = line_directions(np.random.default_rng(0), 60, from_below=True)
-    wrong = calibrate(directions, readings)
-    assert (mounting.inv() * wrong.chain.sensor_from_image.rotation).magnitude() == pytest.approx(
-        np.pi, abs=0.1
-    )
-
-
-def test_a_sloping_plane_is_found_where_it_is_not_assumed_level():
-    slope = Rotation.from_euler("xy", [4.0, -3.0], degrees=True)
-    directions, readings, mounting = line_directions(
-        np.random.default_rng(0), 100, noise_deg=0.05, sensor_noise_deg=0.02, slope=slope
-    )
-    solution = calibrate(directions, readings)
-    normal = solution.chain.target_from_world.rotation.as_matrix()[2]
-    assert np.rad2deg(np.arccos(abs(normal @ slope.apply([0, 0, 1.0])))) < 0.5
-    assert np.linalg.norm(tilt_yaw_roll_deg(solution, mounting)) < 0.8
+    wrong, right = (calibrate(directions, readings, viewed_from=side) for side in ("above", "below"))
+    assert np.linalg.norm(tilt_yaw_roll_deg(right, mounting)) < 5.0
+    turned = (mounting.inv() * wrong.chain.sensor_from_image.rotation).magnitude()
+    assert turned == pytest.approx(np.pi, abs=0.1)
+    # No data tell the two; each says what it took for granted.
+    assert "points down" in wrong.adequacy.verdict
+    assert "points up" in right.adequacy.verdict
 
 
 @pytest.mark.parametrize("level", [True, False])
-@pytest.mark.parametrize("seed", range(4))
-def test_wrong_lines_in_a_tenth_of_the_frames_hardly_move_the_answer(level, seed):
-    rng = np.random.default_rng(seed)
+def test_wrong_lines_in_a_tenth_of_the_frames_hardly_move_the_answer(level):
+    rng = np.random.default_rng(0)
     directions, readings, _ = line_directions(rng, 100, noise_deg=0.1)
     wrong = rng.choice(100, 10, replace=False)
     angle = rng.uniform(-0.6, 0.6, 10)
@@ -155,17 +115,7 @@ def test_beams_that_are_level_on_average_cannot_be_told_from_their_mirror():
         calibrate(directions, readings, level=True)
 
 
-def test_a_wall_is_not_taken_for_a_floor():
-    directions, readings, _ = line_directions(np.random.default_rng(0), 100, noise_deg=0.05)
-    on_its_side = Rotation.from_euler("x", 90, degrees=True) * readings
-    with pytest.raises(InsufficientDataError):
-        calibrate(directions, on_its_side)
-
-
-def test_too_few_lines_and_unknown_sides_are_refused():
+def test_too_few_lines_are_refused():
     directions, readings, _ = line_directions(np.random.default_rng(0), 5)
     with pytest.raises(InsufficientDataError, match="6"):
         calibrate(directions, readings)
-    directions, readings, _ = line_directions(np.random.default_rng(0), 20)
-    with pytest.raises(InvalidInputError, match="viewed_from"):
-        calibrate(directions, readings, viewed_from="left")

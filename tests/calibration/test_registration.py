@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from wire_scenes import PIXEL_MM, scene
 
-from calibration.chain import Seen
+from calibration.points import Seen
 from calibration.registration import calibrate_registered, choose
 from speckle3d.core.errors import InsufficientDataError
 

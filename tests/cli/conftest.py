@@ -68,8 +68,8 @@ def reconstructed(bench, tmp_path_factory):
     modes = ("--drift", "orientation", "--drift", "pose")
 
     def make(folder):
-        rows = run_command("reconstruct", bench / "sweep.h5", "-o", folder, *modes).splitlines()[2:]
-        assert [line.split()[2] for line in rows] == ["image", "orientation", "pose"]
+        rows = run_command("reconstruct", bench / "sweep.h5", "-o", folder, *modes).splitlines()[2:6]
+        assert [line.split()[2] for line in rows] == ["image", "orientation", "pose", "tracker"]
 
     return made_once(tmp_path_factory, "bench-out", make)
 

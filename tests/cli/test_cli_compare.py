@@ -27,7 +27,7 @@ def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, torn, t
         "compare", bench / "sweep.h5", torn, "-o", tmp_path / "study", "--drift", "pose", "--json"
     )
     assert code == 0, err
-    assert json.loads(out)["modes"] == ["image", "pose"]
+    assert json.loads(out)["modes"] == ["image", "pose", "tracker"]
     assert "1 of 2 sweeps" in err
 
 

@@ -26,7 +26,7 @@ def test_sweeps_that_do_not_cross_leave_the_mode_out_and_keep_the_others(run, pa
     assert code == 2, err
     (held,) = json.loads(out)["sweeps"]
     assert held["frames"] == 12
-    assert {row["mode"] for row in held["rows"]} == {"image", "fused"}
+    assert {row["mode"] for row in held["rows"]} == {"image", "fused", "tracker"}
     assert list(held["left_out"]) == ["crossed"]
     assert held["claims"]["image"] > held["claims"]["fused"] > 0
     last = err.strip().splitlines()[-1]
@@ -64,10 +64,7 @@ def test_what_makes_no_pair_is_refused(refused, bench, tmp_path, options, words)
     assert words in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "out", *options)
 
 
-def test_inertia_without_a_wobble_is_left_out_or_claims_little(run, parts):
-    """The hand of a sweep of one second gives the accelerometer little: no length may be claimed from it."""
-    sweep, folder = parts
-    code, out, err = run("reconstruct", sweep, "-o", folder / "inertial", "--drift", "inertial", "--json")
-    (held,) = json.loads(out)["sweeps"]
-    assert code == 2, err
-    assert "drift mode inertial: " in held["left_out"]["inertial"]
+def test_the_removed_mode_says_what_replaces_it(refused, bench, tmp_path):
+    said = refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "out", "--drift", "inertial")
+    assert "inertial was removed: `fused`" in said
+    assert "expect inertial was removed" in refused("expect", "inertial", "--wobble-mm", "0.5")

@@ -131,7 +131,7 @@ def test_empty_voxels_are_not_shown_where_their_states_are_given(run, refused, b
 
 def test_the_picture_of_a_reconstruction_says_where_its_cuts_lie(reconstructed, bench):
     cuts = {each.mode: each for each in read_cuts(reconstructed / "reslice.png")}
-    assert list(cuts) == ["image", "orientation", "pose", "truth"]
+    assert list(cuts) == ["image", "orientation", "pose", "tracker", "truth"]
     # All begin with the first frame's line down the middle vector, each in its own world.
     truth = load_sweep(bench / "sweep.h5").truth
     first = truth[0].inv().apply(cuts["truth"].cut.world_from_mm([0.0, 0.0], [5.0, 15.0]))

@@ -14,7 +14,7 @@ from calibration_files import made
 from speckle3d.cli import common
 from speckle3d.core.progress import bar_on_stderr
 from speckle3d.io.calibrations import write_calibration
-from speckle3d.study.folder import named
+from speckle3d.study.compare import named
 
 HOSTILE = "a\x1b]0;gone\x07\x1b[31m\n\u202e[red]{0}$x^$<script>"
 SHOWN = "a\\x1b]0;gone\\x07\\x1b[31m\\n\\u202e[red]{0}$x^$<script>"

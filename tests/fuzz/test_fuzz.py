@@ -1,44 +1,211 @@
-"""A bounded time of `run.py`: every kind of file, with seeds of its own in each run of the tests."""
+"""Damaged files of every kind that is read: read, or refused in one line; no traceback, crash or hang.
 
+``python tests/fuzz/test_fuzz.py KIND FIRST COUNT`` does some cases of a kind in this process.
+"""
+
+import faulthandler
+import resource
 import subprocess
 import sys
+import tempfile
+import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-RUN = Path(__file__).with_name("run.py")
-KINDS = (
-    "sweep", "curves", "calibration", "reconstruction", "scan", "tum", "toml", "xml", "points", "log",
-    "metaimage", "nrrd", "volume", "surface", "picks", "stream", "igtl",
-)  # fmt: skip
-OTHERS = ("uff", "zea", "mat", "mat73", "dicom", "ultrasonix")
-"""Formats of other systems."""
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+CASES = 200
+MEMORY_BYTES, CASE_S = 2**31, 60
+"""Room for the package and what it loads, and a hundred times what a case takes."""
+
+IMPORT = """
+sampling_rate_hz = 40e6
+vector_pitch_mm = 0.3
+centre_frequency_hz = 6e6
+bandwidth_hz = [4e6, 8e6]
+frame_rate_hz = 20
+column_pitch_mm = 0.1
+row_spacing_mm = 0.1
+dynamic_range_db = 60
+"""
 
 
-def fuzz(tmp_path, *options):
-    command = [sys.executable, RUN, "--failures", tmp_path / "failures", *map(str, options)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
-    return done.stdout
+def write_family(folder):
+    import old_files
+
+    old_files.write_all(folder)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kinds", [KINDS, OTHERS], ids=["own", "others"])
-def test_no_kind_of_file_brings_a_reader_down(tmp_path, kinds):
-    said = fuzz(tmp_path, "--kinds", *kinds, "--cases", 12, "--first", 10**6)
-    for kind in kinds:
-        assert f"{kind}: seeds 1000000 to 1000011: " in said
+def write_images(folder):
+    import image_examples
+    from old_files import sweeps
+
+    from speckle3d.io.plus.write import write_sequence
+
+    image_examples.write_mha(folder / "a.mha", image_examples.grey(), frames=image_examples.tracked(3)[2])
+    write_sequence(folder / "b.nrrd", sweeps()["bmode"][0])
+    write_sequence(folder / "c.mhd", sweeps()["bmode"][0])
 
 
-@pytest.mark.slow
-def test_no_sweep_brings_the_whole_pipeline_down(tmp_path):
-    assert "track: seeds 1000000 to 1000011: " in fuzz(
-        tmp_path, "--kinds", "track", "--cases", 12, "--first", 10**6
-    )
+def write_volumes(folder):
+    from old_files import POSES
+
+    from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
+    from speckle3d.core.volume import Volume
+    from speckle3d.io.voxels.volume_writer import SUFFIXES
+    from speckle3d.io.voxels.volumes import write_volume
+
+    voxels = np.arange(120, dtype=np.uint8).reshape(4, 5, 6)
+    volume = Volume(voxels, (0.5, 0.25, 1.0), POSES[1], {"levels": "linear"})
+    for suffix in SUFFIXES:
+        write_volume(folder / f"v{suffix}", volume)
+    labels = LabelMap(voxels % 3, volume.spacing_mm, POSES[1], {}, STATE_SEGMENTS)
+    write_volume(folder / "s.seg.nrrd", labels)
 
 
-@pytest.mark.slow
-def test_a_case_is_the_same_again_by_its_seed(tmp_path):
-    for place in ("a", "b"):
-        fuzz(tmp_path, "--case", "tum", 7, "--keep", tmp_path / place)
-    assert (tmp_path / "a" / "t.txt").read_bytes() == (tmp_path / "b" / "t.txt").read_bytes()
+def write_surfaces(folder):
+    from speckle3d.core.surface import Surface
+    from speckle3d.io.shapes.surfaces import SUFFIXES, write_surface
+
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    for suffix in SUFFIXES:
+        write_surface(folder / f"s{suffix}", Surface(corners, np.array([[0, 1, 2], [0, 2, 3]])))
+
+
+def write_texts(folder):
+    from old_files import POSES
+
+    from speckle3d.config import Config
+    from speckle3d.io.points import PickedPoints, write_points
+    from speckle3d.io.tum import write_tum
+
+    write_tum(folder / "t.tum", np.arange(4) / 10, POSES)
+    (folder / "c.toml").write_text(Config().to_toml(), encoding="utf-8")
+    write_points(folder / "p.csv", PickedPoints(np.arange(3), np.arange(6.0).reshape(3, 2)))
+
+
+def write_others(folder):
+    import format_examples as examples
+
+    examples.write_uff(folder / "a.uff", examples.iq(), 6e6)
+    examples.write_zea(folder / "b.hdf5", examples.iq())
+    for new in (False, True):
+        examples.write_mat(folder / f"{new:d}.mat", new, RcvData=examples.matlab_order(examples.rf()))
+    examples.write_dicom(folder / "d.dcm", examples.grey(), PixelSpacing=[0.1, 0.2])
+    examples.write_ultrasonix(folder / "e.rf", examples.rf())
+    np.save(folder / "f.npy", examples.grey())
+
+
+def read(path):
+    """Read all of a file, as its users would."""
+    from speckle3d.io.describe import describe
+
+    if path.suffix in READERS:
+        READERS[path.suffix](path)
+        return
+    describe(path)
+    if path.parent.name in ("family", "images", "others") and not RECORDS & {path.stem.split("_")[0]}:
+        from speckle3d.io.load import load_sweep
+
+        sweep = load_sweep(path)
+        for i in range(len(sweep)):
+            sweep.frames[i]
+
+
+RECORDS = {"curves", "calibration", "reconstruction"}
+
+
+def _surface(path):
+    from speckle3d.io.shapes.surfaces import read_surface
+
+    read_surface(path)
+
+
+def _text(path):
+    from speckle3d.config import load_config
+    from speckle3d.io.points import read_points
+    from speckle3d.io.tum import read_tum
+
+    {".tum": read_tum, ".toml": load_config, ".csv": read_points}[path.suffix](path)
+
+
+READERS = {
+    **dict.fromkeys((".stl", ".ply", ".vtk"), _surface),
+    **dict.fromkeys((".tum", ".toml", ".csv"), _text),
+}
+KINDS = {
+    "family": write_family,
+    "images": write_images,
+    "volumes": write_volumes,
+    "surfaces": write_surfaces,
+    "texts": write_texts,
+    "others": write_others,
+}
+
+
+def damaged(content, rng):
+    """Bytes with a few changed, a run of zeros in them, or cut off."""
+    how, data = rng.integers(0, 6), bytearray(content)
+    at = int(rng.integers(0, len(data)))
+    if how == 0:
+        return bytes(data[:at])
+    if how == 1:
+        data[at : at + int(rng.integers(1, 64))] = b""
+        return bytes(data)
+    if how == 2:
+        length = int(rng.integers(1, 64))
+        data[at : at + length] = bytes(len(data[at : at + length]))
+        return bytes(data)
+    # Structures lie at the beginning more often than elsewhere.
+    most = len(data) if how < 5 else min(len(data), 2048)
+    for _ in range(int(rng.integers(1, 9))):
+        data[int(rng.integers(0, most))] = int(rng.integers(0, 256))
+    return bytes(data)
+
+
+def run(kind, first, count):
+    """Do some cases and print each seed before its case; an exception that is not the package's ends it."""
+    from speckle3d.core.errors import Speckle3DError
+
+    faulthandler.enable()
+    warnings.simplefilter("error")
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / kind
+        folder.mkdir()
+        KINDS[kind](folder)
+        beside = {".raw", ".zraw", *(() if kind == "texts" else (".toml",))}
+        paths = sorted(path for path in folder.iterdir() if path.suffix not in beside)
+        if kind in ("images", "others"):
+            (folder / "import.toml").write_text(IMPORT)
+        for path in paths:
+            if kind != "others":
+                read(path)  # whole ones are read
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        whole = {path: path.read_bytes() for path in paths}
+        for seed in range(first, first + count):
+            print(seed, flush=True)
+            rng = np.random.default_rng([*kind.encode(), seed])
+            path = paths[int(rng.integers(0, len(paths)))]
+            path.write_bytes(damaged(whole[path], rng))
+            faulthandler.dump_traceback_later(CASE_S, exit=True)
+            try:
+                read(path)
+            except Speckle3DError as error:
+                if "\n" in str(error):
+                    raise AssertionError(f"expected one line, got {error!r}") from error
+            path.write_bytes(whole[path])
+        faulthandler.cancel_dump_traceback_later()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damage_is_read_or_refused_in_one_line(kind):
+    command = [sys.executable, __file__, kind, "0", str(CASES)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    last = done.stdout.split()[-1:]
+    assert done.returncode == 0, f"{kind}: case {last}:\n{done.stderr[-3000:]}"
+
+
+if __name__ == "__main__":
+    run(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

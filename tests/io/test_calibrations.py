@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 import sweep_examples
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import MismatchError
 from speckle3d.io.calibrations import apply_calibrations, read_calibration, write_calibration
 from speckle3d.io.describe import describe
 from speckle3d.io.hdf5 import sha256_of
@@ -77,27 +76,11 @@ def path(tmp_path):
     return tmp_path / "cal.h5"
 
 
-@settings(deadline=None, max_examples=80, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(written=calibrations())
 def test_a_calibration_comes_back(tmp_path, written):
     write_calibration(tmp_path / "c.h5", written)
     require_same(read_calibration(tmp_path / "c.h5"), written)
-
-
-def test_an_older_file_stays_whole_when_writing_fails(path):
-    before = path.read_bytes()
-    with pytest.raises(TypeError):
-        write_calibration(path, made(rms=object()))
-    assert path.read_bytes() == before
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
-
-
-def test_a_quaternion_must_be_of_length_one(path):
-    write_calibration(path, made("orientation"))
-    with h5py.File(path, "r+") as file:
-        file["sensor_from_image_wxyz"][0] = 2.0
-    with pytest.raises(InvalidInputError, match=r"/sensor_from_image_wxyz"):
-        read_calibration(path)
 
 
 def test_both_sensors_are_calibrated_from_their_files_and_the_files_told(path):

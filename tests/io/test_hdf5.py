@@ -1,12 +1,11 @@
 import hashlib
 import os
 
-import h5py
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.io.hdf5 import atomic_hdf5, atomic_path, open_hdf5, read_checked, sha256_of
+from speckle3d.core.errors import FileError
+from speckle3d.io.hdf5 import atomic_path, sha256_of
 
 
 def write_then(path, text, error=None):
@@ -61,27 +60,3 @@ def test_digest_matches_that_of_the_bytes(tmp_path):
     assert sha256_of(tmp_path / "a") == hashlib.sha256(content).hexdigest()
     with pytest.raises(FileError, match="none"):
         sha256_of(tmp_path / "none")
-
-
-@pytest.mark.parametrize(
-    ("shape", "dtype", "message"),
-    [
-        ((3, 3), float, r"/g/x.*\(3, 3\).*\(2, 3\)"),
-        (("row",), float, r"/g/x.*\(row,\).*\(2, 3\)"),
-        ((2, 3), int, r"/g/x.*int64"),
-    ],
-)
-def test_a_data_set_of_another_shape_or_kind_is_named(tmp_path, shape, dtype, message):
-    with atomic_hdf5(tmp_path / "a.h5", "test") as file:
-        file["g/x"] = np.zeros((2, 3))
-    with open_hdf5(tmp_path / "a.h5") as file, pytest.raises(InvalidInputError, match=message):
-        read_checked(file["g"], "x", shape, dtype)
-
-
-def test_a_word_stands_for_any_length(tmp_path):
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["x"] = np.arange(6).reshape(2, 3)
-    with open_hdf5(tmp_path / "a.h5") as file:
-        got = read_checked(file, "x", ("row", 3))
-    assert got.dtype == np.float64
-    np.testing.assert_array_equal(got, np.arange(6).reshape(2, 3))

@@ -5,17 +5,14 @@ import subprocess
 import sys
 import time
 import tracemalloc
-import zlib
 from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 import sweep_examples
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import BModeSettings, stored_dtype
 from speckle3d.io.describe import describe
 from speckle3d.io.sweep_writer import SweepWriter, write_sweep
@@ -94,16 +91,6 @@ def test_i_and_q_of_another_stored_type_are_stored_as_they_are_read(tmp_path):
     assert stored_dtype(read_sweep(tmp_path / "s.h5").frames) == np.complex64
 
 
-def test_only_i_and_q_make_a_file_of_version_2(path, tmp_path):
-    with h5py.File(path) as file:
-        assert file.attrs["version"] == 1
-    write_sweep(tmp_path / "b.h5", sweep_examples.bmode_sweep())
-    with h5py.File(tmp_path / "b.h5", "r+") as file:
-        assert file.attrs["version"] == 1
-        file.attrs["version"] = 2
-    assert_same_sweep(read_sweep(tmp_path / "b.h5"), sweep_examples.bmode_sweep())
-
-
 @pytest.fixture
 def iq_path(tmp_path):
     write_sweep(tmp_path / "iq.h5", sweep_examples.iq_sweep())
@@ -124,16 +111,11 @@ def replaced(data):
     [
         (lambda file: file.attrs.__setitem__("version", 3), r"version 1 or 2, got 3$"),
         (lambda file: file.attrs.__setitem__("version", 1), r"data set rf or bmode, got none"),
-        (lambda file: file.move("iq", "other"), r"data set rf, iq or bmode, got none"),
         (lambda file: file.create_dataset("rf", data=np.zeros((6, 5, 40), "i2")), r"got rf and iq"),
         (lambda file: file["iq"].attrs.__delitem__("demodulation_frequency_hz"), r"/iq .*demodulation_freq"),
-        (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", -6e6), r"zero or above"),
         (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", 20e6), r"within half"),
         (replaced(np.zeros((6, 5, 40, 3), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40, 3\)"),
-        (replaced(np.zeros((6, 5, 40), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40\)"),
-        (replaced(np.zeros((6, 5, 40, 2), "c8")), r"\(frame, vector, sample\), got \(6, 5, 40, 2\)"),
         (replaced(np.zeros((6, 5, 40), "c16")), r"complex64 or int16, got complex128"),
-        (replaced(np.zeros((6, 5, 40), "f4")), r"complex64 or int16, got float32"),
     ],
 )
 def test_what_is_wrong_with_i_and_q_is_named(iq_path, change, message):
@@ -174,27 +156,6 @@ def test_pairs_that_int16_does_not_hold_are_refused(tmp_path, value):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nan_in_complex_samples_is_named_when_the_frame_is_read(tmp_path):
-    write_sweep(tmp_path / "s.h5", sweep_examples.iq_sweep(paired=False))
-    with h5py.File(tmp_path / "s.h5", "r+") as file:
-        file["iq"][2, 1, 7] = 1 + 1j * np.nan
-    sweep = read_sweep(tmp_path / "s.h5")
-    with pytest.raises(InvalidInputError, match=r"/iq\[2\]\[\(1, 7\)\]"):
-        sweep.frames[2]
-
-
-@pytest.mark.parametrize("paired", [True, False])
-def test_a_truncated_chunk_of_i_and_q_is_never_filled_from_memory(tmp_path, paired):
-    write_sweep(tmp_path / "s.h5", sweep_examples.iq_sweep(paired))
-    offset = (3, 0, 0, 0) if paired else (3, 0, 0)
-    with h5py.File(tmp_path / "s.h5", "r+") as file:
-        file["iq"].id.write_direct_chunk(offset, zlib.compress(bytes(399)))
-    sweep = read_sweep(tmp_path / "s.h5")
-    expected = 800 if paired else 1600
-    with pytest.raises(InvalidInputError, match=rf"/iq\[3\].*expected {expected} bytes, got 399"):
-        sweep.frames[3]
-
-
 def test_bmode_comes_back(tmp_path):
     sweep = sweep_examples.bmode_sweep()
     write_sweep(tmp_path / "s.h5", sweep)
@@ -223,14 +184,6 @@ def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):
     assert sweep.truth is None
 
 
-@pytest.mark.parametrize("skew_rad", [0.3, np.nan])
-def test_a_skew_that_no_image_has_is_refused(path, skew_rad):
-    with h5py.File(path, "r+") as file:
-        file["tracker"].attrs["image_skew_rad"] = skew_rad
-    with pytest.raises(InvalidInputError, match=r"/tracker.*image_skew_rad: expected"):
-        read_sweep(path)
-
-
 def test_rounding_in_a_pose_is_forgiven(path):
     with h5py.File(path, "r+") as file:
         # A float32 writer leaves about 1e-7 everywhere, the last row included.
@@ -240,54 +193,20 @@ def test_rounding_in_a_pose_is_forgiven(path):
     )
 
 
-def test_a_member_of_the_wrong_kind_is_named(path):
-    with h5py.File(path, "r+") as file:
-        del file["orientation"]
-        file["orientation"] = 1.0
-        del file["frame_time_s"]
-        file.create_group("frame_time_s")
-    with pytest.raises(InvalidInputError, match="/frame_time_s"):
-        read_sweep(path)
-    with h5py.File(path, "r+") as file:
-        del file["frame_time_s"]
-        file["frame_time_s"] = np.arange(6.0)
-    with pytest.raises(InvalidInputError, match="/orientation"):
-        read_sweep(path)
-
-
-def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path):
-    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(dtype=np.float32))
+@pytest.mark.parametrize("kind", ["rf", "iq"])
+def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path, kind):
+    sweeps = {"rf": sweep_examples.rf_sweep(dtype=np.float32), "iq": sweep_examples.iq_sweep(paired=False)}
+    write_sweep(tmp_path / "s.h5", sweeps[kind])
     with h5py.File(tmp_path / "s.h5", "r+") as file:
-        file["rf"][2, 1, 7] = np.nan
+        file[kind][2, 1, 7] = np.nan
     sweep = read_sweep(tmp_path / "s.h5")
     sweep.frames[1], sweep.frames[3]
-    with pytest.raises(InvalidInputError, match=r"/rf\[2\]\[\(1, 7\)\]"):
+    with pytest.raises(InvalidInputError, match=rf"/{kind}\[2\]\[\(1, 7\)\]"):
         sweep.frames[2]
 
 
-@settings(deadline=None, max_examples=60)
-@given(st.data())
-def test_damaged_bytes_are_read_or_refused_but_never_a_surprise(tmp_path_factory, data):
-    # Only sample and stream data are damaged: HDF5's own structures are its library's to defend.
-    folder = tmp_path_factory.mktemp("damage")
-    write_sweep(folder / "s.h5", sweep_examples.rf_sweep(dtype=np.float32))
-    with h5py.File(folder / "s.h5") as file:
-        chunks = [file["rf"].id.get_chunk_info(i) for i in range(6)]
-        spans = [(c.byte_offset, c.size) for c in chunks]
-        clock = file["orientation/time_s"]
-        spans.append((clock.id.get_offset(), clock.id.get_storage_size()))
-    start, size = data.draw(st.sampled_from(spans))
-    content = bytearray((folder / "s.h5").read_bytes())
-    for _ in range(3):
-        content[start + data.draw(st.integers(0, size - 1))] = data.draw(st.integers(0, 255))
-    (folder / "s.h5").write_bytes(bytes(content))
-    try:
-        all_frames(read_sweep(folder / "s.h5"))
-    except Speckle3DError as error:
-        assert "\n" not in str(error)  # noqa: PT017 - either outcome is right
-
-
 def test_reading_a_frame_touches_no_other(path):
+    write_sweep(path, sweep_examples.rf_sweep(), compression="gzip")
     with h5py.File(path) as file:
         chunks = [file["rf"].id.get_chunk_info(i) for i in range(6)]
     content = bytearray(path.read_bytes())
@@ -436,11 +355,9 @@ def test_the_writer_refuses_what_the_reader_would(tmp_path, frames, times, optio
 
 
 def test_how_a_sweep_was_simulated_is_kept_and_ignored(tmp_path):
-    sweep = sweep_examples.rf_sweep()
-    with SweepWriter(tmp_path / "s.h5", sweep.grid, sweep.signal) as writer:
-        writer.append(sweep.frames[0], 0.0)
-        writer.write_simulation({"seed": 7, "preset": "tissue", "movement": {"length_mm": 40.0}})
-    assert len(read_sweep(tmp_path / "s.h5")) == 1
+    told = {"seed": 7, "preset": "tissue", "movement": {"length_mm": 40.0}}
+    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(), simulation=told)
+    assert len(read_sweep(tmp_path / "s.h5")) == 6
     with h5py.File(tmp_path / "s.h5") as file:
         assert file["simulation"].attrs["seed"] == 7
         assert json.loads(file["simulation"].attrs["movement"]) == {"length_mm": 40.0}
@@ -448,13 +365,7 @@ def test_how_a_sweep_was_simulated_is_kept_and_ignored(tmp_path):
 
 def test_the_name_of_the_probe_comes_back(tmp_path):
     sweep = replace(sweep_examples.rf_sweep(), probe="L12-5, 4 cm, focus 2 cm")
-    write_sweep(tmp_path / "named.h5", sweep)
-    assert read_sweep(tmp_path / "named.h5").probe == sweep.probe
-    write_sweep(tmp_path / "again.h5", read_sweep(tmp_path / "named.h5"))
-    assert read_sweep(tmp_path / "again.h5").probe == sweep.probe
-    write_sweep(tmp_path / "nameless.h5", sweep_examples.rf_sweep())
-    assert read_sweep(tmp_path / "nameless.h5").probe == ""
-    with h5py.File(tmp_path / "named.h5", "r+") as file:
-        file.attrs["probe"] = 3.0
-    with pytest.raises(InvalidInputError, match="attribute probe: expected a text"):
-        read_sweep(tmp_path / "named.h5")
+    for _ in range(2):
+        write_sweep(tmp_path / "named.h5", sweep)
+        sweep = read_sweep(tmp_path / "named.h5")
+        assert sweep.probe == "L12-5, 4 cm, focus 2 cm"

@@ -7,11 +7,12 @@ import pytest
 import speckle
 
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.examine.recording import doubt_band, doubt_sign, doubt_white
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchSettings
-from speckle3d.matching.texture import doubt_band, doubt_sign, doubt_white, speckle_size
+from speckle3d.matching.texture import speckle_size
 
 GREY = BModeSettings(dynamic_range_db=100.0, full_scale=65535.0)
 """Fine enough to hold intensities as they are."""

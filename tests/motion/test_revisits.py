@@ -8,9 +8,7 @@ import pytest
 from speckle3d import pipeline
 from speckle3d.config import Config
 from speckle3d.matching.chosen import match_again
-from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.planes import PlaneFitter
+from speckle3d.motion.estimate import Motion
 from speckle3d.motion.revisits import (
     AWAY_MM,
     MOST_CANDIDATES,
@@ -67,11 +65,12 @@ def returning(sweep):
 def ties_of(sweep, curves, position):
     """Ties found on a path, and the table that holds their pairs."""
     s = Config()
-    matcher = FrameMatcher(sweep, s.intensity, s.patches, s.inplane, s.matching)
-    fitter = PlaneFitter(DistanceEstimator(curves, matcher.patches), matcher.at_mm, s.planes)
+    matcher = pipeline.matcher_for(sweep, curves, s)
+    problem = pipeline.motion_problem(curves, matcher, len(sweep), s)
+    path = np.column_stack([position, np.zeros((len(position), 2))])
     returns = find_returns(position, s.trajectory.revisit_mm)
     table = match_again(sweep, matcher, [pair for each in returns for pair in each.pairs()])
-    return tie_returns(returns, table, position, fitter, None, s.trajectory.least_correlation), table
+    return tie_returns(returns, Motion(problem, None, None, None, path), table), table
 
 
 # ---- whole sweeps ------------------------------------------------------------------------------------------

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import DistanceEstimator, PatchDistances
-from speckle3d.motion.planes import PlaneFitter, consistent_subset
+from speckle3d.motion.planes import PlaneFitter
+from speckle3d.motion.subset import consistent_subset
 
 GRID = ImageGrid(vectors=127, samples=640, vector_pitch_mm=0.3, sample_spacing_mm=0.06)
 PATCHES = lay_patches(GRID)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, SHARED, SlopeEvidence, pose_covariance
+from speckle3d.core.reconstruction import SharedErrors
+from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, SHARED, claimed_covariance
 
 CENTRE_MM = np.array([7.0, 22.0, 0.0])
 Z_MM = np.concatenate([np.linspace(0, 10, 51), np.linspace(10, 0, 51)[1:]])
@@ -14,8 +15,7 @@ X, Y, Z, TILT, YAW, ROLL = range(6)
 
 def covariance(scale=0.0, turn=(0.0, 0.0), share=0.0, independent=1e-8):
     graph = np.tile(independent * np.eye(6), (len(POSES), 1, 1))
-    evidence = SlopeEvidence(np.ones(2), np.array(turn))
-    return pose_covariance(POSES, graph, CENTRE_MM, scale, evidence, share)
+    return claimed_covariance(POSES, graph, CENTRE_MM, SharedErrors(scale, 0.0, np.array(turn)), share)
 
 
 def test_covariances_are_symmetric_and_positive():
@@ -68,8 +68,7 @@ def test_a_turned_frames_own_errors_are_given_along_the_first_frames_axes():
     poses = RigidTransform.from_rotation(turns)
     graph = np.zeros((2, 6, 6))
     graph[:, X, X], graph[:, Z, Z], graph[:, TILT, TILT] = 4e-4, 1e-6, 1e-8
-    quiet = SlopeEvidence(np.ones(2), np.zeros(2))
-    first, turned = pose_covariance(poses, graph, np.zeros(3), 0.0, quiet)
+    first, turned = claimed_covariance(poses, graph, np.zeros(3), SharedErrors(0.0, 0.0, np.zeros(2)), 0.0)
     assert first[X, X] == pytest.approx(4e-4 * SHARED[X] ** 2)
     assert turned[Z, Z] == pytest.approx(4e-4 * SHARED[X] ** 2)
     assert turned[X, X] == pytest.approx(1e-6 * SHARED[Z] ** 2)

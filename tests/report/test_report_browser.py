@@ -49,12 +49,9 @@ def test_it_opens_without_complaint_or_network(opened, report):
     assert opened.evaluate("document.documentElement.scrollWidth") <= 1280
 
 
-def test_the_interactive_figures_take_the_place_of_the_pictures(opened):
-    figures = opened.query_selector_all("#sweep-1 figure[data-plot]")
-    assert len(figures) == 3
-    for figure in figures:
-        assert figure.query_selector(".plot").evaluate(VISIBLE)
-        assert not figure.query_selector("img").evaluate(VISIBLE)
+def test_the_figures_of_the_chosen_sweep_are_drawn(opened):
+    assert len(opened.query_selector_all("#sweep-1 figure.drawn")) == 3
+    assert all(shows(opened, "#sweep-1 figure"))
     assert opened.query_selector_all("#sweep-1 canvas")
 
 
@@ -94,24 +91,21 @@ def test_screenshots_are_not_blank(opened, tmp_path):
         assert (imread(path)[:, :, :3].min(axis=2) < 0.9).mean() > 0.01
 
 
-def test_without_scripts_and_in_print_every_sweep_shows_its_pictures(browser, report):
+def test_without_scripts_tables_and_pictures_are_there_and_it_says_what_is_not(browser, report):
     context = browser.new_context(java_script_enabled=False)
     page = context.new_page()
     page.goto(report.as_uri())
-    page.emulate_media(media="print")
     assert page.locator(".sweep").count() == 2
-    for figure in page.locator("figure").all():
-        assert figure.locator("img").is_visible()
-    assert page.locator(".plot").first.is_hidden()
-    assert page.locator("#chooser").is_hidden()
+    assert all(image.is_visible() for image in page.locator("figure img").all())
+    assert page.locator("noscript").first.is_visible()
     context.close()
 
 
-def test_print_shows_pictures_even_after_scripts_drew(opened):
+def test_print_shows_every_sweep(opened):
+    opened.evaluate("window.dispatchEvent(new Event('beforeprint'))")
     opened.emulate_media(media="print")
-    assert all(shows(opened, "figure img"))
-    assert not any(shows(opened, ".plot"))
-    assert all(shows(opened, ".sweep"))
+    assert all(shows(opened, ".sweep figure"))
+    assert all(shows(opened, "figure.drawn .main-svg"))
     opened.emulate_media(media="screen")
 
 
@@ -124,5 +118,5 @@ def test_printing_gives_a_short_document(report, tmp_path):
     )  # fmt: skip
     data = target.read_bytes()
     assert data.startswith(b"%PDF")
-    # Two sweeps of two to three pages each, the tables before, configuration and provenance behind.
+    # Two sweeps of three to four pages each, the tables before, configuration and provenance behind.
     assert 5 <= data.count(b"/Type /Page\n") <= 14

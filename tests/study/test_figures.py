@@ -1,19 +1,14 @@
+"""Curves of a reconstruction as they are drawn."""
+
 import numpy as np
 import pytest
 from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 
 from speckle3d.core.errors import FileError, MismatchError
 from speckle3d.core.reconstruction import MODES as RECONSTRUCTED
-from speckle3d.scoring.lengths import accumulated
+from speckle3d.scoring.lengths import accumulated, compare_modes
 from speckle3d.scoring.references import Reference, sweep_curves
-from speckle3d.study.figures import (
-    colour_of,
-    curve_panels,
-    figure_drift,
-    label_of,
-    save_figure,
-    wrapped,
-)
+from speckle3d.study.figures import colour_of, curve_panels, figure_drift, label_of, save_figure
 
 FRAMES = 60
 
@@ -31,11 +26,13 @@ def curves_of(poses, tracker=None, covered=None, covariance=None):
     return sweep_curves(poses, CENTRE_MM, reference, covariance)
 
 
-def test_every_mode_and_the_reference_are_drawn_in_both_panels(sweep):
+def test_every_mode_and_the_reference_are_drawn_and_named_in_both_panels(sweep):
     image, tracker = sweep
     figure = figure_drift(curves_of({"image": image, "pose": image}, tracker))
     offset, tilt = figure.axes
-    assert [line.get_label() for line in offset.lines] == ["tracker", label_of("image"), label_of("pose")]
+    for axes in figure.axes:
+        assert [line.get_label() for line in axes.lines] == ["tracker", "image", "pose"]
+        assert axes.get_legend() is not None
     motion = accumulated(image, CENTRE_MM)
     np.testing.assert_allclose(offset.lines[1].get_ydata(), motion.length_mm)
     np.testing.assert_allclose(tilt.lines[1].get_ydata(), np.rad2deg(motion.tilt_rad))
@@ -48,49 +45,30 @@ def test_the_images_95_percent_interval_is_a_band(sweep):
     # Along z, mm, and tilt, rad; across the images does not count.
     covariance[:, 2, 2], covariance[:, 3, 3] = deviation**2, (0.01 * deviation) ** 2
     covariance[:, 0, 0] = 1e6
-    curves = curves_of({"image": sweep[0], "pose": sweep[0]}, covariance=covariance)
-    length, tilt, yaw, _ = curve_panels(curves)
-    for panel, width in (
-        (length, deviation),
-        (tilt, np.rad2deg(0.01 * deviation)),
-        (yaw, 0.0 * deviation),
-    ):
+    length, tilt, *_ = curve_panels(curves_of({"image": sweep[0], "pose": sweep[0]}, covariance=covariance))
+    for panel, width in ((length, deviation), (tilt, np.rad2deg(0.01 * deviation))):
         (band,) = [each for each in panel.series if each.style == "band"]
         np.testing.assert_allclose(band.points[:, 1] - band.low, 2 * 1.96 * width, atol=1e-9)
-    assert [len(axes.collections) for axes in figure_drift(curves).axes] == [1, 1]
     # No band without the curve that it belongs to.
     assert curves_of({"pose": sweep[0]}, covariance=covariance).half_width is None
 
 
-def test_the_reference_has_gaps_and_does_not_hang_on_its_first_reading(sweep):
+def test_the_reference_has_gaps_and_curves_and_table_have_one_length(sweep):
     image, tracker = sweep
     covered = np.ones(FRAMES, dtype=bool)
     covered[20:30] = False
-    matrices = tracker.as_matrix()
-    matrices[0, :3, 3] += 5.0
-    spoilt = type(tracker).from_matrix(matrices)
-    drawn, spoilt_drawn = (
-        curves_of({"image": image}, each, covered).reference[0] for each in (tracker, spoilt)
-    )
+    drawn = curves_of({"image": image}, tracker, covered).reference[0]
     np.testing.assert_array_equal(np.isnan(drawn), ~covered)
-    # One of nine readings that set the level is bad; their median moves by less than their jitter.
-    assert np.nanmax(np.abs(spoilt_drawn - drawn)[1:]) < 0.2
-
-
-def test_differences_from_the_reference_and_frames_left_out(sweep):
-    image, tracker = sweep
-    curves = curves_of({"image": image}, tracker)
-    frames = np.array([0, 7, 59])
-    panel, *_ = curve_panels(curves, 1, frames, minus_reference=True)
-    reference, mode = panel.series
-    np.testing.assert_array_equal(reference.points, np.column_stack([frames, [0.0, 0.0, 0.0]]))
-    expected = (curves.modes["image"][0] - curves.reference[0])[frames]
-    np.testing.assert_allclose(mode.points[:, 1], expected)
+    # The curve is its own, whatever it is compared with, and begins where the line through its first readings
+    # does, as the table's length.
+    np.testing.assert_array_equal(drawn, curves_of({"pose": tracker}, tracker, covered).reference[0])
+    (row,) = compare_modes({"image": image}, tracker, CENTRE_MM)
+    whole = curves_of({"image": image}, tracker).reference[0]
+    assert np.median(whole[-6:]) == pytest.approx(row.reference_mm, abs=1.5)
 
 
 def test_a_reference_of_other_frames_is_refused(sweep):
     image, tracker = sweep
-    assert len(figure_drift(curves_of({"image": image})).axes[0].lines) == 1
     with pytest.raises(MismatchError, match=r"reference.*60.*60.*59"):
         sweep_curves({"image": image}, CENTRE_MM, Reference("truth", tracker[1:], np.ones(60, dtype=bool)))
 
@@ -112,13 +90,7 @@ def test_neither_pyplot_nor_a_window_system_is_touched(python):
     assert python(code) == "False\n"
 
 
-def test_modes_have_colours_of_their_own_and_unknown_ones_too():
-    modes = [*RECONSTRUCTED, "bent", "stretched"]
+def test_modes_go_by_their_names_and_have_colours_of_their_own():
+    modes = [*RECONSTRUCTED, "tracker", "truth", "bent"]
     assert len({colour_of(mode, modes) for mode in modes}) == len(modes)
-    assert label_of("bent") == "bent"
-
-
-def test_titles_are_wrapped_to_narrow_panels():
-    title = "image-based, consistent subset"
-    assert wrapped(title, 1.0).splitlines() == ["image-based,", "consistent", "subset"]
-    assert wrapped(title, 3.0) == title
+    assert (label_of("pose"), label_of("tracker")) == ("pose", "tracker alone")

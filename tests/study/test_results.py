@@ -1,28 +1,33 @@
+"""Tables and JSON of one sweep and of a study."""
+
 import csv
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import sweep_examples
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.details import recorded_doubts
+from speckle3d.study.details import doubted_modes, recorded_doubts
 from speckle3d.study.results import (
     Summary,
     SweepOutcome,
     csv_text,
     json_text,
-    remark_on,
-    rows_of,
-    table_text,
+    read_summary,
+    summary_text,
     write_study,
     write_summary,
 )
+
+METRES = Doubt("tracker", "units", "expected 23 mm, got 0.023", True)
+SPIKES = Doubt("orientation sensor", "spikes", "3 of 90 readings jump", False, ((3, 3), (7, 9)))
 
 
 @dataclass(frozen=True)
@@ -40,39 +45,37 @@ def row(mode="image", **changes):
     return ModeError(**{**values, **changes})
 
 
-def summaries():
-    details = {"extra": Extra(np.array([1.0, np.nan]), np.float64(2.5)), "note": "ok"}
-    return [Summary("beef, 1", "tracker", 100, 0.95, [row(), row("orientation")], details)]
+def summary(reference="tracker", rows=None, **more):
+    return Summary("beef, 1", reference, 100, 0.95, rows or [row(), row("orientation")], **more)
 
 
 def test_json_holds_every_number_and_null_where_there_is_none():
-    (found,) = json.loads(json_text({"sweeps": summaries()}))["sweeps"]
-    assert found["rows"][1]["mode"] == "orientation"
-    assert found["rows"][0]["tilt_error_deg"] == -1.254
-    assert found["details"] == {"extra": {"spread": [1.0, None], "best": 2.5}, "note": "ok"}
-    assert found["coverage"] == 0.95
+    details = {"extra": Extra(np.array([1.0, np.nan]), np.float64(2.5)), "note": "ok"}
+    (sweep,) = json.loads(json_text({"sweeps": [summary(details=details)]}))["sweeps"]
+    assert sweep["rows"][0]["tilt_error_deg"] == -1.254
+    assert sweep["details"] == {"extra": {"spread": [1.0, None], "best": 2.5}, "note": "ok"}
+    with pytest.raises(InvalidInputError, match="'object'"):
+        json_text({"a": [object()]})
 
 
 def test_csv_reads_back_at_full_precision_even_with_commas_in_names():
-    lines = list(csv.DictReader(io.StringIO(csv_text(rows_of(summaries())))))
+    lines = list(csv.DictReader(io.StringIO(csv_text(summary(claims={"image": 0.08}).records()))))
     assert [line["mode"] for line in lines] == ["image", "orientation"]
     assert lines[0]["sweep"] == "beef, 1"
-    assert float(lines[0]["tilt_error_deg"]) == -1.254
+    assert (float(lines[0]["tilt_error_deg"]), float(lines[0]["sigma_mm"])) == (-1.254, 0.08 * 23.0)
 
 
-def test_table_is_aligned_and_signed_says_the_reference_and_a_name_may_end_in_nan():
-    banan = Summary("banan", "truth", 100, 1.0, [row(tilt_error_deg=float("nan"))])
-    lines = table_text(rows_of([*summaries(), banan])).splitlines()
-    assert lines[0].split()[:3] == ["sweep", "part", "mode"]
-    assert len({len(line) for line in lines[1:]}) == 1
-    assert "+15.0" in lines[2]
-    assert "-1.25" in lines[2]
-    assert lines[-1].split()[:5] == ["banan", "f", "image", "truth", "20.00"]
-    assert lines[-1].split()[-3] == "-"
-
-
-METRES = Doubt("tracker", "units", "expected 23 mm, got 0.023", True)
-SPIKES = Doubt("orientation sensor", "spikes", "3 of 90 readings jump", False, ((3, 3), (7, 9)))
+def test_the_table_is_aligned_narrow_and_says_of_what_its_intervals_are():
+    rows = [row(), row("orientation", tilt_error_deg=float("nan"))]
+    text = summary_text([summary("truth", rows, claims={"image": 0.08})])
+    lines = text.splitlines()
+    assert max(map(len, lines)) < 110
+    assert len({len(line) for line in lines[1:4]}) == 1
+    # 95 % of 8 % of 23 mm.
+    assert lines[2].split()[-8:] == ["image", "23.00", "3.61", "20.00", "+15.0", "-1.25", "+0.10", "+0.00"]
+    assert lines[3].split()[-7:] == ["23.00", "-", "20.00", "+15.0", "-", "+0.10", "+0.00"]
+    assert "95 %" in lines[4]
+    assert "reference: truth" in lines[5]
 
 
 @pytest.mark.parametrize(
@@ -80,41 +83,49 @@ SPIKES = Doubt("orientation sensor", "spikes", "3 of 90 readings jump", False, (
     [
         ("tracker", "pose", {}, "fitted to this tracker"),
         ("truth", "pose", {}, ""),
+        ("tracker", "tracker", {}, "the reference itself"),
         ("truth", "orientation", {"orientation": "spikes"}, "in doubt: spikes"),
         ("tracker", "pose", {"pose": "clock"}, "fitted to this tracker; in doubt: clock"),
-        ("tracker", "orientation", {"pose": "clock"}, ""),
     ],
 )  # fmt: skip
-def test_a_row_says_what_its_numbers_do_not(reference, mode, doubted, words):
-    rows = [row(), row(mode)]
-    summary = Summary("s", reference, 100, 1.0, rows, doubted=doubted)
-    assert remark_on(summary, rows[1]) == words
-    assert (words in table_text(rows_of([summary])).splitlines()[3]) is True
-    (line,) = [x for x in csv.DictReader(io.StringIO(csv_text(rows_of([summary])))) if x["mode"] == mode]
-    assert line["remark"] == words
+def test_what_numbers_do_not_say_stands_below_the_table(reference, mode, doubted, words):
+    of = summary(reference, [row(), row(mode)], doubted=doubted)
+    assert of.remark(of.rows[1]) == words
+    assert (f"beef, 1: {mode}: {words}" in summary_text([of])) is bool(words)
+    assert of.records()[1]["remark"] == words
+
+
+def test_a_length_that_the_tracker_made_worse_is_told_with_the_jitters_share():
+    rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-2.6)]
+    text = summary_text([summary("truth", rows, claims={"tracker": 0.01})])
+    assert "pose is farther from the truth (-2.6 %) than image (+0.6 %)" in text
+    assert "jitter is +- 2.0 % of its length (95 %)" in text
+    rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-0.5)]
+    assert "farther" not in summary_text([summary("truth", rows, claims={"pose": 0.01})])
+
+
+def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
+    images = Doubt("images", "frozen", "...", False)
+    modes = ["image", "orientation", "pose", "tracker"]
+    doubted = doubted_modes(sweep_examples.rf_sweep(), [SPIKES, METRES, images], modes)
+    assert doubted == {
+        "image": "frozen", "orientation": "spikes, frozen", "pose": "units, frozen", "tracker": "units",
+    }  # fmt: skip
 
 
 def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(tmp_path):
     left_out = {"pose": "s: drift mode pose: tracker: ..."}
-    summary = Summary("s", "truth", 100, 1.0, [row()], {}, [METRES, SPIKES], {"image": "x"}, left_out)
-    write_summary(tmp_path, summary)
-    lines = (tmp_path / "table.txt").read_text().splitlines()[-3:]
-    assert [line.split(":")[1].strip() for line in lines] == [
-        "tracker",
-        "orientation sensor",
-        "mode pose is left out",
-    ]
-    assert "units" in lines[0]
-    assert "refused" in lines[0]
-    assert "refused" not in lines[1]
-    (tmp_path / "drift.json").write_text("[]")
-    outcome = SweepOutcome("s", tmp_path, "done", folder=".")
-    study = write_study(tmp_path, [outcome], "")
-    assert list(study.summaries[0].doubts) == [METRES, SPIKES]
-    assert study.summaries[0].left_out == left_out
-    held = json.loads((tmp_path / "study.json").read_text())["doubts"]
-    assert [(each["sweep"], each["suspect"]) for each in held] == [("s", "units"), ("s", "spikes")]
-    assert all(line in study.table for line in lines)
+    doubts = [METRES, SPIKES]
+    of = Summary("s", "truth", 100, 1.0, [row()], {}, doubts, {"image": "x"}, left_out, {"image": 0.1})
+    write_summary(tmp_path, of)
+    table = (tmp_path / "table.txt").read_text()
+    assert "s: tracker: expected 23 mm, got 0.023 (suspect: units); refused" in table
+    assert "s: mode pose is left out" in table
+    assert replace(read_summary(tmp_path, "s"), drift=()) == of
+    study = write_study(tmp_path, [SweepOutcome("s", tmp_path, "done", folder=".")], "")
+    doubts = json.loads((tmp_path / "study.json").read_text())["doubts"]
+    assert [(each["sweep"], each["suspect"]) for each in doubts] == [("s", "units"), ("s", "spikes")]
+    assert "mode pose is left out" in study.table
 
 
 def test_doubts_are_found_again_beside_the_reconstruction_they_belong_to(tmp_path):
@@ -128,29 +139,10 @@ def test_doubts_are_found_again_beside_the_reconstruction_they_belong_to(tmp_pat
     assert recorded_doubts(path, made) is None
 
 
-def test_three_files_appear_and_nothing_else(tmp_path):
-    written = write_summary(tmp_path / "new", *summaries())
-    assert {p.name for p in written} == {"summary.json", "table.txt", "table.csv"}
-    assert {p.name for p in (tmp_path / "new").iterdir()} == {p.name for p in written}
-    assert json.loads(written[0].read_text())["sweeps"][0]["sweep"] == "beef, 1"
-
-
-def test_a_directory_that_cannot_be_made_is_one_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(FileError, match="file"):
-        write_summary(tmp_path / "file", *summaries())
-
-
-def test_what_json_cannot_hold_is_named():
-    with pytest.raises(InvalidInputError, match="'object'"):
-        json_text({"a": [object()]})
-
-
 def test_a_study_takes_the_place_of_the_one_before_with_all_that_was_made_from_it(tmp_path, monkeypatch):
     failed = [SweepOutcome("a", tmp_path / "a.h5", "failed", "first")]
     write_study(tmp_path, failed, "first")
-    (tmp_path / "figures").mkdir()
-    made = [tmp_path / "report.html", tmp_path / "figures" / "overview.png", tmp_path / "paper.txt"]
+    made = [tmp_path / name for name in ("report.html", "overview.png", "paper.txt")]
     for path in made:
         path.write_text("of the first")
     kept = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

@@ -18,9 +18,10 @@ import panel as pn
 from bokeh.models import ColumnDataSource
 from panel.viewable import Viewable
 
-from calibration.chain import Seen
-from calibration.detection.lines import EchoLine, LineFinder, LineSettings, NoLineError
-from calibration.job import Recording
+from calibration.detection.lines import EchoLine, LineFinder, NoLineError
+from calibration.points import Seen
+from calibration.recording import Recording
+from calibration.settings import LineSettings
 from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.frames import FrameChoice
 from speckle3d.app.phantom.marked import slider, widget
@@ -177,12 +178,12 @@ class _Tuner:
     def _line_finder(self) -> LineFinder:
         settings = self.settings()
         assert isinstance(settings, PlaneSettings | OrientationSettings)
-        lines, region = settings.lines, settings.region
+        lines, region = settings, settings.region
         # What is looked at depends on these alone; the rest must follow the slider at once.
         key = lines.columns, lines.smoothing_mm, region
         if self._finder is None or self._finder[0] != key:
             images, size = self._recording.images, self._recording.pixel_mm
-            self._finder = key, LineFinder.of_frames(images, size, lines, settings.region_px)
+            self._finder = key, LineFinder.of_frames(images, size, lines, settings.region)
         return replace(self._finder[1], settings=lines)
 
     def _draw(self, line: EchoLine) -> None:

@@ -54,7 +54,7 @@ class Options:
             If the clock offset is none.
         """
         values = {name: each.value for name, each in self._widgets.items()}
-        return values | {"time_offset_s": offset_of((self._offset.value or "").strip() or None)}
+        return values | {"time_offset_s": offset_of((self._offset.value or "").strip())}
 
     def view(self) -> Viewable:
         """The widgets, folded away."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calibration.chain import Seen
+from calibration.points import Seen
 from speckle3d.io.points import PickedPoints
 
 Point = tuple[float, float, str]

@@ -10,7 +10,7 @@ from bokeh.models import ColumnDataSource, CrosshairTool, HoverTool, Image, Line
 from bokeh.palettes import Greys256
 from bokeh.plotting import figure
 
-from calibration.job import Recording
+from calibration.recording import Recording
 
 USED, DROPPED, REGION = "#0072B2", "#D55E00", "#F0E442"
 """Colours of Okabe and Ito's palette, distinguishable with any colour vision."""

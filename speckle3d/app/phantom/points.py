@@ -13,9 +13,9 @@ import panel as pn
 from bokeh.models import ColumnDataSource, PointDrawTool
 from panel.viewable import Viewable
 
-from calibration.chain import Seen
 from calibration.detection.dots import dots_in_image
-from calibration.job import Recording, choose_crossings
+from calibration.points import Seen
+from calibration.recording import Recording, choose_crossings
 from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.frames import FrameChoice
 from speckle3d.app.phantom.options import Options
@@ -194,7 +194,7 @@ class _Picker:
             return np.asarray(self._candidates.pixels[self._candidates.frame == self._frames.frame])
         if not self._wired.names:
             return np.zeros((0, 2))
-        pixels, _ = dots_in_image(image, self._recording.pixel_mm, None, self._region.corners)
+        pixels, _ = dots_in_image(image, self._recording.pixel_mm, self._region.corners)
         return pixels
 
     def _draw_points(self) -> None:

@@ -97,7 +97,7 @@ class Region:
 
     def _typed(self) -> None:
         try:
-            corners = region_of((self._text.value or "").strip() or None)
+            corners = region_of((self._text.value or "").strip())
         except InvalidInputError:
             self._text.value = "" if self.corners is None else region_text(self.corners)
             return

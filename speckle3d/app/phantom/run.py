@@ -12,9 +12,8 @@ from typing import Any
 import panel as pn
 from panel.viewable import Viewable
 
-from calibration.chain import Seen
-from calibration.identifiability import judge
-from calibration.job import Outcome, Recording
+from calibration.points import Seen
+from calibration.recording import Outcome, Recording
 from calibration.report import text_report
 from speckle3d.app.folder import Folder
 from speckle3d.app.phantom.picture import DROPPED, USED
@@ -127,7 +126,7 @@ class RunPane:
         try:
             seen = self._find(settings, progress)
             outcome = solved(self._recording, seen, settings)
-            return Solved(settings, seen, outcome, bool(judge(outcome.solution).missing))
+            return Solved(settings, seen, outcome, bool(outcome.solution.adequacy.missing))
         except Speckle3DError as error:
             return Solved(settings, seen, refusal=str(error))
 

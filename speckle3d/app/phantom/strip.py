@@ -9,8 +9,9 @@ from bokeh.events import DoubleTap, Tap
 from bokeh.models import BasicTicker, ColumnDataSource, HoverTool, Range1d
 from bokeh.plotting import figure
 
-from calibration.chain import ChainSolution, Seen
-from calibration.job import Outcome
+from calibration.plane import Solution
+from calibration.points import Seen
+from calibration.recording import Outcome
 from speckle3d.app.phantom.picture import DROPPED, USED
 from speckle3d.calibrating.phantoms import BY_HAND
 
@@ -103,7 +104,7 @@ class FrameStrip:
             colour[frame], told[frame] = LEFT_OUT, BY_HAND
         self._frames.data = {"frame": np.arange(self._count), "colour": colour, "told": told}
 
-    def _measure(self, solution: ChainSolution | None) -> None:
+    def _measure(self, solution: Solution | None) -> None:
         self.plot.yaxis.visible = solution is not None
         if solution is None:
             self._residuals.data = {"frame": [], "residual": []}

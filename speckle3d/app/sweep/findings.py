@@ -11,7 +11,7 @@ from speckle3d.core.arrays import IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
-from speckle3d.correction.trust import doubts_of_readings
+from speckle3d.examine.sensors import doubts_of_readings
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.matching.patches import lay_patches
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, FrameInspector, flag_frames

@@ -13,11 +13,11 @@ from speckle3d.app.sweep.pairs import SweepPairs
 from speckle3d.app.sweep.player import Player
 from speckle3d.app.sweep.screen import ScreenImages
 from speckle3d.app.sweep.streams import streams_of
-from speckle3d.config import Config, config_from_toml
+from speckle3d.config import Config, stored_config
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.trust import believed
+from speckle3d.examine.sensors import believed
 
 
 class SweepPage:
@@ -60,7 +60,7 @@ class SweepPage:
     @cached_property
     def _config(self) -> Config:
         made = self._reconstruction
-        return config_from_toml(made.config_toml) if made is not None and made.config_toml else Config()
+        return stored_config(made.config_toml) if made is not None and made.config_toml else Config()
 
     @property
     def _by_orientation(self) -> bool:

@@ -71,7 +71,7 @@ def calibrate_clock(
         told = f"images of the two ways correlate by {found.followed:.2f}"
     else:
         recording = open_recording(images, poses, pixel_mm, sensor, transform)
-        corners = region_of(region)
+        corners = region_of(region or "")
         with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
             seen = detect_lines(recording.images, recording.pixel_mm, None, corners, progress)
         frames, times = len(seen), recording.frame_time_s

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from speckle3d.cli.calibrations import report_written, require_free
-from speckle3d.cli.common import CalibrationOut, Json, PixelMm, Transform, calibrate, naming_options, note
+from speckle3d.cli.common import CalibrationOut, Json, PixelMm, Transform, calibrate, from_options, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
     from calibration.images.angulation import Angulation
-    from calibration.images.solver import ImageCalibration, ImageSettings
+    from calibration.images.solver import ImageCalibration
     from calibration.images.stacks import TrackedImages
+    from calibration.settings import ImageFit
     from speckle3d.core.calibration import Calibration
 
 
@@ -53,10 +54,7 @@ def calibrate_images(
     ] = None,
     transform: Transform = None,
     pixel_mm: PixelMm = None,
-    method: Annotated[
-        Literal["gauss-newton", "nelder-mead"],
-        typer.Option(help="By derivatives, or as published (Wein 2008)."),
-    ] = "gauss-newton",
+    method: Annotated[str | None, typer.Option(help="Was removed; there is one optimiser.")] = None,
     scales: Annotated[bool, typer.Option("--scales", help="Estimate the pixel size too.")] = False,
     capture_mm: Annotated[float, typer.Option(help="How far the start may be off, each way.")] = 20.0,
     capture_deg: Annotated[float, typer.Option(help="The same for its turns.")] = 20.0,
@@ -76,24 +74,18 @@ def calibrate_images(
     """Calibrate a position sensor from two crossing sweeps of anything with visible structure."""
     from calibration.clock.images import delay_from_images
     from calibration.images.report import calibration_from_images, figure_of, notes_of
-    from calibration.images.solver import ImageSettings
+    from calibration.settings import ImageFit
     from speckle3d.calibrating.recordings import open_tracked, require_unsized
     from speckle3d.calibrating.written import write_with_report
     from speckle3d.io.calibrations import read_calibration
 
     if time_offset_s is not None and not abs(time_offset_s) < MOST_OFFSET_S:
         raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
+    if method not in (None, "gauss-newton"):
+        raise InvalidInputError("--method: was removed; the search by derivatives finds what Nelder-Mead did")
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
-    with naming_options():
-        settings = ImageSettings(
-            method=method,
-            scales=scales,
-            capture_mm=capture_mm,
-            capture_deg=capture_deg,
-            tracker_mm=tracker_mm,
-            tracker_deg=tracker_deg,
-        )
+    settings = from_options(ImageFit, locals())
     for path in (first, second):
         require_unsized(path, pixel_mm)
     known = None if start is None else read_calibration(start)
@@ -179,7 +171,7 @@ def _angulation(sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransfo
 
 
 def _solve(
-    sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform, settings: ImageSettings
+    sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform, settings: ImageFit
 ) -> ImageCalibration:
     from calibration.images.solver import calibrate_images as solve
 

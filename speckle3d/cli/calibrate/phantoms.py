@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,203 +13,101 @@ from speckle3d.cli.common import (
     CalibrationOut,
     Images,
     Json,
-    PixelMm,
-    Poses,
-    Region,
-    Transform,
     calibrate,
     emit,
     emit_json,
     from_options,
     note,
 )
+from speckle3d.cli.helping import Command
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.calibrating.settings import ScanSettings
 
-TimeOffset = Annotated[str | None, typer.Option(help="Seconds to add to the sensor's clock, or `estimate`.")]
-FixedPixels = Annotated[
-    bool, typer.Option("--fixed-pixels", help="Keep the pixel size instead of estimating it.")
-]
-PixelError = Annotated[
-    float, typer.Option(min=0.0, help="Standard error of the pixel size, as a share of it; inf if a guess.")
-]
-OutlierSigma = Annotated[
-    float, typer.Option(min=1.0, help="Drop frames whose residual exceeds so many standard deviations.")
-]
-Columns = Annotated[int | None, typer.Option(help="Lines: columns sampled (n).")]
-SmoothingMm = Annotated[
-    float | None, typer.Option(help="Lines: standard deviation of the smoothing (sigma).")
-]
-Threshold = Annotated[float | None, typer.Option(help="Lines: slope that makes an edge, levels/mm (T).")]
-ToleranceMm = Annotated[float | None, typer.Option(help="Lines: how near an edge must be to agree (d).")]
-Consensus = Annotated[float | None, typer.Option(help="Lines: part of the possible columns that agree (p).")]
-Place = Annotated[str | None, typer.Option(help="Lines: where on an echo: front, slope or peak.")]
-LeaveOut = Annotated[
-    str | None, typer.Option(metavar="FRAMES", help="Frames to leave out, from 0, as 3,17-20.")
-]
-Validation = Annotated[
-    Path | None, typer.Option(help="Another recording of the phantom, on which the calibration is checked.")
-]
+METHODS = {
+    "plane": "Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom.",
+    "orientation": "Calibrate an orientation sensor with the floor of a water bath.",
+    "wires": "Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes.",
+}
 
 
-@calibrate.command("plane")
-def calibrate_plane(
-    images: Images,
-    out: CalibrationOut,
-    poses: Poses = None,
-    transform: Transform = None,
-    pixel_mm: PixelMm = None,
-    fixed_pixels: FixedPixels = False,
-    pixel_error: PixelError = 0.02,
-    stages: Annotated[
-        Literal["three", "one"], typer.Option(help="Angles, distances, all; or all at once.")
-    ] = "three",
-    reflector: Annotated[
-        Literal["wall", "bar"],
-        typer.Option(help="A bare wall, whose bias is predicted, or a thin bar (Cambridge)."),
-    ] = "wall",
-    beam_mm: Annotated[
-        list[float] | None, typer.Option(help="Thickness of the beam for that prediction; may be repeated.")
-    ] = None,
-    region: Region = None,
-    time_offset_s: TimeOffset = None,
-    outlier_sigma: OutlierSigma = 4.0,
-    validation: Validation = None,
-    columns: Columns = None,
-    smoothing_mm: SmoothingMm = None,
-    threshold: Threshold = None,
-    tolerance_mm: ToleranceMm = None,
-    consensus: Consensus = None,
-    place: Place = None,
-    leave_out: LeaveOut = None,
-    as_json: Json = False,
-) -> None:
-    """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
-    from speckle3d.calibrating.settings import PlaneSettings
+class _OfSettings(Command):
+    """A command whose options are the fields of its settings, loaded when it is asked for them."""
 
-    given = {**locals(), **_parsed(region, time_offset_s, leave_out)}
-    _calibrate(images, from_options(PlaneSettings, given), out, validation, as_json=as_json)
+    @property
+    def params(self) -> list[Any]:
+        """Of the command, as click has them."""
+        if "_params" not in vars(self):
+            alone = typer.Typer(add_completion=False)
+            alone.command()(_command_of(str(self.name)))
+            command = typer.main.get_command(alone)
+            self._params, self.callback = list(command.params), command.callback
+        return self._params
+
+    @params.setter
+    def params(self, none: list[Any]) -> None:
+        """Ignore that its stand-in has none."""
 
 
-@calibrate.command("orientation")
-def calibrate_orientation(
-    images: Images,
-    out: CalibrationOut,
-    poses: Poses = None,
-    transform: Transform = None,
-    pixel_mm: PixelMm = None,
-    level: Annotated[
-        bool, typer.Option("--level", help="The plane is level: three unknowns, not five.")
-    ] = False,
-    viewed_from: Annotated[
-        Literal["above", "below"], typer.Option(help="Whether the beam points down on average, or up.")
-    ] = "above",
-    sensor: Annotated[
-        Literal["orientation", "tracker"],
-        typer.Option(help="orientation, or tracker: use only what a tracker says of orientation."),
-    ] = "orientation",
-    region: Region = None,
-    time_offset_s: TimeOffset = None,
-    outlier_sigma: OutlierSigma = 4.0,
-    validation: Validation = None,
-    columns: Columns = None,
-    smoothing_mm: SmoothingMm = None,
-    threshold: Threshold = None,
-    tolerance_mm: ToleranceMm = None,
-    consensus: Consensus = None,
-    place: Place = None,
-    leave_out: LeaveOut = None,
-    as_json: Json = False,
-) -> None:
-    """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
-    from speckle3d.calibrating.settings import OrientationSettings
+def _command_of(method: str) -> Any:
+    """The command of a method, with the fields of its settings as parameters."""
+    from speckle3d.calibrating.settings import model_of, written_as
 
-    given = {**locals(), **_parsed(region, time_offset_s, leave_out)}
-    _calibrate(images, from_options(OrientationSettings, given), out, validation, as_json=as_json)
+    def option(name: str, kind: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
+        only = inspect.Parameter.KEYWORD_ONLY
+        return inspect.Parameter(name, only, default=default, annotation=kind)
+
+    def command(images: Path, out: Path, as_json: bool, **options: Any) -> None:
+        _calibrate(images, from_options(model_of(method), options), out, as_json)
+
+    parameters = [option("images", Images), option("out", CalibrationOut)]
+    for name, field in model_of(method).model_fields.items():
+        kind, text, default = field.annotation, written_as(field), field.default
+        told: dict[str, Any] = {"help": field.description}
+        if text is not None:
+            kind, default, told["metavar"] = str | None, None, text.metavar
+        if name == "phantom":
+            default = inspect.Parameter.empty  # the command asks which one
+        flag = typer.Option(f"--{name.replace('_', '-')}", **told)
+        parameters.append(option(name, Annotated[kind, flag], default))
+    parameters.append(option("as_json", Json, False))
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in parameters}
+    return command
 
 
-@calibrate.command("wires")
-def calibrate_wires(
-    images: Images,
-    out: CalibrationOut,
-    phantom: Annotated[str, typer.Option(help="cross, three, or a PLUS configuration of N-wires.")],
-    points: Annotated[
-        Path | None, typer.Option(help="CSV of points picked by hand: frame,column_px,row_px[,wire].")
-    ] = None,
-    poses: Poses = None,
-    transform: Transform = None,
-    pixel_mm: PixelMm = None,
-    fixed_pixels: FixedPixels = False,
-    registration: Annotated[
-        Literal["auto", "held", "turned", "free"],
-        typer.Option(
-            help="The place a configuration says: hold it, its middle only, or estimate it; auto: whichever "
-            "explains frames best that were left out."
-        ),
-    ] = "auto",
-    beside_mm: Annotated[
-        float,
-        typer.Option(help="How far the hand misses a crossing, out of plane, RMS, mm: claims allow for it."),
-    ] = 0.1,
-    region: Region = None,
-    time_offset_s: TimeOffset = None,
-    outlier_sigma: OutlierSigma = 4.0,
-    validation: Validation = None,
-    validation_points: Annotated[
-        Path | None, typer.Option(help="CSV of points picked by hand in that other recording.")
-    ] = None,
-    leave_out: LeaveOut = None,
-    as_json: Json = False,
-) -> None:
-    """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
-    from speckle3d.calibrating.settings import WireSettings
+def _add_command(method: str) -> None:
+    def stand_in() -> None: ...
 
-    if validation is None and validation_points is not None:
-        raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
-    given = {**locals(), **_parsed(region, time_offset_s, leave_out)}
-    others = (points, validation_points, Path(phantom))
-    _calibrate(images, from_options(WireSettings, given), out, validation, validation_points, others, as_json)
+    stand_in.__doc__ = METHODS[method]
+    calibrate.command(method, cls=_OfSettings)(stand_in)
 
 
-def _parsed(region: str | None, time_offset_s: str | None, leave_out: str | None) -> dict[str, Any]:
-    from speckle3d.calibrating.settings import frames_of, offset_of, region_of
-
-    return {
-        "region": region_of(region),
-        "time_offset_s": offset_of(time_offset_s),
-        "leave_out": frames_of(leave_out),
-    }
+for _method in METHODS:
+    _add_command(_method)
 
 
-def _calibrate(
-    images: Path,
-    settings: ScanSettings,
-    out: Path,
-    validation: Path | None,
-    validation_points: Path | None = None,
-    others: Sequence[Path | None] = (),
-    as_json: bool = False,
-) -> None:
+def _calibrate(images: Path, settings: ScanSettings, out: Path, as_json: bool) -> None:
     """Calibrate, check on the other recording, and write the calibration, its report and the dots."""
     from speckle3d.calibrating.phantoms import found, opened, remarks, solved, validated, write_outcome
 
-    require_free(out, images, settings.poses, validation, *others)
+    if settings.validation is None and getattr(settings, "validation_points", None) is not None:
+        raise InvalidInputError("--validation-points: expected the recording in --validation, got none")
+    files = [getattr(settings, name, None) for name in ("points", "validation_points", "phantom")]
+    others = [None if file is None else Path(file) for file in files]
+    require_free(out, images, settings.poses, settings.validation, *others)
     recording = opened(images, settings, settings.poses)
     with progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
         seen = found(recording, settings, getattr(settings, "points", None), progress)
     with naming(str(images)):
         outcome = solved(recording, seen, settings)
-    notes, more = remarks(outcome), []
-    if validation is not None:
-        with progress_bar(f"looking into {validation.name}") as progress:
-            notes += validated(outcome, validation, settings, validation_points, progress)
-        more += ["--validation", str(validation)]
-    if validation_points is not None:
-        more += ["--validation-points", str(validation_points)]
-    written = write_outcome(outcome, settings, images, out, notes, more)
+    notes = remarks(outcome)
+    if settings.validation is not None:
+        with progress_bar(f"looking into {settings.validation.name}") as progress:
+            notes += validated(outcome, settings, progress)
+    written = write_outcome(outcome, settings, images, out, notes)
     report_written(written, notes, outcome.beam, as_json)
 
 

@@ -110,7 +110,7 @@ def reslice(
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes."""
     from speckle3d.io.voxels.volume_writer import SUFFIXES
     from speckle3d.io.voxels.volumes import may_be_volume
-    from speckle3d.study.posed import USUAL_RANGE_DB
+    from speckle3d.study.figures import RANGE_DB
     from speckle3d.study.reslices.cuts import cut_posed
     from speckle3d.study.reslices.places import Place
     from speckle3d.study.reslices.reslice_figures import save_outlines
@@ -158,7 +158,7 @@ def reslice(
         if voxels is not None:
             _require_of_volume(opened, voxels[0], str(volume))
         with progress_bar(f"reslicing {out.name}") as progress:
-            range_db = dynamic_range_db or USUAL_RANGE_DB
+            range_db = dynamic_range_db or RANGE_DB
             picture = cut_posed(opened, located(opened), range_db, voxels, progress)
         _write(picture, out)
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import socket
 import threading
-from dataclasses import replace
 from typing import Self
 
 from speckle3d.io.igtl.link import Inbox, Link, LinkState, Outbox
-from speckle3d.io.igtl.messages import Limits, Received
+from speckle3d.io.igtl.messages import Received
 
 _CONNECT_S = 5.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
@@ -22,7 +21,6 @@ class Connection:
     ----------
     host : str
     port : int
-    limits : Limits, optional
 
     Examples
     --------
@@ -37,11 +35,11 @@ class Connection:
     ('ProbeToTracker', 12.5, True)
     """
 
-    def __init__(self, host: str, port: int, limits: Limits | None = None) -> None:
-        self._address, self._limits = (host, port), limits or Limits()
-        self._inbox, self._outbox = Inbox(self._limits), Outbox(self._limits)
-        self._over, self._lost = threading.Event(), threading.Event()
-        self._connected = threading.Event()
+    def __init__(self, host: str, port: int) -> None:
+        self._address = (host, port)
+        self._inbox, self._outbox = Inbox(), Outbox()
+        self._over, self._lost, self._connected = (threading.Event() for _ in range(3))
+        self._connections = 0
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> Self:
@@ -57,7 +55,6 @@ class Connection:
         self._lost.set()
         if self._thread.is_alive():
             self._thread.join()
-        self._inbox.close()
 
     def wait_connected(self, timeout_s: float) -> bool:
         """Wait for the server; whether it was found in time."""
@@ -80,41 +77,33 @@ class Connection:
     @property
     def state(self) -> LinkState:
         """What has happened so far."""
-        return replace(self._inbox.state(), dropped=self._outbox.dropped)
+        return self._inbox.state(self._connected.is_set(), self._connections - 1, self._outbox.dropped)
 
     def _run(self) -> None:
-        pause_s, found = _FIRST_PAUSE_S, 0
+        pause_s = _FIRST_PAUSE_S
         while not self._over.is_set():
+            before = self._inbox.messages
             try:
                 connected = socket.create_connection(self._address, timeout=_CONNECT_S)
             except (OSError, UnicodeError) as error:  # Unicode: a host that cannot be a name
-                self._inbox.note(False, str(error))
-                self._over.wait(pause_s)
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-                continue
-            messages = self._inbox.state().messages
-            self._listen(connected, found)
-            found += 1
+                self._inbox.last_failure = str(error)
+            else:
+                self._listen(connected)
             # A server that closes at once is no better than none.
-            if self._inbox.state().messages > messages:
-                pause_s = _FIRST_PAUSE_S
-            if not self._over.wait(pause_s):
-                pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
+            pause_s = _FIRST_PAUSE_S if self._inbox.messages > before else min(2 * pause_s, _LONGEST_PAUSE_S)
+            self._over.wait(pause_s)
 
-    def _listen(self, connected: socket.socket, found: int) -> None:
+    def _listen(self, connected: socket.socket) -> None:
         self._lost.clear()
-        if self._over.is_set():
-            connected.close()
-            return
-        self._inbox.note(True, reconnections=min(found, 1))
-        link = Link(connected, self._inbox, self._outbox, self._limits, self._ended)
+        self._connections += 1
         self._connected.set()
-        self._lost.wait()
+        link = Link(connected, self._inbox, self._outbox, self._ended)
+        while not (self._lost.wait(_FIRST_PAUSE_S) or self._over.is_set()):
+            pass
         self._connected.clear()
         link.close()
-        self._inbox.note(False)
         self._outbox.clear()
 
     def _ended(self, reason: str) -> None:
-        self._inbox.note(False, reason)
+        self._inbox.last_failure = reason
         self._lost.set()

@@ -1,25 +1,25 @@
-"""One socket to a peer, read and written by two threads, with bounded memory on either way."""
+"""One socket to a peer, read and written by two threads, with bounded queues on either way."""
 
 from __future__ import annotations
 
+import queue
 import socket
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from speckle3d.core.errors import InvalidInputError
-from speckle3d.io.igtl.framing import Framing, LostError
-from speckle3d.io.igtl.messages import ImageReceived, Limits, MessageError, Received
+from speckle3d.io.igtl.messages import HEADER, MessageError, Received, decode, read_header
 
-_PIECE_BYTES = 2**18
 _LOOK_S = 0.1
 """How often a waiting thread looks whether it is to end."""
 
-_SMALL_BYTES = 512
-"""Counted for a message beside its pixels."""
+STALL_S = 10.0
+"""Longest pause within a message."""
+
+_MOST_RECEIVED, _MOST_SENDING = 256, 64
+"""Messages not yet taken, for which the peer then waits; and not yet sent, of which the oldest go."""
 
 
 @dataclass(frozen=True)
@@ -58,127 +58,92 @@ class LinkState:
 
 
 class Inbox:
-    """Messages received and not yet taken, in order; a full one makes its peers wait. None is dropped.
+    """Messages received and not yet taken, and counts of what has come."""
 
-    Parameters
-    ----------
-    limits : Limits
-    """
-
-    def __init__(self, limits: Limits) -> None:
-        self._most = limits.max_waiting_bytes
-        self._changed = threading.Condition()
-        self._held: deque[Received] = deque()
-        self._bytes = 0
-        self._closed = False
-        self._state, self._heard_s = LinkState(), time.monotonic()
+    def __init__(self) -> None:
+        self._queue: queue.Queue[Received] = queue.Queue(_MOST_RECEIVED)
+        self.messages = self.refused = 0
+        self.last_refused = self.last_failure = ""
+        self.heard_s = time.monotonic()
 
     def put(self, message: Received, over: threading.Event) -> None:
         """Append a message as soon as there is room; not at all if its connection is over before."""
-        with self._changed:
-            while self._bytes >= self._most:
-                if over.is_set():
-                    return
-                self._changed.wait(_LOOK_S)
-            self._held.append(message)
-            self._bytes += _size(message)
-            self._state = replace(self._state, messages=self._state.messages + 1)
-            self._changed.notify_all()
+        while not over.is_set():
+            with suppress(queue.Full):
+                self._queue.put(message, timeout=_LOOK_S)
+                self.messages += 1
+                return
 
     def take(self, timeout_s: float) -> list[Received]:
-        """Take all messages, waiting for the first one; none if the time is over or the inbox is closed."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closed or bool(self._held), timeout_s)
-            taken = list(self._held)
-            self._held.clear()
-            self._bytes = 0
-            self._changed.notify_all()
-            return taken
-
-    def heard(self) -> None:
-        """Note that bytes came."""
-        self._heard_s = time.monotonic()
+        """Take all messages, waiting for the first one; none if none came in time."""
+        taken: list[Received] = []
+        with suppress(queue.Empty):
+            taken.append(self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait())
+            while True:
+                taken.append(self._queue.get_nowait())
+        return taken
 
     def refuse(self, error: MessageError) -> None:
         """Count a message that made no sense."""
-        with self._changed:
-            self._state = replace(self._state, refused=self._state.refused + 1, last_refused=str(error))
+        self.refused += 1
+        self.last_refused = str(error)
 
-    def note(self, connected: bool, failure: str = "", reconnections: int = 0) -> None:
-        """Note that a connection was made or lost."""
-        with self._changed:
-            if connected:
-                self._heard_s = time.monotonic()
-            self._state = replace(
-                self._state,
-                connected=connected,
-                reconnections=self._state.reconnections + reconnections,
-                last_failure=failure or self._state.last_failure,
-            )
-
-    def state(self) -> LinkState:
-        """What has happened so far, but for what was sent."""
-        with self._changed:
-            silent_s = time.monotonic() - self._heard_s
-            return replace(self._state, waiting=len(self._held), silent_s=silent_s)
-
-    def close(self) -> None:
-        """Let nobody wait any longer."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+    def state(self, connected: bool, reconnections: int, dropped: int) -> LinkState:
+        """What has happened so far."""
+        return LinkState(
+            connected, self.messages, self.refused, self.last_refused, max(reconnections, 0), dropped,
+            self._queue.qsize(), time.monotonic() - self.heard_s, self.last_failure,
+        )  # fmt: skip
 
 
 class Outbox:
     """Messages to a peer that are not yet sent; of too many the oldest are dropped."""
 
-    def __init__(self, limits: Limits) -> None:
-        self._most = limits.max_sending_bytes
-        self._changed = threading.Condition()
-        self._held: deque[bytes] = deque()
-        self._bytes = self._in_hand = 0
+    def __init__(self) -> None:
+        self._queue: queue.Queue[bytes] = queue.Queue(_MOST_SENDING)
         self.dropped = 0
 
     def put(self, message: bytes) -> None:
         """Append a message; never waits."""
-        if len(message) > self._most:
-            raise InvalidInputError(
-                f"message: expected at most {self._most} bytes to send, got {len(message)}"
-            )
-        with self._changed:
-            self._held.append(message)
-            self._bytes += len(message)
-            while self._bytes > self._most:
-                self._bytes -= len(self._held.popleft())
+        while True:
+            try:
+                return self._queue.put_nowait(message)
+            except queue.Full:
+                self.clear(1)
+
+    def clear(self, most: int = _MOST_SENDING) -> None:
+        """Drop the oldest messages, as many at most."""
+        with suppress(queue.Empty):
+            for _ in range(most):
+                self._queue.get_nowait()
+                self._queue.task_done()
                 self.dropped += 1
-            self._changed.notify()
 
-    def next(self, timeout_s: float) -> bytes | None:
-        """Take the oldest message, the one before being sent; None if none comes in time."""
-        with self._changed:
-            self._in_hand = 0
-            if not self._changed.wait_for(lambda: bool(self._held), timeout_s):
-                return None
-            self._in_hand = 1
-            message = self._held.popleft()
-            self._bytes -= len(message)
-            return message
-
-    def clear(self) -> None:
-        """Drop all."""
-        with self._changed:
-            self.dropped += len(self._held)
-            self._held.clear()
-            self._bytes = 0
+    def send_to(self, peer: socket.socket, over: threading.Event) -> None:
+        """Send messages as they come until the connection is over."""
+        while not over.is_set():
+            try:
+                left = memoryview(self._queue.get(timeout=_LOOK_S))
+            except queue.Empty:
+                continue
+            try:
+                while left and not over.is_set():
+                    with suppress(TimeoutError):
+                        left = left[peer.send(left) :]
+            finally:
+                self._queue.task_done()
 
     @property
     def waiting(self) -> int:
         """Messages not yet handed to the system as a whole."""
-        return len(self._held) + self._in_hand
+        return self._queue.unfinished_tasks
 
 
 class Link:
     """A connected socket: what it brings goes into `inbox`, what is in `outbox` is sent.
+
+    A message whose body makes no sense is refused alone. Where there is no header of a message, or the peer
+    stalls within one, the connection is given up.
 
     Parameters
     ----------
@@ -187,20 +152,17 @@ class Link:
     """
 
     def __init__(
-        self,
-        connected: socket.socket,
-        inbox: Inbox,
-        outbox: Outbox,
-        limits: Limits,
-        ended: Callable[[str], None],
+        self, connected: socket.socket, inbox: Inbox, outbox: Outbox, ended: Callable[[str], None]
     ) -> None:
-        self._socket, self._inbox, self._outbox = connected, inbox, outbox
-        self._limits, self._ended = limits, ended
+        self._socket, self._inbox, self._outbox, self._ended = connected, inbox, outbox, ended
         self._over, self._ending = threading.Event(), threading.Lock()
         connected.settimeout(_LOOK_S)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self._threads = [threading.Thread(target=each, daemon=True) for each in (self._read, self._write)]
+        self._threads = [
+            threading.Thread(target=self._guarded, args=(work,), daemon=True)
+            for work in (self._read, lambda: outbox.send_to(connected, self._over))
+        ]
         for thread in self._threads:
             thread.start()
 
@@ -214,52 +176,50 @@ class Link:
                 thread.join()
         self._socket.close()
 
+    def _guarded(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except (OSError, MessageError) as error:
+            with self._ending:
+                if self._over.is_set():
+                    return
+                self._over.set()
+            self._ended(str(error))
+
     def _read(self) -> None:
-        framing, heard_s = Framing(self._limits), time.monotonic()
-        piece = bytearray(_PIECE_BYTES)
-        try:
-            while not self._over.is_set():
-                try:
-                    count = self._socket.recv_into(piece)
-                except TimeoutError:
-                    if framing.within_message and time.monotonic() - heard_s > self._limits.stall_s:
-                        raise LostError(
-                            f"expected the rest of a message, got none for {self._limits.stall_s:g} s"
-                        ) from None
-                    continue
-                if not count:
-                    where = " within a message" if framing.within_message else ""
-                    raise ConnectionError(f"closed by the peer{where}")
-                self._inbox.heard()
-                for found in framing.feed(memoryview(piece)[:count]):
-                    if isinstance(found, MessageError):
-                        self._inbox.refuse(found)
-                    else:
-                        self._inbox.put(found, self._over)
-                heard_s = time.monotonic()  # also after a wait for room
-        except LostError as error:
-            self._inbox.refuse(error)
-            self._end(error)
-        except OSError as error:
-            self._end(error)
+        while not self._over.is_set():
+            start = self._receive(HEADER.size, is_start=True)
+            try:
+                header = read_header(start)
+            except MessageError as error:
+                self._inbox.refuse(error)
+                raise
+            body = self._receive(header.body_bytes)
+            try:
+                message = decode(header, body)
+            except MessageError as error:
+                self._inbox.refuse(error)
+            else:
+                self._inbox.put(message, self._over)
 
-    def _write(self) -> None:
-        try:
-            while not self._over.is_set():
-                left = memoryview(self._outbox.next(_LOOK_S) or b"")
-                while left and not self._over.is_set():
-                    with suppress(TimeoutError):
-                        left = left[self._socket.send(left) :]
-        except OSError as error:
-            self._end(error)
-
-    def _end(self, error: Exception) -> None:
-        with self._ending:
-            if self._over.is_set():
-                return
-            self._over.set()
-        self._ended(str(error))
-
-
-def _size(message: Received) -> int:
-    return _SMALL_BYTES + (message.pixels.nbytes if isinstance(message, ImageReceived) else 0)
+    def _receive(self, count: int, is_start: bool = False) -> bytes:
+        """Receive so many bytes; a message may begin after any time, and then has no long pause."""
+        content, begun_s = bytearray(count), time.monotonic()
+        left = memoryview(content)
+        while left:
+            is_within = not is_start or len(left) < count
+            try:
+                came = self._socket.recv_into(left)
+            except TimeoutError:
+                if self._over.is_set():
+                    raise ConnectionError("closed") from None
+                if is_within and time.monotonic() - begun_s > STALL_S:
+                    raise ConnectionError(
+                        f"expected the rest of a message, got none for {STALL_S:g} s"
+                    ) from None
+                continue
+            if not came:
+                raise ConnectionError(f"closed by the peer{' within a message' if is_within else ''}")
+            left, begun_s = left[came:], time.monotonic()
+            self._inbox.heard_s = begun_s
+        return bytes(content)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Frames, ImageGrid, OrientationSensor, Sweep, Tracker
-from speckle3d.io.igtl.packing import packed_image, packed_transform
+from speckle3d.io.igtl.messages import packed_image, packed_transform
 
 _SLICE_MM = 1.0
 """Thickness that an image is given to be seen with."""

@@ -20,9 +20,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.parts import DiskFile
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
+from speckle3d.io.records import Room
 
 SUFFIXES = (".tfm", ".h5")
 
@@ -113,7 +113,8 @@ def _text(parameters: FloatArray) -> str:
 
 
 def _write_hdf5(part: Path, parameters: FloatArray) -> None:
-    with DiskFile(part) as disk, h5py.File(disk, "w") as file:
+    with Room(part) as room, h5py.File(part, "w", locking=False) as file:
+        room.require(0)
         text = h5py.string_dtype("ascii")
         for name, value in (("ITKVersion", "5.4"), ("HDFVersion", h5py.version.hdf5_version)):
             file.create_dataset(name, data=[value], dtype=text)

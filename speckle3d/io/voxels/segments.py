@@ -12,8 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.labels import Segment
-from speckle3d.io.text import numbers
-from speckle3d.io.voxels.volume_headers import unescaped
+from speckle3d.io.text import numbers, unescaped
 
 _FIELD = re.compile(r"Segment(\d{1,5})_(\w+)")
 _REPRESENTATION = "Binary labelmap"

@@ -1,15 +1,24 @@
-"""Volumes written plane by plane, as NRRD, MetaImage or NIfTI files, in memory that stays as it is."""
+"""Volumes written plane by plane, as NRRD, MetaImage or NIfTI files, in memory that stays as it is.
+
+World axes are written as left, posterior, superior (LPS), mm.
+
+References
+----------
+.. [1] G. Kindlmann, "Definition of NRRD File Format", teem.sourceforge.net.
+.. [2] MetaIO documentation, Insight Software Consortium.
+"""
 
 from __future__ import annotations
 
-import struct
+import re
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
+import nibabel
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
@@ -17,25 +26,29 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import Segment, require_segments
-from speckle3d.core.threads import ahead, cores
-from speckle3d.io.deflate import LAST_BLOCK, ZLIB_START, packed_run
+from speckle3d.core.printable import printable
+from speckle3d.core.volume import VOXEL_TYPES, require_spacing
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.header_text import put_packed_size
+from speckle3d.io.header_text import meta_start, put_packed_size
+from speckle3d.io.pixels import meta_type, nrrd_type
+from speckle3d.io.text import unescaped
 from speckle3d.io.voxels.nifti import nifti_header
 from speckle3d.io.voxels.segments import segment_fields
-from speckle3d.io.voxels.volume_headers import VolumeHeader, meta_header, nrrd_header
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
 """Of files that are written; .seg.nrrd is one of them, for labels alone."""
 
 LABELS_ALONE = ".seg.nrrd"
 
-_PIECE_BYTES = 2**20
-"""Bytes that are packed at once: the same for any number of threads, so that files are the same, too."""
-_BATCH_BYTES = 16 * _PIECE_BYTES
+PREFIX = "Speckle3D_"
+"""Before the names of a volume's fields, so that none is taken for one of the format's own."""
 
-_GZIP_START = b"\x1f\x8b\x08" + bytes(6) + b"\xff"
-"""Of a gzip file without name and time, of an unknown system."""
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
+_BATCH_BYTES = 2**24
+_GZIP, _ZLIB = 31, 15
+"""Windows of zlib, by which it tells how a stream begins and ends."""
+_SIDES = (("L", "R"), ("P", "A"), ("S", "I"))
+"""Sides that an axis along a world axis leads to or comes from, by MetaImage's letters."""
 
 
 class VolumeWriter:
@@ -94,32 +107,36 @@ class VolumeWriter:
         compress: bool = True,
         segments: Sequence[Segment] | None = None,
     ) -> None:
-        self._path = Path(path)
-        suffix = require_suffix(self._path, segments is not None)
+        self._path, self._shape = Path(path), shape
+        self._dtype: np.dtype[Any] = np.dtype(dtype).newbyteorder("=")
+        self._suffix = require_suffix(self._path, segments is not None)
+        self._packs = self._suffix == ".nii.gz" or (compress and self._suffix != ".nii")
         with naming(str(path)):
-            kind, plain = np.dtype(dtype).newbyteorder("="), dict[str, str]()
+            self._require_volume(spacing_mm, world_from_grid, fields or {})
+            plain: dict[str, str] = {}
             if segments is not None:
-                require_segments(kind, tuple(segments))
+                require_segments(self._dtype, tuple(segments))
                 plain = segment_fields(segments, shape)
-            self._header = VolumeHeader(shape, spacing_mm, world_from_grid, kind, fields or {}, plain)
-            self._packs = suffix == ".nii.gz" or (compress and suffix != ".nii")
-            self._text = _header_bytes(self._header, suffix, self._packs, segments is not None)
-        self._is_meta = suffix == ".mha"
-        self._stored = kind.newbyteorder("<")
+            matrix = world_from_grid.as_matrix() @ np.diag([*spacing_mm, 1.0]) + 0.0  # no negative zeros
+            if self._suffix in (".nrrd", ".mha"):
+                texts = {f"{PREFIX}{name}": value for name, value in (fields or {}).items()} | plain
+                lines = self._nrrd(matrix, texts) if self._suffix == ".nrrd" else self._meta(matrix, texts)
+                self._header = "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
+            else:
+                texts = {**(fields or {}), **plain}
+                self._header = nifti_header(shape, self._dtype, matrix, texts, segments is not None)
         self._planes = 0
-        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             part = stack.enter_context(atomic_path(self._path))
             self._file = stack.enter_context(part.open("wb"))
             stack.push(self._finish_unless)
-            is_gzip = self._path.name.lower().endswith(".gz")
-            if not is_gzip:
-                self._file.write(self._text)
-            self._voxels = _Packed(self._file, not self._is_meta) if self._packs else _Raw(self._file)
-            if is_gzip:
-                self._voxels.write(self._text)
+            self._packer = _packer(_ZLIB if self._suffix == ".mha" else _GZIP) if self._packs else None
+            if self._suffix == ".nii.gz":
+                self._write(self._header)
+            else:
+                self._file.write(self._header)
             self._stack = stack.pop_all()
         return self
 
@@ -143,93 +160,85 @@ class VolumeWriter:
         FileError
             If the file cannot be written.
         """
-        n_i, n_j, n_k = self._header.shape
+        n_i, n_j, n_k = self._shape
         left = n_k - self._planes
         if planes.ndim != 3 or planes.shape[1:] != (n_j, n_i) or len(planes) > left:
             expected = f"at most {left} planes of {n_j} x {n_i} voxels (j x i)"
             raise MismatchError(f"{self._path}: expected {expected}, got shape {planes.shape}")
-        if planes.dtype.newbyteorder("=") != self._header.dtype:
-            raise MismatchError(
-                f"{self._path}: expected voxels of type {self._header.dtype}, got {planes.dtype}"
-            )
-        step = max(1, _BATCH_BYTES // (n_i * n_j * self._stored.itemsize))
+        if planes.dtype.newbyteorder("=") != self._dtype:
+            raise MismatchError(f"{self._path}: expected voxels of type {self._dtype}, got {planes.dtype}")
+        step = max(1, _BATCH_BYTES // (n_i * n_j * self._dtype.itemsize))
         for first in range(0, len(planes), step):
-            some = np.ascontiguousarray(planes[first : first + step], dtype=self._stored)
-            self._voxels.write(some.data.cast("B"))
+            batch = np.ascontiguousarray(planes[first : first + step], self._dtype.newbyteorder("<"))
+            self._write(batch.data.cast("B"))
         self._planes += len(planes)
 
+    def _write(self, content: bytes | memoryview) -> None:
+        self._file.write(content if self._packer is None else self._packer.compress(content))
+
     def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
-        if error is None:
-            self._finish()
+        if error is not None:
+            return
+        if self._planes != self._shape[2]:
+            raise MismatchError(f"{self._path}: expected {self._shape[2]} planes, got {self._planes}")
+        if self._packer is not None:
+            self._file.write(self._packer.flush())
+            if self._suffix == ".mha":
+                put_packed_size(self._file, self._header, self._file.tell() - len(self._header))
 
-    def _finish(self) -> None:
-        expected = self._header.shape[2]
-        if self._planes != expected:
-            raise MismatchError(f"{self._path}: expected {expected} planes, got {self._planes}")
-        size = self._voxels.finish()
-        if self._is_meta and self._packs:
-            put_packed_size(self._file, self._text, size)
+    def _require_volume(
+        self,
+        spacing_mm: tuple[float, float, float],
+        world_from_grid: RigidTransform,
+        fields: Mapping[str, str],
+    ) -> None:
+        if len(self._shape) != 3 or min(self._shape) < 1:
+            raise InvalidInputError(f"shape: expected three lengths above zero, got {self._shape}")
+        if self._dtype.name not in VOXEL_TYPES:
+            raise InvalidInputError(f"dtype: expected {', '.join(VOXEL_TYPES)}, got {self._dtype}")
+        require_spacing(spacing_mm)
+        if not world_from_grid.single or not np.isfinite(world_from_grid.as_matrix()).all():
+            raise InvalidInputError("world_from_grid: expected one finite pose, got another")
+        for name in fields:
+            if not _NAME.fullmatch(name):
+                raise InvalidInputError(
+                    f"fields: expected names of letters, digits and '_.-' after a letter, got {name!r}"
+                )
 
+    def _nrrd(self, matrix: npt.NDArray[np.float64], fields: Mapping[str, str]) -> list[str]:
+        steps = [f"({_texts(column, ',')})" for column in matrix[:3].T]
+        return [
+            "NRRD0005",
+            f"type: {nrrd_type(self._dtype)}",
+            "dimension: 3",
+            "space: left-posterior-superior",
+            f"sizes: {_texts(self._shape)}",
+            f"space directions: {' '.join(steps[:3])}",
+            "kinds: domain domain domain",
+            "endian: little",
+            f"encoding: {'gzip' if self._packs else 'raw'}",
+            'space units: "mm" "mm" "mm"',
+            f"space origin: {steps[3]}",
+            *(f"{name}:={_escaped(value)}" for name, value in fields.items()),
+            "",
+        ]
 
-class _Raw:
-    """Bytes as they are."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-
-    def write(self, data: bytes | memoryview) -> None:
-        self._file.write(data)
-
-    def finish(self) -> int:
-        return 0
-
-
-class _Packed:
-    """Bytes in one stream of deflate whose blocks are packed in threads: gzip's, or zlib's."""
-
-    def __init__(self, file: BinaryIO, is_gzip: bool) -> None:
-        self._file, self._is_gzip = file, is_gzip
-        self._waiting = bytearray()
-        self._check, self._sum = (_crc32(), 0) if is_gzip else (zlib.adler32, 1)
-        self._given = 0
-        self._size = file.write(_GZIP_START if is_gzip else ZLIB_START)
-
-    def write(self, data: bytes | memoryview) -> None:
-        self._sum = self._check(data, self._sum)
-        self._given += len(data)
-        self._waiting += data
-        if len(self._waiting) >= _BATCH_BYTES:
-            whole = len(self._waiting) // _PIECE_BYTES * _PIECE_BYTES
-            self._pack(whole)
-
-    def finish(self) -> int:
-        """Write what still waits, and the check sum; returns the bytes of the whole stream."""
-        self._pack(len(self._waiting))
-        if self._is_gzip:
-            end = struct.pack("<2I", self._sum, self._given & 0xFFFFFFFF)
-        else:
-            end = struct.pack(">I", self._sum)
-        return self._size + self._file.write(LAST_BLOCK + end)
-
-    def _pack(self, stop: int) -> None:
-        # Blocks are written in order, while others pack those behind them.
-        for packed in ahead(packed_run, self._pieces(stop), most=2 * cores()):
-            self._size += self._file.write(packed)
-        del self._waiting[:stop]
-
-    def _pieces(self, stop: int) -> Iterator[bytes]:
-        for first in range(0, stop, _PIECE_BYTES):
-            yield bytes(self._waiting[first : min(first + _PIECE_BYTES, stop)])
-
-
-def _crc32() -> Callable[[bytes | memoryview, int], int]:
-    """Function of gzip's check sum: ISA-L's, or zlib's where it is missing."""
-    try:
-        from isal import isal_zlib
-    except ImportError:
-        return zlib.crc32
-    found: Callable[[bytes | memoryview, int], int] = isal_zlib.crc32
-    return found
+    def _meta(self, matrix: npt.NDArray[np.float64], fields: Mapping[str, str]) -> list[str]:
+        spacing = np.linalg.norm(matrix[:3, :3], axis=0)
+        return [
+            *meta_start(3, 0 if self._packs else None),
+            f"TransformMatrix = {_texts((matrix[:3, :3] / spacing).T.ravel())}",
+            f"Offset = {_texts(matrix[:3, 3])}",
+            "CenterOfRotation = 0 0 0",
+            f"AnatomicalOrientation = {''.join(nibabel.aff2axcodes(matrix, _SIDES))}",
+            f"ElementSpacing = {_texts(spacing)}",
+            f"DimSize = {_texts(self._shape)}",
+            # As PLUS tells a volume from a sequence of frames.
+            "Kinds = domain domain domain",
+            *(f"{name} = {_escaped(value)}" for name, value in fields.items()),
+            f"ElementType = MET_{meta_type(self._dtype)}",
+            "ElementDataFile = LOCAL",
+        ]
 
 
 def require_suffix(path: Path, is_labels: bool = False) -> str:
@@ -251,7 +260,31 @@ def require_suffix(path: Path, is_labels: bool = False) -> str:
     return suffix
 
 
-def _header_bytes(header: VolumeHeader, suffix: str, is_packed: bool, is_labels: bool) -> bytes:
-    if suffix == ".nrrd":
-        return nrrd_header(header, "gzip" if is_packed else "raw")
-    return meta_header(header, is_packed) if suffix == ".mha" else nifti_header(header, is_labels)
+def own_fields(fields: Mapping[str, str]) -> dict[str, str]:
+    """Fields of a volume among those in a header."""
+    return {
+        name.removeprefix(PREFIX): unescaped(value)
+        for name, value in fields.items()
+        if name.startswith(PREFIX) and name != PREFIX
+    }
+
+
+def _escaped(text: str) -> str:
+    r"""Write text on one line, with line breaks and backslashes as NRRD has them: ``\n`` and ``\\``.
+
+    Blanks at its ends are lost, and control characters are shown as Python writes them.
+    """
+    shown = printable(text.strip().replace("\r\n", "\n"), kept="\n")
+    return shown.replace("\\", "\\\\").replace("\n", "\\n")
+
+
+def _texts(values: Iterable[float], between: str = " ") -> str:
+    return between.join(str(value) if isinstance(value, int) else repr(float(value)) for value in values)
+
+
+def _packer(window: int) -> Any:
+    try:  # four times as fast as zlib
+        from isal import isal_zlib
+    except ImportError:
+        return zlib.compressobj(1, zlib.DEFLATED, window)
+    return isal_zlib.compressobj(1, isal_zlib.DEFLATED, window)

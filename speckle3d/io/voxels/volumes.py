@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +20,24 @@ from speckle3d.io.hdf5 import reading
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.pixels import read_pixels
 from speckle3d.io.text import numbers
-from speckle3d.io.voxels.nifti import GZIP_SIGNATURE, NiftiImage, is_nifti, read_nifti
+from speckle3d.io.voxels.nifti import is_nifti, read_nifti
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
-from speckle3d.io.voxels.volume_headers import own_fields
-from speckle3d.io.voxels.volume_writer import VolumeWriter
+from speckle3d.io.voxels.volume_writer import VolumeWriter, own_fields
 
 _SNIFFED_BYTES = 4096
 
 _SAME_PLACE_MM = 1e-3
 """Two grids are one if they differ by less: NIfTI keeps places to single precision."""
 
-_TO_LPS = {"left-anterior-superior": (1, -1, 1), "right-anterior-superior": (-1, -1, 1)}
+_TO_LPS = {
+    "left-anterior-superior": (1, -1, 1), "las": (1, -1, 1),
+    "right-anterior-superior": (-1, -1, 1), "ras": (-1, -1, 1),
+}  # fmt: skip
 """Signs that turn a space of NRRD into the one of MetaImage and this package; others stay as they are."""
-_SPACES = {"las": "left-anterior-superior", "ras": "right-anterior-superior"}
+
+_MM = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "cm": 10.0, "m": 1e3, "meter": 1e3, "um": 1e-3, "\u00b5m": 1e-3,
+       "micron": 1e-3}  # fmt: skip
+"""Millimetres of the units of NRRD and MetaImage."""
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -84,7 +87,7 @@ def is_volume(path: PathLike) -> bool:
     if is_metaimage(start) or is_nrrd(start):
         header = read_header(path)
         return header.is_volume or (header.kinds == 3 * ["domain"] and not header.frames)
-    return _is_nifti_file(path, start)
+    return is_nifti(Path(path), start)
 
 
 def may_be_volume(path: PathLike) -> bool:
@@ -100,57 +103,12 @@ def may_be_volume(path: PathLike) -> bool:
     start = _start(path)
     if is_metaimage(start) or is_nrrd(start):
         return b"Seq_Frame" not in start
-    return _is_nifti_file(path, start)
+    return is_nifti(Path(path), start)
 
 
 def _start(path: PathLike) -> bytes:
     with reading(path), open_regular(path) as stream:
         return stream.read(_SNIFFED_BYTES)
-
-
-def _is_nifti_file(path: PathLike, start: bytes) -> bool:
-    return is_nifti(start) or (start.startswith(GZIP_SIGNATURE) and str(path).lower().endswith(".nii.gz"))
-
-
-@dataclass(frozen=True)
-class _Stored:
-    """Voxels as a file holds them.
-
-    Attributes
-    ----------
-    spacing_mm : ndarray, shape (3,)
-    axes : ndarray, shape (3, 3)
-        Directions of the grid's axes in the world, a row each.
-    origin_mm : ndarray, shape (3,)
-    fields : mapping of str to str
-        All of the file's own.
-    own : mapping of str to str
-        Those of a volume of this package.
-    is_labels : bool
-    """
-
-    size: tuple[int, ...]
-    voxels: npt.NDArray[Any]
-    spacing_mm: FloatArray
-    axes: FloatArray
-    origin_mm: FloatArray
-    fields: Mapping[str, str] = field(default_factory=dict)
-    own: Mapping[str, str] = field(default_factory=dict)
-    is_labels: bool = False
-
-    @classmethod
-    def of_steps(
-        cls,
-        size: tuple[int, ...],
-        voxels: npt.NDArray[Any],
-        steps_mm: FloatArray,
-        origin_mm: FloatArray,
-        **others: Any,
-    ) -> _Stored:
-        """Take spacing and directions from the steps to the next voxel along each axis, a row each."""
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            spacing = np.linalg.norm(steps_mm, axis=1)
-            return cls(size, voxels, spacing, steps_mm / spacing[:, None], origin_mm, **others)
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -175,24 +133,41 @@ def read_volume(path: PathLike) -> Volume:
     InvalidInputError
         If it is not a grey three-dimensional image.
     """
-    with reading(path), open_regular(path) as stream:
-        start = stream.read(_SNIFFED_BYTES)
-        size_bytes = stream.seek(0, 2)
-    is_packed = start.startswith(GZIP_SIGNATURE)
-    if is_packed or is_nifti(start):
-        found = _nifti(read_nifti(Path(path), size_bytes, is_packed))
+    start = _start(path)
+    if is_nifti(Path(path), start):
+        voxels, matrix, fields, is_labels = read_nifti(Path(path))
+        own = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
     elif is_metaimage(start) or is_nrrd(start):
         header = read_header(path)
-        found = _meta(header) if is_metaimage(start) else _nrrd(header)
+        fields, own, is_labels = header.fields, own_fields(header.fields), is_segmentation(header.fields)
+        if fields.get("ElementNumberOfChannels", "1") != "1":
+            raise InvalidInputError(f"{path}: expected a grey image, got more than one value per pixel")
+        voxels = read_pixels(header.pixels)
+        if len(header.size) != 3 or voxels.size != np.prod(header.size, dtype=object):
+            got = f"{len(header.size)} axes {header.size} of {voxels.size} numbers"
+            raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
+        # The first axis runs fastest in a file.
+        voxels = voxels.reshape(header.size[::-1]).T
+        matrix = _meta_matrix(header) if is_metaimage(start) else _nrrd_matrix(header)
     else:
         raise InvalidInputError(
-            f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii), got something else"
+            f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
         )
-    if len(found.size) != 3 or found.voxels.size != np.prod(found.size, dtype=object):
-        got = f"{len(found.size)} axes {found.size} of {found.voxels.size} numbers"
+    if voxels.ndim != 3 or not voxels.size or voxels.dtype.kind not in "iuf":
+        got = f"shape {voxels.shape} of {voxels.dtype}"
         raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
+    voxels = voxels.astype(voxels.dtype.newbyteorder("="), copy=False)
     with naming(str(path)):
-        return _volume(found, str(path))
+        voxels, spacing, pose = _placed(voxels, matrix)
+        if is_labels:
+            return LabelMap(_labels(voxels), spacing, pose, own, read_segments(fields, str(path)))
+        return Volume(
+            voxels if voxels.dtype.name in VOXEL_TYPES else voxels.astype(np.float32), spacing, pose, own
+        )
+
+
+load_volume = read_volume
+"""Its public name, `speckle3d.load_volume`."""
 
 
 def read_states(path: PathLike, volume: Volume) -> ByteArray:
@@ -222,90 +197,81 @@ def read_states(path: PathLike, volume: Volume) -> ByteArray:
     return states.voxels
 
 
-def _volume(found: _Stored, where: str) -> Volume:
-    spacing = found.spacing_mm
-    if not (np.isfinite(spacing).all() and (spacing > 0).all()):
-        raise InvalidInputError(f"spacing: expected lengths above zero, got {spacing.tolist()}")
-    # The first axis runs fastest in a file.
-    voxels = found.voxels.reshape(found.size[::-1]).T
-    axes, origin = found.axes, found.origin_mm
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
-        if np.linalg.det(axes) < 0:
-            origin = origin + axes[2] * spacing[2] * (voxels.shape[2] - 1)
-            axes, voxels = axes * [[1.0], [1.0], [-1.0]], voxels[:, :, ::-1]
-    matrix = np.eye(4)
-    matrix[:3, :3] = axes.T
-    matrix[:3, 3] = origin
+def _placed(
+    voxels: npt.NDArray[Any], world_from_index: FloatArray
+) -> tuple[npt.NDArray[Any], tuple[float, float, float], RigidTransform]:
+    """Voxels of a right-handed grid, its spacing and its pose."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused
+        matrix = np.array(world_from_index, dtype=float)
+        spacing = np.linalg.norm(matrix[:3, :3], axis=0)
+        if not (np.isfinite(spacing).all() and (spacing > 0).all()):
+            raise InvalidInputError(f"spacing: expected lengths above zero, got {spacing.tolist()}")
+        if np.linalg.det(matrix[:3, :3]) < 0:
+            matrix[:3, 3] += matrix[:3, 2] * (voxels.shape[2] - 1)
+            matrix[:3, 2] *= -1.0
+            voxels = voxels[:, :, ::-1]
+        matrix[:3, :3] /= spacing
     pose: RigidTransform = transforms_from_matrices(matrix[None], "direction")[0]
-    if found.is_labels:
-        voxels = _labels(voxels)
-        segments = read_segments(found.fields, where)
-        return LabelMap(voxels, tuple(spacing.tolist()), pose, found.own, segments)
-    kept = voxels if voxels.dtype.name in VOXEL_TYPES else voxels.astype(np.float32)
-    return Volume(kept, tuple(spacing.tolist()), pose, found.own)
+    return voxels, tuple(spacing.tolist()), pose
 
 
 def _labels(voxels: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Labels as whole numbers of two bytes at most."""
     if voxels.dtype.name in LABEL_TYPES:
         return voxels
-    found = voxels.astype(np.uint16)
-    if not np.array_equal(found, voxels):
+    with np.errstate(invalid="ignore"):
+        labels = voxels.astype(np.uint16)
+    if not np.array_equal(labels, voxels):
         raise InvalidInputError("labels: expected whole numbers from 0 to 65535, got others")
-    return found
+    return labels
 
 
-def _nifti(image: NiftiImage) -> _Stored:
-    own = {name: text for name, text in image.fields.items() if not is_segmentation({name: text})}
-    return _Stored.of_steps(
-        image.size, image.voxels, image.steps_mm, image.origin_mm,
-        fields=image.fields, own=own, is_labels=image.is_labels,
-    )  # fmt: skip
+def _meta_matrix(header: SequenceHeader) -> FloatArray:
+    """World (LPS, mm) from index of a MetaImage."""
+    spacing = _of_field(header, ("ElementSpacing", "ElementSize"), np.ones(3))
+    axes = _of_field(header, ("TransformMatrix", "Rotation", "Orientation"), np.eye(3).ravel())
+    matrix = np.eye(4)
+    matrix[:3, :3] = axes.reshape(3, 3).T * spacing
+    matrix[:3, 3] = _of_field(header, ("Offset", "Position", "Origin"), np.zeros(3))
+    matrix[:3] *= _mm_of(header, header.fields.get("DistanceUnits", ""))
+    return matrix
 
 
-def _text_fields(header: SequenceHeader) -> dict[str, Any]:
-    fields = header.fields
-    return {"fields": fields, "own": own_fields(fields), "is_labels": is_segmentation(fields)}
-
-
-def _meta(header: SequenceHeader) -> _Stored:
-    fields, count = header.fields, len(header.size)
-    spacing = _of_field(header, ("ElementSpacing", "ElementSize"), count, np.ones(count))
-    axes = _of_field(header, ("TransformMatrix", "Rotation", "Orientation"), count**2, np.eye(count).ravel())
-    origin = _of_field(header, ("Offset", "Position", "Origin"), count, np.zeros(count))
-    if int(fields.get("ElementNumberOfChannels", "1")) != 1:
-        raise InvalidInputError(f"{header.path}: expected a grey image, got more than one value per pixel")
-    voxels, axes = read_pixels(header.pixels), axes.reshape(count, count)
-    return _Stored(header.size, voxels, spacing, axes, origin, **_text_fields(header))
-
-
-def _of_field(header: SequenceHeader, names: Iterable[str], count: int, default: FloatArray) -> FloatArray:
+def _of_field(header: SequenceHeader, names: tuple[str, ...], default: FloatArray) -> FloatArray:
     name = next((name for name in names if name in header.fields), None)
     if name is None:
         return default
-    return np.array(numbers(header.fields[name], count, f"{header.path}: {name}"))
+    return np.array(numbers(header.fields[name], default.size, f"{header.path}: {name}"))
 
 
-def _nrrd(header: SequenceHeader) -> _Stored:
-    count, where = len(header.size), header.path
-    if "space directions" in header.fields:
-        axes = _vectors(header.fields["space directions"], count, f"{where}: space directions")
+def _nrrd_matrix(header: SequenceHeader) -> FloatArray:
+    """World (LPS, mm) from index of an NRRD file."""
+    fields, where, matrix = header.fields, header.path, np.eye(4)
+    if "space directions" in fields:
+        matrix[:3, :3] = _vectors(fields["space directions"], 3, f"{where}: space directions").T
+        units = fields.get("space units", "")
     else:
-        axes = np.diag(_of_field(header, ("spacings",), count, np.ones(count)))
-    origin = np.zeros((1, count))
-    if "space origin" in header.fields:
-        origin = _vectors(header.fields["space origin"], 1, f"{where}: space origin")
-    if axes.shape != (count, count) or origin.shape != (1, count):
-        raise InvalidInputError(f"{where}: expected directions and origin of {count} numbers, got others")
-    space = header.fields.get("space", "").lower()
-    signs = np.array(_TO_LPS.get(_SPACES.get(space, space), (1, 1, 1)))[:count]
-    return _Stored.of_steps(
-        header.size, read_pixels(header.pixels), axes * signs, origin[0] * signs, **_text_fields(header)
-    )
+        matrix[:3, :3] = np.diag(_of_field(header, ("spacings",), np.ones(3)))
+        units = fields.get("units", "")
+    if "space origin" in fields:
+        matrix[:3, 3] = _vectors(fields["space origin"], 1, f"{where}: space origin")[0]
+    words = {word.strip().lower() for word in re.findall(r'"([^"]*)"', units)} or {""}
+    if len(words) > 1:
+        raise InvalidInputError(f"{where}: expected one unit for all axes, got {units}")
+    signs = _TO_LPS.get(fields.get("space", "").lower(), (1, 1, 1))
+    matrix[:3] *= np.array(signs)[:, None] * _mm_of(header, words.pop())
+    return matrix
+
+
+def _mm_of(header: SequenceHeader, unit: str) -> float:
+    if unit.lower() not in _MM:
+        known = ", ".join(word for word in _MM if word)
+        raise InvalidInputError(f"{header.path}: expected a unit among {known}, got {unit!r}")
+    return _MM[unit.lower()]
 
 
 def _vectors(text: str, count: int, where: str) -> FloatArray:
-    rows = [numbers(v.replace(",", " "), None, where) for v in re.findall(r"\(([^)]*)\)", text)]
-    if len(rows) != count or len({len(row) for row in rows}) != 1:
-        raise InvalidInputError(f"{where}: expected {count} vectors of one length, got {text[:40]!r}")
+    rows = [numbers(row.replace(",", " "), 3, where) for row in re.findall(r"\(([^)]*)\)", text)]
+    if len(rows) != count:
+        raise InvalidInputError(f"{where}: expected {count} vector(s) of three numbers, got {text[:40]!r}")
     return np.array(rows)

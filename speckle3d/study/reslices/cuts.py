@@ -23,8 +23,10 @@ from speckle3d.imaging.images import Images
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT
+from speckle3d.scoring.lengths import END_FRAMES, ModeError, accumulated, compare_modes
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
+from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
 from speckle3d.study.reslices.cut_geometry import Anchors, anchors_of
 from speckle3d.study.reslices.places import (
@@ -78,28 +80,28 @@ class CutPicture:
     place : str
         Where the cut is.
     unit : str
-        Of the images: "dB" or "level", and of what.
+        Of the images: dB below the maximum, or "level", and of what.
     levels : tuple of float, optional
         Black and white.
-    reference : str, optional
-        Mode that the others are compared with.
     name : str
         Of the sweep or the volume.
     numbers : ndarray of int, shape (n,), optional
         Of the frames; by default from 0.
     anchors : mapping of str to mapping
         Poses of some frames of each mode; see `cut_geometry.anchors_of`.
+    lengths : mapping of str to str
+        How long each mode is, in words.
     """
 
     cuts: Mapping[str, DrawnCut]
     axes: tuple[str, str] = ("along the sweep", "depth")
     place: str = ""
-    unit: str = "dB"
+    unit: str = "dB, 0: maximum"
     levels: tuple[float, float] | None = None
-    reference: str | None = None
     name: str = ""
     numbers: IntArray | None = None
     anchors: Mapping[str, Anchors] = field(default_factory=dict)
+    lengths: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -170,8 +172,8 @@ def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None
 
 def _known_reference(sweep: Sweep, asked: Sequence[str]) -> str:
     """What several modes are compared with, if nobody says."""
-    known = find_reference(sweep) if len(asked) > 1 else None
-    return known.name if known is not None and known.covered.all() else asked[0]
+    reference = find_reference(sweep) if len(asked) > 1 else None
+    return reference.name if reference is not None and reference.covered.all() else asked[0]
 
 
 def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
@@ -187,7 +189,7 @@ def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
 def cut_posed(
     opened: OpenedModes,
     place: Place,
-    dynamic_range_db: float = 60.0,
+    dynamic_range_db: float = RANGE_DB,
     voxels: tuple[Volume, ByteArray | None] | None = None,
     progress: Callable[[int, int], None] | None = None,
     made: tuple[Images, ImageGrid] | None = None,
@@ -219,28 +221,60 @@ def cut_posed(
         # B-mode that does not say its range stays in grey levels.
         step_db = dynamic_range_db / 255 if opened.posed.range_is_known else 1.0
         white = 255 if opened.posed.range_is_known else 0
-        found = [((each - white) * step_db).astype(np.float32) for each in levels]
+        images_of_modes = [((each - white) * step_db).astype(np.float32) for each in levels]
     else:
-        found = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
+        images_of_modes = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
     there = opened.poses[opened.reference]
-    if not any(np.isfinite(each).any() for each in found):
+    if not any(np.isfinite(each).any() for each in images_of_modes):
         raise InvalidInputError(
             f"cut: expected one that meets the sweep, which lies {sweep_extent(there, grid)}, got one that "
             "shows nothing"
         )
     cuts = {
         mode: DrawnCut.of_sweep(image, cut, grid, opened.poses[mode])
-        for (mode, cut), image in zip(placed.items(), found, strict=True)
+        for (mode, cut), image in zip(placed.items(), images_of_modes, strict=True)
     }
     shown = placed[opened.reference]
     where = ", ".join(filter(None, [place.words(grid), view_of(shown, there)]))
-    unit, limits = _unit_of_images(opened.posed, dynamic_range_db)
-    shown_range = limits if voxels is None else None
-    unit = unit if voxels is None else _unit_of(voxels[0])
-    reference = opened.reference if len(cuts) > 1 else None
-    axes, name = place.axes(shown, there), opened.posed.sweep.name
-    anchors = {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()}
-    return CutPicture(cuts, axes, where, unit, shown_range, reference, name, numbers, anchors)
+    unit, limits = ("dB, 0: maximum", (-dynamic_range_db, 0.0))
+    if not opened.posed.range_is_known:
+        unit, limits = "level", (0.0, 255.0)
+    return CutPicture(
+        cuts,
+        place.axes(shown, there),
+        where,
+        unit if voxels is None else _unit_of(voxels[0]),
+        limits if voxels is None else None,
+        opened.posed.sweep.name,
+        numbers,
+        {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()},
+        length_words(_rows(opened, grid.centre_mm), opened.reference),
+    )
+
+
+def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
+    """How long each mode is by its rows, and how far from the reference; of all parts of the sweep."""
+    words: dict[str, list[str]] = {}
+    for row in rows:
+        percent = "" if np.isnan(row.length_error_percent) else f" {row.length_error_percent:+.1f} %"
+        words.setdefault(row.mode, []).append(f"{row.estimate_mm:.2f} mm{percent}")
+        if row.mode == rows[0].mode and np.isfinite(row.reference_mm):
+            words.setdefault(reference, []).append(f"{row.reference_mm:.2f} mm")
+    return {mode: ", ".join(each) for mode, each in words.items()}
+
+
+def _rows(opened: OpenedModes, centre_mm: FloatArray) -> list[ModeError]:
+    """Lengths of the modes, against the reference if that is one."""
+    others = {mode: each for mode, each in opened.poses.items() if mode != opened.reference}
+    there = opened.poses[opened.reference]
+    if len(there) < 2:
+        return []
+    if not others:
+        length_mm = float(accumulated(there, centre_mm).length_mm[-1])
+        return [ModeError.of_estimate("all", opened.reference, len(there), length_mm)]
+    return compare_modes(
+        others, there, centre_mm, end_frames=END_FRAMES if opened.reference == "tracker" else 1
+    )
 
 
 def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:
@@ -257,15 +291,10 @@ def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | 
     return CutPicture({"volume": drawn}, names, place.words(), _unit_of(volume), name=name)
 
 
-def _unit_of_images(posed: PosedSweep, dynamic_range_db: float) -> tuple[str, tuple[float, float]]:
-    """Unit of a sweep's images, and the values that are shown black and white."""
-    return ("dB", (-dynamic_range_db, 0.0)) if posed.range_is_known else ("level", (0.0, 255.0))
-
-
 def _unit_of(volume: Volume) -> str:
     """What a volume's levels are, as far as its file says."""
-    told = volume.fields.get("levels", "")
-    return f"level, {told}" if told else "level"
+    levels = volume.fields.get("levels", "")
+    return f"level, {levels}" if levels else "level"
 
 
 def cut_as_volume(picture: CutPicture) -> Volume:
@@ -290,7 +319,7 @@ def cut_as_volume(picture: CutPicture) -> Volume:
         # From 1 up, so that 0 means nothing was seen.
         level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
         voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
-        what = f"log-compressed, {high - low:g} dB" if picture.unit == "dB" else "grey levels of the B-mode"
+        what = f"log-compressed, {high - low:g} dB" if high == 0 else "grey levels of the B-mode"
         fields["levels"] = f"{what} from 1 to 255; 0 where nothing was seen"
     step = drawn.cut.pixel_mm
     return Volume(voxels[None].T, (step, step, step), drawn.cut.world_from_plane, fields)

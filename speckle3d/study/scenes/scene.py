@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import jinja2
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import STATE_SEGMENTS
+from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.voxels.settings import CompoundingSettings
@@ -19,7 +22,6 @@ from speckle3d.io.shapes.polylines import write_polylines
 from speckle3d.io.shapes.transforms import write_transform
 from speckle3d.scoring.references import REFERENCES
 from speckle3d.study.posed import PosedSweep
-from speckle3d.study.scenes.mrml import COLOURED, Scene
 from speckle3d.study.scenes.sequences import PosedSequence
 from speckle3d.study.scenes.voxels import (
     BEST_FIRST,
@@ -31,10 +33,20 @@ from speckle3d.study.scenes.voxels import (
 
 SCENE = "scene.mrml"
 
-_COLOURS = (
-    (0.2, 0.6, 1.0), (1.0, 0.5, 0.1), (0.3, 0.8, 0.3), (0.9, 0.3, 0.3), (0.6, 0.4, 0.9), (0.6, 0.5, 0.3),
-)  # fmt: skip
-"""Of the outlines of one mode after the other."""
+_TEMPLATE = Path(__file__).with_name(SCENE)
+_COLOURS = ("0.2 0.6 1", "1 0.5 0.1", "0.3 0.8 0.3", "0.9 0.3 0.3", "0.6 0.4 0.9", "0.6 0.5 0.3")
+"""Of the outlines of one mode after the other: red, green and blue."""
+
+_NAMES = {
+    "volume": "volume-{}.nrrd",
+    "state": "state-{}.seg.nrrd",
+    "outlines": "outlines-{}.vtk",
+    "first": "first-frame-{}.tfm",
+    "deviation": "deviation-{}.nrrd",
+    "images": "images-{}.seq.nrrd",
+    "poses": "poses-{}.seq.mha",
+}
+"""Files of a mode, by what they hold."""
 
 
 @dataclass(frozen=True)
@@ -56,31 +68,11 @@ class SceneRequest:
     with_images: bool = False
     with_deviation: bool = False
 
-
-@dataclass(frozen=True)
-class _Files:
-    """Names of the files of one mode."""
-
-    volume: str
-    state: str
-    outlines: str
-    first: str
-    deviation: str
-    images: str
-    poses: str
-
-    @classmethod
-    def of(cls, mode: str) -> _Files:
-        names = (
-            "volume-{}.nrrd", "state-{}.seg.nrrd", "outlines-{}.vtk", "first-frame-{}.tfm",
-            "deviation-{}.nrrd", "images-{}.seq.nrrd", "poses-{}.seq.mha",
-        )  # fmt: skip
-        return cls(*(name.format(mode) for name in names))
-
-    def written(self, request: SceneRequest) -> list[str]:
-        deviation = [self.deviation] if request.with_deviation else []
-        images = [self.images, self.poses] if request.with_images else []
-        return [self.volume, self.state, self.outlines, self.first, *deviation, *images]
+    def files(self, mode: str) -> dict[str, str]:
+        """Names of a mode's files that are written."""
+        left_out = [] if self.with_deviation else ["deviation"]
+        left_out += [] if self.with_images else ["images", "poses"]
+        return {what: name.format(mode) for what, name in _NAMES.items() if what not in left_out}
 
 
 def write_scene(
@@ -118,16 +110,13 @@ def write_scene(
     if not modes or len({*modes}) != len(modes):
         raise InvalidInputError(f"{folder}: expected one mode or more, each once, got {', '.join(modes)}")
     target = Path(folder)
-    names = [name for mode in modes for name in _Files.of(mode).written(asked)]
-    with FileSet(SCENE, tuple(names), _left(target, names)).replaced(target) as part:
-        scene, reports, volumes = Scene(), list[VolumeReport](), list[str]()
+    names = [name for mode in modes for name in asked.files(mode).values()]
+    reports = []
+    with FileSet(SCENE, tuple(names), _stale(target, names)).replaced(target) as part:
         for i, each in enumerate(posed):
-            shown = _part_of(progress, i, len(posed))
-            report = _write_mode(part, each, asked, shown)
+            report = _write_mode(part, each, asked, _part_of(progress, i, len(posed)))
             reports.append(replace(report, path=target / report.path.name))
-            volumes.append(_add_mode(scene, each, asked, i))
-        scene.show(volumes[0])
-        (part / SCENE).write_text(scene.text(), encoding="utf-8")
+        (part / SCENE).write_text(_scene_text(posed, asked), encoding="utf-8")
     return reports
 
 
@@ -147,12 +136,12 @@ def require_scene_place(folder: Path, *inputs: Path | None) -> None:
         raise InvalidInputError(f"{folder}: expected a new name or a scene to replace, got another folder")
 
 
-def _left(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
+def _stale(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     """Files of a scene in the folder that the new one does not have."""
     if not (folder / SCENE).is_file():
         return ()
-    known = {name for mode in (*BEST_FIRST, *REFERENCES) for name in vars(_Files.of(mode)).values()}
-    return tuple(sorted(name for name in known - {*names} if (folder / name).exists()))
+    ours = {name.format(mode) for mode in (*BEST_FIRST, *REFERENCES) for name in _NAMES.values()}
+    return tuple(sorted(name for name in ours - {*names} if (folder / name).exists()))
 
 
 def _part_of(progress: Progress | None, i: int, count: int) -> Progress | None:
@@ -165,34 +154,35 @@ def _part_of(progress: Progress | None, i: int, count: int) -> Progress | None:
 def _write_mode(
     folder: Path, posed: PosedSweep, request: SceneRequest, progress: Progress | None
 ) -> VolumeReport:
-    files = _Files.of(posed.mode)
-    deviation = folder / files.deviation if request.with_deviation else None
+    files = {what: folder / name for what, name in request.files(posed.mode).items()}
     voxels = VolumeRequest(
-        folder / files.volume, request.settings, request.grid, None, folder / files.state, deviation
+        files["volume"], request.settings, request.grid, None, files["state"], files.get("deviation")
     )
     report = write_voxels(posed, voxels, progress)
     sequence = PosedSequence.of(posed, request.settings.dynamic_range_db)
     outlines = frame_outlines(sequence.sweep.grid, posed.world_from_image)
-    write_polylines(folder / files.outlines, outlines, {"frame": posed.frames.astype(np.float64)})
-    write_transform(folder / files.first, posed.world_from_image[0])
+    write_polylines(files["outlines"], outlines, {"frame": posed.frames.astype(np.float64)})
+    write_transform(files["first"], posed.world_from_image[0])
     if request.with_images:
-        sequence.write(folder / files.images)
-        sequence.write_poses(folder / files.poses)
+        sequence.write(files["images"])
+        sequence.write_poses(files["poses"])
     return report
 
 
-def _add_mode(scene: Scene, posed: PosedSweep, request: SceneRequest, i: int) -> str:
-    """Add a mode's nodes; returns the identity of its volume."""
-    files, name = _Files.of(posed.mode), f"{posed.sweep.name}, {posed.mode}"
-    window = (0.0, 255.0) if request.settings.voxel_type == "uint8" else None
-    volume = scene.add_volume(name, files.volume, window)
-    scene.add_labels(f"{name}: voxels", files.state, volume, STATE_SEGMENTS)
-    if request.with_deviation:
-        said = f"{name}: standard deviation of position along the sweep, mm"
-        scene.add_volume(said, files.deviation, None, COLOURED)
-    scene.add_lines(f"{name}: outlines", files.outlines, _COLOURS[i % len(_COLOURS)], visible=i == 0)
-    scene.add_transform(f"{name}: first frame", files.first)
-    if request.with_images:
-        rate = len(posed.frames) / max(float(np.ptp(posed.sweep.frame_time_s[posed.frames])), 1e-3)
-        scene.add_moving_images(f"{name}: frames", files.images, files.poses, rate)
-    return volume
+def _scene_text(posed: Sequence[PosedSweep], request: SceneRequest) -> str:
+    """Scene as XML; everything that comes from outside is escaped."""
+    modes: list[dict[str, Any]] = []
+    for i, each in enumerate(posed):
+        seconds = max(float(np.ptp(each.sweep.frame_time_s[each.frames])), 1e-3)
+        modes.append(
+            {
+                "name": printable(f"{each.sweep.name}, {each.mode}"),
+                "files": request.files(each.mode),
+                "is_bytes": request.settings.voxel_type == "uint8",
+                "colour": _COLOURS[i % len(_COLOURS)],
+                "frames_per_s": f"{len(each.frames) / seconds:g}",
+            }
+        )
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(_TEMPLATE.read_text(encoding="utf-8"))
+    return template.render(modes=modes, segments=", ".join(each.name for each in STATE_SEGMENTS))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -13,17 +12,16 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, Segment
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.measures.uncertainty import DeviationField
 from speckle3d.imaging.region import Region
-from speckle3d.imaging.voxels.grid import Slab, VoxelGrid, grid_as_asked, grid_like, spacing_within
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_as_asked, grid_like, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.slabs import compound_slabs
 from speckle3d.io.reconstructions import read_reconstruction
@@ -32,8 +30,10 @@ from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.pose_errors import posed_errors_of
 from speckle3d.study.posed import MARK, PosedSweep, pose_mark
 
-BEST_FIRST = ("fused", "crossed", "pose", "inertial", "orientation", "image")
+BEST_FIRST = ("fused", "crossed", "pose", "orientation", "image")
 """Modes in the order in which a volume takes its poses: those that set the length first."""
+
+_DEVIATION = "standard deviation of position along the sweep, mm"
 
 Axes = Literal["sweep", "world", "principal"]
 
@@ -86,7 +86,10 @@ class GridRequest:
             return grid_like(read_volume(self.like))
         if self.spacing_mm is not None and self.within_gb is not None:
             raise InvalidInputError("--within-gb: expected no --spacing-mm beside it")
-        axes = self._axes(images, world_from_image)
+        axes = Rotation.identity()
+        if self.axes != "world":
+            is_smallest = self.axes == "principal"
+            axes = principal_axes(images, world_from_image) if is_smallest else sweep_axes(world_from_image)
         spacing: float | tuple[float, float, float] = self.spacing_mm or settings.voxel_mm
         if self.within_gb is not None:
             spacing = spacing_within(images, world_from_image, self.within_gb, axes, settings.voxel_type)
@@ -99,13 +102,6 @@ class GridRequest:
             shape=self.shape,
             size_mm=self.size_mm,
         )
-
-    def _axes(self, images: ImageGrid, world_from_image: RigidTransform) -> Rotation:
-        if self.axes == "world":
-            return Rotation.identity()
-        if self.axes == "principal":
-            return principal_axes(images, world_from_image)
-        return sweep_axes(world_from_image)
 
 
 @dataclass(frozen=True)
@@ -185,8 +181,8 @@ class VolumeReport:
 
 def best_mode(reconstruction_file: Path) -> str:
     """First of `BEST_FIRST` that a reconstruction holds."""
-    held = read_reconstruction(reconstruction_file, with_pairs=False).poses
-    return next(mode for mode in BEST_FIRST if mode in held)
+    poses = read_reconstruction(reconstruction_file, with_pairs=False).poses
+    return next(mode for mode in BEST_FIRST if mode in poses)
 
 
 def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress | None = None) -> VolumeReport:
@@ -214,21 +210,34 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     images = source.grid, source.world_from_image
     grid = request.grid.grid(*(request.region.part(*images) if request.region else images), settings)
     counts = np.zeros(3, dtype=np.int64)
-    place = grid.shape, grid.spacing_mm, grid.world_from_grid
+    mask = None if request.region is None else request.region.mask(source.grid)
+    weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
     fields = fields_of(posed, request, meaning)
+    deviation = None
+    if request.deviation_path is not None:
+        deviation = DeviationField(_errors(posed, "the deviation of position"), source.grid, grid)
     with ExitStack() as files:
-        writers = [
-            files.enter_context(VolumeWriter(path, *place, kind, fields | more, segments=segments))
-            for path, kind, more, segments in _outputs(request)
-        ]
-        deviation = _deviation(posed, source, grid) if request.deviation_path else None
-        for slab in _slabs(posed, source, grid, request):
+
+        def opened(
+            path: Path, kind: str, levels: str = meaning, segments: tuple[Segment, ...] | None = None
+        ) -> VolumeWriter:
+            place = grid.shape, grid.spacing_mm, grid.world_from_grid
+            return files.enter_context(
+                VolumeWriter(path, *place, kind, fields | {"levels": levels}, segments=segments)
+            )
+
+        voxels = opened(request.path, settings.voxel_type)
+        states = opened(request.state_path, "uint8", meaning, STATE_SEGMENTS) if request.state_path else None
+        deviations = None
+        if request.deviation_path is not None:
+            deviations = opened(request.deviation_path, "float32", _DEVIATION)
+        for slab in compound_slabs(source, grid, settings, weights, mask):
             stop = slab.first + len(slab.state)
-            made = [slab.voxels, *([slab.state] if request.state_path else [])]
-            if deviation is not None:
-                made.append(deviation.planes(slab.first, stop, slab.state))
-            for writer, planes in zip(writers, made, strict=True):
-                writer.append(planes)
+            voxels.append(slab.voxels)
+            if states is not None:
+                states.append(slab.state)
+            if deviations is not None and deviation is not None:
+                deviations.append(deviation.planes(slab.first, stop, slab.state))
             counts += [np.count_nonzero(slab.state == state) for state in range(3)]
             if progress is not None:
                 progress(stop, grid.shape[2])
@@ -236,30 +245,6 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
             raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
     seconds = time.perf_counter() - began
     return VolumeReport(request.path, posed.mode, grid, counts, request.path.stat().st_size, seconds)
-
-
-def _slabs(posed: PosedSweep, source: PosedImages, grid: VoxelGrid, request: VolumeRequest) -> Iterator[Slab]:
-    settings = request.settings
-    mask: BoolArray | None = None if request.region is None else request.region.mask(source.grid)
-    weighted = settings.rule == "weighted" and settings.backward_mm == 0
-    weights = confidence(posed, grid) if weighted else None
-    return compound_slabs(source, grid, settings, weights, mask)
-
-
-def _outputs(
-    request: VolumeRequest,
-) -> Iterator[tuple[Path, str, dict[str, str], tuple[Segment, ...] | None]]:
-    """Files to write: path, type, what else they say, and segments of labels."""
-    yield request.path, request.settings.voxel_type, {}, None
-    if request.state_path is not None:
-        yield request.state_path, "uint8", {}, STATE_SEGMENTS
-    if request.deviation_path is not None:
-        said = {"levels": "standard deviation of position along the sweep, mm"}
-        yield request.deviation_path, "float32", said, None
-
-
-def _deviation(posed: PosedSweep, source: PosedImages, grid: VoxelGrid) -> DeviationField:
-    return DeviationField(_errors(posed, "the deviation of position"), source.grid, grid)
 
 
 def _errors(posed: PosedSweep, purpose: str) -> PosedErrors:
@@ -297,18 +282,15 @@ def confidence(posed: PosedSweep, grid: VoxelGrid) -> FloatArray:
 def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[str, str]:
     """What a volume's file says of it."""
     settings = request.settings
+    method = {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
+    if settings.backward_mm == 0:
+        filled = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"
+        method = {"splat": settings.splat, "rule": settings.rule, "fill_radius": filled}
     return {
         "levels": meaning,
         "poses": posed.mode,
         MARK: pose_mark(posed.world_from_image),
-        **_method(settings),
+        **method,
         "recording": posed.sweep.name,
         "made_by": f"speckle3d {version('speckle3d')}",
     }
-
-
-def _method(settings: CompoundingSettings) -> dict[str, str]:
-    if settings.backward_mm > 0:
-        return {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
-    filled = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"
-    return {"splat": settings.splat, "rule": settings.rule, "fill_radius": filled}

@@ -4,7 +4,7 @@ import pytest
 from speckle3d.app.sweep.pairs import SweepPairs, nearest_lag
 from speckle3d.config import Config
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.matching.blocks import StageTimes, match_sweep
+from speckle3d.matching.frames import StageTimes, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 
 

@@ -17,8 +17,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from crossing_images import crossing_world
 
-from calibration.chain import ImagePoints
 from calibration.detection.crossings import crossings_in_frames
+from calibration.points import ImagePoints
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 

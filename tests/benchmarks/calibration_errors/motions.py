@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import ImagePoints
-from calibration.motions import MOTIONS
-from calibration.orientation import calibrate_orientation
-from calibration.plane import calibrate_plane
+from calibration.motion import MOTIONS
+from calibration.orientation import OrientationFit, calibrate_orientation
+from calibration.plane import PlaneFit, calibrate_plane
+from calibration.points import ImagePoints
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 
@@ -36,9 +36,7 @@ MISSING = {
     "no roll": ("roll",),
     "yaw only": ("tilt", "roll", "depth"),
 }
-WORDS = dict(
-    zip(("tilt", "yaw", "roll", "sideways", "depth"), (motion.advice for motion in MOTIONS), strict=True)
-)
+WORDS = dict(zip(("tilt", "yaw", "roll", "sideways", "depth"), MOTIONS, strict=True))
 DRIFT_S = 5.0
 
 
@@ -186,12 +184,6 @@ def scan(seed, missing: tuple[str, ...] = (), level: bool = False) -> Scan:
     )
 
 
-def directions_of(made: Scan) -> tuple:
-    """What an orientation sensor has of a scan of a level floor, and the ratio of its pixels."""
-    along = made.ends_px[:, 1] - made.ends_px[:, 0]
-    return along, np.arange(len(along)), made.readings.rotation, made.pixel_mm
-
-
 def crossing(seed, still: tuple[str, ...]) -> tuple[ImagePoints, Scan]:
     """A crossing of wires seen at places all over the image, from a probe that turns about few axes."""
     made = scan([seed, 4], tuple(name for name in still if name != "depth"))
@@ -236,7 +228,7 @@ def judged(trial) -> tuple[float, float, frozenset[str] | None]:
     try:
         if mode == "directions":
             made = scan([seed, place], missing, level=True)
-            solution = calibrate_orientation(*directions_of(made), level=seed % 2 == 0)
+            solution = calibrate_orientation(made.lines, made.pixel_mm, OrientationFit(level=seed % 2 == 0))
             return 0.0, made.error(solution)[1], None
         if mode == "crossing":
             points, made = crossing([seed, place], missing)
@@ -251,7 +243,11 @@ def judged(trial) -> tuple[float, float, frozenset[str] | None]:
         else:
             made = scan([seed, place], missing)
             lines = with_wrong_lines(made, seed) if kind == "wrong lines" else made.lines
-            given = {"prior": (made.given_mm,), "held": (made.pixel_mm, False), "unknown": ()}[mode]
+            given = {
+                "prior": (made.given_mm,),
+                "held": (made.pixel_mm, PlaneFit(fixed_pixels=True)),
+                "unknown": (),
+            }[mode]
             solution = calibrate_plane(lines, *given)
     except InsufficientDataError as refusal:
         return np.nan, np.nan, frozenset(word for word, text in WORDS.items() if text in str(refusal))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.orientation import calibrate_orientation
+from calibration.points import ImagePoints
 from speckle3d.core.errors import InsufficientDataError
 
 from .hand import smooth, wander
@@ -82,9 +83,10 @@ def judged(trial: Trial) -> Judged:
     """Calibrate a scan and hold the answer against the truth."""
     directions, readings, mounting, time_s, images = scan(trial)
     below = float(np.rad2deg(np.arcsin(np.clip(-images.as_matrix()[:, 2, 1].mean(), -1.0, 1.0))))
-    frames = np.arange(len(directions))
+    poses = RigidTransform.from_rotation(readings)
+    lines = ImagePoints(directions, np.arange(len(directions)), poses, time_s=time_s)
     try:
-        solution = calibrate_orientation(directions, frames, readings, np.ones(2), time_s=time_s)
+        solution = calibrate_orientation(lines, np.ones(2))
     except InsufficientDataError as error:
         return Judged(below, refused=str(error))
     step = (solution.chain.sensor_from_image.rotation.inv() * mounting).as_rotvec()

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.images.angulation import angulation
-from calibration.images.solver import ImageSettings, calibrate_images
+from calibration.images.solver import calibrate_images
+from calibration.settings import ImageFit
 from calibration_errors._sweep_scenes import Scene, SceneSettings, scene
 from calibration_errors.rows import Row, trials
 from speckle3d.core.errors import InsufficientDataError
@@ -121,7 +122,7 @@ def _calibrated(made: Scene, setup: Setup) -> Outcome:
     # What two sweeps' errors differ by.
     more = np.sqrt(2.0) * setup.drift
     tracker = {"tracker_mm": 0.3 * more, "tracker_deg": 0.2 * more} if setup.drift > USUAL_DRIFT else {}
-    found = calibrate_images(made.first, made.second, start, ImageSettings(threads=1, **reach, **tracker))
+    found = calibrate_images(made.first, made.second, start, ImageFit(**reach, **tracker))
     off = made.truth.inv() * found.sensor_from_image
     centre = grid.centre_mm
     error = np.concatenate([np.rad2deg(off.rotation.as_rotvec()), off.apply(centre) - centre])

@@ -30,9 +30,8 @@ FIRST_SEED = 970_001
 """Judged seeds count from here; development used 1 to 99."""
 LENGTH_MM = 24.0
 _CROSSED = {"preset": "crossed", "vectors": 96, "samples": 2600, "length_mm": LENGTH_MM, "frames": 150}
-_INERTIAL = {"preset": "tissue", "vectors": 48, "samples": 2600, "length_mm": LENGTH_MM, "frames": 250}
 _STEPS = {"steps": 41, "step_mm": 0.05, "blocks": 3}
-KINDS = ("crossed", "oblique", "wobble", "tremor", "short")
+KINDS = ("crossed", "oblique", "short")
 
 
 def crossing_pair(seed: int, angle_deg: float, folder: Path = DEFAULT) -> tuple[Path, Path]:
@@ -43,13 +42,6 @@ def crossing_pair(seed: int, angle_deg: float, folder: Path = DEFAULT) -> tuple[
     for number, path in enumerate(paths):
         _made(path, settings[number], number)
     return paths
-
-
-def wobbled(seed: int, kind: str, folder: Path = DEFAULT) -> Path:
-    """A tissue sweep of 24 mm in 10 s with an orientation sensor, wobbled on purpose or merely trembling."""
-    motion = {"wobble_mm": 0.5, "wobble_hz": 3.0} if kind == "wobble" else {"tremor_mm": 0.05}
-    settings = SimulationSettings(seed=seed, **_INERTIAL, **motion)
-    return _made(folder / f"{kind}-{seed}-{key_of(settings.model_dump_json())}.h5", settings)
 
 
 def short(seed: int, folder: Path = DEFAULT) -> Path:
@@ -105,7 +97,7 @@ def borrowed_curves(
 def _make(kind: str, seed: int, folder: Path) -> list[Path]:
     if kind in ("crossed", "oblique"):
         return list(crossing_pair(seed, 90.0 if kind == "crossed" else 45.0, folder))
-    return [short(seed, folder) if kind == "short" else wobbled(seed, kind, folder)]
+    return [short(seed, folder)]
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""RF sweeps through the public command: lengths by crossing, inertia, fusion, with curves right and wrong.
+"""RF sweeps through the public command: lengths by crossing, fusion, with curves right and wrong.
 
 A sweep is confident and wrong where its length is off by more than three of its own claimed deviations and
 by more than twice the case's target.
@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 
 from length.rows import Row
-from length.scenes import borrowed_curves, crossing_pair, short, wobbled
+from length.scenes import borrowed_curves, crossing_pair, short
 from speckle3d.io.curves import write_curves
 
 RIGHT = Path(__file__).resolve().parents[3] / "data" / "curves.h5"
@@ -120,10 +120,6 @@ def _crossed(seed: int, angle_deg: float, curves: Path, cache: Path, *left_out: 
     return [*call, "--drift", "crossed", "--drift", "fused"]
 
 
-def _wobbled(seed: int, kind: str, cache: Path) -> Path:
-    return without(wobbled(seed, kind, cache), "tracker")
-
-
 def _single(seed: int, curves: Path, cache: Path, modes: Sequence[str], sweep: Path) -> list[Any]:
     out = cache / "out" / f"{sweep.stem}-{curves.stem}-{'-'.join(modes)}"
     return ["reconstruct", sweep, "--curves", curves, "-o", out, *(f"--drift={mode}" for mode in modes)]
@@ -185,26 +181,6 @@ CASES = (
         2.0,
         4.0,
         0.7,
-    ),
-    Case(
-        "inertial, wobble of 0.5 mm at 3 Hz, curves wrong by 10 %",
-        lambda seed, cache: _single(
-            seed, wrong_curves(cache), cache, ("inertial", "fused"), _wobbled(seed, "wobble", cache)
-        ),
-        ("inertial", "fused", "image"),
-        1.5,
-        3.0,
-        0.3,
-    ),
-    Case(
-        "inertial, tremor of 0.05 mm",
-        lambda seed, cache: _single(
-            seed, wrong_curves(cache), cache, ("inertial", "fused"), _wobbled(seed, "tremor", cache)
-        ),
-        ("inertial", "fused", "image"),
-        4.0,
-        8.0,
-        0.3,
     ),
     Case(
         "fused with tracker, 3.6 to 6 mm: no worse than image and pose",

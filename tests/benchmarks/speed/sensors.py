@@ -12,8 +12,9 @@ from calibration_examples import scan_plane
 from imu_logs import samples
 from vqf import VQF, offlineVQF
 
-from calibration.images.solver import ImageSettings, calibrate_from_sweeps
+from calibration.images.solver import calibrate_from_sweeps
 from calibration.plane import _three_stages, calibrate_plane
+from calibration.settings import ImageFit
 from speed.rows import Row, timed
 from xsens.fusion.methods import Method
 from xsens.fusion.orient import orient
@@ -48,7 +49,7 @@ def plane(runs: int) -> list[Row]:
 def images(runs: int, seed: int = 601) -> list[Row]:
     """A calibration from two crossing sweeps, 20 mm and 20 degrees off at most."""
     crossing, start = prepared(seed), displaced(np.random.default_rng(183))
-    taken = timed(lambda: calibrate_from_sweeps(crossing, start, ImageSettings()), runs)
+    taken = timed(lambda: calibrate_from_sweeps(crossing, start, ImageFit()), runs)
     what = "calibration from two sweeps, 160 frames each"
     return [Row(what, taken.seconds, "s", target=IMAGES_S, falling=True, cores=taken.cores)]
 

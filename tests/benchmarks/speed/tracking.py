@@ -10,7 +10,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import cores, on_one_thread
 from speckle3d.io.load import load_sweep
-from speckle3d.matching.blocks import StageTimes
+from speckle3d.matching.frames import StageTimes
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.pipeline import track
 from speed.rows import Row, timed

@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.chain import POSE, Chain, ImagePoints, as_directions
 from calibration.clock.fitted import estimate_offset, with_uncertain_offset
 from calibration.clock.offset import covered
 from calibration.orientation import calibrate_orientation
-from calibration.plane import Plane, calibrate_plane
-from calibration.solver import solve_chain
+from calibration.plane import Chain, Plane, Problem, calibrate_plane
+from calibration.points import POSE, ImagePoints
+from calibration.settings import PlaneFit
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
@@ -57,7 +57,7 @@ def scan(frame_s, pixels, readings):
 
 def tracker_offset(frame_s, pixels, readings, **options):
     return estimate_offset(
-        lambda points: calibrate_plane(points, PIXEL_MM, fit_pixels=False),
+        lambda points: calibrate_plane(points, PIXEL_MM, PlaneFit(fixed_pixels=True)),
         scan(frame_s, pixels, readings),
         readings,
         **options,
@@ -69,28 +69,26 @@ def from_truth(frame_s, pixels, readings, **options):
     truth = Chain(PIXEL_MM, TRIAL_1, RigidTransform.identity())
 
     def solve(points):
-        return solve_chain(points, Plane(), truth, POSE)
+        return Problem(Plane(), POSE).solve(points, truth)
 
     return estimate_offset(solve, scan(frame_s, pixels, readings), readings, **options)
 
 
-def by_directions(points):
-    along = as_directions(points)
-    return calibrate_orientation(along.pixels, along.frame, along.world_from_sensor.rotation, PIXEL_MM)
-
-
 def orientation_offset(frame_s, pixels, readings, **options):
     turns = TimedRotations(readings.time_s, readings.world_from_sensor.rotation)
-    return estimate_offset(by_directions, scan(frame_s, pixels, readings), turns, **options)
+    return estimate_offset(
+        lambda points: calibrate_orientation(points, PIXEL_MM),
+        scan(frame_s, pixels, readings),
+        turns,
+        **options,
+    )
 
 
 @pytest.mark.parametrize(
     ("estimate", "seed"),
     [
-        pytest.param(from_truth, 0, marks=pytest.mark.slow),
-        pytest.param(tracker_offset, 0, marks=pytest.mark.slow),
+        (from_truth, 0),
         pytest.param(tracker_offset, 1, marks=pytest.mark.slow),
-        pytest.param(orientation_offset, 0, marks=pytest.mark.slow),
         pytest.param(orientation_offset, 1, marks=pytest.mark.slow),
     ],
 )
@@ -103,7 +101,7 @@ def test_a_clock_that_is_off_is_found_within_the_claimed_error(estimate, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2])
 def test_a_trackers_white_noise_does_not_pull_the_offset_to_a_sample(seed):
     frame_s, pixels, readings = record(seed)
     rng = np.random.default_rng([seed, 5])
@@ -123,7 +121,7 @@ def test_an_uncertain_clock_widens_what_follows_from_it():
     frame_s, pixels, readings = record(0)
     points = scan(frame_s - 0.0, pixels, TimedPoses(readings.time_s + OFFSET_S, readings.world_from_sensor))
     truth = Chain(PIXEL_MM, TRIAL_1, RigidTransform.identity())
-    solution = solve_chain(points, Plane(), truth, POSE)
+    solution = Problem(Plane(), POSE).solve(points, truth)
     wider = with_uncertain_offset(
         solution, TimedPoses(readings.time_s + OFFSET_S, readings.world_from_sensor), 0.0
     )
@@ -137,23 +135,6 @@ def test_an_uncertain_clock_widens_what_follows_from_it():
 def test_a_clock_beyond_the_range_is_refused():
     with pytest.raises(InsufficientDataError, match=r"within 0.06 s of 0 s"):
         from_truth(*(each[::3] for each in record(0)[:2]), record(0)[2], search_s=0.06)
-
-
-def test_readings_that_cover_no_frame_at_all_offsets_are_refused():
-    frame_s, pixels, readings = record(0)
-    points = scan(frame_s, pixels, readings)
-    with pytest.raises(InsufficientDataError, match=r"30 s before"):
-        estimate_offset(lambda points: None, points, readings, search_s=30.0)
-
-
-def test_a_calibration_that_fails_everywhere_says_why():
-    frame_s, pixels, readings = record(0)
-
-    def refuse(points):
-        raise InsufficientDataError("the probe was not turned")
-
-    with pytest.raises(InsufficientDataError, match=r"none among 13 tried: the probe was not turned"):
-        estimate_offset(refuse, scan(frame_s, pixels, readings), readings, search_s=0.12)
 
 
 @settings(deadline=None, max_examples=60)
@@ -170,18 +151,3 @@ def test_covered_frames_have_a_reading_at_every_offset_that_may_be_tried(seed, s
     shifts = np.linspace(-slack_s, slack_s, 41 if slack_s else 1)
     always = np.all([readings.covers(frame_s - offset_s - shift) for shift in shifts], axis=0)
     np.testing.assert_array_equal(there, always)
-
-
-@pytest.mark.slow
-def test_dropouts_of_the_sensor_are_left_out_and_the_clock_is_still_found():
-    frame_s, pixels, readings = record(1)
-    seen = np.ones(len(readings), dtype=bool)
-    for start_s in (5.0, 17.3, 30.1):
-        # Shorter than twice the range searched: frames amid it have readings at both ends of the range.
-        seen &= (readings.time_s < start_s) | (readings.time_s > start_s + 0.3)
-    gappy = TimedPoses(readings.time_s[seen], readings.world_from_sensor[seen])
-    there = covered(gappy, frame_s, 0.0, SEARCH_S)
-    # Three gaps of 0.3 s and what is searched to either side; there are readings beyond both ends.
-    assert (~there).sum() == pytest.approx(3 * (0.3 + 2 * SEARCH_S) * FRAMES_HZ, abs=3)
-    found = tracker_offset(frame_s[there], pixels[there], gappy, search_s=SEARCH_S)
-    assert abs(found.seconds - OFFSET_S) < 3.6 * found.standard_error_s

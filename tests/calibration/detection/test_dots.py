@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wire_scenes import PIXEL_MM, SHAPE, picture, plus_results, scene
+from wire_scenes import PIXEL_MM, picture, plus_results, scene
 
-from calibration.detection.dots import DotSettings, dots_in_frames, dots_in_image
-from speckle3d.core.errors import InvalidInputError
+from calibration.detection.dots import dots_in_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage
 from speckle3d.io.plus_config import read_wire_phantom
@@ -30,12 +29,6 @@ def test_a_dot_is_placed_between_pixels_whatever_the_gain(u, v, gain, floor):
     np.testing.assert_allclose(score[0], gain * (kept[0] - kept[1]), rtol=0.03)
 
 
-def test_pixels_need_not_be_square():
-    pixel_mm = (0.3, 0.05)
-    image = gaussian_dot((20.4, 120.7), pixel_mm=pixel_mm, shape=(40, 240))
-    np.testing.assert_allclose(dots_in_image(image, pixel_mm)[0], [[20.4, 120.7]], atol=0.1)
-
-
 def test_wires_are_found_in_speckle_through_side_lobes_and_ringing():
     shown, rng = scene(1, frames=12), np.random.default_rng(0)
     away, ranks = [], []
@@ -53,92 +46,10 @@ def test_wires_are_found_in_speckle_through_side_lobes_and_ringing():
     assert np.median(ranks) == 8
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.3, -0.6])
-def test_a_wire_is_seen_over_a_floor_that_is_brighter(slope):
-    column, row = np.arange(SHAPE[0])[:, None] * PIXEL_MM[0], np.arange(SHAPE[1])[None] * PIXEL_MM[1]
-    rng = np.random.default_rng(5)
-    floor = np.exp(-((row - 34.0 - slope * (column - 35.0)) ** 2) / 0.3**2 / 2)
-    image = np.maximum(
-        picture([(250.0, 60.0)], seed=3, strength=[0.1]), 255 * floor * rng.uniform(0.7, 1, (SHAPE[0], 1))
-    )
-    pixels, _ = dots_in_image(image, PIXEL_MM)
-    wire = np.linalg.norm(pixels - [250.0, 60.0], axis=1) < 2.0
-    assert wire.sum() == 1
-    # The floor has a maximum every 2 mm or so of its 70 mm: left are its ends, and where it is most uneven.
-    assert len(pixels) < 10
-
-
 def test_speckle_alone_shows_hardly_a_dot():
     found = [len(dots_in_image(picture(NOTHING, seed=k, haze=0.1), PIXEL_MM)[0]) for k in range(6)]
     # Some 3000 independent places; five deviations of Gaussian noise would be met in one of 600 images.
     assert sum(found) <= 3
-
-
-def test_of_two_dots_too_close_the_stronger_one_stays():
-    near = picture([(200.0, 100.0), (203.0, 100.0)], strength=[0.2, 0.6], lobes=0, tails=0)
-    assert len(dots_in_image(near, PIXEL_MM, DotSettings(apart_mm=1.0))[0]) == 1
-    far = picture([(200.0, 100.0), (230.0, 100.0)], strength=[0.2, 0.6], lobes=0, tails=0)
-    pixels, _ = dots_in_image(far, PIXEL_MM, DotSettings(apart_mm=1.0))
-    np.testing.assert_allclose(pixels, [[230, 100], [200, 100]], atol=0.5)
-
-
-def test_only_the_region_counts_and_only_so_many_candidates():
-    true = scene(2, frames=1).pixels[0]
-    image = picture(true)
-    left, right = true[:, 0].min() - 10, true[:, 0].mean()
-    region = [(left, 0), (right, 0), (right, SHAPE[1] - 1), (left, SHAPE[1] - 1)]
-    pixels, _ = dots_in_image(image, PIXEL_MM, region_px=region)
-    assert len(pixels) >= (true[:, 0] < right).sum()
-    assert (pixels[:, 0] < right + 0.5 / PIXEL_MM[0]).all()
-    assert len(dots_in_image(image, PIXEL_MM, DotSettings(candidates=4))[0]) == 4
-
-
-class OneByOne:
-    """Frames on a disk: counts what is read, and how much of it at once."""
-
-    def __init__(self, frames):
-        self.frames, self.shape, self.read = frames, frames.shape, []
-
-    def __getitem__(self, index):
-        self.read.append(int(index))
-        return self.frames[index]
-
-
-def test_frames_are_read_one_at_a_time_and_empty_ones_told():
-    frames = OneByOne(
-        np.stack([picture([(200.0, 100.0)]), np.zeros(SHAPE, np.uint8), picture([(100.0, 50.0)])])
-    )
-    told = []
-    dots = dots_in_frames(frames, PIXEL_MM, progress=lambda done, total: told.append((done, total)))
-    assert frames.read == [0, 1, 2]
-    assert told == [(1, 3), (2, 3), (3, 3)]
-    assert set(dots.frame) == {0, 2}
-    assert dots.dropped == {1: "no dot"}
-    alone = dots_in_image(frames.frames[2], PIXEL_MM)
-    np.testing.assert_array_equal(dots.pixels[dots.frame == 2], alone[0])
-    np.testing.assert_array_equal(dots.score[dots.frame == 2], alone[1])
-
-
-@pytest.mark.parametrize(
-    ("image", "pixel_mm", "message"),
-    [
-        (np.zeros((5, 5, 5)), PIXEL_MM, r"image.*\(5, 5, 5\)"),
-        (np.zeros((50, 50), complex), PIXEL_MM, "image.*complex"),
-        (np.zeros((50, 50)), (0.1, 0.0), "pixel_mm"),
-        (np.zeros((50, 50)), (0.1,), "pixel_mm"),
-        (np.full((50, 50), np.nan), PIXEL_MM, r"image\[\(0, 0\)\]"),
-    ],
-)
-def test_images_that_are_none_are_refused(image, pixel_mm, message):
-    with pytest.raises(InvalidInputError, match=message):
-        dots_in_image(image, pixel_mm)
-
-
-def test_a_bad_frame_is_named():
-    frames = np.zeros((3, 50, 50))
-    frames[2, 1, 1] = np.inf
-    with pytest.raises(InvalidInputError, match=r"^frame 2: image\[\(1, 1\)\]"):
-        dots_in_frames(frames, PIXEL_MM)
 
 
 @pytest.mark.slow
@@ -151,7 +62,7 @@ def test_real_wires_are_found_where_others_found_them(realdata):
     frames, points, _, _ = plus_results(folder, "Validation")
     away = []
     for frame, point in list(zip(frames, points, strict=True))[::4]:
-        pixels, _ = dots_in_image(sweep.frames[frame], [config.pixel_mm] * 2, None, config.clip_px)
+        pixels, _ = dots_in_image(sweep.frames[frame], [config.pixel_mm] * 2, config.clip_px)
         away.append(np.linalg.norm(pixels[None] - point[:, None], axis=2).min(axis=1))
     # Measured 0.79 px in the middle and 3.9 px at most; a dot's echo is 40 px wide and 13 px high.
     assert np.median(away) < 1.0

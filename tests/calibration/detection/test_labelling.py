@@ -1,15 +1,12 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 from wire_scenes import ENDS_MM, PIXEL_MM, candidates, cut, n_phantom, scene
 
-from calibration.chain import Chain
 from calibration.detection.dots import Dots
-from calibration.detection.labelling import LabelSettings, label_by_calibration, label_dots
-from calibration.starts import free_fits, rigid_fits
-from speckle3d.core.errors import InvalidInputError
+from calibration.detection.labelling import label_by_calibration, label_dots
+from calibration.plane import Chain
+from calibration.wire_fits import free_fits, rigid_fits
 
 SYMMETRIC_MM = np.array(
     [
@@ -36,7 +33,7 @@ RIGHT_MM = 5 * NOISE_MM
 """Farther than this from its wire a dot is another one: ringing is 1.2 mm off."""
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("degrees", "wrong"), [(5.0, 1.0), (15.0, 1.05), (30.0, 0.96)])
 def test_wires_are_told_apart_among_wrong_dots_however_the_image_lies(seed, degrees, wrong):
     shown = scene(seed, frames=12, degrees=degrees)
@@ -50,15 +47,6 @@ def test_wires_are_told_apart_among_wrong_dots_however_the_image_lies(seed, degr
     assert (away_mm(labelled, shown).reshape(-1, 9).max(axis=1) > RIGHT_MM).sum() <= 1
 
 
-def test_upside_down_and_from_behind_wires_keep_their_names():
-    shown = scene(3, frames=1, degrees=8.0)
-    for signs in ([-1, 1], [1, -1], [-1, -1]):
-        turned = replace(shown, pixels=(shown.pixels - [220, 160]) * signs + [220, 160])
-        labelled = label_dots(Dots(*candidates(turned, 0, NOISE_MM)), shown.phantom, PIXEL_MM)
-        assert len(labelled) == 9
-        assert away_mm(labelled, turned).max() < RIGHT_MM
-
-
 def test_a_phantom_that_looks_the_same_from_two_sides_is_taken_the_usual_way():
     shown = scene(4, frames=5, degrees=8.0, ends=SYMMETRIC_MM)
     labelled = label_dots(Dots(*candidates(shown, 0, NOISE_MM, wrong=0)), shown.phantom, PIXEL_MM)
@@ -69,14 +57,19 @@ def test_a_phantom_that_looks_the_same_from_two_sides_is_taken_the_usual_way():
     assert (upper[:, 0] > labelled.pixels[labelled.wire == 2][:, 0]).all()
 
 
-def test_a_frame_without_one_of_the_wires_is_dropped_for_it():
-    shown = scene(5, frames=6)
-    dots = Dots(*candidates(shown, 0, NOISE_MM, wrong=0, missing={(2, 4), (4, 0)}))
-    labelled = label_dots(dots, shown.phantom, PIXEL_MM)
-    assert set(labelled.frame) == {0, 1, 3, 5}
-    assert set(labelled.dropped) == {2, 4}
-    # Each says which stage it failed in; the stage depends on which wire is missing.
-    assert all(labelled.dropped.values())
+def test_a_frame_says_which_rule_failed_and_by_how_much():
+    shown = scene(5, frames=1)
+
+    def reason(pixels):
+        dots = Dots(np.zeros(len(pixels), int), pixels, np.ones(len(pixels)))
+        return label_dots(dots, shown.phantom, PIXEL_MM).dropped[0]
+
+    right = shown.pixels[0]
+    assert "8 dots for 9 wires" in reason(np.delete(right, 4, axis=0))
+    assert "narrower than the wires'" in reason(0.7 * right)
+    assert "28 % narrower" in reason(right * [1.0, 0.7])
+    bent = right + np.where(np.arange(9)[:, None] == 4, [0.0, 2.0 / PIXEL_MM[1]], 0.0)
+    assert "two layers" in reason(bent)
 
 
 def truth(shown):
@@ -95,52 +88,7 @@ def test_a_calibration_finds_the_wires_that_show_and_no_others():
     assert {pair for pair, r in zip(sorted(pairs), right, strict=True) if not r} <= missing
 
 
-def test_a_calibration_takes_no_dot_beyond_the_gate():
-    shown = scene(7, frames=2)
-    dots = Dots(*candidates(shown, 0, noise_mm=0.0, wrong=0))
-    apart = replace(
-        truth(shown), sensor_from_image=shown.sensor_from_image * RigidTransform.from_translation([0, -3, 0])
-    )
-    none = label_by_calibration(
-        dots, shown.phantom, apart, shown.world_from_sensor, LabelSettings(gate_mm=1.0)
-    )
-    assert (away_mm(none, shown) > 1.0).all()
-    wide = label_by_calibration(
-        dots, shown.phantom, apart, shown.world_from_sensor, LabelSettings(gate_mm=3.3)
-    )
-    assert len(wide) == 18
-
-
-def test_no_dots_are_no_wires():
-    nothing = Dots(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0), {0: "no dot"})
-    shown = scene(8, frames=1)
-    for labelled in (
-        label_dots(nothing, shown.phantom, PIXEL_MM),
-        label_by_calibration(nothing, shown.phantom, truth(shown), shown.world_from_sensor),
-    ):
-        assert len(labelled) == 0
-        assert labelled.dropped == {0: "no dot"}
-
-
-@pytest.mark.parametrize(
-    ("ends", "patterns", "message"),
-    [(ENDS_MM[:3], ((0, 1, 2),), "two N.*1"), (ENDS_MM[:, :, [1, 0, 2]], (), "two N.*0")],
-)
-def test_phantoms_whose_wires_cannot_be_told_apart_are_refused(ends, patterns, message):
-    dots = Dots(np.zeros(1, dtype=int), np.ones((1, 2)), np.ones(1))
-    with pytest.raises(InvalidInputError, match=message):
-        label_dots(dots, n_phantom(ends=ends, patterns=patterns), PIXEL_MM)
-
-
-def test_layers_that_are_askew_are_refused():
-    ends = ENDS_MM[:6].copy()
-    ends[3:] = Rotation.from_euler("z", 20, degrees=True).apply(ends[3:].reshape(-1, 3)).reshape(3, 2, 3)
-    dots = Dots(np.zeros(1, dtype=int), np.ones((1, 2)), np.ones(1))
-    with pytest.raises(InvalidInputError, match=r"\(d\)"):
-        label_dots(dots, n_phantom(ends=ends, patterns=((0, 1, 2), (3, 4, 5))), PIXEL_MM)
-
-
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_an_image_that_cuts_wires_is_found_among_them(seed):
     rng = np.random.default_rng(seed)
     turn = Rotation.from_rotvec(rng.uniform(-0.2, 0.2, 3)) * Rotation.from_euler("x", -90, degrees=True)

@@ -4,14 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from matplotlib.path import Path as Polygon
-from pydantic import ValidationError
 
-from calibration.detection.lines import LineSettings, NoLineError, detect_line, detect_lines
-from calibration.detection.region import lay_columns
-from speckle3d.core.errors import InvalidInputError
+from calibration.detection.lines import NoLineError, detect_line, detect_lines
+from calibration.settings import LineSettings
 
 PIXEL_MM = (0.25, 0.08)
 FRONT = LineSettings(place="front")
@@ -119,13 +114,6 @@ def test_a_floor_is_found_where_it_is(conditions, degrees):
     assert 0.7 * line.possible <= line.consensus <= line.possible <= 61
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int16, np.uint16, "grey of 40 dB"])
-def test_a_floor_is_found_in_levels_of_any_kind(kind):
-    amplitude = floor_echo(2, 10.0, 4.0)
-    image = grey(amplitude, 40.0) if isinstance(kind, str) else (1000 * amplitude).astype(kind)
-    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 10.0, 4.0)
-
-
 @pytest.mark.slow
 def test_standard_errors_are_those_of_speckle_and_the_two_points_err_independently():
     lines = [detect_line(floor_image(seed, 8.0, 5.0, (128, 220), lobes=0.0), PIXEL_MM) for seed in range(120)]
@@ -141,16 +129,6 @@ def test_standard_errors_are_those_of_speckle_and_the_two_points_err_independent
     assert abs(np.corrcoef(off.T)[0, 1]) < 0.3  # three standard errors
 
 
-def test_neighbouring_columns_likeness_counts():
-    image = floor_image(3, 10.0, 0.0)
-    few, many = (
-        detect_line(image, PIXEL_MM, LineSettings(columns=n, place="front")).point_sd_mm for n in (40, 160)
-    )
-    # Beams 0.45 mm wide: columns 0.25 mm apart tell little that those 1 mm apart do not, which as independent
-    # ones would halve the error.
-    assert many > 0.7 * few
-
-
 def test_where_on_the_echo_the_line_is_put():
     image = floor_image(4, 10.0, 3.0, rough_mm=0.1)
     depths = [
@@ -160,14 +138,6 @@ def test_where_on_the_echo_the_line_is_put():
     assert -0.7 - LEAD_MM / 2 < depths[0] < depths[1] < depths[2]
     assert abs(depths[1] + LEAD_MM) < 0.2
     assert abs(depths[2]) < 0.2  # a rough floor's own depth and half
-
-
-def test_a_threshold_decides_what_counts_as_an_echo():
-    image = floor_image(5, 12.0, 0.0, lobes=0.04, haze=0.0, rough_mm=0.1)
-    low, high = (detect_line(image, PIXEL_MM, LineSettings(threshold=t, place="front")) for t in (20.0, 90.0))
-    assert abs(too_deep_mm(low, 0.8 * 12.0, 0.0).mean() + LEAD_MM) < 0.5
-    assert_on_floor(high, 12.0, 0.0)
-    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 12.0, 0.0)
 
 
 def test_noise_has_no_line():
@@ -190,95 +160,6 @@ def test_noise_has_no_line():
 def test_a_frame_without_content_says_so(image, reason):
     with pytest.raises(NoLineError, match=f"^no line: .*{reason}"):
         detect_line(image, PIXEL_MM, FRONT)
-
-
-class TestRegion:
-    """A line as in TR 303's Figure 15: eleven columns, of which the first and the last two cannot meet it."""
-
-    REGION = ((0, 0), (100, 0), (100, 50), (85, 70), (82, 100), (8, 110), (0, 70))
-
-    def image(self):
-        # Rows 100, 98, ... in columns 0, 10, ... 100 but for the second, which is elsewhere in the region.
-        rows = np.array([50, 30, 96, 94, 92, 90, 88, 86, 84, 55, 40])
-        image = np.zeros((101, 140))
-        for column, row in zip(range(0, 101, 10), rows, strict=True):
-            image[column, row:] = 100.0
-        return image
-
-    def detected(self, consensus):
-        s = LineSettings(columns=11, consensus=consensus, place="slope", tolerance_mm=1.0)
-        return detect_line(self.image(), (1.0, 1.0), s, self.REGION)
-
-    def test_columns_the_line_cannot_meet_are_not_asked(self):
-        line = self.detected(7 / 8)
-        assert (line.consensus, line.possible) == (7, 8)
-        assert line.inlier_px[:, 0].tolist() == [20, 30, 40, 50, 60, 70, 80]
-        # An edge lies between the last dark row and the first bright one.
-        np.testing.assert_allclose(np.diff(line.points_px, axis=0)[0] @ [0.2, 1.0], 0.0, atol=1e-3)
-
-    def test_of_those_it_can_meet_enough_must_agree(self):
-        with pytest.raises(NoLineError, match=r"7 of 8 .*8 "):
-            self.detected(7 / 8 + 0.01)
-
-
-def test_only_what_is_inside_a_region_that_is_not_convex_counts():
-    image = floor_image(6, 12.0, 2.0)
-    image[20:140, 40:70] = 255  # a bar across the water
-    image[60:90, 40:160] = 0  # and no floor in the middle
-    around = [(0, 80), (0, 290), (159, 290), (159, 80), (95, 80), (90, 250), (60, 250), (55, 80)]
-    line = detect_line(image, PIXEL_MM, FRONT, region_px=around)
-    assert_on_floor(line, 12.0, 2.0)
-    assert line.possible < 50
-    assert not ((line.inlier_px[:, 0] > 61) & (line.inlier_px[:, 0] < 89)).any()
-    with pytest.raises(NoLineError):
-        detect_line(image, PIXEL_MM, FRONT, region_px=[(0, 0), (159, 0), (159, 60), (0, 60)])
-
-
-@settings(deadline=None, max_examples=60)
-@given(seed=st.integers(0, 2**32 - 1), corners=st.integers(3, 9))
-def test_any_simple_polygon_holds_the_rows_it_should(seed, corners):
-    rng = np.random.default_rng(seed)
-    turn = np.sort(rng.uniform(0, 2 * np.pi, corners))
-    star = np.stack([np.cos(turn), np.sin(turn)], axis=1) * rng.uniform(10, 60, (corners, 1)) + [50, 40]
-    try:
-        columns = lay_columns((90, 80), 90, star)
-    except InvalidInputError:
-        return
-    at = np.stack(np.meshgrid(columns.column, np.arange(80), indexing="ij"), axis=-1).reshape(-1, 2)
-    held = Polygon(star).contains_points(at).reshape(columns.inside.shape)
-    assert (held != columns.inside).sum() <= 1  # rounding at a side
-    for place, first, last in columns.spans:
-        assert columns.inside[place, first : last + 1].all()
-        assert not columns.inside[place, [k for k in (first - 1, last + 1) if 0 <= k < 80]].any()
-    assert columns.inside.sum() == (columns.spans[:, 2] - columns.spans[:, 1] + 1).sum()
-
-
-@settings(deadline=None, max_examples=12)
-@given(
-    seed=st.integers(0, 1000),
-    degrees=st.floats(-12, 12),
-    gain=st.floats(0.01, 1e3),
-    level=st.floats(-100, 100),
-    down=st.integers(0, 20),
-    right=st.integers(0, 30),
-)
-def test_mirrored_shifted_and_amplified_images_have_mirrored_shifted_and_equal_lines(
-    seed, degrees, gain, level, down, right
-):
-    image = floor_image(seed, 9.0, degrees, (100, 240), haze=0.0).astype(float)
-    line = detect_line(image, PIXEL_MM, FRONT)
-    other = detect_line(image[::-1], PIXEL_MM, FRONT)
-    np.testing.assert_allclose(other.points_px[::-1], line.points_px * [-1, 1] + [99, 0], atol=1e-3)
-    assert other.point_sd_mm == pytest.approx(line.point_sd_mm, rel=1e-3)
-    other = detect_line(gain * image + level, PIXEL_MM, FRONT)
-    np.testing.assert_allclose(other.points_px, line.points_px, atol=0.02)  # float32 levels
-    dark = np.pad(image, ((right, 5), (down, 0)), constant_values=0.0)
-    corners = np.array([(0, 10), (99, 10), (99, 239), (0, 239)])
-    inside, moved = (
-        detect_line(im, PIXEL_MM, FRONT, region_px=corners + by)
-        for im, by in ((image, (0, 0)), (dark, (right, down)))
-    )
-    np.testing.assert_allclose(moved.points_px, inside.points_px + np.array([right, down]), atol=1e-3)
 
 
 class Reading:
@@ -321,13 +202,6 @@ def test_a_sequence_has_its_lines_and_its_reasons():
     assert calls == [(k + 1, 8) for k in range(8)]
 
 
-def test_a_sequence_without_lines_is_empty_not_an_error():
-    found = detect_lines(np.zeros((3, 50, 60), np.uint8), PIXEL_MM)
-    assert found.frame.shape == (0,)
-    assert found.pixels.shape == (0, 2, 2)
-    assert set(found.dropped) == {0, 1, 2}
-
-
 def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
     images, depths, degrees = moving_floor()
     ring = 255 * (np.sin(np.arange(36) / 36 * 6 * np.pi) ** 2)
@@ -346,55 +220,3 @@ def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
     found.pixels[:] -= [70, 40]
     assert found.dropped == {}
     assert_on_floors(found, depths, degrees)
-
-
-def test_a_probe_held_still_does_not_hide_the_floor():
-    images = [floor_image(7, 10.0, 3.0, noise=0.0)] * 4 + [floor_image(7, 10.0, 3.0, noise=0.01)]
-    for sequence in (images[:4], images):
-        found = detect_lines(Reading(sequence), PIXEL_MM, FRONT)
-        assert found.dropped == {}
-        assert_on_floors(found, [10.0] * 5, [3.0] * 5)
-
-
-def test_a_region_is_taken_as_it_is():
-    images, *_ = moving_floor(4)
-    region = [(20, 60), (140, 60), (140, 290), (20, 290)]
-    found = detect_lines(Reading(images), PIXEL_MM, FRONT, region_px=region)
-    each = [detect_line(image, PIXEL_MM, FRONT, region_px=region) for image in images]
-    np.testing.assert_array_equal(found.pixels, [line.points_px for line in each])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (((0.25,),), r"pixel_mm.*\[0\.25\]"),
-        (((0.25, -1.0),), "pixel_mm.*-1"),
-        ((PIXEL_MM, None, [(0, 0), (1, 1)]), r"region_px.*\(2, 2\)"),
-        ((PIXEL_MM, None, [(0, 0), (9, np.nan), (9, 9)]), r"region_px\[\(1, 1\)\]"),
-        ((PIXEL_MM, None, [(900, 0), (950, 0), (950, 90)]), "region_px.*160 x 300"),
-        ((PIXEL_MM, None, [(0, -90), (90, -90), (90, -5)]), "region_px.*160 x 300"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(arguments, message):
-    image = floor_image(0)
-    for detect, given_image in ((detect_line, image), (detect_lines, image[None])):
-        with pytest.raises(InvalidInputError, match=message):
-            detect(given_image, *arguments)
-
-
-def test_images_of_another_kind_are_refused():
-    with pytest.raises(InvalidInputError, match=r"\(2, 160, 300\)"):
-        detect_line(np.zeros((2, *SHAPE)), PIXEL_MM)
-    with pytest.raises(InvalidInputError, match="complex128"):
-        detect_line(np.zeros(SHAPE, complex), PIXEL_MM, FRONT)
-    for frames in (np.zeros(SHAPE), np.zeros((2, *SHAPE), complex)):
-        with pytest.raises(InvalidInputError, match="frames"):
-            detect_lines(frames, PIXEL_MM, FRONT)
-
-
-@pytest.mark.parametrize(
-    "setting", [{"columns": 2}, {"smoothing_mm": 0}, {"tolerance_mm": -1}, {"consensus": 1.1}, {"sigma": 1}]
-)
-def test_settings_out_of_range_or_misspelt_are_refused(setting):
-    with pytest.raises(ValidationError):
-        LineSettings(**setting)

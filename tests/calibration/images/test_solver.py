@@ -3,19 +3,16 @@ import dataclasses
 import numpy as np
 import pytest
 from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
-from pydantic import ValidationError
-from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS
 from calibration.images.report import similarities
 from calibration.images.similarity import Estimate, prepare
-from calibration.images.solver import ImageSettings, calibrate_from_sweeps, calibrate_images
-from calibration.images.stacks import read_stack
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.streams import TimedPoses
+from calibration.images.solver import calibrate_from_sweeps, calibrate_images
+from calibration.settings import ImageFit
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import ImageGrid
 
-REFINE = ImageSettings(capture_mm=0.0, capture_deg=0.0)
+REFINE = ImageFit(capture_mm=0.0, capture_deg=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -24,20 +21,14 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def told():
-    """What was told of the progress of `crossing` and `found`."""
-    return []
+def crossing(scene):
+    return prepare(*scene[:2])
 
 
 @pytest.fixture(scope="module")
-def crossing(scene, told):
-    return prepare(*scene[:2], lambda *step: told.append(step))
-
-
-@pytest.fixture(scope="module")
-def found(scene, crossing, told):
+def found(scene, crossing):
     start = displaced(scene[2], np.random.default_rng(0))
-    return calibrate_from_sweeps(crossing, start, progress=lambda *step: told.append(step))
+    return calibrate_from_sweeps(crossing, start)
 
 
 @pytest.fixture(scope="module")
@@ -56,18 +47,8 @@ def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     assert np.linalg.norm(error[[0, 2]]) < 0.1
     turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
     assert np.rad2deg(turned) < 0.5
-
-
-def test_result_says_what_was_gained(found):
-    # No overlap at all at such a start, or less alike.
-    assert not found.similarity.before >= found.similarity.after
-    assert found.similarity.after > 0.9
-    assert found.held_out.after > 0.9
-    assert found.converged
-    assert found.evaluations > 1000
-    for used, held in zip(found.sweeps.frames_used, found.sweeps.frames_held_out, strict=True):
-        assert sorted([*used, *held]) == list(range(36))
-        assert len(held) == 3
+    assert result.converged
+    assert min(result.similarity.after, result.held_out.after) > 0.9
 
 
 def test_errors_are_within_what_the_covariance_says(scene, found):
@@ -79,14 +60,6 @@ def test_errors_are_within_what_the_covariance_says(scene, found):
     # Neither is it a bound that anything keeps. What the tracker may displace a sweep by, 0.15 mm, makes up
     # most of it: 0.1 mm across and out of plane, twice that along the beam.
     assert (spread < [0.15, 0.3, 0.15]).all()
-
-
-def test_covariance_of_a_point_is_that_of_its_place(found):
-    rng, point = np.random.default_rng(0), np.array([10.0, 20.0, 0.0])
-    pose = rng.multivariate_normal(np.zeros(6), found.covariance, 100_000)
-    moved = np.cross(pose[:, :3], point) + pose[:, 3:]
-    # A covariance from n samples is known to sqrt(2 / n), here half a per cent; six times that.
-    np.testing.assert_allclose(np.diag(found.covariance_of(point)), moved.var(axis=0), rtol=0.03)
 
 
 @pytest.mark.slow
@@ -122,64 +95,6 @@ def test_pixel_sizes_are_found():
     assert (held.scale_errors == 0.0).all()
 
 
-@pytest.mark.slow
-def test_published_method_reaches_the_same_from_nearby(others):
-    first, second, truth = others
-    start = displaced(truth, np.random.default_rng(5), 4.0, 4.0)
-    result = calibrate_images(first, second, start, ImageSettings(method="nelder-mead"))
-    error = centre_error_mm(result.sensor_from_image, truth, first.grid)
-    # Published: 2.4 mm at the centre.
-    assert np.linalg.norm(error) < 2.4
-    assert result.similarity.after > result.similarity.before
-    assert np.isfinite(result.covariance).all()
-
-
-@pytest.mark.slow
-def test_what_never_changes_is_not_compared(scene):
-    first, second, truth = scene
-    start = displaced(truth, np.random.default_rng(6), 3.0, 3.0)
-    plain = calibrate_images(first, second, start, REFINE)
-    views = []
-    for view in (first, second):
-        images = view.images.copy()
-        images[:, :10], images[:, -10:], images[:, :, 215:] = 0, 0, 20  # a sector's sides, and writing
-        views.append(dataclasses.replace(view, images=images))
-    masked = calibrate_images(*views, start, REFINE)
-    error = centre_error_mm(masked.sensor_from_image, truth, first.grid)
-    assert np.linalg.norm(error) < 0.5
-    # Less of the image is left, so less is known.
-    assert np.trace(masked.covariance) > np.trace(plain.covariance)
-
-
-def test_pixels_that_never_change_show_nothing(scene):
-    images = scene[0].images.copy()
-    images[:, :20] = 7
-    stack, _ = read_stack(dataclasses.replace(scene[0], images=images))
-    columns = np.arange(stack.images.shape[1]) * stack.pixels[0] / scene[0].grid.vector_pitch_mm
-    dark = np.isnan(stack.images).all(axis=(0, 2))
-    np.testing.assert_array_equal(dark, columns < 19.5)
-
-
-@pytest.mark.slow
-def test_frames_without_readings_are_left_out(scene):
-    first, second, truth = scene
-    kept = slice(6, None)
-    few = TimedPoses(first.readings.time_s[kept], first.readings.world_from_sensor[kept])
-    start = displaced(truth, np.random.default_rng(7), 3.0, 3.0)
-    result = calibrate_images(dataclasses.replace(first, readings=few), second, start, REFINE)
-    assert min(*result.sweeps.frames_used[0], *result.sweeps.frames_held_out[0]) == 6
-    assert np.linalg.norm(centre_error_mm(result.sensor_from_image, truth, first.grid)) < 0.5
-
-
-def test_delay_of_the_sensor_counts(scene):
-    view, frames = scene[0], np.arange(3, 30)
-    late = TimedPoses(view.readings.time_s + 0.06, view.readings.world_from_sensor)
-    shifted = dataclasses.replace(view, readings=late, time_offset_s=-0.06)
-    np.testing.assert_allclose(
-        shifted.world_from_sensor(frames).as_matrix(), view.world_from_sensor(frames).as_matrix(), atol=1e-9
-    )
-
-
 def test_parallel_sweeps_are_refused_however_they_fan():
     first, _, truth = crossing_sweeps(2, frames=20, fan_deg=50.0, jitter=(0.0, 0.0))
     second, *_ = crossing_sweeps(2, frames=20, fan_deg=50.0, crossing_deg=4.0, jitter=(0.0, 0.0))
@@ -197,64 +112,18 @@ def test_sweeps_without_fan_are_refused():
 
 
 def test_similarity_falls_from_the_answer_whichever_parameters_move(crossing, found):
-    comparison = crossing.whole(1.0, 10, found.sensor_from_image)
+    comparison = crossing.whole(1.0, found.sensor_from_image, 10)
     about = Estimate(found.sensor_from_image, found.scales)
     offset = np.linspace(-6.0, 6.0, 13)
-    curves = np.stack([similarities(comparison, about, (name,), offset) for name in PARAMETERS])
+    curves = np.stack([similarities(comparison, about, name, offset) for name in PARAMETERS])
     assert (np.abs(offset[np.nanargmax(curves, axis=1)]) <= 0.5).all()
     assert (curves[:, 6] - np.nanmin(curves, axis=1) > 0.05).all()
-    surface = similarities(comparison, about, ("x", "yaw"), offset[4:9])
-    np.testing.assert_allclose(surface[:, 2], curves[PARAMETERS.index("x"), 4:9])
-    np.testing.assert_allclose(surface[2], curves[PARAMETERS.index("yaw"), 4:9])
-
-
-def test_progress_is_told(found, told):
-    stages = [stage for stage, *_ in told]
-    order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing"]
-    order += ["looking beside", "deciding", "refining"]
-    assert list(dict.fromkeys(stages)) == order
-    assert all(1 <= done <= total for _, done, total in told)
 
 
 @pytest.mark.slow
 def test_sweeps_of_different_things_are_refused(scene, others):
     with pytest.raises(InsufficientDataError):
         calibrate_images(scene[0], others[1], scene[2])
-
-
-def test_sweeps_apart_are_refused(scene):
-    first, second, truth = scene
-    away = RigidTransform.from_translation([500.0, 0.0, 0.0]) * second.readings.world_from_sensor
-    apart = dataclasses.replace(second, readings=TimedPoses(second.readings.time_s, away))
-    with pytest.raises(InsufficientDataError, match="no overlap"):
-        calibrate_images(first, apart, truth)
-    with pytest.raises(InsufficientDataError, match="no overlap"):
-        calibrate_images(first, apart, truth, REFINE)
-
-
-def test_bad_input_is_named(scene):
-    first, second, truth = scene
-    still = dataclasses.replace(second, images=np.zeros_like(second.images))
-    with pytest.raises(InsufficientDataError, match="sweep 2"):
-        calibrate_images(first, still, truth)
-    short = TimedPoses(second.readings.time_s[:4], second.readings.world_from_sensor[:4])
-    with pytest.raises(InsufficientDataError, match=r"sweep 2: .*10 .* 4"):
-        calibrate_images(first, dataclasses.replace(second, readings=short), truth)
-    coarse = dataclasses.replace(second, grid=dataclasses.replace(second.grid, vector_pitch_mm=0.5))
-    with pytest.raises(MismatchError, match=r"sweep 2: .*sweep 1"):
-        calibrate_images(first, coarse, truth)
-    with pytest.raises(MismatchError, match=r"sweep 2: .*30 .* 36"):
-        calibrate_images(first, dataclasses.replace(second, images=second.images[:30]), truth)
-    with pytest.raises(InvalidInputError, match="start"):
-        calibrate_images(first, second, RigidTransform.concatenate([truth, truth]))
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"method": "amoeba"}, {"capture_mm": -1.0}, {"capture_deg": 91}, {"threads": 0}]
-)
-def test_settings_are_checked(wrong):
-    with pytest.raises(ValidationError, match=next(iter(wrong))):
-        ImageSettings(**wrong)
 
 
 @pytest.mark.slow

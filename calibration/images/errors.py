@@ -1,0 +1,318 @@
+"""Claimed errors of a calibration from two sweeps: the jackknife over tissue and images, and the tracker's.
+
+An answer sits on a bump of speckle, where the similarity falls more steeply than it would without speckle. So
+the curvature behind the standard errors is taken over displacements wider than speckle; from its place on the
+bump alone, errors were claimed half as large as they were. Where tissue is layered there may be nothing but
+such bumps, and the one found far from the truth: so the fit is started again beside the answer, and where it
+ends elsewhere, that is part of the claim.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.spatial.transform import RigidTransform
+
+from calibration.images.angulation import PARAMETERS, Angulation, point_motion
+from calibration.images.fit import LEVERS_MM, Refined, about_pivot, refine
+from calibration.images.search import apart_mm
+from calibration.images.similarity import Comparison, Estimate, Level, Similarity
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.geometry import skew
+
+WIDE_MM = 1.6
+"""Root mean square displacement between the sweeps, in units of the images' size, over which curvature is
+taken: over twice the blur, beyond which speckle is no longer like itself. In 15 simulated pairs claims were
+0.7 of the errors at 0.3 mm, 0.9 at 1 mm, 1.2 at 1.6 mm."""
+
+NARROW_MM = 0.3
+"""As `WIDE_MM`, where pixel sizes are estimated: they so nearly replace displacements that over wide steps
+the similarity's bends of a higher order drown the difference."""
+
+_FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0, 0.2, 0.2])
+"""Largest steps, rad, mm and relative sizes: of an error that hardly shows no step would be wide enough."""
+
+LEAST_CURVATURE = 0.01
+"""Least curvature in any direction, as a share of Gauss-Newton's. Layers have 0.01 to 0.06, other tissue 0.07
+and more: below, the standard errors are so large that the answer is refused."""
+
+BLOCK_MM = 10.0
+"""Side of the blocks of tissue whose patches have correlated errors, in units of the images' size: two
+patches, since neighbours show the same speckle and reflections."""
+
+STRETCH = 3
+"""Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
+
+WANDERS = 1.0
+"""Time over which a tracker's error is like itself, in lengths of a sweep: seconds."""
+
+DEEP_MM = 0.1
+"""Standard deviation of a displacement along the beam that all of the tissue shares, so that no differences
+between its parts show it, in units of the images' size: a thick beam displays echoes from beside the image
+plane too deep. The root mean square over six simulated pairs of sweeps."""
+
+RESTARTED = Level(1.0, images=8, overlap=0.25)
+"""Resolution of the fits started again: at finer ones speckle holds them halfway for tens of steps, in tissue
+of clear structure too."""
+
+_BESIDE_DEG, _BESIDE_MM, _RESTART_STEPS = 2.0, 1.5, 14
+"""Turns about the image's centre and displacements, in units of the images' size, from which fits start
+again: over speckle's size, and within reach of the fit. And the most steps of each."""
+
+_SIDES = np.array([[1, 1, 1, 1, 1, 1], [1, -1, 1, -1, -1, 1]])
+"""Signs of turns and displacements; each side has its opposite."""
+
+MOST_MM, MOST_DEG = 1.0, 2.5
+"""Largest standard errors of the image's centre and turns: 95 % intervals of 2 mm, within which the published
+method agreed with phantoms in vivo (Wein and Khamene 2008), and 5 degrees. It agreed within 4 degrees;
+simulated sweeps of good motion over tissue of low contrast claim up to 2.1 degrees of standard error."""
+
+LEAST_SIMILARITY = 0.3
+"""Correlation of patches where speckle is blurred away, times the root of the share of them with support,
+below which sweeps are taken to show too little in common. Of sweeps of different tissue the best found is
+0.1 to 0.2; of the same, 0.35 in the heaviest speckle and shadow tried, to 0.9."""
+
+RIVAL_MM, CLEAR_LEAD = 3.0, 2.0
+"""Distance at which another place found by the search is another answer and not the same one unrefined; and
+the lead over it, in standard errors of their difference, that an answer must have."""
+
+
+def curvature_of(
+    refined: Refined, angulation: Angulation, unit: float, share: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Curvature of each patch's weighted correlation, (p, f, f), and of all, (f, f), over speckle's width.
+
+    By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full,
+    is several times too stiff.
+    """
+    base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
+    wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
+    steps, columns = _steps(angulation, wide, unit), []
+    for parameter in refined.free:
+        step = np.zeros(len(LEVERS_MM))
+        step[parameter] = steps[parameter]
+        places = (refined.estimate.stepped(sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
+        seen = [refined.comparison.at(place, True, share) for place in places]
+        columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
+    bends = np.stack(columns, axis=2)
+    return bends, positive(bends.sum(axis=0), refined.system[0])
+
+
+def claimed(
+    refined: Refined,
+    bends: FloatArray,
+    curvature: FloatArray,
+    restarted: Comparison,
+    unit: float,
+    tracker: tuple[float, float],
+    share: bool = False,
+) -> FloatArray:
+    """Covariance of an answer's turns, displacements and relative pixel sizes at the image's origin, (8, 8).
+
+    Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
+    tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for
+    seconds displaces one sweep against the other and shows in no such change; its effect is computed. To
+    their sum comes the scatter of fits started beside the answer.
+
+    Parameters
+    ----------
+    bends, curvature
+        See `curvature_of`.
+    restarted : Comparison
+        At `RESTARTED`.
+    unit : float
+        Size of the images relative to the usual.
+    tracker : tuple of float
+        Standard deviation of what the tracker displaces and turns one sweep against the other by, on each
+        axis, mm and rad.
+
+    References
+    ----------
+    .. [1] A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference", Journal of
+       Human Resources, 2015 (the jackknife over clusters).
+    """
+    base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
+    slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
+    wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
+    blocks = _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit)))
+    sweep, image = refined.comparison.images.T
+    stretches = _numbered(np.column_stack([sweep, _numbered(np.column_stack([sweep, image])) // STRETCH]))
+    left_out = [_left_out(slopes, bends, one, curvature) for one in (blocks, stretches)]
+    pulls = _pulls(refined, wide, base, share)
+    moved = np.linalg.inv(curvature)
+    wander = moved @ _wandering(refined, pulls, np.repeat(np.square(tracker), 3)) @ moved.T
+    covariance = base @ (sum(left_out) + wander) @ base.T
+    covariance[4, 4] += (DEEP_MM * unit) ** 2
+    covariance[:6, :6] += _scatter(refined, restarted, unit, share)
+    return np.asarray(covariance)
+
+
+def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: FloatArray) -> None:
+    """Refuse an answer whose claimed errors are too large to be of use.
+
+    Raises
+    ------
+    InsufficientDataError
+        With what would help: other motion, or other tissue.
+    """
+    pose = covariance[:6, :6]
+    moved = point_motion(centre_mm[None])[0]
+    turns = np.rad2deg(np.sqrt(np.diag(pose)[:3]))
+    shifts = np.sqrt(np.diag(moved @ pose @ moved.T))
+    if turns.max() <= MOST_DEG and shifts.max() <= MOST_MM:
+        return
+    worst = int(np.argmax(np.concatenate([turns / MOST_DEG, shifts / MOST_MM])))
+    got = f"{turns[worst]:.1f} degrees" if worst < 3 else f"{shifts[worst - 3]:.1f} mm"
+    sufficient = angulation.verdict == "sufficient"
+    help_by = "scan tissue with more structure in all directions" if sufficient else angulation.advice
+    limit = f"{MOST_DEG:g} degrees" if worst < 3 else f"{MOST_MM:g} mm"
+    raise InsufficientDataError(
+        f"expected sweeps that tell {PARAMETERS[worst]} to {limit} (standard error), got {got}; {help_by}"
+    )
+
+
+def require_one_answer(
+    comparison: Comparison,
+    found: Estimate,
+    rivals: list[Estimate],
+    centre_mm: FloatArray,
+    share: bool = False,
+) -> None:
+    """Refuse an answer if another that the search found, far from it, is as good for all that is known.
+
+    Raises
+    ------
+    InsufficientDataError
+        Saying how far off the other is.
+    """
+    here = comparison.at(found, share=share)
+    for rival in rivals:
+        apart = apart_mm(rival, found, centre_mm)
+        if apart < RIVAL_MM:
+            continue
+        there = comparison.at(rival, share=share)
+        if there.score < LEAST_SIMILARITY:
+            continue
+        both = here.valid & there.valid
+        lead = here.score - there.score
+        blocks = _numbered(np.floor(comparison.places_mm(found.sensor_from_image)[both] / BLOCK_MM))
+        gain = np.bincount(blocks, here.alike[both] - there.alike[both]) / max(int(both.sum()), 1)
+        noise = float(np.sqrt(np.square(gain - gain.mean()).sum())) if both.any() else 0.0
+        if lead < CLEAR_LEAD * noise:
+            raise InsufficientDataError(
+                f"expected one mounting that fits the sweeps best, got another {apart:.0f} mm from it that "
+                f"fits as well (correlation {there.score:.3f} and {here.score:.3f}, +- {noise:.3f}): tissue "
+                "with more structure, or a better start with a smaller --capture-mm, would tell them apart"
+            )
+
+
+def _scatter(refined: Refined, restarted: Comparison, unit: float, share: bool) -> FloatArray:
+    """Mean square of how far fits that start beside the answer end from one that starts at it, shape (6, 6).
+
+    Not about their own mean: fits that all end in the same other place are in doubt, too. Nor about the
+    answer, for at `RESTARTED` images are blurred, which moves all ends alike.
+    """
+    beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * unit], 3)
+
+    def end(side: FloatArray) -> RigidTransform:
+        start = refined.estimate.stepped(np.append(side * beside, [0.0, 0.0]), refined.pivot_mm)
+        found = refine(restarted, start, max_steps=_RESTART_STEPS, share=share).estimate
+        return found.sensor_from_image
+
+    back = end(np.zeros(6)).inv()
+    away = [back * end(side) for side in np.concatenate([_SIDES, -_SIDES])]
+    ends = np.array([np.append(one.rotation.as_rotvec(), one.translation) for one in away])
+    return np.asarray(ends.T @ ends / (len(ends) - 1))
+
+
+def _steps(angulation: Angulation, wide_mm: float, unit: float) -> FloatArray:
+    """Steps of the parameters that displace the sweeps against each other by a width."""
+    shows = np.append(angulation.alone, [1.0, 1.0])
+    shows[:3] /= np.deg2rad(1.0)
+    shows[6:] = 0.5 * LEVERS_MM[6:]
+    farthest = _FARTHEST * np.repeat([1.0, unit, 1.0], [3, 3, 2])
+    return np.asarray(np.minimum(wide_mm / np.maximum(shows, 1e-6), farthest))
+
+
+def _pulls(refined: Refined, step_mm: float, base: FloatArray, share: bool) -> FloatArray:
+    """How each patch's slopes change as the second sweep is displaced along the world's axes, (p, f, 3)."""
+    first, second = refined.comparison.stacks
+    columns = []
+    for axis in np.eye(3):
+        seen = []
+        for sign in (-1.0, 1.0):
+            world = RigidTransform.from_translation(sign * step_mm * axis) * second.world_from_sensor
+            moved = replace(refined.comparison, stacks=(first, replace(second, world_from_sensor=world)))
+            seen.append(moved.at(refined.estimate, True, share))
+        columns.append(_fallen(refined, seen) @ base / (2.0 * step_mm))
+    return np.stack(columns, axis=2)
+
+
+def _fallen(refined: Refined, seen: list[Similarity]) -> FloatArray:
+    """Difference of the weighted slopes at two places, of patches with support throughout; zero of others."""
+    there = refined.similarity.valid & seen[0].valid & seen[1].valid
+    fallen = refined.weight[:, None] * (seen[0].gradient - seen[1].gradient)
+    return np.where(there[:, None], fallen, 0.0)
+
+
+def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> FloatArray:
+    """Covariance of the slope from an error of each sweep's poses that wanders over the sweep's length.
+
+    An image's error counts where the image is compared, and as much again where it is cut.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (6,)
+        Of displacements (mm^2) and turns (rad^2) of one sweep against the other about the tissue.
+    """
+    share = np.linalg.norm(pulls, axis=(1, 2))
+    arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), 1e-300)
+    each = 2.0 * np.concatenate([pulls, pulls @ -skew(arms)], axis=2)
+    found = np.zeros((pulls.shape[1],) * 2)
+    for sweep, stack in enumerate(refined.comparison.stacks):
+        ours, image = refined.comparison.images.T
+        sums = np.zeros((len(stack), *each.shape[1:]))
+        np.add.at(sums, image[ours == sweep], each[ours == sweep])
+        lag = np.arange(len(stack)) / (WANDERS * len(stack))
+        alike = np.exp(-np.abs(lag[:, None] - lag))
+        # Half of the variance is this sweep's.
+        found += np.einsum("iak,ij,jbk,k->ab", sums, alike, sums, 0.5 * variance, optimize=True)
+    return found
+
+
+def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvature: FloatArray) -> FloatArray:
+    """Jackknife over clusters: covariance by what the answer moves by when each is left out."""
+    count = int(cluster.max()) + 1
+    if count < 2:
+        raise InsufficientDataError(
+            "expected sweeps that share more tissue, got too little to compare its parts"
+        )
+    slope, bend = np.zeros((count, slopes.shape[1])), np.zeros((count, *curvature.shape))
+    np.add.at(slope, cluster, slopes)
+    np.add.at(bend, cluster, bends)
+    moves = np.array(
+        [_solved(curvature, curvature - 0.5 * (b + b.T), s) for b, s in zip(bend, slope, strict=True)]
+    )
+    moves -= moves.mean(axis=0)
+    return np.asarray((count - 1.0) / count * moves.T @ moves)
+
+
+def _solved(whole: FloatArray, rest: FloatArray, slope: FloatArray) -> FloatArray:
+    """The step that is left to take; the rest of the tissue counts at least a fifth of the whole."""
+    return np.asarray(np.linalg.solve(positive(rest, whole, 0.2), slope))
+
+
+def _numbered(cells: FloatArray) -> IntArray:
+    """Number of each patch's cell, from zero."""
+    return np.asarray(np.unique(cells, axis=0, return_inverse=True)[1], dtype=np.int64).ravel()
+
+
+def positive(found: FloatArray, normal: FloatArray, least: float = LEAST_CURVATURE) -> FloatArray:
+    """Symmetrise, and raise to at least a share of a positive matrix in every direction."""
+    firm = normal + 1e-9 * np.trace(normal) * np.eye(len(normal))
+    part, axes = eigh((found + found.T) / 2.0, firm)
+    back = firm @ axes
+    return np.asarray((back * np.maximum(part, least)) @ back.T)

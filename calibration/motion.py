@@ -1,0 +1,252 @@
+"""Whether the motion of a scan determines a calibration, which motions it lacks, and what it leaves open.
+
+References
+----------
+.. [1] R. W. Prager et al., CUED/F-INFENG/TR 303, 1997, section 4.2 (condition number of the scaled Jacobian).
+.. [2] P.-W. Hsu et al., "Rapid, easy and reliable calibration for freehand 3D ultrasound", Ultrasound Med.
+Biol.
+   32, 2006 (reliability from its eigenvectors).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calibration.points import CHAIN, columns_of
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError
+
+if TYPE_CHECKING:
+    from calibration.plane import Solution
+
+MAX_CONDITION = 1000.0
+"""Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
+_TWO_SIDED = 1.96
+REFUSED_MM, REFUSED_RAD = 5.0 / _TWO_SIDED, np.deg2rad(5.0) / _TWO_SIDED
+"""Standard error of the image's worst corner, and about its worst axis, above which a solution is refused:
+95 % intervals of 5 mm and 5 degrees, which a ruler and a protractor on the probe achieve."""
+WEAK_MM, WEAK_RAD = 1.0, np.deg2rad(1.0)
+"""Standard error of a weakly determined solution; 1 degree is the published precision (Housden 2008)."""
+MISFIT_MM, MISFIT_RAD = 3.0, np.deg2rad(5.0)
+"""Root mean square residual above which the phantom does not explain the images: the worst published is 3.5
+mm as a distance, with early magnetic trackers (TR 303, section 5), 2 mm in each component."""
+TIE = 25.0
+"""Evidence of a rival below which two answers are not told apart: five standard deviations."""
+
+_LEAST_SIGMA_MM, _LEAST_SIGMA_RAD = 0.1, np.deg2rad(0.1)
+"""Lines are not found more exactly; residuals of exact data would make every motion look sufficient."""
+_ALLOWED_LACKING = 0.65
+"""Share of what is allowed where a motion is absent: the standard error is itself uncertain, and three of
+it are to stay below 5 mm and 5 degrees."""
+_LET_PASS = 2.0
+"""Share of what is allowed that errors may reach, were residuals those of a phantom that fits, for a misfit
+to be the phantom's."""
+_UNKNOWN, _UNKNOWN_RAD, _UNKNOWN_MM = 0.3, 1.0, 300.0
+"""Standard deviations before anything is measured: of a pixel size as a share of it, of angles and places."""
+
+_STEP_RAD, _SHIFT, _LEAST_SHIFT_MM = np.deg2rad(15.0), 0.2, 8.0
+"""A motion on purpose: by this angle, or by this share of the image, at least so many millimetres, to
+either side."""
+_ABSENT = 0.25
+"""Standard deviation, over such a step, below which a motion is absent: a hand that means to hold still
+wobbles by 0.7 to 1.4 degrees, one that moves on purpose by five."""
+_OBLONG = 3.0
+"""Pixels found to be so oblong are taken for square: their shape was not determined."""
+
+TILT = "tilt the probe to and fro (rotate about the image's lateral axis)"
+YAW = "rotate about the beam axis"
+ROLL = "roll the probe from side to side (rotate about the elevational axis)"
+SIDEWAYS = "shift the probe sideways (the phantom then appears elsewhere across the image)"
+UP_AND_DOWN = "move the probe up and down (the phantom then appears at other depths)"
+MOTIONS = (TILT, YAW, ROLL, SIDEWAYS, UP_AND_DOWN)
+
+_WORDS = {
+    "s_x": "the column pitch", "s_y": "the row spacing",
+    "x": "a shift across the image", "y": "a shift along the beam", "z": "a shift out of the image's plane",
+    "alpha": "roll", "beta": "yaw", "gamma": "tilt",
+    "x_c": "the phantom's x", "y_c": "the phantom's y", "z_c": "the phantom's z",
+    "alpha_c": "the phantom's turn about z", "beta_c": "its turn about y", "gamma_c": "its turn about x",
+}  # fmt: skip
+_TAKES_PART = 0.5
+"""Share of the largest component of an eigenvector from which a parameter is named."""
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """How well the motion determines a calibration, if the phantom explains the images.
+
+    Attributes
+    ----------
+    standard_error : float
+        Of the image's worst corner, mm; about its worst axis, rad, where only directions are known.
+    missing : tuple of str
+        Motions that would help; none if the answer is certain enough.
+    weakest : str
+        What the motion determines least, in words.
+    """
+
+    standard_error: float
+    condition_number: float
+    missing: tuple[str, ...]
+    weakest: str
+    refused: bool
+    verdict: str
+
+
+class InadequateError(InsufficientDataError):
+    """A solution that is refused, with the reason.
+
+    Attributes
+    ----------
+    solution : Solution, optional
+        Still a start for others; none once the error is shown with the name of what it came from.
+    """
+
+    def __init__(self, message: str, solution: Solution | None = None) -> None:
+        super().__init__(message)
+        self.solution = solution
+
+
+def require_adequate(solution: Solution) -> Solution:
+    """Return `solution` if its motion was sufficient.
+
+    Raises
+    ------
+    InadequateError
+        Naming the missing motions, if the answer is too uncertain to be used, or another explains the
+        images as well; or if the phantom does not explain the images.
+    """
+    if solution.adequacy.refused:
+        raise InadequateError(solution.adequacy.verdict, solution)
+    return solution
+
+
+def judge(solution: Solution) -> Adequacy:
+    """Judge the motion of a solution, and whether the phantom explains the images at all."""
+    angular, condition = solution.angular, solution.condition_number
+    white = _errors(solution, _bounded(solution))
+    errors = np.maximum(white, _errors(solution, solution.full_covariance))
+    refused_at, weak_at = np.array([REFUSED_MM, REFUSED_RAD]), np.array([WEAK_MM, WEAK_RAD])
+    excess, weak = float((errors / refused_at).max()), bool((errors / weak_at).max() > 1)
+    error, weakest = float(errors[1 if angular else 0]), weakest_of(solution.jacobian, solution.free)
+    share = (MISFIT_RAD if angular else MISFIT_MM) / max(solution.rms, np.finfo(float).tiny)
+    # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
+    # solver runs away in the direction left open.
+    if share < 1 and share * float((white / refused_at).max()) <= _LET_PASS:
+        misfit = (
+            f"the phantom does not explain the images (they miss it by {_size(solution.rms, angular)}): do "
+            "the images and the sensor readings belong together, and are the phantom, its wires and their "
+            "numbers the ones named?"
+        )
+        return Adequacy(error, condition, (), weakest, True, misfit)
+    tied = solution.rival is not None and solution.rival.evidence < TIE
+    extent_of = extents(solution)
+    lacking = [motion for motion, extent in extent_of.items() if extent < _ABSENT]
+    dots = solution.phantom.seen_as == "dot"
+    # Dots of wires tell the image's place from a few frames; what they lack is in their errors.
+    allowed = _ALLOWED_LACKING if lacking and not dots else 1.0
+    # Of a plane always equally deep, errors in the poses shrink free pixels, more than any error claimed.
+    unsized = solution.phantom.seen_as == "line" and solution.prior is None and "s_x" in solution.free
+    unsized &= UP_AND_DOWN in lacking
+    refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied or unsized)
+    # If none is absent, the one that was there and not far enough.
+    missing = tuple(lacking or [min(extent_of, key=lambda one: extent_of[one])]) if weak or refused else ()
+    state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
+    if not angular and errors[1] / REFUSED_RAD > errors[0] / REFUSED_MM:
+        state += f" and {_size(errors[1], True)}"
+    state += f", condition number {condition:.3g}"
+    advice = "; and ".join(missing)
+    if tied and excess <= allowed:
+        verdict = f"two answers explain the images equally well, one of them mirrored ({state}): {advice}"
+    elif refused:
+        verdict = f"the motion does not determine the calibration ({state}): {advice}; weakest is {weakest}"
+    elif weak:
+        verdict = f"the motion determines the calibration weakly ({state}): {advice}; weakest is {weakest}"
+    else:
+        verdict = f"the motion was sufficient ({state})"
+    if solution.assumed:
+        verdict += f"; {solution.assumed}"
+    return Adequacy(error, condition, missing, weakest, refused, verdict)
+
+
+def weakest_of(jacobian: FloatArray, free: tuple[str, ...]) -> str:
+    """What a motion determines least, in words: the last eigenvector of the scaled normal matrix."""
+    scaled = jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
+    part = np.abs(np.linalg.eigh(scaled.T @ scaled)[1][:, 0])
+    named = [name for name, share in zip(free, part, strict=True) if share > _TAKES_PART * part.max()]
+    first, *rest = (_WORDS[name] for name in named)
+    return f"{first} (with {' and '.join(rest)})" if rest else first
+
+
+def extents(solution: Solution) -> dict[str, float]:
+    """How much of each motion a scan has: standard deviation over that of a motion on purpose.
+
+    Lines tell roll and depth by themselves, and the sensor alone tells how far the plane's normal moved in
+    its frame: the mounting, which is not known well where a motion is missing, hardly enters. Motions that
+    cannot help are left out: a plane whose lines have a place looks the same from every side.
+    """
+    points, size = solution.points_used, solution.chain.pixel_mm
+    steps_mm = np.maximum(_SHIFT * points.pixels.max(axis=0) * size, _LEAST_SHIFT_MM)
+    if solution.phantom.seen_as == "dot":
+        turns = solution.chain.target_from_image(points).rotation
+        spread = (turns.mean().inv() * turns).as_rotvec().std(axis=0) / _STEP_RAD
+        return dict(zip(MOTIONS, [*spread, *(points.pixels * size).std(axis=0) / steps_mm], strict=True))
+    up = points.turns.transpose(0, 2, 1) @ solution.chain.target_from_world.rotation.as_matrix()[2]
+    middle = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
+    swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
+    if solution.prior is not None:
+        size = solution.prior.pixel_mm
+    elif "s_x" in solution.free and not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
+        size = np.full(2, size[1])
+    ends = (points.pixels * size).reshape(-1, 1 if solution.angular else 2, 2)
+    along = ends[:, 0] if solution.angular else ends[:, 1] - ends[:, 0]
+    slope = np.arctan(along[:, 1] / along[:, 0])
+    # The slope depends on the pixels' shape, which may be wrong; the normal swings as far at least.
+    spread_of = {TILT: np.sqrt(max(swing - slope.var(), 0.0)), ROLL: min(slope.std(), np.sqrt(swing))}
+    if solution.angular and solution.phantom.determined:
+        # A plane that is not known to be level has a slope, which turning about its normal tells apart.
+        turns = points.world_from_sensor.rotation
+        spread_of[YAW] = ((turns.mean().inv() * turns).as_rotvec() @ middle).std()
+    spread_of = {motion: float(angle / _STEP_RAD) for motion, angle in spread_of.items()}
+    if not solution.angular:
+        centre = ends.mean(axis=1)
+        column = np.median(centre[:, 0])
+        depth = centre[:, 1] + (column - centre[:, 0]) * along[:, 1] / along[:, 0]
+        # About the column at which the lines cross: turning the probe there does not change the depth.
+        steps = np.column_stack([np.ones(len(slope)), np.tan(slope)])
+        left = depth - steps @ np.linalg.lstsq(steps, depth, rcond=None)[0]
+        spread_of[UP_AND_DOWN] = float(left.std() / steps_mm[1])
+    return spread_of
+
+
+def _bounded(solution: Solution) -> FloatArray:
+    """Covariance of `CHAIN` if errors are independent, as large as detection's, and answers plausible."""
+    size = solution.chain.pixel_mm * _UNKNOWN
+    if solution.prior is not None:
+        size = solution.prior.pixel_mm * solution.prior.error
+    widths = dict(zip(("s_x", "s_y"), size, strict=True))
+    before = [widths.get(name, _UNKNOWN_MM if name[0] in "xyz" else _UNKNOWN_RAD) for name in solution.free]
+    least = _LEAST_SIGMA_RAD if solution.angular else _LEAST_SIGMA_MM
+    measured = solution.jacobian.T @ solution.jacobian / max(solution.sigma, least) ** 2
+    information = measured + np.diag(np.array(before) ** -2.0)
+    columns = columns_of(solution.free)
+    full = np.zeros((len(CHAIN), len(CHAIN)))
+    full[np.ix_(columns, columns)] = np.linalg.inv(information)
+    return full
+
+
+def _errors(solution: Solution, covariance: FloatArray) -> FloatArray:
+    """Standard errors of the worst corner, mm (zero for directions), and about the worst axis, rad."""
+    angle = float(np.sqrt(np.linalg.eigvalsh(covariance[5:8, 5:8])[-1]))
+    if solution.angular:
+        return np.array([0.0, angle])
+    moved = solution.corners_moved
+    corners = np.einsum("kip,pq,kiq->k", moved, covariance, moved)
+    return np.array([float(np.sqrt(corners.max())), angle])
+
+
+def _size(error: float, angular: bool) -> str:
+    return f"{np.rad2deg(error):.2g} degrees" if angular else f"{error:.2g} mm"

@@ -1,0 +1,341 @@
+"""Errors that wander: the answer and the covariance of a calibration whose sensor drifts over seconds.
+
+Plain least squares takes all errors for white and the sensor's poses for exact. But a sensor's error wanders
+(Ornstein and Uhlenbeck), so that neighbouring frames say the same: residuals are whitened for a grid of sizes
+and times of the wandering, and the answers of the grid are averaged by their restricted likelihood [2]_. And
+the derivatives contain the poses' errors, which are in the residuals too, so that pixel sizes come out too
+small: derivatives are taken at poses and points corrected by what the residuals say [1]_.
+
+References
+----------
+.. [1] F. R. Helmert, "Die Ausgleichungsrechnung nach der Methode der kleinsten Quadrate", Teubner, 1907; W.
+A.
+   Fuller, "Measurement error models", Wiley, 1987.
+.. [2] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
+   Biometrika 58, 1971 (restricted maximum likelihood, REML).
+.. [3] A. C. Harvey and G. D. A. Phillips, Biometrika 66, 1979 (generalised least squares by a Kalman filter).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.points import SeenAs, columns_of
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.threads import ahead
+from speckle3d.kernels.wander import innovations
+
+if TYPE_CHECKING:
+    from calibration.plane import Chain, Equations, PixelPrior
+
+WANDER = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
+JITTER = (0.0, 0.5, 1.5)
+"""Sizes tried of the error that is new in every frame and moves all its residuals together."""
+STEADY = 0.5
+"""Probability, before anything is measured, that nothing wanders."""
+PROPORTIONS_MM = (0.5, 2.0, 8.0)
+"""Errors of position over errors of rotation tried, mm per degree: trackers are specified at 0.25 mm with 0.5
+degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
+
+_TIMES = 4
+_SHORTEST, _LONGEST = 4.0, 2.0
+"""Time constants tried: from four frames, of which fewer look like white noise, to twice the recording, which
+looks like a straight line."""
+_NEGLIGIBLE = 1e-4
+"""Weight over the largest below which a point of the grid has no say in the next step."""
+_SINGULAR = 1e-15
+"""Ratio of eigenvalues below which a direction counts as not determined."""
+_SMALLEST = 1e-12
+"""Residuals below are rounding: nothing wanders in them."""
+_STEPS = 3
+"""The first finds the answer, the second takes the errors out of the derivatives, the third the rest."""
+_SETTLED = 0.05
+"""Standard errors of a second step below which there is no third."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Errors of a sensor and an image, and what they leave uncertain.
+
+    Attributes
+    ----------
+    step : ndarray, shape (p,)
+        Added to the parameters, it makes the residuals least.
+    covariance : ndarray, shape (p, p)
+    white : float
+        Standard deviation of the white noise of a residual.
+    wander : float
+        Root mean square effect of the wandering error on a residual, in the residuals' unit.
+    time_s : float
+        Its time constant, in the unit of the times given; NaN where nothing wanders.
+    spread : ndarray, shape (k,)
+        Variances of the components of the sensor's error in a frame, wandering and jitter together.
+    """
+
+    step: FloatArray
+    covariance: FloatArray
+    white: float
+    wander: float
+    time_s: float
+    spread: FloatArray
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Sizes of wandering and jitter over the white noise, and time constants, tried together."""
+
+    wander: FloatArray
+    jitter: FloatArray
+    time_s: FloatArray
+    unit: FloatArray
+    """Variance of each component of an error whose root mean square effect is one, shape (g, k)."""
+    prior: FloatArray
+
+    def __getitem__(self, some: BoolArray) -> Grid:
+        return Grid(
+            self.wander[some], self.jitter[some], self.time_s[some], self.unit[some], self.prior[some]
+        )
+
+
+def make_grid(
+    effects: FloatArray, frame_time_s: FloatArray, proportions: Sequence[FloatArray], jitter: Sequence[float]
+) -> Grid:
+    """All that is tried.
+
+    Parameters
+    ----------
+    effects : ndarray, shape (m, k)
+        Derivatives of the residuals by the k components of the sensor's error.
+    proportions : sequence of ndarray, shape (k,)
+        Standard deviations of the components, in proportion to each other.
+    """
+    span = max(float(np.ptp(frame_time_s)), _SMALLEST)
+    spacing = float(np.median(np.diff(frame_time_s))) if len(frame_time_s) > 1 else span
+    times = np.geomspace(min(max(_SHORTEST * spacing, _SMALLEST), span), _LONGEST * span, _TIMES)
+    units = []
+    for proportion in proportions:
+        effect = float(np.mean((effects * proportion) ** 2)) * len(proportion)
+        units.append(proportion**2 / max(effect, _SMALLEST**2))
+    steady = [(0.0, shake, times[0], unit) for shake in jitter for unit in (units if shake else units[:1])]
+    moving = [(w, shake, t, unit) for w in WANDER for shake in jitter for t in times for unit in units]
+    wander, shake, time, unit = (np.array(column) for column in zip(*steady, *moving, strict=True))
+    prior = np.where(wander == 0, STEADY / len(steady), (1.0 - STEADY) / len(moving))
+    return Grid(wander, shake, time, unit, prior)
+
+
+def fit_wandering(
+    jacobian: FloatArray,
+    residuals: FloatArray,
+    effects: FloatArray,
+    starts: IntArray,
+    frame_time_s: FloatArray,
+    grid: Grid,
+    prior: FloatArray | None = None,
+    excess: FloatArray | None = None,
+) -> tuple[Noise, Grid]:
+    """Solve linear least squares whose residuals carry white noise and a sensor's wandering error.
+
+    Parameters
+    ----------
+    jacobian, residuals : ndarray, shapes (m, p) and (m,)
+    effects : ndarray, shape (m, k)
+    starts : ndarray of int, shape (frames + 1,)
+        First residual of each frame, and their number; residuals of a frame have one sensor reading.
+    prior : ndarray, shape (p, p), optional
+        Inverse covariance of what is known of the parameters besides.
+    excess : ndarray, shape (p,), optional
+        By how much the present parameters exceed what is known.
+
+    Returns
+    -------
+    noise : Noise
+    grid : Grid
+        The part of the grid that has a say.
+    """
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    information = np.zeros((len(scale), len(scale))) if prior is None else prior / np.outer(scale, scale)
+    columns = np.ascontiguousarray(np.column_stack([jacobian / scale, residuals]))
+    normal, log_determinant = _whitened(columns, np.ascontiguousarray(effects), starts, frame_time_s, grid)
+    matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
+    free = max(len(residuals) - len(scale), 1)
+    sizes, axes = np.linalg.eigh(matrix)
+    along = np.einsum("gij,gi->gj", axes, pull)
+    firm = np.where(sizes > _SINGULAR * sizes[:, -1:], sizes, np.inf)
+    variance = np.maximum(np.maximum(energy - (along**2 / firm).sum(axis=1), 0.0) / free, _SMALLEST**2)
+    volume = np.log(np.maximum(sizes, _SINGULAR * sizes[:, -1:] + _SMALLEST)).sum(axis=1)
+    likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
+    weight = grid.prior * np.exp(likelihood - likelihood.max())
+    weight /= weight.sum()
+    back = np.zeros(len(scale)) if excess is None else information @ (excess * scale)
+    spread = np.linalg.pinv(matrix / variance[:, None, None] + information, rcond=_SINGULAR, hermitian=True)
+    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + back)
+    step = weight @ steps
+    away = steps - step
+    covariance = np.einsum("g,gij->ij", weight, spread) + (weight * away.T) @ away
+    moving = weight * (grid.wander > 0)
+    noise = Noise(
+        step / scale,
+        covariance / np.outer(scale, scale),
+        float(np.sqrt(weight @ variance)),
+        float(np.sqrt(weight @ (variance * grid.wander**2))),
+        float(np.exp(moving @ np.log(grid.time_s) / moving.sum())) if moving.sum() > 0 else np.nan,
+        (weight * variance * (grid.wander**2 + grid.jitter**2)) @ grid.unit,
+    )
+    return noise, grid[weight > _NEGLIGIBLE * weight.max()]
+
+
+def _whitened(
+    columns: FloatArray, effects: FloatArray, starts: IntArray, frame_time_s: FloatArray, grid: Grid
+) -> tuple[FloatArray, FloatArray]:
+    """Products of the columns' innovations, (g, c, c), and logarithms of their variance, (g,)."""
+    pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
+    normal = np.empty((len(grid.wander), columns.shape[1], columns.shape[1]))
+
+    def one(g: int) -> float:
+        kept, unit = np.exp(-pauses_s / grid.time_s[g]), grid.unit[g]
+        wander, shake = unit * grid.wander[g] ** 2, unit * grid.jitter[g] ** 2
+        return float(innovations(columns, effects, starts, kept, wander, shake, normal[g]))
+
+    return normal, np.array(list(ahead(one, range(len(normal)))))
+
+
+def sensor_effects(equations: Equations, chain: Chain) -> FloatArray:
+    """How residuals move with turns of the sensor about the world's axes, rad, and shifts, mm; (n, r, 6)."""
+    points, target = equations.points, chain.target_from_world.as_matrix()[:3, :3]
+    in_world = equations.rows @ target
+    flat = np.column_stack([points.pixels * chain.pixel_mm, np.zeros(len(points))])
+    arm = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.apply(flat))
+    return np.concatenate([np.cross(arm[:, None], in_world), in_world], axis=2)
+
+
+def fit_noise(
+    equations: Equations,
+    chain: Chain,
+    free: Sequence[str],
+    seen_as: SeenAs,
+    prior: PixelPrior | None = None,
+    more: FloatArray | None = None,
+) -> tuple[Chain, Noise]:
+    """Go from a least-squares solution to the one that knows that the sensor's errors wander.
+
+    Parameters
+    ----------
+    equations : Equations
+        Without outliers, frames ascending.
+    free : sequence of str, length p
+        The parameters estimated.
+    more : ndarray, shape (n r, k), optional
+        Derivatives of the residuals by further parameters, which are zero so far.
+
+    Returns
+    -------
+    chain : Chain
+    noise : Noise
+        Its covariance is that of the free parameters, and of the further ones after them. Its step is the
+        last one's, of the further ones the sum of all.
+    """
+    points, columns, several = equations.points, columns_of(free), equations.rows.shape[1]
+    first = np.flatnonzero(np.diff(points.frame, prepend=points.frame[0] - 1))
+    starts = several * np.append(first, len(points))
+    frame_time_s = points.times[starts[:-1] // several]
+    beside = np.zeros((equations.offsets.size, 0)) if more is None else more
+    further, count = np.zeros(beside.shape[1]), len(free)
+    information, excess = _known(prior, chain, free, count + len(further))
+    corrected, expected, grid = equations, np.zeros(len(beside)), None
+    for number in range(_STEPS):
+        values, slopes = corrected.at(chain)
+        # What was taken out of the points, put back as the small thing that it is.
+        residuals = values.ravel() + expected + beside @ further
+        jacobian = np.hstack([slopes.reshape(len(beside), -1)[:, columns], beside])
+        effects = sensor_effects(corrected, chain).reshape(len(beside), -1)
+        if seen_as == "direction":
+            effects = effects[:, :2]  # the heading hardly moves lines of a plane that is nearly level
+        if grid is None:
+            lonely = len(starts) - 1 == len(beside)
+            grid = make_grid(effects, frame_time_s, _proportions(seen_as), (0.0,) if lonely else JITTER)
+        noise, grid = fit_wandering(
+            jacobian, residuals, effects, starts, frame_time_s, grid, information, excess
+        )
+        sensor, image = _divided(residuals + jacobian @ noise.step, effects, starts, noise)
+        step = np.zeros(slopes.shape[-1])
+        step[columns] = noise.step[:count]
+        chain, further = chain.displaced(step), further + noise.step[count:]
+        information, excess = _known(prior, chain, free, count + len(further))
+        corrected, expected = _corrected(equations, chain, sensor, image)
+        if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
+            break
+    return chain, replace(noise, step=np.append(noise.step[:count], further))
+
+
+def _proportions(seen_as: SeenAs) -> list[FloatArray]:
+    if seen_as == "direction":
+        return [np.ones(2)]
+    return [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in PROPORTIONS_MM]
+
+
+def _known(
+    prior: PixelPrior | None, chain: Chain, free: Sequence[str], count: int
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Inverse covariance of what is known of the pixel size, and by how much the parameters exceed it."""
+    if prior is None:
+        return None, None
+    inverse, excess = np.zeros(count), np.zeros(count)
+    columns = [list(free).index(name) for name in ("s_x", "s_y")]
+    inverse[columns] = (prior.pixel_mm * prior.error) ** -2.0
+    excess[columns] = chain.pixel_mm - prior.pixel_mm
+    return np.diag(inverse), excess
+
+
+def _divided(
+    residuals: FloatArray, effects: FloatArray, starts: IntArray, noise: Noise
+) -> tuple[FloatArray, FloatArray]:
+    """Divide residuals between the sensor and the image, each frame by itself: their expected errors.
+
+    Returns
+    -------
+    sensor : ndarray, shape (m, k)
+        Error of the sensor in the frame of each residual.
+    image : ndarray, shape (m,)
+        What is left for the image.
+    """
+    size = np.diff(starts)
+    frame = np.repeat(np.arange(len(size)), size)
+    place = np.arange(len(residuals)) - starts[frame]
+    moved, left = np.zeros((len(size), size.max(), effects.shape[1])), np.zeros((len(size), size.max()))
+    moved[frame, place], left[frame, place] = effects, residuals
+    white = max(noise.white, _SMALLEST) ** 2
+    covariance = (moved * noise.spread) @ np.swapaxes(moved, 1, 2) + white * np.eye(size.max())
+    pull = np.linalg.solve(covariance, left[..., None])[..., 0]
+    sensor = noise.spread * np.einsum("fa,fak->fk", pull, moved)
+    return sensor[frame], white * pull[frame, place]
+
+
+def _corrected(
+    equations: Equations, chain: Chain, sensor: FloatArray, image: FloatArray
+) -> tuple[Equations, FloatArray]:
+    """Take expected errors out of poses and pixels; return also what that takes out of the residuals."""
+    points, (n, several) = equations.points, equations.offsets.shape
+    error = np.zeros((n, 6))
+    error[:, : sensor.shape[1]] = sensor[::several]
+    moved = points.world_from_sensor.as_matrix()
+    moved[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
+    moved[:, :3, 3] -= error[:, 3:]
+    in_world = equations.rows @ chain.target_from_world.as_matrix()[:3, :3]
+    in_image = in_world @ points.turns @ chain.sensor_from_image.as_matrix()[:3, :2]
+    # The smallest displacement in the image, mm, that explains what is left to it.
+    square = in_image @ np.swapaxes(in_image, 1, 2) + 1e-9 * np.eye(several)
+    pull = np.linalg.solve(square, image.reshape(n, several, 1))[..., 0]
+    moved_mm = np.einsum("nr,nri->ni", pull, in_image)
+    poses = RigidTransform(moved, normalize=False)
+    shown = replace(points, world_from_sensor=poses, pixels=points.pixels - moved_mm / chain.pixel_mm)
+    corrected = replace(equations, points=shown)
+    effects = sensor_effects(corrected, chain).reshape(-1, 6)
+    turned = np.repeat(error, several, axis=0)
+    return corrected, np.sum(effects * turned, axis=1) + np.einsum("nri,ni->nr", in_image, moved_mm).ravel()

@@ -1,0 +1,177 @@
+"""Points of a phantom in images, joined with the sensor's poses, and the names of what they determine."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import require_finite
+from speckle3d.core.shown import shown
+
+SOME_FRAMES = 100
+"""Frames that choose among starting points; the answer is refined from all."""
+
+SeenAs = Literal["line", "direction", "dot"]
+"""What points are: the two ends of a line, the direction of one, or a dot."""
+
+SCALES = ("s_x", "s_y")
+ANGLES = ("alpha", "beta", "gamma")
+POSE = ("x", "y", "z", *ANGLES)
+"""``sensor_from_image`` (the report's R_T_P): position, mm, and angles about z, y and x (roll, yaw, tilt),
+rad."""
+PROBE = (*SCALES, *POSE)
+TARGET = ("x_c", "y_c", "z_c", "alpha_c", "beta_c", "gamma_c")
+"""``target_from_world`` (the report's C_T_T)."""
+CHAIN = (*PROBE, *TARGET)
+
+
+def columns_of(names: Sequence[str]) -> list[int]:
+    """Where parameters are in `CHAIN`."""
+    return [CHAIN.index(name) for name in names]
+
+
+@shown
+@dataclass(frozen=True)
+class ImagePoints:
+    """Points of a phantom in the images, and where the sensor was.
+
+    Parameters
+    ----------
+    pixels : ndarray, shape (n, 2)
+        Column u and row v, fractional.
+    frame : ndarray of int, shape (n,)
+        The frame each point is in; points of a frame are used or dropped together.
+    world_from_sensor : RigidTransform, length n
+        Translation in mm.
+    wire : ndarray of int, shape (n,), optional
+        The wire each point lies on.
+    time_s : ndarray, shape (n,), optional
+        When each point's frame was taken; without it, frames are taken to be evenly spaced. A sensor's error
+        wanders with it.
+    """
+
+    pixels: FloatArray
+    frame: IntArray
+    world_from_sensor: RigidTransform
+    wire: IntArray | None = None
+    time_s: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.pixels.ndim != 2 or self.pixels.shape[1] != 2:
+            raise InvalidInputError(f"pixels: expected shape (n, 2), got {self.pixels.shape}")
+        require_finite(self.pixels, "pixels")
+        counts = {len(self.pixels), len(self.frame), len(self.world_from_sensor)}
+        counts |= {len(one) for one in (self.wire, self.time_s) if one is not None}
+        if len(counts) > 1:
+            raise MismatchError(
+                f"expected as many points as frames, poses, wires and times, got {sorted(counts)}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def __getitem__(self, chosen: BoolArray | IntArray | slice) -> ImagePoints:
+        wire = None if self.wire is None else self.wire[chosen]
+        time_s = None if self.time_s is None else self.time_s[chosen]
+        return ImagePoints(
+            self.pixels[chosen], self.frame[chosen], self.world_from_sensor[chosen], wire, time_s
+        )
+
+    @cached_property
+    def turns(self) -> FloatArray:
+        """Rotation matrices of the poses, shape (n, 3, 3)."""
+        return np.ascontiguousarray(self.world_from_sensor.as_matrix()[:, :3, :3])
+
+    @cached_property
+    def shifts_mm(self) -> FloatArray:
+        """Translations of the poses, shape (n, 3)."""
+        return np.asarray(self.world_from_sensor.translation)
+
+    @cached_property
+    def frames(self) -> IntArray:
+        """Numbers of the frames that have points, ascending."""
+        return np.unique(self.frame)
+
+    def of_some_frames(self, count: int) -> ImagePoints:
+        """The points of at most `count` frames, spread evenly over the recording."""
+        places = np.unique(np.linspace(0, len(self.frames) - 1, count).astype(int))
+        return self[np.isin(self.frame, self.frames[places])]
+
+    @property
+    def times(self) -> FloatArray:
+        """`time_s`, or the frames' numbers where times are not known, shape (n,)."""
+        return np.asarray(self.frame, dtype=float) if self.time_s is None else self.time_s
+
+    @classmethod
+    def of_lines(
+        cls,
+        frame: IntArray,
+        points_px: FloatArray,
+        world_from_sensor: RigidTransform,
+        time_s: FloatArray | None = None,
+    ) -> ImagePoints:
+        """Two points of a line in each frame: m frames, poses and times, `points_px` of shape (m, 2, 2)."""
+        twice = np.repeat(np.arange(len(frame)), 2)
+        times = None if time_s is None else np.asarray(time_s)[twice]
+        poses = world_from_sensor[twice]
+        return cls(points_px.reshape(-1, 2), np.asarray(frame)[twice], poses, time_s=times)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was found in the images of a sequence.
+
+    Attributes
+    ----------
+    frame : ndarray of int, shape (m,)
+        Of each line, or of each dot; ascending.
+    pixels : ndarray, shape (m, 2, 2) for lines, (m, 2) for dots
+        Column and row, fractional, of two points on each line, or of each dot.
+    wire : ndarray of int, shape (m,), optional
+        Number of the wire that each dot shows.
+    dropped : dict of int to str
+        Why other frames show nothing.
+    """
+
+    frame: IntArray
+    pixels: FloatArray
+    wire: IntArray | None = None
+    dropped: dict[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, chosen: BoolArray | IntArray) -> Seen:
+        wire = None if self.wire is None else self.wire[chosen]
+        return Seen(self.frame[chosen], self.pixels[chosen], wire, self.dropped)
+
+    def without(self, frames: Collection[int], reason: str) -> Seen:
+        """Leave out frames, for the same reason each, whether anything was found in them or not."""
+        if not frames:
+            return self
+        kept = self[~np.isin(self.frame, list(frames))]
+        return replace(kept, dropped={**self.dropped, **dict.fromkeys(frames, reason)})
+
+    @property
+    def are_lines(self) -> bool:
+        """Whether lines were found, not dots."""
+        return self.pixels.ndim == 3
+
+    def points(self, world_from_sensor: RigidTransform, time_s: FloatArray | None = None) -> ImagePoints:
+        """Join with the sensor's pose and the time of each line or dot."""
+        if self.are_lines:
+            return ImagePoints.of_lines(self.frame, self.pixels, world_from_sensor, time_s)
+        return ImagePoints(self.pixels, self.frame, world_from_sensor, self.wire, time_s)
+
+
+def as_directions(lines: ImagePoints) -> ImagePoints:
+    """Directions of lines given by two points each; their poses keep the rotation alone."""
+    turns = RigidTransform.from_rotation(lines.world_from_sensor[::2].rotation)
+    return replace(lines[::2], pixels=lines.pixels[1::2] - lines.pixels[::2], world_from_sensor=turns)

@@ -1,0 +1,84 @@
+"""Images as NumPy, pictures and video have them, (row, column), read as the frames of a sweep."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import InvalidInputError
+
+_LUMINANCE = np.array([0.299, 0.587, 0.114])
+"""Of red, green and blue: ITU-R BT.601."""
+
+_HELP = {
+    "pitch_mm": "distance between columns and between rows, from the scanner's depth ruler",
+    "frame_rate_hz": "frames per second, on the scanner's screen, or frame_time_s",
+    "dynamic_range_db": "decibels from black to white, beside the image on the scanner's screen",
+    "signal": "an RFSettings that says how the echoes were sampled",
+}
+
+
+class Images(Protocol):
+    """Images in memory or in files: shape (n, row, column), with an axis of 3 or 4 colours more or not."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of all."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of their numbers."""
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        """Read one."""
+
+
+class ImageFrames:
+    """Frames (column, row) of images; colours become grey by luminance.
+
+    Raises
+    ------
+    InvalidInputError
+        If the images are of another shape or type.
+    """
+
+    def __init__(self, images: Images) -> None:
+        shape, kind = images.shape, np.dtype(images.dtype)
+        is_colour = len(shape) == 4 and shape[3] in (3, 4) and kind == np.uint8
+        if not (len(shape) == 3 or is_colour) or 0 in shape:
+            raise InvalidInputError(
+                "frames: expected images of shape (n, row, column), or uint8 (n, row, column, 3), got "
+                f"{shape} of {kind}"
+            )
+        if kind.name not in ("uint8", "int16", "float32", "complex64"):
+            raise InvalidInputError(
+                "frames: expected grey levels as uint8, or echoes as int16, float32 or complex64, got "
+                f"{kind}: convert them with astype"
+            )
+        self.any_thread = isinstance(images, np.ndarray) or getattr(images, "any_thread", False)
+        self._images, self.dtype = images, kind.newbyteorder("=")
+        self.shape = (shape[0], shape[2], shape[1])
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        image = np.asarray(self._images[range(len(self))[index]])
+        if image.shape[:2] != self.shape[:0:-1]:
+            raise InvalidInputError(
+                f"frame {index}: expected {self.shape[2]} rows of {self.shape[1]} columns, got {image.shape}"
+            )
+        if image.ndim == 3:
+            image = np.rint(image[..., :3] @ _LUMINANCE).astype(np.uint8)
+        return np.ascontiguousarray(image.T, self.dtype)
+
+
+def require_all(**values: object) -> None:
+    """Raise `InvalidInputError` that asks by name for all values that are None."""
+    missing = [f"{name} ({_HELP[name]})" for name, value in values.items() if value is None]
+    if missing:
+        raise InvalidInputError(
+            f"arrays do not say, so give {', '.join(missing)}: see docs/howto/pictures.md"
+        )

@@ -1,0 +1,121 @@
+"""What modes claim: covariances of poses by the scatter of readings and by what is known of the sensors.
+
+All covariances are of (x, y, z, tilt, yaw, roll) of every frame about the image's centre, against the first
+frame and along its axes, mm and rad.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial import legendre
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.geometry import skew
+from speckle3d.correction.settings import FusedSettings
+
+CUBIC = 3
+LEAST_LENGTH_MM = 1e-9
+"""Of a sweep that did not move, whose relative error is as good as infinite."""
+
+
+def length_sigma(poses: RigidTransform, covariance: FloatArray, centre_mm: FloatArray) -> float:
+    """Relative standard deviation of a sweep's length: that of its farthest frame's elevation.
+
+    Parameters
+    ----------
+    poses : RigidTransform, length n
+    covariance : ndarray, shape (n, 6, 6)
+    """
+    z_mm = (poses[0].inv() * poses).apply(centre_mm)[:, 2]
+    farthest = int(np.argmax(np.abs(z_mm)))
+    return float(np.sqrt(covariance[farthest, 2, 2]) / max(abs(float(z_mm[farthest])), LEAST_LENGTH_MM))
+
+
+def correlated_readings(error: FloatArray, shapes: int) -> float:
+    """How many neighbouring readings err as one: the sum of their autocorrelation, at least one.
+
+    Parameters
+    ----------
+    error : ndarray, shape (m, k)
+        Residuals of a fit.
+    shapes : int
+        Slow shapes that the fit has taken out of each column: where it lies, its slope, its bend. These make
+        every autocovariance smaller by `shapes` / m of the sum of all, which is put back.
+    """
+    error = error - error.mean(axis=0)
+    m, energy = len(error), float((error**2).sum())
+    total, lags = energy, 1
+    while lags < m // 4:
+        alike = float((error[lags:] * error[:-lags]).sum())
+        if alike <= 0.0:
+            break
+        total, lags = total + 2.0 * alike, lags + 1
+    lost = min((2 * lags - 1) * shapes / m, 0.75) if lags > 1 else 0.0
+    return max(total / max(energy, np.finfo(float).tiny) / (1.0 - lost), 1.0)
+
+
+def curve_errors(error: FloatArray, frames: int) -> FloatArray:
+    """Covariance of poses that cubics in time have bent onto readings, by what these leave, shape (n, 6, 6).
+
+    A cubic through m readings of variance s2 errs at t in -1 to 1 by s2 / m times the sum of
+    (2 k + 1) P_k(t)^2 over Legendre's polynomials of order 0 to 3. What it leaves beyond white jitter is an
+    error of single frames.
+
+    Parameters
+    ----------
+    error : ndarray, shape (m, 6)
+        Readings less corrected poses, (x, y, z, tilt, yaw, roll), in the order of frames.
+    frames : int
+        n, nearly all of which have a reading.
+    """
+    order = np.arange(CUBIC + 1)
+    basis = legendre.legvander(np.linspace(-1.0, 1.0, frames), CUBIC) * np.sqrt(2.0 * order + 1.0)
+    against_first = ((basis - basis[0]) ** 2).sum(axis=1) / len(error)
+    alike = [correlated_readings(column[:, None], CUBIC + 1) for column in error.T]
+    white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
+    left = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
+    variance = against_first[:, None] * error.var(axis=0) * alike
+    variance[1:] += left
+    return np.asarray(variance[:, :, None] * np.eye(6))
+
+
+def tracker_errors(
+    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, known: FusedSettings
+) -> FloatArray:
+    """Covariance by a tracker's millimetres, mounting and clock, which none of its readings shows."""
+    from_first = poses[0].inv() * poses
+    path, turned = from_first.apply(centre_mm) - centre_mm, from_first.rotation.as_matrix() - np.eye(3)
+    drift = np.gradient(path, time_s, axis=0)
+    drift -= drift[0]
+    across = skew(path)
+    covariance = np.zeros((len(poses), 6, 6))
+    covariance[:, :3, :3] = (
+        known.tracker_scale_sigma**2 * path[:, :, None] * path[:, None, :]
+        + known.clock_sigma_s**2 * drift[:, :, None] * drift[:, None, :]
+        + known.mounting_sigma_rad**2 * across @ across.transpose(0, 2, 1)
+        + known.mounting_sigma_mm**2 * turned @ turned.transpose(0, 2, 1)
+    )
+    covariance[:, 3:, 3:] = known.mounting_sigma_rad**2 * turned @ turned.transpose(0, 2, 1)
+    return covariance
+
+
+def orientation_errors(
+    poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, known: FusedSettings
+) -> FloatArray:
+    """Covariance by an orientation sensor's slow errors, which bend the path, too.
+
+    Parameters
+    ----------
+    poses : RigidTransform, length n
+        In the sensor's world, z up.
+    """
+    sigma = np.array([known.inclination_sigma_rad, known.inclination_sigma_rad, known.heading_sigma_rad])
+    to_first = poses[0].rotation.as_matrix().T
+    slow = to_first @ np.diag(sigma**2) @ to_first.T
+    grown = 2.0 * (1.0 - np.exp(-(time_s - time_s[0]) / known.wander_s))
+    path = (poses[0].inv() * poses).apply(centre_mm) - centre_mm
+    # An angle that grows evenly along the way moves its end by half as much as one that is there throughout.
+    bent = -0.5 * skew(path)
+    errors = np.concatenate([bent, np.broadcast_to(np.eye(3), bent.shape)], axis=1)
+    return np.asarray(grown[:, None, None] * errors @ slow @ errors.transpose(0, 2, 1))

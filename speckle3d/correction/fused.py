@@ -1,0 +1,191 @@
+"""Mode ``fused``: the images' path, bent by small corrections onto all sensors, in one least-squares problem.
+
+Unknown are corrections of the images' steps (`ImagePath`: a scale and rates of turn for the whole sweep, and
+small increments over a few frames each) and, of every sensor, its world, mounting, clock, millimetres and
+wander (`SensorReadings`). Corrections are in the images' own millimetres and are all that the images' errors
+are: no residual of theirs grows or shrinks with the scale, as it would where edges are compared with poses.
+
+References
+----------
+.. [1] R. J. Housden et al., BioMedical Engineering OnLine 7:5, 2008, equations 1 to 3 (the corrected chain).
+.. [2] P. J. Huber, "Robust statistics", Wiley, 1981 (the loss).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.errors import MismatchError
+from speckle3d.core.leastsquares import huber_weights
+from speckle3d.core.relative import RelativePoses
+from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.correction.claims import length_sigma
+from speckle3d.correction.image_path import ImagePath
+from speckle3d.correction.scale import FusedPoses, ScaleEvidence
+from speckle3d.correction.sensor_readings import SensorReadings
+from speckle3d.correction.settings import FusedSettings
+
+HUBER = 2.0
+"""Deviations, by the root mean square of three residuals, at which a reading begins to lose weight."""
+MOST_ROUNDS, CONVERGED = 12, 1e-5
+FARTHEST = 2.0
+"""Factor between the lengths of images and tracker beyond which no average of the two means anything."""
+
+
+@dataclass(frozen=True)
+class FusionProblem:
+    """Everything that is known of a sweep. The unknowns are the path's coefficients, then each sensor's."""
+
+    path: ImagePath
+    sensors: tuple[SensorReadings, ...]
+    evidence: tuple[ScaleEvidence, ...]
+
+    @property
+    def columns(self) -> list[slice]:
+        """Where the unknowns of the path and of each sensor are."""
+        ends = np.cumsum([self.path.sigma.size, *(sensor.size for sensor in self.sensors)])
+        return [slice(int(first), int(last)) for first, last in zip([0, *ends[:-1]], ends, strict=True)]
+
+    def solve(self) -> tuple[FloatArray, FloatArray, FusionProblem]:
+        """Best unknowns, their covariance, and the problem with the sensors' jitter as it was found."""
+        # A path that cannot follow a sensor that wanders shows how large its error is.
+        stiff = replace(self, path=self.path.stiff)
+        unknowns, _ = stiff.iterated(np.zeros(self.columns[-1].stop))
+        poses = self.path.chain.poses(unknowns[self.columns[0]])
+        sensors = zip(self.sensors, self.columns[1:], strict=True)
+        problem = replace(self, sensors=tuple(each.sized(poses, unknowns[own]) for each, own in sensors))
+        unknowns, matrix = problem.iterated(unknowns)
+        return unknowns, np.asarray(np.linalg.inv(matrix), dtype=float), problem
+
+    def iterated(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton with Huber's weights: unknowns, and the matrix of the normal equations there."""
+        matrix, gradient = self.normal_equations(unknowns)
+        for _ in range(MOST_ROUNDS):
+            step = cho_solve(cho_factor(matrix), -gradient)
+            unknowns = unknowns + step
+            matrix, gradient = self.normal_equations(unknowns)
+            if np.abs(step[self.columns[0]]).max() < CONVERGED:
+                break
+        return unknowns, matrix
+
+    def normal_equations(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Matrix and gradient, summed over pieces of the equations."""
+        matrix, gradient = np.zeros((unknowns.size, unknowns.size)), np.zeros(unknowns.size)
+        for columns, residual, slope in self._equations(unknowns):
+            root = np.sqrt(huber_weights(np.sqrt((residual**2).mean(axis=1)), HUBER))[:, None]
+            weighed, pull = (slope * root[:, :, None]).reshape(-1, slope.shape[-1]), (residual * root).ravel()
+            matrix[np.ix_(columns, columns)] += weighed.T @ weighed
+            gradient[columns] += weighed.T @ pull
+        return matrix, gradient
+
+    def _equations(self, unknowns: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Columns, residuals (k, r) of which a row has one weight, and derivatives (k, r, columns)."""
+        every: IntArray = np.arange(unknowns.size)
+        on_path = self.columns[0]
+        coefficients = unknowns[on_path]
+        residual, slope = self.path.prior(coefficients)
+        yield every[on_path], residual[:, None], slope[:, None]
+        for evidence in self.evidence:
+            residual, slope = self.path.misfit(coefficients, evidence)
+            yield every[on_path], residual[None], slope[None]
+        for sensor, own in zip(self.sensors, self.columns[1:], strict=True):
+            residual, slope = sensor.prior(unknowns[own])
+            yield every[own], residual[:, None], slope[:, None]
+            joint = np.concatenate([every[on_path], every[own]])
+            for residual, slope in sensor.equations(self.path, coefficients, unknowns[own]):
+                yield joint, residual, slope
+
+
+def fuse(
+    edges: RelativePoses,
+    image: RigidTransform,
+    share: float,
+    scale_sigma: float,
+    curves_sigma: float,
+    turn_sigma_per_mm: FloatArray,
+    centre_mm: FloatArray,
+    frame_time_s: FloatArray,
+    orientation: OrientationSensor | None = None,
+    tracker: Tracker | None = None,
+    evidence: Sequence[ScaleEvidence] = (),
+    settings: FusedSettings | None = None,
+) -> FusedPoses:
+    """Estimate poses from all that is known of a sweep.
+
+    Parameters
+    ----------
+    edges : RelativePoses
+        Frame pairs, with covariances as if pairs were independent of each other.
+    image : RigidTransform, length n
+        Image-based poses that were solved from `edges`.
+    share : float
+        Mean share of echoes that stay from frame to frame.
+    scale_sigma, curves_sigma : float
+        Relative standard deviation of the scale of distances, and the part of it that is the curves'.
+    turn_sigma_per_mm : ndarray, shape (2,)
+        Standard deviations of yaw and of tilt per mm that the images lack, rad/mm.
+    centre_mm : ndarray, shape (3,)
+        The image's centre.
+    frame_time_s : ndarray, shape (n,)
+    orientation : OrientationSensor, optional
+    tracker : Tracker, optional
+        Sensors without a mounting, or with too few readings over the frames, are left out.
+    evidence : sequence of ScaleEvidence
+        What a crossing sweep says of the scale.
+    settings : FusedSettings, optional
+
+    Raises
+    ------
+    MismatchError
+        If images and tracker differ in length by more than a factor of two.
+
+    Returns
+    -------
+    FusedPoses
+        In the world of the tracker, or else of the orientation sensor with its origin at the first frame's
+        image origin, or else of the first frame.
+    """
+    settings = settings or FusedSettings()
+    centre = RigidTransform.from_translation(centre_mm)
+    start = centre.inv() * (image[0].inv() * image) * centre
+    own_sigma = float(np.sqrt(max(scale_sigma**2 - curves_sigma**2, 0.0)))
+    path = ImagePath.of(edges, start, share, scale_sigma, own_sigma, turn_sigma_per_mm, frame_time_s)
+    known = start.as_matrix(), centre_mm, frame_time_s, settings
+    readings = (SensorReadings.of(tracker, *known), SensorReadings.of(orientation, *known))
+    if (
+        readings[0] is not None
+        and not 1.0 / FARTHEST < (ratio := readings[0].travel_ratio(known[0])) < FARTHEST
+    ):
+        raise MismatchError(
+            f"expected a tracker that travels as far as the images, within a factor of {FARTHEST:g}, got "
+            f"{ratio:.3g} times as far: compare modes image and pose"
+        )
+    problem = FusionProblem(path, tuple(each for each in readings if each is not None), tuple(evidence))
+    unknowns, whole, problem = problem.solve()
+    coefficients, inside = unknowns[problem.columns[0]], problem.columns[0]
+    poses = path.chain.poses(coefficients)
+    slopes = path.chain.frame_errors(coefficients, poses, np.zeros(3))
+    covariance = np.einsum("nic,cd,njd->nij", slopes, whole[inside, inside], slopes, optimize=True)
+    bent = centre * RigidTransform.from_matrix(poses) * centre.inv()
+    world = RigidTransform.identity()
+    if problem.sensors:
+        world = problem.sensors[0].world_of(unknowns[problem.columns[1]])
+        if problem.sensors[0].places:
+            world = world * centre.inv()
+        else:
+            world = RigidTransform.from_rotation(world.rotation)
+    return FusedPoses(
+        poses=world * bent,
+        covariance=covariance,
+        log_scale=float(np.log1p(path.mean_rates()[0] @ coefficients)),
+        log_scale_sigma=length_sigma(bent, covariance, centre_mm),
+        evidence=tuple(evidence),
+        used=("images", *(each.name for each in problem.sensors), *(each.source for each in evidence)),
+        sizes={f"{each.name} jitter": float(each.jitter[int(each.places)]) for each in problem.sensors},
+    )

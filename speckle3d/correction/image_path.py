@@ -1,0 +1,155 @@
+"""The images' path, and the corrections of its steps that the images' errors allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM, RelativePoses
+from speckle3d.correction.curves import AXES, CorrectedChain
+from speckle3d.correction.scale import ScaleEvidence
+
+FRAMES_PER_KNOT, MOST_KNOTS = 4, 40
+"""Corrections change from knot to knot: the images' own detail is finer than any sensor's between them."""
+SIDEWAYS, SIDEWAYS_BY_SHARE = 0.005, (0.5, 0.1)
+"""Standard deviation of motion along x and y that images see for each mm along z where structure runs across:
+least, and its growth with the share of echoes that stay. Of simulated phantoms and tissue."""
+LEAST_STEP_MM = 0.005
+"""A resting probe's corrections spread over its frames as if each moved by so much."""
+UNJOINED = np.array([1.0, 1.0, 1.0, 0.05, 0.05, 0.05])
+"""Standard deviation of a hand's motion between two frames that no pair joins, mm and rad."""
+HAND_TURN_RAD = float(np.deg2rad(1.0))
+"""How far a scanning hand tilts and yaws in a second, deviation of a random walk: over tissue images see none
+of it. Three freehand sweeps of the PLUS library turn by 0.4 to 1.6 degrees in a second."""
+HELD_MM = 1e-6
+LEAST_SCALE_CHANGE = 0.1
+"""The scale changes along a sweep by at least this share of what it may be wrong by."""
+Z = AXES.index("z")
+
+
+@dataclass(frozen=True)
+class ImagePath:
+    """The images' path about the image's centre, and how its steps may be corrected.
+
+    The correction of step f in each of (x, y, z, tilt, yaw, roll) is ``rate * step_mm[f]`` plus the step's
+    share of an increment of its own between two knots; see `CorrectedChain` for what it does to the path.
+
+    Attributes
+    ----------
+    chain : CorrectedChain
+        With k + 1 coefficients for each axis: the rate, per mm of the images, and k increments.
+    sigma : ndarray, shape (6, k + 1)
+        Standard deviations of the coefficients before any sensor is read.
+    step_mm : ndarray, shape (n,)
+        Elevational step into each frame.
+    """
+
+    chain: CorrectedChain
+    sigma: FloatArray
+    step_mm: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        edges: RelativePoses,
+        path: RigidTransform,
+        share: float,
+        scale_sigma: float,
+        own_scale_sigma: float,
+        turn_sigma_per_mm: FloatArray,
+        frame_time_s: FloatArray,
+    ) -> ImagePath:
+        """Allow what the covariances of the edges and the images' common errors do.
+
+        Parameters
+        ----------
+        path : RigidTransform, length n
+            About the image's centre; the first is the identity.
+        share : float
+            Mean share of echoes that stay from frame to frame.
+        scale_sigma, own_scale_sigma : float
+            Relative standard deviation of the scale of distances, with and without that of the curves.
+        turn_sigma_per_mm : ndarray, shape (2,)
+            Of yaw and tilt, rad/mm.
+        frame_time_s : ndarray, shape (n,)
+        """
+        n = len(path)
+        step = np.concatenate([[0.0], (path[:-1].inv() * path[1:]).translation[:, Z]])
+        knots = np.linspace(0, n - 1, int(np.clip((n - 1) // FRAMES_PER_KNOT, 1, MOST_KNOTS)) + 1).astype(int)
+        interval = np.searchsorted(knots, np.arange(1, n), "left") - 1
+        length = np.maximum(np.abs(step[1:]), LEAST_STEP_MM)
+        travel = np.bincount(interval, length)
+        basis = np.zeros((n, 6, knots.size))
+        basis[np.arange(1, n), :, interval + 1] = (length / travel[interval])[:, None]
+        basis[:, :5, 0] = step[:, None]
+        yaw, tilt = turn_sigma_per_mm
+        x, y = SIDEWAYS + np.multiply(SIDEWAYS_BY_SHARE, share)
+        change = max(own_scale_sigma, LEAST_SCALE_CHANGE * scale_sigma)
+        density = SCALE_CHANGE_MM * np.square([x, y, change, 0.0, 0.0, 0.0])
+        density[3:5] = TURN_CHANGE_MM * np.square([tilt, yaw])
+        sigma = np.ones((6, knots.size))
+        sigma[:5, 0] = x, y, scale_sigma, tilt, yaw
+        scatter = np.square(SHARED * (1.0 + STRUCTURE * share))[:, None] * _knot_variances(edges, knots, n)
+        sigma[:, 1:] = np.sqrt(scatter + density[:, None] * travel)
+        sigma[3:5, 1:] = np.hypot(sigma[3:5, 1:], HAND_TURN_RAD * np.sqrt(np.diff(frame_time_s[knots])))
+        return cls(CorrectedChain.of(path, AXES, basis), sigma, step)
+
+    @property
+    def stiff(self) -> ImagePath:
+        """The path whose places are corrected by rates alone."""
+        sigma = self.sigma.copy()
+        sigma[:3, 1:] = HELD_MM
+        return replace(self, sigma=sigma)
+
+    def prior(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Coefficients over their deviations, and derivatives; of the scale's rate the logarithm counts."""
+        sigma, value, scale = self.sigma.ravel(), coefficients.copy(), Z * self.sigma.shape[1]
+        slope = 1.0 / sigma
+        value[scale] = np.log1p(coefficients[scale])
+        slope[scale] /= 1.0 + coefficients[scale]
+        return value / sigma, np.diag(slope)
+
+    @property
+    def outward(self) -> FloatArray:
+        """Sign of each frame's part in the way to the farthest frame and back, shape (n,)."""
+        return np.where(np.arange(self.step_mm.size) <= np.argmax(np.abs(np.cumsum(self.step_mm))), 1.0, -1.0)
+
+    def mean_rates(self) -> FloatArray:
+        """Corrections of z, tilt and yaw per mm, there and back, by coefficient, shape (3, c)."""
+        rows = np.zeros((3, *self.sigma.shape))
+        for row, axis in enumerate((2, 3, 4)):
+            rows[row, axis] = self.outward @ self.chain.basis[:, axis] / (self.outward @ self.step_mm)
+        return rows.reshape(3, -1)
+
+    def misfit(self, coefficients: FloatArray, evidence: ScaleEvidence) -> tuple[FloatArray, FloatArray]:
+        """Residuals, of unit variance, of the mean scale and turns as a crossing sweep has them."""
+        rows = self.mean_rates()
+        mean = rows @ coefficients
+        size, axes = np.linalg.eigh(evidence.information)
+        root = np.sqrt(np.maximum(size, 0.0))[:, None] * axes.T
+        error = np.array([np.log1p(mean[0]), *mean[1:] / (1.0 + mean[0])]) - evidence.values
+        return root @ error, root @ rows / (1.0 + mean[0])
+
+
+def _knot_variances(edges: RelativePoses, knots: IntArray, frames: int) -> FloatArray:
+    """Variances of motion from knot to knot, each component by itself and pairs independent, shape (6, k)."""
+    every = np.arange(frames)
+    ends = np.concatenate([edges.first, every[:-1], edges.second, every[1:]])
+    size = ends.size // 2
+    sign, rows = np.repeat([-1.0, 1.0], size), np.tile(np.arange(size), 2)
+    difference = sparse.csr_matrix((sign, (rows, ends)), (size, frames))[:, 1:]
+    between = np.zeros((frames, knots.size - 1))
+    between[knots[1:], np.arange(knots.size - 1)] += 1.0
+    between[knots[:-1], np.arange(knots.size - 1)] -= 1.0
+    variances = []
+    for axis in range(6):
+        joined = 1.0 / edges.covariance[:, axis, axis]
+        information = np.concatenate([joined, np.full(frames - 1, UNJOINED[axis] ** -2)])
+        factor = splu((difference.T @ sparse.diags(information) @ difference).tocsc())
+        variances.append((between[1:] * factor.solve(between[1:])).sum(axis=0))
+    return np.array(variances)

@@ -1,0 +1,275 @@
+"""Readings of one sensor against the images' path: residuals, derivatives, and the sensor's own unknowns.
+
+A reading of orientation or pose at time t is, but for its jitter,
+
+    world * wander(t) * path(t + late) * (centre from sensor) * mounting
+
+with a tracker's places stretched by its millimetres. The unknowns are small and kept in one vector: turn and
+shift of the world, turn and shift of the mounting, clock, log of the millimetres, and an orientation sensor's
+wandering error at knots in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.geometry import skew
+from speckle3d.core.leastsquares import robust_sigma
+from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.correction.claims import correlated_readings
+from speckle3d.correction.image_path import ImagePath
+from speckle3d.correction.settings import FusedSettings
+
+FEWEST_READINGS = 10
+PER_PIECE = 512
+"""Readings whose equations are held in memory at a time."""
+WANDER_KNOTS_PER_TIME, MOST_WANDER_KNOTS = 10, 60
+"""Knots of the wandering error in the time in which it changes."""
+LEAST_JITTER = np.array([2e-5, 2e-3])
+"""Of a turn, rad, and a place, mm: the last digits of sensors; simulated ones may have no noise."""
+SLOW_SHAPES = 3
+"""Values that the path's rates take from each axis of the residuals: where it lies, its slope, its bend."""
+TICK_S = 1e-3
+ANYWHERE = 1e4
+"""Standard deviation of what is not known at all, mm and rad."""
+WORLD_TURN, WORLD_SHIFT, MOUNTING_TURN, MOUNTING_SHIFT = (slice(k, k + 3) for k in (0, 3, 6, 9))
+CLOCK, MILLIMETRES, RIGID = 12, 13, 14
+
+
+@dataclass(frozen=True)
+class SensorReadings:
+    """Readings of one sensor, and where its world lies.
+
+    Attributes
+    ----------
+    centre_from_sensor : RigidTransform
+        The mounting, to the image's centre.
+    world : RigidTransform
+        Sensor's world from the path's, to begin with.
+    measured : RigidTransform, length m
+    time_s : ndarray, shape (m,)
+        On the images' clock.
+    jitter : ndarray, shape (2,)
+        Standard deviation of a turn, rad, and of a place, mm, about each axis.
+    """
+
+    name: str
+    places: bool
+    centre_from_sensor: RigidTransform
+    world: RigidTransform
+    measured: RigidTransform
+    time_s: FloatArray
+    frame_time_s: FloatArray
+    settings: FusedSettings
+    jitter: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        sensor: OrientationSensor | Tracker | None,
+        path: FloatArray,
+        centre_mm: FloatArray,
+        frame_time_s: FloatArray,
+        settings: FusedSettings,
+    ) -> SensorReadings | None:
+        """Readings over the frames; None without a sensor, a mounting, or readings enough.
+
+        Parameters
+        ----------
+        path : ndarray, shape (n, 4, 4)
+            Of the image's centre.
+        """
+        if sensor is None or sensor.sensor_from_image is None:
+            return None
+        time_s = sensor.readings.time_s + sensor.time_offset_s
+        inside = np.flatnonzero((time_s >= frame_time_s[0]) & (time_s <= frame_time_s[-1]))
+        if inside.size < FEWEST_READINGS:
+            return None
+        measured, mounting = (
+            _rigid(sensor.readings.world_from_sensor[inside]),
+            _rigid(sensor.sensor_from_image),
+        )
+        places = isinstance(sensor, Tracker)
+        to_centre = RigidTransform.from_translation(-centre_mm if places else np.zeros(3))
+        readings = cls(
+            sensor.label,
+            places,
+            to_centre * mounting.inv(),
+            RigidTransform.identity(),
+            measured,
+            time_s[inside],
+            frame_time_s,
+            settings,
+            np.ones(2),
+        )
+        readings = replace(readings, world=readings._registered(path))
+        second = [
+            (values[2:] - 2.0 * values[1:-1] + values[:-2]) / np.sqrt(6.0)
+            for values in readings.errors(path, np.zeros(readings.size))
+        ]
+        jitter = [robust_sigma(values, least) for values, least in zip(second, LEAST_JITTER, strict=True)]
+        return replace(readings, jitter=np.array(jitter))
+
+    @property
+    def knots_s(self) -> FloatArray:
+        """Times at which the wandering error is unknown; none of a tracker."""
+        if self.places:
+            return np.zeros(0)
+        wanted = WANDER_KNOTS_PER_TIME * np.ptp(self.time_s) / self.settings.wander_s
+        count = int(np.clip(np.ceil(wanted), 2, MOST_WANDER_KNOTS))
+        return np.linspace(self.time_s[0], self.time_s[-1], count)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return RIGID + 3 * self.knots_s.size
+
+    def _registered(self, path: FloatArray) -> RigidTransform:
+        """The world that most readings agree on."""
+        mounted = self._expected(path, np.zeros(self.size))
+        turns = self.measured.rotation * mounted.rotation.inv()
+        turn = turns[int(np.argmin((turns.mean().inv() * turns).magnitude()))]
+        place = np.median(self.measured.translation - turn.apply(mounted.translation), axis=0)
+        return RigidTransform.from_components(place, turn)
+
+    def travel_ratio(self, path: FloatArray) -> float:
+        """How many times as far as the images the sensor travels, along the path that both have."""
+        mounted = self._expected(path, np.zeros(self.size)) * self.centre_from_sensor.inv()
+        images, measured = (
+            each.translation - each.translation.mean(axis=0)
+            for each in (mounted, self.measured * self.centre_from_sensor.inv())
+        )
+        return float((images * measured).sum() / max((images**2).sum(), LEAST_JITTER[1] ** 2))
+
+    def world_of(self, unknowns: FloatArray) -> RigidTransform:
+        """Sensor's world from the path's; it turns about the middle of the readings."""
+        pivot = RigidTransform.from_translation(self.measured.translation.mean(axis=0))
+        turn = RigidTransform.from_rotation(Rotation.from_rotvec(unknowns[WORLD_TURN]))
+        shift = RigidTransform.from_translation(unknowns[WORLD_SHIFT])
+        return shift * pivot * turn * pivot.inv() * self.world
+
+    def _frames(self, unknowns: FloatArray) -> tuple[IntArray, FloatArray]:
+        """The frame before each reading, and the reading's share of the time to the next."""
+        time_s, frames = self.time_s + unknowns[CLOCK], self.frame_time_s
+        before = np.clip(np.searchsorted(frames, time_s, "right") - 1, 0, frames.size - 2)
+        return before, (time_s - frames[before]) / np.diff(frames)[before]
+
+    def _expected(self, path: FloatArray, unknowns: FloatArray) -> RigidTransform:
+        """What would be read but for wander and wrong millimetres."""
+        before, share = self._frames(unknowns)
+        poses = RigidTransform.from_matrix(path)
+        step = (poses[:-1].inv() * poses[1:]).as_exp_coords()[before]
+        between = poses[before] * RigidTransform.from_exp_coords(step * share[:, None])
+        turn = Rotation.from_rotvec(unknowns[MOUNTING_TURN])
+        mounting = RigidTransform.from_components(unknowns[MOUNTING_SHIFT], turn)
+        return self.world_of(unknowns) * between * self.centre_from_sensor * mounting
+
+    def _hats(self) -> FloatArray:
+        """Weights of the wander's knots at each reading, shape (m, k)."""
+        knots = self.knots_s
+        rows = [np.interp(self.time_s, knots, row) for row in np.eye(knots.size)]
+        return np.stack(rows, axis=1) if rows else np.zeros((self.time_s.size, 0))
+
+    def errors(self, path: FloatArray, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Expected less measured turns, rad, and places, mm, along the world's axes, shape (m, 3) each."""
+        expected = self._expected(path, unknowns)
+        turn = (expected.rotation * self.measured.rotation.inv()).as_rotvec()
+        if not self.places:
+            return turn + self._hats() @ unknowns[RIGID:].reshape(-1, 3), np.zeros_like(turn)
+        place = expected.translation
+        stretched = place + unknowns[MILLIMETRES] * (place - place.mean(axis=0))
+        return turn, stretched - self.measured.translation
+
+    def equations(
+        self, path: ImagePath, coefficients: FloatArray, unknowns: FloatArray
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+        """Residuals over their jitter, shape (k, 3), and derivatives, shape (k, 3, columns), in pieces.
+
+        The columns are the path's coefficients, then the sensor's unknowns. A turn, or a place, is a row.
+        """
+        poses = path.chain.poses(coefficients)
+        errors = self.errors(poses, unknowns)
+        tick = np.zeros(self.size)
+        tick[CLOCK] = TICK_S
+        expected, later = self._expected(poses, unknowns), self._expected(poses, unknowns + tick)
+        ahead = (
+            (later.rotation * expected.rotation.inv()).as_rotvec() / TICK_S,
+            (later.translation - expected.translation) / TICK_S,
+        )
+        twists = path.chain.twists(coefficients, poses)
+        for first in range(0, self.time_s.size, PER_PIECE):
+            rows = slice(first, first + PER_PIECE)
+            slopes = self._slopes(rows, twists, expected, unknowns, ahead)
+            for kind in range(1 + self.places):
+                yield errors[kind][rows] / self.jitter[kind], slopes[kind] / self.jitter[kind]
+
+    def _slopes(
+        self,
+        rows: slice,
+        twists: tuple[FloatArray, FloatArray],
+        expected: RigidTransform,
+        unknowns: FloatArray,
+        ahead: tuple[FloatArray, FloatArray],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of some readings' turns and places."""
+        before, share = (values[rows, None, None] for values in self._frames(unknowns))
+        at = before[:, 0, 0]
+        turn, shift = (part[at] * (1.0 - share) + part[at + 1] * share for part in twists)
+        world, axes = self.world_of(unknowns), expected[rows].rotation.as_matrix()
+        to_world, place, c = world.rotation.as_matrix(), expected.translation, turn.shape[-1]
+        turns, places = np.zeros((2, len(at), 3, c + self.size))
+        own = turns[:, :, c:]
+        turns[:, :, :c] = to_world @ turn
+        own[:, :, WORLD_TURN] = np.eye(3)
+        own[:, :, MOUNTING_TURN] = axes
+        own[:, :, CLOCK] = ahead[0][rows]
+        own[:, :, RIGID:] = np.einsum("mk,ij->mikj", self._hats()[rows], np.eye(3)).reshape(len(at), 3, -1)
+        if self.places:
+            on_path = (world.inv() * expected[rows]).translation
+            own = places[:, :, c:]
+            places[:, :, :c] = to_world @ (shift - skew(on_path) @ turn)
+            own[:, :, WORLD_TURN] = -skew(place[rows] - self.measured.translation.mean(axis=0))
+            own[:, :, WORLD_SHIFT] = np.eye(3)
+            own[:, :, MOUNTING_SHIFT] = axes
+            own[:, :, CLOCK] = ahead[1][rows]
+            own[:, :, MILLIMETRES] = place[rows] - place.mean(axis=0)
+        return turns, places
+
+    def prior(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals of what is known of mounting, clock, millimetres and wander, and their derivatives."""
+        s = self.settings
+        mounting = [*[s.mounting_sigma_rad] * 3, *[s.mounting_sigma_mm] * 3]
+        rigid = 1.0 / np.array([*[ANYWHERE] * 6, *mounting, s.clock_sigma_s, s.tracker_scale_sigma])
+        k = self.knots_s.size
+        matrix = np.zeros((self.size, self.size))
+        matrix[range(RIGID), range(RIGID)] = rigid
+        if k:
+            size = np.array([s.inclination_sigma_rad, s.inclination_sigma_rad, s.heading_sigma_rad])
+            kept = float(np.exp(-(self.knots_s[1] - self.knots_s[0]) / s.wander_s))
+            change = np.eye(k) - kept * np.eye(k, k=-1)
+            change[1:] /= np.sqrt(1.0 - kept**2)
+            matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / size))
+        return matrix @ unknowns, matrix
+
+    def sized(self, path: FloatArray, unknowns: FloatArray) -> SensorReadings:
+        """The readings with the jitter that is left of them along a path.
+
+        Parameters
+        ----------
+        path : ndarray, shape (n, 4, 4)
+            Too stiff to follow a sensor that wanders.
+        """
+        jitter = [
+            max(robust_sigma(error), least) * np.sqrt(correlated_readings(error, SLOW_SHAPES))
+            for error, least in zip(self.errors(path, unknowns), self.jitter, strict=True)
+        ]
+        return replace(self, jitter=np.array(jitter))
+
+
+def _rigid(samples: RigidTransform | Rotation) -> RigidTransform:
+    return RigidTransform.from_rotation(samples) if isinstance(samples, Rotation) else samples

@@ -1,0 +1,150 @@
+"""An orientation sensor against its own gyroscope and accelerometer, in each convention possibly mistaken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.sweep import OrientationSensor
+
+TURN_S = 0.3
+"""A hand's wobble turns round within this time; over longer ones a gyroscope's bias counts."""
+FEWEST_READINGS = 20
+LEAST_TURN_DEG, SCALE_ERROR = 0.1, 0.05
+"""Noise of a turn over `TURN_S`, and the share of it by which gyroscopes and readings honestly differ."""
+LEAST_GAIN = 4.0
+"""Logarithm of the likelihood by which a convention must explain the gyroscope better: good simulated sensors
+gain up to 0.1, faulty ones from 5."""
+MOST_BIAS_DEG_S = 3.0
+"""Biases of gyroscopes in orientation sensors are below 1 degree/s once they have stood still."""
+TILTED_DEG, UPRIGHT_DEG = 25.0, 10.0
+"""Angle between gravity and the world's z that contradicts a sensor, and that a convention may leave."""
+MIRRORS = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0), "z": (1.0, 1.0, -1.0)}
+
+
+def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:
+    """Readings as they would be if a convention had been mistaken, and its name."""
+    xyzw = turned.as_quat()
+    yield "quaternions stored xyzw for wxyz", Rotation.from_quat(xyzw[:, [3, 0, 1, 2]])
+    yield "quaternions wxyz taken for xyzw", Rotation.from_quat(xyzw[:, [1, 2, 3, 0]])
+    yield "quaternions inverted", turned.inv()
+    for axis, signs in MIRRORS.items():
+        flip = np.diag(signs)
+        yield f"handedness: {axis} mirrored", Rotation.from_matrix(flip @ turned.as_matrix() @ flip)
+
+
+@dataclass(frozen=True)
+class GyroscopeTurns:
+    """Turns over `TURN_S` by a sensor's gyroscope, from some readings to others.
+
+    Attributes
+    ----------
+    lag : int
+        Readings from one end to the other.
+    degrees : ndarray, shape (m - lag, 3)
+    """
+
+    lag: int
+    seconds: float
+    degrees: FloatArray
+
+    @classmethod
+    def of(cls, sensor: OrientationSensor) -> GyroscopeTurns | None:
+        """None without a gyroscope, or with too few readings."""
+        rate, time_s = sensor.gyroscope_rad_s, sensor.readings.time_s
+        if rate is None or len(time_s) < FEWEST_READINGS:
+            return None
+        pause = np.diff(time_s)
+        lag = max(1, round(TURN_S / float(np.median(pause))))
+        if len(time_s) <= 2 * lag:
+            return None
+        angle = np.cumsum((rate[1:] + rate[:-1]) / 2 * pause[:, None], axis=0)
+        angle = np.concatenate([np.zeros((1, 3)), angle])
+        return cls(lag, lag * float(np.median(pause)), np.rad2deg(angle[lag:] - angle[:-lag]))
+
+    def difference(self, turned: Rotation) -> FloatArray:
+        """The gyroscope's turns less the readings', degrees, shape (m - lag, 3)."""
+        return np.asarray(
+            self.degrees - (turned[: -self.lag].inv() * turned[self.lag :]).as_rotvec(degrees=True)
+        )
+
+    def misfit(self, difference: FloatArray) -> float:
+        """Negative log likelihood of a difference, but for a bias; overlapping turns count once."""
+        noise = LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
+        return float(len(self.degrees) / self.lag * np.log(_spread(difference) ** 2 + noise**2).sum())
+
+    def gain(self, turned: Rotation, other: Rotation | None = None) -> float:
+        """Log likelihood of `other` readings, or of none that turn, over that of `turned`."""
+        against = self.degrees if other is None else self.difference(other)
+        return self.misfit(self.difference(turned)) - self.misfit(against)
+
+    def gain_reversed(self, turned: Rotation) -> float:
+        """Log likelihood of the readings, were the gyroscope of the other sign, over that as they are."""
+        difference = self.difference(turned)
+        return self.misfit(difference) - self.misfit(difference - 2.0 * self.degrees)
+
+    def bias_deg_s(self, turned: Rotation) -> float:
+        """Rate by which the gyroscope turns on the whole and the readings do not."""
+        return float(np.linalg.norm(np.median(self.difference(turned), axis=0))) / self.seconds
+
+
+def _spread(values: FloatArray) -> FloatArray:
+    """Standard deviation by column, from the median distance to the median."""
+    return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
+
+
+def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
+    """At most one: the convention in which readings turn as the gyroscope, or that they do not."""
+    turns, readings = GyroscopeTurns.of(sensor), sensor.readings.world_from_sensor
+    if turns is None:
+        return
+    upright = [
+        (turns.gain(readings, other), name)
+        for name, other in conventions(readings)
+        if not _gravity_from_vertical(sensor, other) > UPRIGHT_DEG
+    ]
+    gain, name = max(upright, default=(0.0, ""))
+    still, bias = turns.gain(readings), turns.bias_deg_s(readings)
+    if gain > max(LEAST_GAIN, turns.gain_reversed(readings)):
+        evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
+        yield Doubt(sensor.label, name, evidence, True)
+    elif still > LEAST_GAIN:
+        evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
+        yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
+    elif bias > MOST_BIAS_DEG_S:
+        evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"
+        yield Doubt(sensor.label, "heading drift, or a gyroscope's bias", evidence, False)
+
+
+def turns_confirmed(sensor: OrientationSensor) -> bool:
+    """Whether the gyroscope turns enough to tell, and the readings with it."""
+    turns = GyroscopeTurns.of(sensor)
+    return turns is not None and turns.gain(sensor.readings.world_from_sensor) < -LEAST_GAIN
+
+
+def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:
+    """At most one: gravity is not along the world's z; refuted if a convention brings it there."""
+    readings = sensor.readings.world_from_sensor
+    degrees = _gravity_from_vertical(sensor, readings)
+    if not degrees > TILTED_DEG:
+        return
+    mended = [
+        name for name, other in conventions(readings) if _gravity_from_vertical(sensor, other) < UPRIGHT_DEG
+    ]
+    suspect = (mended or ["a world whose z is not vertical, or an accelerometer on other axes"])[0]
+    evidence = f"expected gravity along the world's z, got it {degrees:.0f} degrees off"
+    yield Doubt(sensor.label, suspect, evidence, bool(mended))
+
+
+def _gravity_from_vertical(sensor: OrientationSensor, readings: Rotation) -> float:
+    """Angle between gravity, as readings turn it, and the world's z, degrees; NaN if not measured."""
+    if sensor.accelerometer_m_s2 is None:
+        return float("nan")
+    up = np.median(readings.apply(sensor.accelerometer_m_s2), axis=0)
+    size = float(np.linalg.norm(up))
+    return float(np.degrees(np.arccos(min(1.0, abs(float(up[2])) / size)))) if size > 0 else float("nan")

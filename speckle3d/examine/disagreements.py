@@ -1,0 +1,156 @@
+"""Images and sensors that say different things: both numbers, side by side. Either may be wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.geometry import relative_poses
+from speckle3d.core.leastsquares import robust_sigma
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+
+JOINT_CLAIMS = 3.0
+"""Joint standard deviations beyond which two numbers disagree (DESIGN, Disagreement)."""
+UNITS = {1000.0: "metres", 100.0: "decimetres", 25.4: "inches", 10.0: "centimetres"}
+UNIT_FACTOR = 1.5
+"""Factor within which a path must be such a multiple: units are farther apart, paths by images nearer."""
+FEWEST_FRAMES = 10
+SMOOTH_FRAMES = 9
+"""Frames of which the running median is taken, so that jitter is not taken for motion."""
+LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.013
+"""Errors of place and roll that sensors have beside their jitter: of a mounting off by 1 mm or a third
+of a degree while the probe turns by 5 degrees, and of a heading."""
+SIDEWAYS = 0.05
+"""Motion along x or y that images see for each mm of travel where structure of tissue runs across."""
+
+
+def disagreements(
+    sweep: Sweep, image: RigidTransform, covariance: FloatArray, length_sigma: float
+) -> tuple[Doubt, ...]:
+    """Compare what the images and each sensor say of length, of motion in the image's plane, and of roll.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        n frames.
+    image : RigidTransform, length n
+        Image-based poses, of the sign that was settled.
+    covariance : ndarray, shape (n, 6, 6)
+        Claimed for them.
+    length_sigma : float
+        Relative standard deviation of their length.
+    """
+    found: list[Doubt] = []
+    for sensor in (sweep.tracker, sweep.orientation):
+        if sensor is None or sensor.sensor_from_image is None:
+            continue
+        covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
+        if covered.size >= FEWEST_FRAMES:
+            found += _compared(sensor, sweep, image[covered], covariance[covered], covered, length_sigma)
+    return tuple(found)
+
+
+def _compared(
+    sensor: OrientationSensor | Tracker,
+    sweep: Sweep,
+    image: RigidTransform,
+    covariance: FloatArray,
+    covered: IntArray,
+    length_sigma: float,
+) -> Iterator[Doubt]:
+    centre, about = sweep.grid.centre_mm, f"images and {sensor.label}"
+    measured = sensor.world_from_image(sweep.frame_time_s[covered])
+    poses = measured if isinstance(measured, RigidTransform) else RigidTransform.from_rotation(measured)
+    by_images, by_sensor = _motion(image, centre), _motion(poses, centre)
+    travel = np.abs(by_images[:, 2])
+    noise = jitter_of(poses, centre)
+    unit = unit_of_length(image, sensor, poses) if isinstance(sensor, Tracker) else ""
+    for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"):
+        if axis < 3 and not isinstance(sensor, Tracker):
+            continue
+        own = np.hypot(np.sqrt(covariance[:, axis, axis]), SIDEWAYS * travel if axis < 2 else 0.0)
+        if axis == 2:
+            own = np.hypot(own, length_sigma * travel)
+        least = LEAST_SIGMA_MM if axis < 3 else LEAST_SIGMA_RAD
+        its = np.full_like(own, np.hypot(noise[int(axis > 2)] / np.sqrt(SMOOTH_FRAMES), least))
+        size = np.abs(by_images[:, axis] - by_sensor[:, axis]) / np.hypot(own, its)
+        worst = int(np.argmax(travel if axis == 2 else size))
+        if size[worst] > JOINT_CLAIMS or (unit and axis == 2):
+            factor, mm = (1.0, "mm") if axis < 3 else (float(np.degrees(1.0)), "degrees")
+            images, other = (
+                f"{factor * float(path[worst, axis]):.3g} +- {factor * float(sigma[worst]):.2g} {mm}"
+                for path, sigma in ((by_images, own), (by_sensor, its))
+            )
+            words = f"{name} {images} by the images, {other} by the {sensor.label}"
+            yield Doubt(about, unit and f"units: {unit} for millimetres", words, False)
+            return
+
+
+def _motion(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """(x, y, z, tilt, yaw, roll) summed over steps along each image's own axes, mm and rad, shape (n, 6).
+
+    So no slow error of tilt or yaw, which images see badly, passes for one of place. Smoothed.
+    """
+    steps = relative_poses(poses)
+    moved = np.hstack([steps.apply(centre_mm) - centre_mm, steps.rotation.as_rotvec()])
+    path = np.concatenate([np.zeros((1, 6)), np.cumsum(moved, axis=0)])
+    path = median_filter(path, (SMOOTH_FRAMES, 1), mode="mirror")
+    return np.asarray(path - path[0])
+
+
+def jitter_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """Standard deviation of the place of an image's centre, mm, and of its turn, rad, but for slow motion."""
+    turns = (poses.rotation.mean().inv() * poses.rotation).as_rotvec()
+    values = (poses.apply(centre_mm), turns)
+    second = ((each[2:] - 2.0 * each[1:-1] + each[:-2]) / np.sqrt(6.0) for each in values)
+    return np.array([max(robust_sigma(column) for column in each.T) for each in second])
+
+
+def apart(numbers: tuple[float, float], sigmas: tuple[float, float]) -> bool:
+    """Whether two numbers differ by more than their joint claims allow."""
+    return abs(numbers[0] - numbers[1]) > JOINT_CLAIMS * float(np.hypot(*sigmas))
+
+
+def unit_of_length(image: RigidTransform, tracker: Tracker, poses: RigidTransform) -> str:
+    """Name of the unit that a tracker's places are in, if its path is such a multiple of the images'; or "".
+
+    Parameters
+    ----------
+    image, poses : RigidTransform, length n
+        ``world_from_image`` by the images and by the tracker.
+    """
+    assert tracker.sensor_from_image is not None
+    images, measured = (
+        np.linalg.norm(path.translation - path.translation[0], axis=1)
+        for path in (image * tracker.sensor_from_image.inv(), poses * tracker.sensor_from_image.inv())
+    )
+    ratio = float((images * measured).sum() / max((images**2).sum(), LEAST_SIGMA_MM**2))
+    for factor, name in UNITS.items():
+        for multiple, unit in (1.0 / factor, name), (factor, f"1/{factor:g} of a millimetre"):
+            if multiple / UNIT_FACTOR < ratio < multiple * UNIT_FACTOR:
+                return unit
+    return ""
+
+
+def differing_lengths(lengths: Mapping[str, tuple[float, float]]) -> tuple[Doubt, ...]:
+    """Modes whose lengths differ by more than three joint claims: among these there is no best.
+
+    Parameters
+    ----------
+    lengths : dict of str to (float, float)
+        Length of each mode and its standard deviation, mm.
+    """
+    found = []
+    for (one, (first, own)), (other, (second, its)) in combinations(lengths.items(), 2):
+        if apart((first, second), (own, its)):
+            words = (
+                f"length {first:.2f} +- {own:.2f} mm in mode {one}, {second:.2f} +- {its:.2f} mm in {other}"
+            )
+            found.append(Doubt(f"modes {one} and {other}", "", words, False))
+    return tuple(found)

@@ -1,0 +1,298 @@
+"""Whether a sweep's images can be what they are taken for: one probe that moves past what it images.
+
+Each test asks for what no honest sweep shows, however noisy, and needs no truth: frames far apart that hold
+the same echoes in the same place, frames that resemble the one before less than the one before that, pairs
+that are equally alike and not equally far apart, and a length that the images leave open.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import isotonic_regression
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.sweep import Sweep
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.standing import standing_share
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.motion.distances import LEAST_CORRELATION
+from speckle3d.motion.signs import SignedPairs
+from speckle3d.motion.trajectory import HELD_MM
+
+IMAGES = "images"
+"""What all doubts of this module are about."""
+
+OPEN_SHARE, LOOSE_SHARE = 0.5, 0.25
+"""Standard error over length from which a length is refused and flagged. Good sweeps claim up to 0.06, those
+with noise of half the signal's power 0.15."""
+
+MOST_FRAMES = 10
+"""Frames in which standing echoes are looked for: 45 pairs, held at once."""
+ECHO_LIMITS = (0.01, 0.1), (0.15, 1 / 2)
+"""From which clutter is flagged and refused: share of the median patch's power, and share of patches lost.
+Simulated phantoms read 4 % long at 0.006, 8 % at 0.025, six standard errors wrong at 0.09; sweeps without
+clutter have up to 0.005. A quarter of the patches lost is made good by the adaptation to coherent echoes,
+half not."""
+INTENSITY_LIMITS = (0.1, 1 / 3), (0.25, 2 / 3)
+"""The same for images without phase, where layers along the sweep count, too: bone and spine have 0.01 to
+0.05 and lose 0.14 to 0.21 of their patches. A quarter of the intensity's variation is half of the echo's
+power."""
+STANDING_SIGMA = 5.0
+"""Standard errors that a share must be above zero."""
+PATCH_LOST = 0.2
+"""Share from which a patch is lost to what stands still; without, patches scatter by 0.02."""
+
+OUT_OF_TURN = 0.1
+"""By how much a frame must be less like the last one than like the one before that: ten times what the median
+over fifty patches scatters by."""
+MOST_OUT_OF_TURN = 0.6
+"""Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
+MOST_STRANGERS = 0.3
+"""Share of frames like neither of the last two, but like an earlier one."""
+
+ALIKE = (0.2, 0.9)
+"""Median correlations between which distances are compared: more hides in noise, less in what stays."""
+WINDOW = 8
+"""Frames over which distances are compared with what pairs as alike have elsewhere: a fold of the path takes
+no more. A quarter of a window on comes the next."""
+LISTED = 4
+"""Cuts that are named."""
+LEAST_COMPARED = 6
+"""Pairs that a window needs."""
+FOLD_TOLD, FOLD_PATCHES = 8, 24
+"""Patches from which a fold is told, and from which it is refused: a median over fewer scatters too much."""
+FOLD_FLAGGED, FOLD_REFUSED = 0.25, 0.40
+"""Mean departure over mean distance in the worst window. Of 64 small sweeps of 6 to 21 patches, those right
+to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, and three that are a quarter to
+a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
+
+
+def examine_standing(
+    sweep: Sweep,
+    matcher: FrameMatcher,
+    curves: DecorrelationCurves,
+    position_mm: FloatArray,
+    usable: BoolArray,
+) -> tuple[Doubt, ...]:
+    """Look for echoes that are the same in frames beyond the reach of speckle.
+
+    Raises
+    ------
+    InsufficientDataError
+        If so much stands still that distances mean nothing.
+    """
+    frames = far_apart(position_mm, usable, curves)
+    if len(frames) < 2:
+        return ()
+    share = standing_share(sweep, matcher, frames.tolist())
+    found = standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
+    return unrefuted([found], sweep.name, InsufficientDataError)
+
+
+def examine_path(
+    sweep: Sweep,
+    poses: RigidTransform,
+    covariance: FloatArray,
+    table: CorrelationTable,
+    pairs: SignedPairs,
+    patch_centre_mm: FloatArray,
+    reach_mm: float,
+    usable: BoolArray,
+) -> tuple[Doubt, ...]:
+    """Ask whether a length is open, a sweep in pieces, or a path contradicted by pairs.
+
+    Raises
+    ------
+    InsufficientDataError
+        If the images do not determine the length, or cannot be those of one probe that moves.
+    """
+    z_mm, sigma_mm = poses.apply(sweep.grid.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2])
+    found = (
+        undetermined(z_mm, sigma_mm, reach_mm),
+        severed(pairs.first, pairs.second, usable),
+        folded(table, poses, patch_centre_mm, usable),
+    )
+    return unrefuted(found, sweep.name, InsufficientDataError)
+
+
+def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:
+    """Doubt a length whose standard error is a large part of itself and of what the curves measure.
+
+    Parameters
+    ----------
+    position_mm, sigma_mm : ndarray, shape (n,)
+        Elevational position of every frame, and its standard deviation against the first.
+    reach_mm : float
+        Largest distance in the curves: a probe at rest is known to much less.
+    """
+    length, sigma = float(np.ptp(position_mm)), float(np.max(sigma_mm))
+    allowed = max(OPEN_SHARE * length, reach_mm)
+    loose = max(LOOSE_SHARE * length, reach_mm / 2)
+    if sigma <= loose:
+        return None
+    limit = allowed if sigma > allowed else loose
+    evidence = (
+        f"expected a length known to {limit:.3g} mm, got {length:.3g} mm with a standard error of "
+        f"{sigma:.3g} mm: the correlations do not determine it"
+    )
+    return Doubt(IMAGES, "too little speckle in common", evidence, sigma > allowed)
+
+
+def interleaved(table: CorrelationTable, frames: int, least_correlation: float) -> Doubt | None:
+    """Doubt a sweep whose frames resemble earlier ones more than the last: not recorded in this order."""
+    last, before, best = (np.full(frames, np.nan) for _ in range(3))
+    lag = table.second - table.first
+    last[table.second[lag == 1]] = table.median[lag == 1]
+    before[table.second[lag == 2]] = table.median[lag == 2]
+    best[table.second] = -np.inf
+    np.maximum.at(best, table.second, table.median)
+    known = np.isfinite(last) & np.isfinite(before) & (best >= least_correlation)
+    if known.sum() < 4:
+        return None
+    swapped = float(np.mean(before[known] > last[known] + OUT_OF_TURN))
+    strangers = float(np.mean(np.maximum(last, before)[known] < least_correlation))
+    if swapped <= MOST_OUT_OF_TURN and strangers <= MOST_STRANGERS:
+        return None
+    share, what = max((swapped, "the one before the last"), (strangers, "frames before the last two"))
+    evidence = (
+        f"expected frames most like the one just before, got {share:.0%} of them ({int(known.sum())}) more "
+        f"like {what}"
+    )
+    return Doubt(IMAGES, "sweeps interleaved, or frames out of order", evidence, True)
+
+
+def far_apart(position_mm: FloatArray, usable: BoolArray, curves: DecorrelationCurves) -> IntArray:
+    """Frames of which each lies beyond the reach of speckle from the one before, `MOST_FRAMES` at most.
+
+    Parameters
+    ----------
+    position_mm : ndarray, shape (n,)
+    usable : ndarray of bool, shape (n,)
+    """
+    left = np.median(curves.correlation, axis=0)
+    apart_mm = float(curves.distance_mm[np.argmax(left <= max(LEAST_CORRELATION, left[-1]))])
+    chosen: list[int] = []
+    for frame in np.flatnonzero(usable).tolist():
+        if not chosen or abs(position_mm[frame] - position_mm[chosen[-1]]) >= apart_mm:
+            chosen.append(frame)
+    some = np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_FRAMES))
+    return np.array([chosen[round(float(k))] for k in some], dtype=np.int64)
+
+
+def standing(share: FloatArray, frames: int, cells: float, of_echo: bool = True) -> Doubt | None:
+    """Doubt images that hold the same echoes in the same place however far apart they are.
+
+    Parameters
+    ----------
+    share : ndarray, shape (p,)
+        Of each patch's power, from `speckle3d.matching.standing.standing_share`.
+    frames : int
+        From which it was found.
+    cells : float
+        Independent speckle cells in a patch.
+    of_echo : bool
+        Whether the images have phase.
+    """
+    known = share[np.isfinite(share)]
+    if not known.size or frames < 2:
+        return None
+    # Each pair's coherence scatters by one over the root of twice its cells; pairs that share a frame are
+    # nearly independent, and a median scatters by a quarter more than a mean.
+    chance = STANDING_SIGMA * 1.25 / np.sqrt(cells * frames * (frames - 1))
+    least = max(PATCH_LOST, chance)
+    median, lost = float(np.median(known)), float(np.mean(known > least))
+    chance *= 1.25 / np.sqrt(known.size)
+    flagged, refused = (
+        median > max(limit, chance) or lost > most
+        for limit, most in (ECHO_LIMITS if of_echo else INTENSITY_LIMITS)
+    )
+    if not flagged:
+        return None
+    evidence = (
+        f"expected nothing in common between {frames} frames beyond speckle's reach, got {median:.1%} of the "
+        f"echo's power the same at the same place in the median patch, and over {least:.0%} in "
+        f"{lost:.0%} of the patches"
+    )
+    return Doubt(IMAGES, "static clutter, or noise on a probe at rest", evidence, refused)
+
+
+def folded(
+    table: CorrelationTable, poses: RigidTransform, patch_centre_mm: FloatArray, usable: BoolArray
+) -> Doubt | None:
+    """Doubt a path on which pairs that are equally alike are not equally far apart.
+
+    Whatever noise and structure do to correlations, they fall as frames move apart. The distance that goes
+    with each correlation is found from the sweep itself, by isotonic regression; where the path takes a wrong
+    turn and folds back on itself, distances fall short of it.
+
+    Parameters
+    ----------
+    poses : RigidTransform, length n
+    patch_centre_mm : ndarray, shape (p, 2)
+        In the image.
+    usable : ndarray of bool, shape (n,)
+    """
+    low, high = ALIKE
+    rows = np.flatnonzero((table.median > low) & (table.median < high))
+    rows = rows[usable[table.first[rows]] & usable[table.second[rows]]]
+    rows = rows[np.argsort(-table.median[rows], kind="stable")]
+    if rows.size < LEAST_COMPARED or len(patch_centre_mm) < FOLD_TOLD:
+        return None
+    second = table.second[rows]
+    apart = _distance(poses[table.first[rows]].inv() * poses[second], patch_centre_mm)
+    expected = np.asarray(isotonic_regression(apart).x)
+    worst, at = 0.0, 0
+    for start in range(0, len(poses), WINDOW // 4):
+        inside = (second >= start) & (second < start + WINDOW)
+        if inside.sum() >= LEAST_COMPARED:
+            # Where the probe rests there is no distance to compare with.
+            typical = max(float(expected[inside].mean()), float(expected.mean()) / 4, 1e-9)
+            departure = float(np.abs(apart - expected)[inside].mean()) / typical
+            worst, at = max((worst, at), (departure, start))
+    if worst <= FOLD_FLAGGED:
+        return None
+    evidence = (
+        f"expected frames equally alike to be equally far apart, got distances {worst:.0%} off what the "
+        f"sweep's other pairs have, about frame {at + WINDOW // 2}"
+    )
+    refuted = worst > FOLD_REFUSED and len(patch_centre_mm) >= FOLD_PATCHES
+    where = (at, min(at + WINDOW, len(poses)) - 1)
+    return Doubt(IMAGES, "direction lost, noise or clutter", evidence, refuted, (where,))
+
+
+def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | None:
+    """Doubt a sweep in pieces: frames that no pair joins to any before them, though both sides are sound.
+
+    Parameters
+    ----------
+    first, second : ndarray of int, shape (e,)
+        Frames of the pairs that the trajectory was solved from.
+    usable : ndarray of bool, shape (n,)
+    """
+    spans = np.zeros(usable.size + 1, dtype=int)
+    np.add.at(spans, first + 1, 1)
+    np.add.at(spans, second + 1, -1)
+    open_before = np.flatnonzero(np.cumsum(spans)[:-1] == 0)
+    cuts = [k for k in open_before[open_before > 0].tolist() if usable[:k].any() and usable[k:].any()]
+    # Lost frames are open on both sides; one cut at each run of them.
+    cuts = [k for k in cuts if k - 1 not in cuts]
+    if not cuts:
+        return None
+    more = f" and {len(cuts) - LISTED} more" if len(cuts) > LISTED else ""
+    evidence = (
+        f"expected speckle that joins all frames, got none across frame {', '.join(map(str, cuts[:LISTED]))}"
+        f"{more}: what was travelled there is a guess within {HELD_MM:g} mm"
+    )
+    where = tuple((k, k) for k in cuts)
+    return Doubt(IMAGES, "too fast, lifted, or frames lost", evidence, False, where)
+
+
+def _distance(relative: RigidTransform, patch_centre_mm: FloatArray) -> FloatArray:
+    """Median elevational distance of the patches between the frames of each pair, shape (e,), mm."""
+    at = np.column_stack([patch_centre_mm, np.zeros(len(patch_centre_mm))])
+    matrix = relative.as_matrix()
+    return np.asarray(np.median(np.abs(matrix[:, 2, :3] @ at.T + matrix[:, 2, 3:]), axis=1))

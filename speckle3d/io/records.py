@@ -1,0 +1,201 @@
+"""Frozen dataclasses as groups of an HDF5 file, and files of them that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from types import NoneType, TracebackType
+from typing import Any, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
+
+import h5py
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import naming
+from speckle3d.core.files import PathLike
+from speckle3d.io.hdf5 import (
+    atomic_path,
+    has_member,
+    locate,
+    read_attribute,
+    read_checked,
+    read_text,
+    read_vector_attribute,
+    require_group,
+)
+from speckle3d.io.meanings import label
+
+_AHEAD_BYTES, _SPARE_BYTES = 16 * 2**20, 2**18
+"""Room on the disk that is taken before it is needed, and what HDF5 may need for its own after a write."""
+
+Record = TypeVar("Record")
+
+
+class Room:
+    """Room on the disk taken before HDF5 needs it, so that a full disk is an error before HDF5 meets it.
+
+    HDF5 cannot close a file whose last bytes it cannot write, and takes the interpreter down with it. Without
+    ``posix_fallocate``, as on Windows and macOS, nothing is taken.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._taken = path, 0
+        self._file = os.open(path, os.O_RDWR)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        os.close(self._file)
+        if kind is None:
+            self.trim(self._path)
+
+    @staticmethod
+    def trim(path: Path) -> None:
+        """Give back what a closed file did not need: HDF5 cuts off what lies behind its end."""
+        with h5py.File(path, "r+", locking=False):  # somebody may be reading it
+            pass
+
+    def require(self, file_bytes: int, more_bytes: int = 0) -> None:
+        """Take room for a file of a length and what is to be added; raises `OSError` if there is none."""
+        stop = file_bytes + more_bytes + _SPARE_BYTES
+        if stop > self._taken and hasattr(os, "posix_fallocate"):
+            stop += min(stop, _AHEAD_BYTES)
+            os.posix_fallocate(self._file, self._taken, stop - self._taken)
+            self._taken = stop
+
+
+class HDF5Writer:
+    """Write a file of the family in a block; it appears whole when the block ends, or not at all.
+
+    Attributes
+    ----------
+    file : h5py.File
+        Open within the block.
+    """
+
+    file: h5py.File
+
+    def __init__(self, path: PathLike, format_name: str, version: int = 1) -> None:
+        self.path, self._format = path, {"format": format_name, "version": version}
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            part = stack.enter_context(atomic_path(self.path))
+            self.room = stack.enter_context(Room(part))
+            self.file = stack.enter_context(h5py.File(part, "w", locking=False))
+            self.file.attrs.update(self._format)
+            self.room.require(0)
+            stack.push(self._finish_unless)
+            self._begin()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def put(self, group: h5py.Group, name: str, value: Any) -> None:
+        """Write a value under a name by its type, as the function `put`."""
+        put(group, name, value, self.room)
+
+    def put_fields(self, group: h5py.Group, record: object, skip: Sequence[str] = ()) -> None:
+        """Write each field of a dataclass by its name, but those to skip."""
+        for name, value in vars(record).items():
+            if name not in skip:
+                self.put(group, name, value)
+
+    def put_text(self, group: h5py.Group, name: str, text: str | Sequence[str]) -> None:
+        """Write a text, or a list of them, as a data set: it may be more than an attribute holds."""
+        plain = _unicode(text) if isinstance(text, str) else [_unicode(line) for line in text]
+        group.create_dataset(name, data=plain, dtype=h5py.string_dtype())
+
+    def _begin(self) -> None:
+        """Write what is known before the block."""
+
+    def _finish(self) -> None:
+        """Write what is known when the block has ended without an error."""
+
+    def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
+        if error is None:
+            self._finish()
+            label(self.file)
+
+
+def put(group: h5py.Group, name: str, value: Any, room: Room, **layout: Any) -> None:
+    """Write a value under a name by its type; `layout` is of a data set, as h5py has it.
+
+    Numbers, texts and tuples of numbers become attributes, arrays and rigid transforms data sets, rotations
+    a data set of quaternions with ``_wxyz`` behind its name, dataclasses and mappings groups. None is not
+    written.
+    """
+    if value is None:
+        return
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        inner = group.require_group(name)
+        for key, item in value.items():
+            put(inner, key, item, room)
+    elif isinstance(value, str):
+        group.attrs[name] = _unicode(value)
+    elif isinstance(value, int | float | tuple):
+        group.attrs[name] = value
+    elif isinstance(value, Rotation):
+        put(group, f"{name}_wxyz", value.as_quat(scalar_first=True), room)
+    else:
+        values = np.asarray(value.as_matrix() if isinstance(value, RigidTransform) else value)
+        room.require(group.file.id.get_filesize(), values.nbytes)
+        group.create_dataset(name, data=values, **layout)
+
+
+def _unicode(text: str) -> str:
+    """A text without the halves of letters by which Python writes paths that are no Unicode."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def read_record(group: h5py.Group, kind: type[Record], **values: Any) -> Record:
+    """Read a dataclass that `HDF5Writer.put_fields` wrote; older files may lack fields with a default.
+
+    Parameters
+    ----------
+    values : any
+        Fields that are not read, by name.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the field that is missing, or of another kind.
+    """
+    hints = get_type_hints(kind)
+    for field in fields(kind):  # type: ignore[arg-type]
+        if field.name in values:
+            continue
+        options = [part for part in get_args(hints[field.name]) if part is not NoneType]
+        is_optional = len(options) < len(get_args(hints[field.name]))
+        is_needed = field.default is MISSING and field.default_factory is MISSING and not is_optional
+        hint = options[0] if is_optional else hints[field.name]
+        if is_needed or has_member(group, field.name) or field.name in group.attrs:
+            values[field.name] = _read_value(group, field.name, hint)
+        elif is_optional and field.default is MISSING:
+            values[field.name] = None
+    with naming(locate(group)):
+        return kind(**values)
+
+
+def _read_value(group: h5py.Group, name: str, hint: Any) -> Any:
+    """Read an attribute, an array or a group by the type of the field that it is for."""
+    if is_dataclass(hint):
+        return read_record(require_group(group, name), hint)  # type: ignore[arg-type]
+    if hint in (int, float):
+        return hint(read_attribute(group, name))
+    origin, parts = get_origin(hint), get_args(hint)
+    if hint is str or origin is Literal:
+        return read_text(group, name)
+    if origin is tuple:
+        return tuple(read_vector_attribute(group, name, len(parts)).tolist())
+    return read_checked(group, name, None, get_args(parts[1])[0])

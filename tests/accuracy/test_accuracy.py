@@ -1,0 +1,56 @@
+"""Every mode, on small sweeps of every kind, is as accurate as `table.toml` has it and claims the same."""
+
+from pathlib import Path
+
+import pytest
+from accuracy_set import INDEPENDENT, KEPT, MOST_CLAIMS, AccuracySet, read_table, simulate_set
+from made_once import made_once
+
+ROOM = 1.5
+"""What a figure may grow by before it counts as worse."""
+LEAST_PERCENT, LEAST_DEG = 0.3, 0.1
+"""Errors so small are luck of the draw: a change that means nothing moves them by as much."""
+
+TABLE = read_table()
+CLAIMED = {row: values for row, values in TABLE.items() if "claim_percent" in values}
+every_row = pytest.mark.parametrize("row", TABLE)
+every_claim = pytest.mark.parametrize("row", CLAIMED)
+
+
+@pytest.fixture(scope="session")
+def accuracy_set(tmp_path_factory, shipped):
+    if KEPT:
+        return AccuracySet(Path(KEPT), shipped)
+    folder = made_once(tmp_path_factory, "accuracy", lambda folder: simulate_set(folder, shipped))
+    return AccuracySet(folder, shipped)
+
+
+@pytest.fixture
+def errors(accuracy_set, row):
+    case, mode = row.split(" | ")
+    if case.startswith("independent") and not INDEPENDENT.is_dir():
+        pytest.skip(f"needs sweeps of another physics in {INDEPENDENT}")
+    return accuracy_set.errors(case)[mode]
+
+
+@every_row
+def test_length_is_as_accurate_as_measured(row, errors):
+    assert abs(errors.length_percent) <= max(ROOM * abs(TABLE[row]["length_percent"]), LEAST_PERCENT)
+
+
+@every_row
+def test_tilt_is_as_accurate_as_measured(row, errors):
+    assert abs(errors.tilt_deg) <= max(ROOM * abs(TABLE[row]["tilt_deg"]), LEAST_DEG)
+
+
+@every_claim
+def test_claim_is_what_was_measured(row, errors):
+    assert 1 / ROOM <= errors.claim_percent / TABLE[row]["claim_percent"] <= ROOM
+
+
+@pytest.mark.parametrize("row", [row for row, values in TABLE.items() if "missed" not in values])
+def test_errors_are_within_goals_and_claims(row, errors):
+    goals = TABLE[row]
+    assert abs(errors.length_percent) <= goals.get("goal_percent", 100.0)
+    assert abs(errors.tilt_deg) <= goals.get("goal_deg", 90.0)
+    assert errors.claim_percent is None or errors.over_claim <= MOST_CLAIMS

@@ -1,0 +1,213 @@
+"""Break the package on purpose, one way at a time, and see which test notices.
+
+Run: ``python tests/benchmarks/mutants.py [NAME ...] [--all] [--keep FOLDER]``. A mutant changes what a public
+function takes or returns, in the process of the tests alone, so that no file is touched; the tests that it
+selects are run, or those of the README's command. Ends with 1 if a mutant survives or no longer applies.
+"""
+
+import argparse
+import importlib
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import wraps
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.core.errors import Speckle3DError
+
+ROOT = Path(__file__).resolve().parents[2]
+CHOSEN = "SPECKLE3D_MUTANT"
+NOT_APPLIED = 99
+"""How a run of tests ends in which a mutant's change itself failed."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A change of a function, and the tests that are to notice.
+
+    Attributes
+    ----------
+    function : str
+        Module and name.
+    change : callable
+        Called with the function, its arguments and those with names; returns what the mutant returns.
+    tests : str
+        Which rows of the accuracy set, or else which tests, as pytest's ``-k`` has it.
+    """
+
+    function: str
+    change: Callable
+    tests: str
+
+
+def unadapted(function, sweep, curves, config=None, **others):
+    from speckle3d.config import Config
+
+    config = config or Config()
+    off = config.coherence.model_copy(update={"adapt": False})
+    return function(sweep, curves, config.model_copy(update={"coherence": off}), **others)
+
+
+def bent(function, sweep, curves, *others, **named):
+    """Distances 8 % short at the skin, right at 20 mm, and long below: the curves of another lens."""
+    distance, factor = curves.distance_mm, 1.0 + 0.004 * (curves.depth_mm - 20.0)
+    rho = [np.interp(distance / f, distance, row) for f, row in zip(factor, curves.correlation, strict=True)]
+    return function(sweep, replace(curves, correlation=np.array(rho)), *others, **named)
+
+
+def claimed(change):
+    def changed(function, *arguments, **named):
+        tracked = function(*arguments, **named)
+        return replace(tracked, covariance=change(tracked))
+
+    return changed
+
+
+def without_curves(tracked):
+    """Covariance without what the curves' common error adds to the distance."""
+    covariance = tracked.covariance.copy()
+    z = tracked.image.apply(tracked.grid.centre_mm)[:, 2]
+    covariance[:, 2, 2] -= (tracked.curves_sigma * (z - z[0])) ** 2
+    return covariance
+
+
+def overcorrected(function, tracked, *arguments, **named):
+    """Steps that are turned the other way than the correction turned them."""
+    corrections = function(tracked, *arguments, **named)
+    found = tracked.image[:-1].inv() * tracked.image[1:]
+    changed = {}
+    for mode, each in corrections.items():
+        right = each.poses[:-1].inv() * each.poses[1:]
+        poses = [each.poses[0]]
+        for step in found * right.inv() * found:
+            poses.append(poses[-1] * step)
+        changed[mode] = replace(each, poses=RigidTransform.concatenate(poses))
+    return changed
+
+
+def late(function, *arguments, **named):
+    sweep = function(*arguments, **named)
+    sensors = {"tracker": sweep.tracker, "orientation": sweep.orientation}
+    moved = {k: v and replace(v, time_offset_s=v.time_offset_s + 0.05) for k, v in sensors.items()}
+    return replace(sweep, **moved)
+
+
+def shifted(function, *arguments, **named):
+    volume = function(*arguments, **named)
+    return replace(volume, voxels=np.roll(volume.voxels, 1, axis=2))
+
+
+def mislabelled(function, *arguments, **named):
+    labelled = function(*arguments, **named)
+    swapped = np.where(labelled.wire < 2, 1 - labelled.wire, labelled.wire)
+    return replace(labelled, wire=swapped)
+
+
+def enlarged(function, *arguments, **named):
+    solution = function(*arguments, **named)
+    return replace(solution, chain=replace(solution.chain, pixel_mm=1.03 * solution.chain.pixel_mm))
+
+
+def wrong_sign(function, *arguments, **named):
+    sign, source = function(*arguments, **named)
+    return -sign, source
+
+
+TRACK, DIRECTION = "speckle3d.pipeline:track", "speckle3d.motion.direction:settle_direction"
+MUTANTS = {
+    "tissue correction off": Mutant(TRACK, unadapted, "tilt and tissue and not independent"),
+    "straightening as it is": Mutant(TRACK, bent, "tilt or length"),
+    "claims halved": Mutant(TRACK, claimed(lambda tracked: tracked.covariance / 4.0), "claim"),
+    "claim without the curves' part": Mutant(TRACK, claimed(without_curves), "claim"),
+    "drift correction in the wrong sense": Mutant("speckle3d.corrections:correct", overcorrected, "tilt"),
+    "mirror not resolved": Mutant(DIRECTION, lambda *_, **__: (1, "assumed"), "length and phantom"),
+    "sign of the motion": Mutant(DIRECTION, wrong_sign, "length and phantom"),
+    "sensors' clock off by 50 ms": Mutant("speckle3d.io.load:load_sweep", late, "clock"),
+    "quaternion order swapped": Mutant(
+        "speckle3d.core.geometry:rotations_from_quaternions",
+        lambda function, wxyz, where: function(np.roll(wxyz, 1, axis=-1), where),
+        "orientation_sensor",
+    ),
+    "voxels shifted by one": Mutant("speckle3d.imaging.voxels.volume:compound", shifted, "voxel"),
+    "wires mislabelled": Mutant("calibration.detection.labelling:label_by_calibration", mislabelled, "wires"),
+    "calibration's scale 3 % off": Mutant("calibration.plane:calibrate_plane", enlarged, "scale"),
+}
+
+
+def apply(mutant):
+    """Put a mutant's function into its module, before others import it from there."""
+    module, name = mutant.function.split(":")
+    module = importlib.import_module(module)
+    function = getattr(module, name)
+
+    @wraps(function)
+    def changed(*arguments, **named):
+        try:
+            return mutant.change(function, *arguments, **named)
+        except Speckle3DError:
+            raise  # what the package itself refuses
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            pytest.exit(f"{type(error).__name__}: {error}", NOT_APPLIED)
+
+    setattr(module, name, changed)
+
+
+if os.environ.get(CHOSEN):  # in a process of tests, as their plug-in
+    apply(MUTANTS[os.environ[CHOSEN]])
+
+
+def tested(name, selection, folder):
+    """Code with which the tests end, and their output."""
+    paths = os.pathsep.join([str(ROOT), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": paths, CHOSEN: name, "SPECKLE3D_ACCURACY_SWEEPS": str(folder)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutants", *selection]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join(MUTANTS)}; by default all".replace("%", "%%")
+    )
+    parser.add_argument("--all", action="store_true", help="run the README's tests, not those selected")
+    parser.add_argument("--keep", type=Path, help="folder of the accuracy set's sweeps, made if not there")
+    options = parser.parse_args()
+    sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+    alive = []
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = (options.keep or Path(scratch) / "sweeps").resolve()
+        if not folder.is_dir():
+            from accuracy_set import simulate_set
+
+            folder.mkdir(parents=True)
+            simulate_set(folder, ROOT / "data")
+        names = options.names or list(MUTANTS)
+        selected = " or ".join(f"({MUTANTS[name].tests})" for name in names)
+        code, output = tested("", ["-x", "tests/accuracy", "-k", selected], folder)
+        if code:
+            sys.exit(f"{output}\nexpected tests that pass without a mutant")
+        for name in names:
+            wanted = ["-n", "auto", "--dist", "loadfile"] if options.all else ["-x", "tests/accuracy"]
+            selected = wanted if options.all else [*wanted, "-k", MUTANTS[name].tests]
+            code, output = tested(name, selected, folder)
+            killers = re.findall(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", output, re.MULTILINE)
+            if code == 1 and killers:
+                print(f"{name}: killed by {'; '.join(killers)}", flush=True)
+                continue
+            alive.append(name)
+            why = "survived" if code == 0 else f"does not apply, mend it\n{output[-1500:]}"
+            print(f"mutant {name}: {why}", flush=True)
+    sys.exit(1 if alive else 0)
+
+
+if __name__ == "__main__":
+    main()

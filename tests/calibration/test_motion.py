@@ -1,0 +1,134 @@
+"""Whether the motion was sufficient: what is said, and that the motion asked for does cure the refusal."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_examples import BEAM_DOWN, COLUMNS, PIXEL_MM, TRIAL_1, about, centre_of, scan_wires
+from scipy.spatial.transform import RigidTransform
+
+from calibration.motion import MOTIONS, REFUSED_MM, TILT, WEAK_MM, require_adequate, weakest_of
+from calibration.orientation import calibrate_orientation
+from calibration.plane import Plane, Problem, calibrate_plane
+from calibration.points import ImagePoints
+from calibration.settings import OrientationFit
+from calibration.wires import calibrate_cross_wire
+from speckle3d.core.errors import InsufficientDataError
+
+FULL = {"tilt": 25.0, "roll": 15.0, "rotate": 25.0, "move": 11.0, "shift": 15.0}
+"""What a hand does when told to: degrees, or mm, to both sides. Named by the first word of the advice."""
+
+
+def lines_of(moves, count=200, noise_mm=0.1):
+    """Lines of a floor, from a probe that turns about a point of it, 23 mm deep unless moved up and down."""
+    rng, middle_mm = np.random.default_rng(0), (COLUMNS - 1) / 2 * PIXEL_MM[0]
+
+    def turned(word, axis):
+        return about(axis, np.deg2rad(moves.get(word, 0.0)) * rng.uniform(-1, 1, count))
+
+    turn = BEAM_DOWN * turned("roll", 2) * turned("tilt", 0) * turned("rotate", 1)
+    depth = 23.0 + moves.get("move", 0.0) * rng.uniform(-1, 1, count)
+    up = turn.inv().apply([0.0, 0.0, 1.0])
+    height = -(up[:, 0] * middle_mm + up[:, 1] * depth)
+    place = np.column_stack([rng.uniform(-100, 100, (count, 2)), height])
+    ends = np.array([0.0, COLUMNS - 1.0])
+    rows = -(height[:, None] + up[:, :1] * ends * PIXEL_MM[0]) / up[:, 1:2]
+    rows += noise_mm * rng.standard_normal(rows.shape)
+    pixels = np.stack([np.broadcast_to(ends, rows.shape), rows / PIXEL_MM[1]], axis=-1)
+    poses = RigidTransform.from_components(place, turn) * TRIAL_1.inv()
+    return ImagePoints.of_lines(np.arange(count), pixels, poses)
+
+
+def calibrate_lines(moves):
+    return calibrate_plane(lines_of(moves))
+
+
+def calibrate_directions(moves, level=False):
+    return calibrate_orientation(lines_of(moves, 100), PIXEL_MM, OrientationFit(level=level))
+
+
+def calibrate_dots(moves):
+    named = {"tilt_deg": "tilt", "roll_deg": "roll", "yaw_deg": "rotate"}
+    degrees = {name: moves.get(word, 0.0) for name, word in named.items()}
+    pixels, readings = scan_wires(np.random.default_rng(0), np.zeros((60, 3)), noise_mm=0.3, **degrees)
+    return calibrate_cross_wire(ImagePoints(pixels, np.arange(60), readings))
+
+
+def advised(text):
+    return [motion.split()[0] for motion in MOTIONS if motion in text]
+
+
+@pytest.mark.parametrize(
+    ("calibrate", "done"),
+    [
+        (calibrate_lines, ("roll",)),
+        (calibrate_lines, ("tilt", "move")),
+        (calibrate_directions, ("tilt", "roll")),
+        (calibrate_directions, ("roll", "rotate")),
+        (calibrate_dots, ()),
+        (calibrate_dots, ("roll",)),
+    ],
+)
+def test_doing_as_told_cures_a_calibration(calibrate, done):
+    moves = {word: FULL[word] for word in done}
+    with pytest.raises(InsufficientDataError) as refused:
+        calibrate(moves)
+    new = [word for word in advised(str(refused.value)) if word not in moves]
+    assert new
+    solution = calibrate(moves | {word: FULL[word] for word in new})
+    chain, error = solution.chain, solution.adequacy.standard_error
+    # Four times the standard error: of the worst corner, or about the worst axis.
+    if solution.angular:
+        assert (TRIAL_1.rotation.inv() * chain.sensor_from_image.rotation).magnitude() < 4 * error
+    else:
+        away = centre_of(chain.sensor_from_image, chain.pixel_mm) - centre_of(TRIAL_1, PIXEL_MM)
+        assert np.linalg.norm(away) < 4 * error
+
+
+def test_only_what_is_missing_is_named():
+    with pytest.raises(InsufficientDataError) as refused:
+        calibrate_lines({"tilt": 25.0, "roll": 15.0, "rotate": 25.0})
+    assert advised(str(refused.value)) == ["move"]
+    with pytest.raises(InsufficientDataError) as refused:
+        calibrate_directions({"roll": 15.0, "rotate": 25.0}, level=True)
+    assert advised(str(refused.value)) == ["tilt"]
+
+
+def test_three_words_for_three_states():
+    moves = {"roll": 15.0, "move": 11.0}
+    sufficient = calibrate_plane(lines_of(moves | {"tilt": 25.0})).adequacy
+    assert (sufficient.refused, sufficient.missing) == (False, ())
+    assert sufficient.standard_error < WEAK_MM
+    assert f"{sufficient.standard_error:.2g} mm" in sufficient.verdict
+    weakly = calibrate_plane(lines_of(moves | {"tilt": 8.0}, noise_mm=0.4)).adequacy
+    assert not weakly.refused
+    assert WEAK_MM < weakly.standard_error < REFUSED_MM
+    assert TILT in weakly.verdict
+    assert weakly.weakest in weakly.verdict
+
+
+def test_exact_lines_do_not_make_any_motion_sufficient():
+    lines = lines_of({"tilt": 0.3, "roll": 0.3, "move": 11.0}, noise_mm=0.0)
+    with pytest.raises(InsufficientDataError, match="tilt"):
+        calibrate_plane(lines)
+
+
+def test_the_weakest_direction_is_named_in_words():
+    rng = np.random.default_rng(0)
+    x, y, other = rng.standard_normal((3, 50))
+    alike = np.column_stack([x, x + 1e-3 * y, other])
+    assert weakest_of(alike, ("y", "z_c", "gamma")) == "a shift along the beam (with the phantom's z)"
+
+
+def test_a_phantom_that_does_not_explain_the_images_is_not_blamed_on_the_motion():
+    lines = lines_of({"tilt": 25.0, "roll": 15.0, "move": 11.0}, count=400)
+    solution = calibrate_plane(lines)
+    # The floor bulges, as a sheet of rubber does: 8 mm over 100 mm.
+    shift, turn = lines.world_from_sensor.as_components()
+    lifted = shift + np.outer(8.0 * np.sum(shift[:, :2] ** 2, axis=1) / 1e4, [0.0, 0.0, 1.0])
+    bulging = replace(lines, world_from_sensor=RigidTransform.from_components(lifted, turn))
+    wrong = Problem(Plane(), outlier_sigma=np.inf).solve(bulging, solution.chain)
+    with pytest.raises(InsufficientDataError, match=r"phantom.*\d mm"):
+        require_adequate(wrong)
+    assert wrong.adequacy.missing == ()
+    assert require_adequate(solution) is solution

@@ -1,0 +1,150 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fused_scenes import CENTRE_MM, errors, scene
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import MismatchError
+from speckle3d.core.streams import TimedPoses
+from speckle3d.correction import fused
+from speckle3d.correction.fused import FusionProblem, fuse
+from speckle3d.correction.image_path import ImagePath
+from speckle3d.correction.scale import ScaleEvidence
+from speckle3d.correction.sensor_readings import SensorReadings
+from speckle3d.correction.settings import FusedSettings
+from speckle3d.simulation.movement import HandMotion
+from speckle3d.simulation.sensors import TrackerModel
+
+
+def path_mm(poses):
+    return float((poses[0].inv() * poses[-1]).apply(CENTRE_MM)[2])
+
+
+def moved(tracker, shift_mm=0.0, factor=1.0):
+    poses = tracker.readings.world_from_sensor
+    places = factor * poses.translation + shift_mm
+    readings = TimedPoses(tracker.readings.time_s, RigidTransform.from_components(places, poses.rotation))
+    return replace(tracker, readings=readings)
+
+
+def test_without_sensors_the_images_length_and_claim_remain():
+    made = scene(1, frames=16, length_mm=2.0)
+    found = fuse(*made.given())
+    assert path_mm(found.poses) == pytest.approx(path_mm(made.image), abs=1e-6)
+    own = np.sqrt(made.covariance[-1, 2, 2])
+    assert np.sqrt(found.covariance[-1, 2, 2]) == pytest.approx(own, rel=0.2)
+    assert found.used == ("images",)
+
+
+def test_evidence_of_the_scale_counts_by_its_information_against_the_images_claim():
+    made = scene(2, frames=16, length_mm=2.0, scale_sigma=0.05)
+    told = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))
+    found = fuse(*made.given(), evidence=[told])
+    # Variances of the mean scale before: common and changing parts; after: the evidence's own, nearly.
+    prior, own = 0.05**2 * (1.0 + 2.0 / 2.0), 0.01**2
+    assert found.log_scale == pytest.approx(0.04 * prior / (prior + own), abs=2e-3)
+    assert found.log_scale_sigma == pytest.approx(0.01, rel=0.2)
+    assert found.used == ("images", "crossing")
+
+
+def test_a_loop_of_the_images_says_nothing_of_their_scale():
+    # Edges between both visits once made shrinking cheap: every edge counts in the images' own millimetres.
+    made = scene(5, frames=40, length_mm=4.0, motion=HandMotion(reverse=True, pauses=0))
+    found = fuse(*made.given(), made.orientation)
+    assert found.log_scale == pytest.approx(0.0, abs=1e-3)
+    assert found.log_scale_sigma > 0.8 * made.scale_sigma
+
+
+def test_a_tracker_much_too_far_from_the_images_is_not_averaged_with_them():
+    made = scene(3, frames=40, length_mm=4.0)
+    with pytest.raises(MismatchError, match=r"times as far: compare modes"):
+        fuse(*made.given(), tracker=moved(made.tracker, factor=1e-3))
+
+
+def test_derivatives_match_differences(monkeypatch):
+    monkeypatch.setattr(fused, "HUBER", 1e9)
+    made = scene(4, frames=16, length_mm=2.0)
+    centre = RigidTransform.from_translation(CENTRE_MM)
+    start = centre.inv() * made.image * centre
+    path = ImagePath.of(made.edges, start, 0.1, 0.03, 0.02, made.turn_sigma_per_mm, made.time_s)
+    known = start.as_matrix(), CENTRE_MM, made.time_s, FusedSettings()
+    sensors = tuple(SensorReadings.of(each, *known) for each in (made.tracker, made.orientation))
+    told = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.eye(3) / 0.01**2)
+    problem = FusionProblem(path, sensors, (told,))
+    rng = np.random.default_rng(0)
+    at = 1e-3 * rng.standard_normal(problem.columns[-1].stop)
+    step = 1e-6 * rng.standard_normal(at.size)
+    ahead, behind = (problem._equations(at + sign * step) for sign in (1.0, -1.0))
+    for (columns, _, slope), (_, after, _), (_, before, _) in zip(
+        problem._equations(at), ahead, behind, strict=True
+    ):
+        wanted = (after - before) / 2.0
+        # Right to first order in the turns of world and errors, and but for the motion's bend between frames.
+        np.testing.assert_allclose(slope @ step[columns], wanted, atol=0.03 * np.abs(wanted).max())
+
+
+LENGTHS = {"short": (60, 5.0), "long": (240, 20.0)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", LENGTHS)
+def test_with_a_tracker_lengths_are_no_worse_than_the_better_of_both_and_claims_hold(case):
+    frames, length_mm = LENGTHS[case]
+    found = {"images": [], "tracker": [], "fused": []}
+    inside = []
+    for seed in range(100, 112):
+        made = scene(seed, frames=frames, length_mm=length_mm)
+        both = fuse(*made.given(), made.orientation, made.tracker)
+        sensed = made.tracker.world_from_image(made.time_s)
+        for name, poses in (("images", made.image), ("tracker", sensed), ("fused", both.poses)):
+            found[name].append(100 * (path_mm(poses) / path_mm(made.truth) - 1))
+        inside.append(np.abs(errors(both.poses, made.truth)) / np.sqrt(np.diag(both.covariance[-1])))
+    rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in found.items()}
+    assert rms["fused"] < 1.1 * min(rms["images"], rms["tracker"])
+    within = np.array(inside)
+    assert within.max() < 3.5
+    assert 0.5 < (within < 1.0).mean() < 0.95
+
+
+@pytest.mark.slow
+def test_outliers_and_wander_of_a_tracker_move_the_poses_little():
+    made = scene(7, tracker=TrackerModel(position_mm=0.1))
+    rng = np.random.default_rng(7)
+    many = len(made.tracker.readings.time_s)
+    wild = np.where(rng.random((many, 1)) < 0.05, rng.choice([-3.0, 3.0], (many, 3)), 0.0)
+    kept = np.exp(-0.02 / 1.0)
+    wander = rng.standard_normal((many, 3))
+    for k in range(1, many):
+        wander[k] = kept * wander[k - 1] + np.sqrt(1.0 - kept**2) * wander[k]
+    clean = fuse(*made.given(), tracker=made.tracker)
+    spiked = fuse(*made.given(), tracker=moved(made.tracker, wild))
+    assert abs(path_mm(spiked.poses) - path_mm(clean.poses)) < np.sqrt(clean.covariance[-1, 2, 2])
+    wandering = fuse(*made.given(), tracker=moved(made.tracker, 0.3 * wander))
+    assert wandering.log_scale_sigma > 1.5 * clean.log_scale_sigma
+    assert abs(path_mm(wandering.poses) - path_mm(made.truth)) < 3.0 * np.sqrt(wandering.covariance[-1, 2, 2])
+
+
+@pytest.mark.slow
+def test_two_thousand_frames_take_seconds():
+    made = scene(8, frames=300, length_mm=24.0)
+    again = np.resize(np.concatenate([np.arange(300), np.arange(298, 0, -1)]), 2000)
+    time_s = 0.04 * np.arange(2000)
+    poses = made.truth[again] * made.tracker.sensor_from_image.inv()
+    jitter = Rotation.from_rotvec(2e-3 * np.random.default_rng(0).standard_normal((2000, 3)))
+    readings = TimedPoses(time_s, RigidTransform.from_components(poses.translation, poses.rotation * jitter))
+    tracker = replace(made.tracker, readings=readings, time_offset_s=0.0)
+    first = np.arange(1999)
+    steps = made.image[again[:-1]].inv() * made.image[again[1:]]
+    centre = RigidTransform.from_translation(CENTRE_MM)
+    edges = replace(
+        made.edges,
+        first=first,
+        second=first + 1,
+        poses=centre.inv() * steps * centre,
+        covariance=np.tile(made.edges.covariance[0], (1999, 1, 1)),
+    )
+    found = fuse(edges, made.image[again], *made.given()[2:-1], time_s, tracker=tracker)
+    true = made.truth[again]
+    z = [(p[0].inv() * p).apply(CENTRE_MM)[:, 2] for p in (found.poses, true)]
+    assert np.abs(z[0] - z[1]).max() < 0.25

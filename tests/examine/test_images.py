@@ -1,0 +1,211 @@
+"""What no honest sweep shows, on tables of correlations made for the purpose."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
+from speckle import curves
+
+from speckle3d.examine.images import (
+    MOST_FRAMES,
+    far_apart,
+    folded,
+    interleaved,
+    severed,
+    standing,
+    undetermined,
+)
+from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.matching.schedule import PairSchedule
+from speckle3d.matching.table import CorrelationTable
+
+WIDTH_MM, CELLS = 0.45, 60.0
+PATCHES_MM = np.array([[x, y] for x in (2.0, 6.0, 10.0) for y in np.linspace(5.0, 25.0, 9)])
+
+
+def table_of(position_mm, seed=0, noise=0.03, gain=1.0, source=None):
+    """The pairs that the schedule wants; `source`: which tissue each frame shows."""
+    rng, schedule = np.random.default_rng(seed), PairSchedule()
+    source = np.zeros(len(position_mm)) if source is None else source
+    rows = []
+    for frame in range(len(position_mm)):
+        found = {}
+        for first in schedule.references(frame):
+            rho = gain * np.exp(-((position_mm[frame] - position_mm[first]) ** 2) / (2 * WIDTH_MM**2))
+            rho *= source[frame] == source[first]
+            found[first] = float(np.clip(rho + noise * (1 - rho) * rng.standard_normal(), 0.0, 1.0))
+        rows += [(first, frame, found[first]) for first in sorted(found)]
+        schedule.settle(frame, found)
+    first, second, median = (np.array(column) for column in zip(*rows, strict=True))
+    correlation = np.repeat(median[:, None], len(PATCHES_MM), axis=1).astype(np.float32)
+    return CorrelationTable(first, second, correlation, median, (InPlaneMotion(),) * len(rows))
+
+
+def along(position_mm):
+    zero = np.zeros_like(position_mm)
+    return RigidTransform.from_translation(np.column_stack([zero, zero, position_mm]))
+
+
+SWEEP = np.linspace(0.0, 10.0, 80)
+HONEST = {
+    "one way": SWEEP,
+    "fast": np.linspace(0.0, 10.0, 28),
+    "there and back": np.concatenate([SWEEP[:40], SWEEP[40::-1]]),
+    "a third at rest": np.concatenate([np.zeros(40), SWEEP]),
+    "wobbling by hand": SWEEP + 0.3 * np.sin(2 * np.pi * 3.0 * np.arange(80) / 25.0),
+    "at rest": np.zeros(60),
+}
+
+
+@pytest.mark.parametrize("motion", HONEST)
+@pytest.mark.parametrize("gain", [1.0, 0.8])
+def test_honest_sweeps_are_not_doubted(motion, gain):
+    position = HONEST[motion]
+    table, usable = table_of(position, gain=gain), np.ones(position.size, dtype=bool)
+    assert interleaved(table, position.size, 0.2) is None
+    assert folded(table, along(position), PATCHES_MM, usable) is None
+    assert severed(table.first[table.median > 0.2], table.second[table.median > 0.2], usable) is None
+
+
+@pytest.mark.parametrize("sweeps", [2, 3])
+def test_sweeps_recorded_in_turn_are_refused(sweeps):
+    count = 40
+    position = np.repeat(np.linspace(0.0, 5.0, count), sweeps)
+    doubt = interleaved(table_of(position, source=np.tile(np.arange(sweeps), count)), position.size, 0.2)
+    assert doubt is not None
+    assert doubt.refuted
+    assert "interleaved" in doubt.suspect
+
+
+def test_the_same_tissue_seen_in_turn_from_two_sides_is_refused():
+    there = np.linspace(0.0, 8.0, 60)
+    position = np.column_stack([there, there[::-1]]).ravel()
+    doubt = interleaved(table_of(position), position.size, 0.2)
+    assert doubt is not None
+    assert doubt.refuted
+
+
+def test_a_path_that_turns_where_the_images_do_not_is_doubted():
+    # Pairs across a turn are as alike as others and on this path nearer to each other.
+    once, often = np.where(SWEEP < 6.0, SWEEP, 12.0 - SWEEP), np.abs((SWEEP + 0.5) % 1.0 - 0.5)
+    for path, refuted in ((once, False), (often, True)):
+        doubt = folded(table_of(SWEEP), along(path), PATCHES_MM, np.ones(SWEEP.size, dtype=bool))
+        assert doubt is not None
+        assert doubt.refuted == refuted
+        ((first, last),) = doubt.frames
+        assert f"about frame {(first + last + 1) // 2}" in doubt.evidence
+        if path is once:
+            # The turn lies at 6 of 12 mm.
+            assert first <= np.searchsorted(SWEEP, 6.0) <= last + 1
+
+
+def test_motion_read_from_noise_on_a_probe_at_rest_is_refused():
+    wander = np.cumsum(np.random.default_rng(1).normal(0.0, 0.15, 80))
+    table = table_of(np.zeros(80), gain=0.45, noise=0.05)
+    doubt = folded(table, along(wander), PATCHES_MM, np.ones(80, dtype=bool))
+    assert doubt is not None
+    assert doubt.refuted
+
+
+def test_frames_not_to_be_used_do_not_speak():
+    turned = np.where(SWEEP < 6.0, SWEEP, 12.0 - SWEEP)
+    assert folded(table_of(SWEEP), along(turned), PATCHES_MM, SWEEP < 5.8) is None
+
+
+def test_a_turning_probe_is_judged_by_all_of_its_image():
+    """About the image's centre: the centre does not move, the patches do."""
+    angle = np.deg2rad(np.linspace(0.0, 30.0, 80))
+    centre = np.array([6.0, 15.0, 0.0])
+    about = RigidTransform.from_translation(centre)
+    poses = (
+        about * RigidTransform.from_rotation(Rotation.from_rotvec(angle[:, None] * [1.0, 0, 0])) * about.inv()
+    )
+    table = table_of(10.0 * angle)
+    assert folded(table, poses, PATCHES_MM, np.ones(80, dtype=bool)) is None
+
+
+@pytest.mark.parametrize(
+    ("length_mm", "sigma_mm", "refused"),
+    [(3.58, 12111.0, True), (12.0, 6.5, True), (12.0, 4.0, False), (0.1, 2.6, True)],
+)
+def test_a_length_that_is_left_open_is_doubted(length_mm, sigma_mm, refused):
+    position = np.linspace(0.0, length_mm, 20)
+    doubt = undetermined(position, np.linspace(0.0, sigma_mm, 20), 2.5)
+    assert doubt is not None
+    assert doubt.refuted == refused
+    assert f"{sigma_mm:.3g} mm" in doubt.evidence
+
+
+@pytest.mark.parametrize(("length_mm", "sigma_mm"), [(12.0, 0.1), (12.0, 2.9), (0.0, 1.2), (100.0, 20.0)])
+def test_a_length_that_is_known_is_not(length_mm, sigma_mm):
+    assert undetermined(np.linspace(0.0, length_mm, 20), np.full(20, sigma_mm), 2.5) is None
+
+
+def test_the_farthest_point_of_a_sweep_that_comes_back_is_its_length():
+    there_and_back = np.concatenate([SWEEP, SWEEP[::-1]])
+    assert undetermined(there_and_back, np.full(160, 2.4), 2.0) is None
+
+
+def test_frames_far_apart_are_beyond_the_reach_of_speckle():
+    known = curves(sigma_mm=WIDTH_MM)
+    position = np.concatenate([np.zeros(30), np.linspace(0.0, 30.0, 200)])
+    usable = np.ones(position.size, dtype=bool)
+    usable[60:80] = False
+    chosen = far_apart(position, usable, known)
+    assert chosen.size == MOST_FRAMES
+    assert usable[chosen].all()
+    # exp(-d^2 / 2 w^2) is 0.03 at d = 2.65 w.
+    assert np.diff(position[chosen]).min() >= 2.6 * WIDTH_MM
+    assert far_apart(np.zeros(50), np.ones(50, dtype=bool), known).size == 1
+
+
+@pytest.mark.parametrize(
+    ("share", "refuted"),
+    [
+        (np.full(50, 0.02), False),
+        (np.full(50, 0.09), False),
+        (np.full(50, 0.2), True),
+        (np.r_[np.full(10, 0.5), np.zeros(40)], False),
+        (np.r_[np.full(26, 0.5), np.zeros(24)], True),
+    ],
+)
+def test_echoes_that_stand_still_are_doubted(share, refuted):
+    doubt = standing(share, MOST_FRAMES, CELLS)
+    assert doubt is not None
+    assert doubt.refuted == refuted
+
+
+def test_what_chance_leaves_in_common_is_not():
+    rng = np.random.default_rng(0)
+    for patches, frames in ((6, 2), (6, 10), (50, 2), (400, 10)):
+        scatter = 1.25 / np.sqrt(2 * CELLS * frames * (frames - 1) / 2)
+        for _ in range(200):
+            assert standing(scatter * rng.standard_normal(patches), frames, CELLS) is None
+    assert standing(np.full(5, np.nan), 4, CELLS) is None
+
+
+def test_without_phase_layers_along_the_sweep_are_not_clutter():
+    layers = np.r_[np.full(10, 0.5), np.full(40, 0.04)]
+    assert standing(layers, MOST_FRAMES, CELLS, of_echo=False) is None
+    assert standing(np.full(50, 0.3), MOST_FRAMES, CELLS, of_echo=False).refuted
+
+
+def test_a_sweep_in_pieces_is_flagged_at_each_cut():
+    usable = np.ones(30, dtype=bool)
+    usable[[10, 20]] = False
+    chain = np.array([(k, k + 1) for k in range(29) if k + 1 not in (10, 20)])
+    doubt = severed(chain[:, 0], chain[:, 1], usable)
+    assert doubt is not None
+    assert not doubt.refuted
+    assert "frame 10, 20:" in doubt.evidence
+    assert doubt.frames == ((10, 10), (20, 20))
+
+
+def test_a_lost_frame_that_others_bridge_is_no_cut():
+    usable = np.ones(30, dtype=bool)
+    usable[10] = False
+    chain = [(k, k + 1) for k in range(29) if k + 1 != 10 and k != 10] + [(9, 11)]
+    assert severed(np.array([a for a, _ in chain]), np.array([b for _, b in chain]), usable) is None
+    # Lost at the end, nothing sound lies beyond.
+    usable[25:] = False
+    short = [(a, b) for a, b in chain if b < 25]
+    assert severed(np.array([a for a, _ in short]), np.array([b for _, b in short]), usable) is None

@@ -1,0 +1,131 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from faults import FAULTS_BY_NAME, ORIENTATION, TRACKER
+from rare_faults import RARE
+
+from speckle3d.config import Config
+from speckle3d.core.errors import MismatchError
+from speckle3d.corrections import correct
+from speckle3d.examine.disagreements import differing_lengths, disagreements
+from speckle3d.examine.sensors import cleaned_readings, examined_sensors
+from speckle3d.motion.direction import settle_direction
+
+AGAINST_THEMSELVES = {
+    "tracker frozen": "frozen",
+    "tracker frozen from halfway": "frozen",
+    "tracker frozen in the middle fifth": "frozen",
+    "tracker spikes of 30 mm": "spikes",
+    "tracker noise of 3 mm": "noise",
+    "tracker random": "scrambled",
+    "orientation stored xyzw": "xyzw",
+    "orientation inverted": "inverted",
+    "orientation mirrored": "handedness",
+    "orientation x of the other sign": "axes",
+    "orientation random": "scrambled",
+    "orientation spikes of 180 deg": "spikes",
+    "orientation constant": "frozen",
+    "orientation frozen from halfway": "frozen",
+    "orientation heading drift of 5 deg/s": "drift",
+}
+"""Faults of `tests/faults.py` in which a sensor contradicts itself, and a word for each."""
+BESIDE_THE_IMAGES = {
+    "tracker in metres": "metres",
+    "tracker in centimetres": "centimetres",
+    "tracker in inches": "inches",
+    "tracker matrices inverted": "length",
+    "tracker mount turned by 180 deg about x": "length",
+    "tracker mount turned by 20 deg about y": "x ",
+    "tracker drift of 5 mm": "x ",
+    "tracker of another sweep": "",
+}
+"""Faults that only the images contradict: both numbers are told."""
+EVERY = {fault.name: fault for fault in (*TRACKER, *ORIENTATION, *RARE)}
+
+
+def doubts_of(sweep, tracked):
+    examined = examined_sensors(sweep, tracked.image)
+    claims = tracked.covariance, tracked.scale_sigma
+    return examined, disagreements(examined.trusted, tracked.image, *claims)
+
+
+def test_good_sensors_are_not_doubted(sweep, tracked):
+    assert tracked.doubts == ()
+    examined, found = doubts_of(sweep, tracked)
+    assert examined.doubts == found == ()
+    assert examined.turn_confirmed
+    assert examined.trusted is sweep
+
+
+@pytest.mark.parametrize("name", AGAINST_THEMSELVES)
+def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracked):
+    fault = EVERY[name]
+    examined, _ = doubts_of(fault.into(sweep), tracked)
+    assert {doubt.about for doubt in examined.doubts} == {fault.about}
+    assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in examined.doubts)
+    if fault.honest == "refuse" and "x of" not in name:
+        assert any(doubt.refuted for doubt in examined.doubts)
+
+
+@pytest.mark.parametrize("name", BESIDE_THE_IMAGES)
+def test_images_and_a_sensor_that_differ_are_told_side_by_side_and_nobody_is_left_out(name, sweep, tracked):
+    bad = EVERY[name].into(sweep)
+    examined, found = doubts_of(bad, tracked)
+    assert examined.trusted.tracker is not None
+    assert found
+    assert not any(doubt.refuted for doubt in found)
+    assert all("by the images" in doubt.evidence and "by the tracker" in doubt.evidence for doubt in found)
+    assert BESIDE_THE_IMAGES[name] in f"{found[0].suspect} {found[0].evidence}"
+
+
+def test_lengths_of_modes_beyond_three_joint_claims_are_told_with_both_numbers():
+    lengths = {"image": (12.0, 0.3), "pose": (10.0, 0.1), "fused": (11.5, 0.3)}
+    told = differing_lengths(lengths)
+    assert [doubt.about for doubt in told] == ["modes image and pose", "modes pose and fused"]
+    assert "12.00 +- 0.30 mm" in told[0].evidence
+    assert "10.00 +- 0.10 mm" in told[0].evidence
+
+
+@pytest.mark.parametrize("name", ["orientation stored xyzw", "orientation inverted", "orientation random"])
+def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracked):
+    bad = FAULTS_BY_NAME[name].into(replace(sweep, tracker=None, truth=None))
+    # Without what it measures beside its orientation, only the images are left to say so.
+    bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
+    for recorded in (bad, bare):
+        examined = examined_sensors(recorded, tracked.image)
+        sign = settle_direction(examined.trusted, tracked.image, Config().sensors, examined.turn_confirmed)
+        assert sign == (1, "assumed")
+
+
+def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tracked):
+    bad = FAULTS_BY_NAME["tracker frozen"].into(sweep)
+    doubts = examined_sensors(bad, tracked.image).doubts
+    with pytest.raises(MismatchError, match=r"pose.*tracker.*frozen"):
+        correct(replace(tracked, doubts=doubts), bad, ["pose"])
+    config = Config(sensors={"examine": False})
+    assert len(correct(tracked, bad, ["pose"], config)["pose"].poses) == len(sweep)
+
+
+def test_spikes_are_left_out_and_counted(sweep, tracked):
+    bad = FAULTS_BY_NAME["tracker spikes of 30 mm"].into(sweep)
+    cleaned, (doubt,) = cleaned_readings(bad)
+    places = [each.tracker.readings.world_from_sensor.translation for each in (bad, sweep)]
+    spiked = np.linalg.norm(places[0] - places[1], axis=1) > 10.0
+    left_out = len(bad.tracker.readings) - len(cleaned.tracker.readings)
+    assert left_out >= spiked.sum()
+    assert str(left_out) in doubt.evidence
+    at = bad.tracker.readings.time_s[spiked] + bad.tracker.time_offset_s
+    at = at[(at >= sweep.frame_time_s[0]) & (at <= sweep.frame_time_s[-1])]
+    named = np.concatenate([np.arange(first, last + 1) for first, last in doubt.frames])
+    assert np.isin(np.abs(sweep.frame_time_s[:, None] - at).argmin(axis=0), named).all()
+    good, mended = (correct(tracked, each, ["pose"])["pose"].poses for each in (sweep, bad))
+    ends = [(p[0].inv() * p[-1]).apply(sweep.grid.centre_mm)[2] for p in (good, mended)]
+    # A tenth of the readings less: their jitter of 0.15 mm over some 20 that tell an end.
+    assert ends[1] == pytest.approx(ends[0], abs=0.05)
+
+
+def test_a_gyroscope_on_other_axes_does_not_refute_the_readings(sweep, tracked):
+    turned_round = replace(sweep.orientation, gyroscope_rad_s=-sweep.orientation.gyroscope_rad_s)
+    examined = examined_sensors(replace(sweep, tracker=None, orientation=turned_round), tracked.image)
+    assert [(doubt.refuted, "gyroscope" in doubt.suspect) for doubt in examined.doubts] == [(False, True)]

@@ -1,0 +1,103 @@
+"""Arrays, pictures and video, and what has to be told of them."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import speckle3d
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.sweep import RFSettings
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.load import import_notes, load_sweep
+from speckle3d.io.sweep_writer import write_sweep
+
+GREY = np.arange(12 * 9 * 7, dtype=np.uint8).reshape(12, 9, 7)
+PIXELS = {"column_pitch_mm": 0.2, "row_spacing_mm": 0.1, "dynamic_range_db": 60.0}
+RF = RFSettings(40e6, 1540.0, 5e6, (3e6, 7e6))
+
+
+def frames_of(sweep):
+    return np.stack([sweep.frames[i] for i in range(len(sweep))])
+
+
+def test_arrays_make_a_sweep(tmp_path):
+    sweep = speckle3d.Sweep.from_arrays(
+        GREY,
+        pitch_mm=(0.2, 0.1),
+        frame_rate_hz=20.0,
+        dynamic_range_db=60.0,
+        first_row_depth_mm=2.0,
+        probe="L14",
+    )
+    np.testing.assert_array_equal(frames_of(sweep), GREY.transpose(0, 2, 1))
+    grid = sweep.grid
+    assert (grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm) == (0.2, 0.1, 2.0)
+    np.testing.assert_allclose(sweep.frame_time_s, np.arange(12) / 20)
+    write_sweep(tmp_path / "s.h5", sweep)
+    np.testing.assert_array_equal(frames_of(load_sweep(tmp_path / "s.h5")), frames_of(sweep))
+
+
+def test_echoes_lie_as_they_were_sampled():
+    times = np.arange(12) ** 1.1
+    sweep = speckle3d.Sweep.from_arrays(
+        GREY.astype(np.int16), pitch_mm=0.3, frame_time_s=times, signal=RF, name="rf"
+    )
+    assert sweep.grid.sample_spacing_mm == pytest.approx(0.01925)
+    np.testing.assert_array_equal(sweep.frame_time_s, times)
+
+
+@pytest.mark.parametrize(("frames", "given", "missing"), [
+    (GREY, {}, ["pitch_mm", "frame_rate_hz", "dynamic_range_db", "pictures.md"]),
+    (GREY, {"pitch_mm": 0.1, "dynamic_range_db": 60.0}, ["frame_rate_hz"]),
+    (GREY.astype(np.int16), {"pitch_mm": 0.1, "frame_rate_hz": 20.0}, ["signal"]),
+    (GREY.astype(float), {}, ["float64", "astype"]),
+    (GREY[0], {}, ["(n, row, column)"]),
+])  # fmt: skip
+def test_what_is_missing_is_asked_for_by_name(frames, given, missing):
+    with pytest.raises(InvalidInputError) as error:
+        speckle3d.Sweep.from_arrays(frames, **given)
+    assert all(word in str(error.value) for word in missing)
+
+
+def test_an_array_file_is_read(tmp_path):
+    np.save(tmp_path / "grey.npy", GREY)
+    with pytest.raises(MissingSettingsError) as error:
+        load_sweep(tmp_path / "grey.npy")
+    assert set(error.value.settings) == {*PIXELS, "frame_rate_hz"}
+    sweep = load_sweep(tmp_path / "grey.npy", ImportSettings(**PIXELS, frame_rate_hz=20))
+    np.testing.assert_array_equal(frames_of(sweep), GREY.transpose(0, 2, 1))
+    np.save(tmp_path / "rf.npy", GREY.astype(np.int16))
+    with pytest.raises(MissingSettingsError) as error:
+        load_sweep(tmp_path / "rf.npy")
+    assert "sampling_rate_hz" in error.value.settings
+    given = ImportSettings(
+        vector_pitch_mm=0.3, sampling_rate_hz=40e6, centre_frequency_hz=5e6, bandwidth_hz=(3e6, 7e6),
+        frame_rate_hz=20,
+    )  # fmt: skip
+    assert load_sweep(tmp_path / "rf.npy", given).signal == RF
+    assert any("1540" in note for note in import_notes(tmp_path / "rf.npy", given))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_folder_of_pictures_is_read_in_the_order_of_its_numbers(tmp_path, suffix):
+    flat = np.repeat(np.arange(0, 240, 20, dtype=np.uint8), 9 * 7).reshape(12, 9, 7)
+    for i, image in enumerate(flat):
+        colour = np.stack([image] * 3, axis=-1) if suffix == ".jpg" else image
+        Image.fromarray(colour).save(tmp_path / f"frame{i}{suffix}")
+    (tmp_path / "import.toml").write_text(
+        "frame_rate_hz = 20\n" + "\n".join(f"{k} = {v}" for k, v in PIXELS.items())
+    )
+    sweep = load_sweep(tmp_path)
+    # JPEG keeps a flat picture to a level or two.
+    np.testing.assert_allclose(frames_of(sweep).astype(int), flat.transpose(0, 2, 1), atol=2)
+    assert any("colour" in note for note in import_notes(tmp_path)) == (suffix == ".jpg")
+
+
+def test_a_video_says_its_rate_or_is_asked_for_it(tmp_path):
+    pytest.importorskip("imageio")
+    images = [Image.fromarray(np.full((9, 7), level, np.uint8)) for level in (0, 60, 120, 180)]
+    images[0].save(tmp_path / "v.gif", save_all=True, append_images=images[1:], duration=50)
+    sweep = load_sweep(tmp_path / "v.gif", ImportSettings(**PIXELS, frame_rate_hz=20))
+    for i in (0, 1, 2, 3, 1, 0):
+        assert abs(int(sweep.frames[i][0, 0]) - 60 * i) <= 2
+    np.testing.assert_allclose(sweep.frame_time_s, np.arange(4) / 20)

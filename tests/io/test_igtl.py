@@ -1,0 +1,314 @@
+"""OpenIGTLink against pyigtl, and both ends of a connection over the loopback."""
+
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pyigtl
+import pytest
+from igtl_examples import LAST, changed, decoded, image, transform, with_body
+from pyigtl.messages import MessageBase
+
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.io.igtl import link
+from speckle3d.io.igtl.connection import Connection
+from speckle3d.io.igtl.messages import (
+    MessageError,
+    Other,
+    packed_image,
+    packed_status,
+    packed_text,
+    packed_transform,
+)
+from speckle3d.io.igtl.server import Server
+
+WAIT_S = 60.0
+# Places are single precision in messages.
+SINGLE = 1e-5
+
+
+def by_pyigtl(message):
+    fields = MessageBase.parse_header(message[:58])
+    made = MessageBase.create_message(fields["message_type"])
+    made.unpack(fields, message[58:])
+    return made
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, "f4", "f8"])
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_image_of_pyigtl_is_read(dtype, version):
+    message, pixels, place = image(dtype=dtype, version=version)
+    got = decoded(message)
+    assert (got.device, got.time_s, got.components) == ("Image_Reference", 12.25, 1)
+    assert got.pixels.dtype == dtype
+    np.testing.assert_array_equal(got.pixels, pixels)
+    np.testing.assert_allclose(got.image_to_world, place, atol=SINGLE)
+    np.testing.assert_allclose(got.spacing_mm, [0.3, 0.1, 2.0], atol=SINGLE)
+
+
+def test_an_image_in_lps_is_turned_into_ras():
+    message, pixels, place = image(world="lps")
+    np.testing.assert_array_equal(decoded(message).pixels, pixels)
+    np.testing.assert_allclose(decoded(message).image_to_world, np.diag([-1, -1, 1, 1]) @ place, atol=SINGLE)
+
+
+@pytest.mark.parametrize("shape", [(6, 9), (6, 9, 4), (6, 9, 3)])
+def test_pyigtl_and_we_read_an_image_of_ours(shape):
+    pixels = np.random.default_rng(0).integers(0, 100, shape).astype(np.int16)
+    place = np.array([[0.0, 0, 2, 1], [0.3, 0, 0, 2], [0, 0.1, 0, 3], [0, 0, 0, 1]])
+    colours = 3 if shape[-1] == 3 else 1
+    message = packed_image("Volume", 1700000000.123456, pixels, place, colours)
+    theirs, ours = by_pyigtl(message), decoded(message)
+    whole = pixels[:, :, None] if pixels.ndim == 2 or colours == 3 else pixels
+    np.testing.assert_array_equal(theirs.image, whole.transpose(2, 1, 0, *range(3, whole.ndim)))
+    np.testing.assert_array_equal(ours.pixels, pixels)
+    assert ours.components == colours
+    for matrix, time_s in (
+        (theirs.ijk_to_world_matrix, theirs.timestamp),
+        (ours.image_to_world, ours.time_s),
+    ):
+        np.testing.assert_allclose(matrix, place, atol=SINGLE)
+        assert time_s == pytest.approx(1700000000.123456, abs=1e-6)
+
+
+def test_big_endian_pixels_are_turned():
+    message, pixels, _ = image()
+    body = bytearray(message[58:])
+    body[4] = 1
+    body[72:] = np.frombuffer(body[72:], "<i2").astype(">i2").tobytes()
+    np.testing.assert_array_equal(decoded(with_body(message, bytes(body))).pixels, pixels)
+
+
+@pytest.mark.parametrize(("said", "valid"), [
+    ({}, True),
+    ({"TransformValid": "True", "TransformStatus": "OK"}, True),
+    ({"TransformValid": "False"}, False),
+    ({"TransformStatus": "OUT_OF_VIEW"}, False),
+])  # fmt: skip
+def test_a_transform_of_plus_says_whether_the_tool_was_in_sight(said, valid):
+    message, matrix = transform(version=2, **said)
+    assert decoded(message).valid == valid
+    np.testing.assert_allclose(decoded(message).matrix, matrix, atol=SINGLE)
+
+
+@pytest.mark.parametrize("valid", [True, False])
+def test_a_transform_of_ours_is_read_by_pyigtl(valid):
+    matrix = transform()[1]
+    message = packed_transform("ImageToReference", 3.5, matrix, valid)
+    for got in (by_pyigtl(message).matrix, decoded(message).matrix):
+        np.testing.assert_allclose(got, matrix, atol=SINGLE)
+    assert decoded(message).valid == valid
+    assert by_pyigtl(message).metadata.get("TransformValid") == (None if valid else "False")
+
+
+def test_texts_states_and_others():
+    assert by_pyigtl(packed_text("Check", 1.0, "too fast – slower")).string == "too fast \\u2013 slower"
+    assert packed_status("Check", 2.0, "lifted", 5)[58 + 30 :] == b"lifted\0"
+    assert decoded(packed_status("Check", 2.0, "lifted")) == Other("Check", 2.0, "STATUS")
+
+
+def test_a_check_sum_of_zero_was_not_made_and_an_extended_header_may_be_longer():
+    """As some senders write them."""
+    message, matrix = transform(version=2)
+    body = message[58:]
+    longer = struct.pack("> H", 16) + body[2:12] + bytes(4) + body[12:]
+    for other in (with_body(message, body, crc=0), with_body(message, longer)):
+        np.testing.assert_allclose(decoded(other).matrix, matrix, atol=SINGLE)
+
+
+IMAGE = image()[0]
+
+
+@pytest.mark.parametrize(("message", "said"), [
+    (IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]), "check sum"),
+    (with_body(IMAGE, IMAGE[58:-1]), "cannot be unpacked"),
+    (changed(3, "B", 9), "cannot be unpacked"),
+    (changed(6, ">3H", 65535, 65535, 65535), "cannot be unpacked"),
+    (changed(12, ">f", float("nan")), "finite"),
+    (with_body(transform()[0], bytes(47)), "cannot be unpacked"),
+    (b"\0\0" + IMAGE[2:], "version 0"),
+    (IMAGE[:2] + b"\xff" * 12 + IMAGE[14:], "header of a message"),
+    (IMAGE[:42] + b"\xff" * 8 + IMAGE[50:], "18446744073709551615 bytes"),
+])  # fmt: skip
+def test_what_makes_no_sense_is_refused_in_one_line(message, said):
+    with pytest.raises(MessageError, match=said) as error:
+        decoded(message)
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize(("values", "said"), [
+    (("d" * 21, 0.0, np.zeros((3, 4), np.uint8)), "at most 20 letters"),
+    (("d", -0.5, np.zeros((3, 4), np.uint8)), "time from 0"),
+    (("d", 0.0, np.zeros((3, 70000), np.uint8)), "65535 each"),
+    (("d", 0.0, np.zeros((3, 4), np.complex64)), "complex64"),
+])  # fmt: skip
+def test_what_openigtlink_cannot_hold_is_not_packed(values, said):
+    with pytest.raises(InvalidInputError, match=said):
+        packed_image(*values, np.eye(4))
+
+
+def until(is_so, timeout_s=WAIT_S):
+    end = time.monotonic() + timeout_s
+    while not is_so():
+        assert time.monotonic() < end, "waited too long"
+        time.sleep(0.005)
+
+
+def taken(receiver, count):
+    got, end = [], time.monotonic() + WAIT_S
+    while len(got) < count and time.monotonic() < end:
+        got += receiver.receive(0.1)
+    return got
+
+
+@pytest.fixture
+def listening():
+    """A bare socket that a client connects to, and the client's port."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(WAIT_S)
+        yield server, server.getsockname()[1]
+
+
+def test_every_message_comes_in_order_to_every_client_and_back():
+    images = [packed_image("I", k, np.full((40, 300), k, np.int16), np.eye(4)) for k in range(50)]
+    with (
+        Server(0) as server,
+        Connection("127.0.0.1", server.port) as one,
+        Connection("127.0.0.1", server.port) as two,
+    ):
+        until(lambda: server.clients == 2)
+        for message in images:
+            server.send(message)
+        for client in (one, two):
+            got = taken(client, 50)
+            assert [message.time_s for message in got] == list(range(50))
+            assert all((message.pixels == k).all() for k, message in enumerate(got))
+            assert (client.state.messages, client.state.refused, client.state.dropped) == (50, 0, 0)
+        assert server.drain(WAIT_S)
+        one.send(packed_transform("Pose", 1.0, np.eye(4)))
+        assert [message.device for message in taken(server, 1)] == ["Pose"]
+
+
+def test_a_connection_waits_for_its_server_and_reconnects():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with Connection("127.0.0.1", port) as connection:
+        until(lambda: "refused" in connection.state.last_failure)
+        assert not connection.state.connected
+        for k in range(2):
+            with Server(port) as server:
+                assert connection.wait_connected(WAIT_S)
+                assert server.wait_connected(WAIT_S)
+                server.send(LAST)
+                assert [message.device for message in taken(connection, 1)] == ["Last"]
+                assert connection.state.reconnections == k
+            until(lambda: not connection.state.connected)
+
+
+def test_a_damaged_body_is_refused_alone_and_a_damaged_header_ends_the_connection(listening):
+    server, port = listening
+    with Connection("127.0.0.1", port) as connection:
+        peer, _ = server.accept()
+        peer.sendall(LAST + IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]) + LAST)
+        assert len(taken(connection, 2)) == 2
+        state = connection.state
+        assert (state.connected, state.messages, state.refused) == (True, 2, 1)
+        assert "check sum" in state.last_refused
+        peer.sendall(b"\0\1no header" + bytes(100) + LAST)
+        again, _ = server.accept()
+        assert connection.state.refused == 2
+        assert "header" in connection.state.last_failure
+        again.sendall(LAST)
+        assert len(taken(connection, 1)) == 1
+        peer.close()
+        again.close()
+
+
+@pytest.mark.parametrize("dies", [True, False])
+def test_a_peer_that_dies_or_stalls_within_a_message_costs_that_message(listening, monkeypatch, dies):
+    monkeypatch.setattr(link, "STALL_S", 0.3)
+    server, port = listening
+    with Connection("127.0.0.1", port) as connection:
+        peer, _ = server.accept()
+        peer.sendall(LAST)
+        assert len(taken(connection, 1)) == 1
+        until(lambda: connection.state.silent_s > 0.5)  # silence between messages is no stall
+        assert connection.state.connected
+        peer.sendall(LAST + LAST[:70])
+        if dies:
+            peer.close()
+        again, _ = server.accept()
+        assert ("within a message" if dies else "0.3 s") in connection.state.last_failure
+        again.sendall(LAST)
+        assert len(taken(connection, 2)) == 2
+        assert connection.state.reconnections == 1
+        peer.close()
+        again.close()
+
+
+def test_what_nobody_takes_waits_at_the_peer_and_nothing_is_lost(monkeypatch):
+    monkeypatch.setattr(link, "_MOST_RECEIVED", 3)
+    message = packed_image("I", 0.0, np.zeros((500, 1000), np.int16), np.eye(4))
+    with Server(0) as server, Connection("127.0.0.1", server.port) as connection:
+        assert server.wait_connected(WAIT_S)
+        for _ in range(60):
+            server.send(message)
+        until(lambda: connection.state.waiting == 3)
+        time.sleep(0.2)
+        assert connection.state.waiting == 3
+        assert len(taken(connection, 60)) == 60
+        assert server.state.dropped == 0
+
+
+def test_a_peer_that_reads_nothing_loses_the_oldest_and_nobody_waits_for_it(listening, monkeypatch):
+    monkeypatch.setattr(link, "_MOST_SENDING", 3)
+    server, port = listening
+    with Connection("127.0.0.1", port) as connection:
+        peer, _ = server.accept()
+        for k in range(60):
+            connection.send(packed_image("I", k, np.zeros((500, 1000), np.int16), np.eye(4)))
+        assert connection.state.dropped > 20
+        begin = time.monotonic()
+        connection.close()
+        assert time.monotonic() - begin < 5.0
+        peer.close()
+    assert not [thread for thread in threading.enumerate() if "_guarded" in thread.name]
+
+
+def test_a_client_may_come_and_go():
+    with Server(0) as server:
+        for _ in range(20):
+            socket.create_connection(("127.0.0.1", server.port)).close()
+        until(lambda: server.state.reconnections == 19 and server.clients == 0)
+        with Connection("127.0.0.1", server.port) as connection:
+            until(lambda: server.clients == 1)
+            server.send(LAST)
+            assert len(taken(connection, 1)) == 1
+
+
+def test_a_taken_port_is_one_line():
+    with Server(0) as server, pytest.raises(FileError, match="free port"):
+        Server(server.port)
+
+
+def test_pyigtl_connects_to_our_server():
+    client = None
+    with Server(0) as server:
+        try:
+            client = pyigtl.OpenIGTLinkClient("127.0.0.1", server.port)
+            assert server.wait_connected(WAIT_S)
+            server.send(packed_image("Volume", 1.5, np.ones((3, 4, 5), np.uint8), np.eye(4)))
+            assert client.wait_for_message("Volume", WAIT_S).image.shape == (5, 4, 3)
+            client.send_message(pyigtl.TransformMessage(np.eye(4), 2.0, "Back"), wait=False)
+            assert [message.device for message in taken(server, 1)] == ["Back"]
+        finally:
+            if client is not None:
+                client.stop()
+
+
+def test_a_host_that_cannot_be_a_name_is_told_and_does_not_end_the_thread():
+    with Connection("a..b", 18944) as connection:
+        until(lambda: "label" in connection.state.last_failure)
+        assert not connection.state.connected

@@ -1,0 +1,102 @@
+"""Attenuation by the echo's spectrum, with structure and noise in it, and the curves stretched for it."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra
+from speckle3d.core.sweep import RFSettings
+from speckle3d.motion.attenuation import UNKNOWN_SIGMA, estimate_attenuation
+from speckle3d.motion.diffraction import (
+    Lens,
+    half_distance,
+    sheet_spectrum,
+    speckle_correlation,
+)
+
+BAND = (5e6, 10e6)
+DEPTH = np.arange(3.5, 40.0, 3.0)
+FREQUENCY = np.linspace(5e6, 10e6, 21)
+DISTANCE = 0.01 * np.arange(251)
+LENS = Lens(5.0, 20.0, 10.0)
+CELLS = 4000.0
+"""Independent values of a row's power at each frequency: 16 frames of 48 vectors."""
+
+
+def _power(attenuation, rng=None, exponent=0.0, noise=0.0, band=BAND):
+    power = sheet_spectrum(FREQUENCY, band, attenuation, 2.0, DEPTH)
+    power = power * (FREQUENCY / 7.5e6) ** -np.broadcast_to(exponent, DEPTH.shape)[:, None]
+    power = power / power.mean(axis=1, keepdims=True) + np.broadcast_to(noise, DEPTH.shape)[:, None]
+    return power if rng is None else power * rng.gamma(CELLS / FREQUENCY.size, size=power.shape)
+
+
+@cache
+def _curves(attenuation=0.5):
+    power = _power(attenuation)
+    rho = speckle_correlation(LENS, DEPTH[:, None], FREQUENCY, power[:, None], DISTANCE)
+    key = CurveKey(RFSettings(200e6 / 3, 1540.0, 7.5e6, BAND), 0.3, 3.6, 3.0, 2.0, "echo")
+    rho = np.minimum.accumulate(np.clip(rho, 1e-4, 1.0), axis=1)
+    return DecorrelationCurves(
+        key,
+        DEPTH,
+        DISTANCE,
+        rho,
+        np.full(DEPTH.size, 60.0),
+        spectrum=EchoSpectra(DEPTH, FREQUENCY, power),
+    )
+
+
+def _found(curves, power):
+    return estimate_attenuation(curves, EchoSpectra(DEPTH, FREQUENCY, power))
+
+
+@pytest.mark.parametrize("difference", [-0.3, -0.1, 0.0, 0.1, 0.3])
+def test_attenuation_in_spite_of_structure_and_noise(difference):
+    curves, errors, claims = _curves(), [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        exponent = np.where(rng.random(DEPTH.size) < 0.5, rng.exponential(0.7, DEPTH.size), 0.0)
+        noise = 0.2 * (DEPTH / DEPTH[-1]) ** 4
+        found = _found(curves, _power(0.5 + difference, rng, exponent, noise))
+        errors.append(found.difference_db_cm_mhz - difference)
+        claims.append(found.sigma_db_cm_mhz)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.02
+    assert np.abs(np.divide(errors, claims)).max() < 2.0
+
+
+def test_none_over_a_phantom():
+    curves = _curves()
+    found = [_found(curves, _power(0.5, np.random.default_rng(seed))) for seed in range(8)]
+    assert np.abs([each.difference_db_cm_mhz for each in found]).max() < 0.015
+
+
+@pytest.mark.parametrize("difference", [-0.2, 0.3])
+def test_curves_stretch_as_the_beam_widens(difference):
+    there, given = _curves(0.5 + difference), _curves(0.5)
+    stretched = _found(given, _power(0.5 + difference)).applied(given)
+    half = [
+        np.array([half_distance(DISTANCE, row) for row in each.correlation])
+        for each in (stretched, there, given)
+    ]
+    assert np.abs(half[0] / half[1] - 1.0).max() < 0.016
+    assert np.abs(half[2] / half[1] - 1.0).max() > 0.05
+    # Curves that have been stretched belong to the tissue, and are not stretched again.
+    assert abs(_found(stretched, _power(0.5 + difference)).difference_db_cm_mhz) < 0.01
+
+
+@pytest.mark.parametrize("shift_hz", [-0.5e6, 0.5e6])
+def test_another_transmit_band_is_told_and_not_taken_for_attenuation(shift_hz):
+    band = (BAND[0] + shift_hz, BAND[1] + shift_hz)
+    found = _found(_curves(), _power(0.5, np.random.default_rng(1), band=band))
+    assert found.difference_db_cm_mhz == 0.0
+    assert found.sigma_db_cm_mhz == UNKNOWN_SIGMA
+    assert [each.suspect for each in found.doubts] == ["another transmit band or filter than the phantom's"]
+
+
+def test_without_a_spectrum_the_claim_covers_soft_tissue():
+    given = replace(_curves(), spectrum=None)
+    found = _found(given, _power(0.8))
+    assert found.applied(given) is given
+    assert 0.025 < found.log_length_sigma < 0.035
