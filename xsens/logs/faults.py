@@ -73,6 +73,7 @@ def measured(log: ImuLog) -> ImuLog:
     InvalidInputError
         If its rows are of several sensors in turn.
     """
+    log = _without_damage(log)
     _require_one_sensor(log)
     readings: dict[str, FloatArray | None] = {name: getattr(log, name) for name in VECTORS}
     dead = np.zeros(len(log), dtype=bool)
@@ -110,20 +111,32 @@ _WORDS = {
 }
 
 
+def _without_damage(log: ImuLog) -> ImuLog:
+    """The log without numbers that are damage in any unit, counted in its notes."""
+    changed: dict[str, Any] = {}
+    notes = []
+    for name in VECTORS:
+        rows = getattr(log, name)
+        if rows is not None and (np.abs(rows) >= _ABSURD).any():
+            wild = (np.abs(rows) >= _ABSURD).any(axis=1)
+            changed[name] = np.where(wild[:, None], np.nan, rows)
+            notes.append(f"{name.split('_')[0]}: {int(wild.sum())} out of range: taken as missing")
+    return replace(log, **changed, notes=(*log.notes, *notes)) if changed else log
+
+
 def _bad(name: str, rows: FloatArray, dead: BoolArray, log: ImuLog) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
     limits, finite = _LIMITS[name], _every(np.isfinite(rows))
     rows = rows if finite.all() else np.where(finite[:, None], rows, np.nan)
     size = np.fmax.reduce([np.abs(np.where(finite, axis, 0.0)) for axis in rows.T])
-    zero, unit, wild = finite & (size == 0.0), 1.0, size >= _ABSURD
-    rows = np.where(wild[:, None], np.nan, rows) if wild.any() else rows
+    zero, unit = finite & (size == 0.0), 1.0
     if name == VECTORS[2]:
         zero |= finite & (size < 1e-12)
-        some = finite & ~zero & ~wild
+        some = finite & ~zero
         unit = float(np.median(np.linalg.norm(rows[some], axis=1))) if some.any() else 1.0
     beyond = finite & (size > limits.largest * unit)
     if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
-        beyond = wild
+        beyond[:] = False
     rows = np.where(beyond[:, None], np.nan, rows) if beyond.any() else rows
     start, length = _runs(rows)
     usual, (before, after) = int(np.median(length)), _jumps(rows, start, length)
@@ -247,8 +260,7 @@ def _require_one_sensor(log: ImuLog) -> None:
             continue
         middle = len(rows) // 2
         rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
-        there = (np.abs(rows) < _ABSURD) & (rows != 0.0).any(axis=1)[:, None]
-        rows = np.where(there, rows, np.nan)
+        rows = np.where((rows != 0.0).any(axis=1)[:, None], rows, np.nan)
         apart = [_median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
         for sensors in range(2, _MOST_SENSORS + 1):
             if np.min(apart[: sensors - 1]) > _OTHER * apart[sensors - 1] + 0.02 * _median_norm(rows):
