@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 @app.command(
     "expect", hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
 )
-def expect(names: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+def expect(names: Annotated[list[str] | None, typer.Argument(help="Ignored.")] = None) -> None:
     """Say what replaces `expect inertial`."""
     from speckle3d.core.reconstruction import REMOVED_MODES
 
