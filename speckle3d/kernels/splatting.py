@@ -327,3 +327,22 @@ def keep_largest(
                         ):
                             table[k + w, j + v, i + u] = level
                 x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def means_of_counts(table: Words, offset: int, voxels: Float32Array) -> None:
+    """Turn what `count_nearest` made into means.
+
+    Parameters
+    ----------
+    table : ndarray, shape (n_k, n_j, n_i)
+    offset : int
+        What was added to each level.
+    voxels : ndarray, shape (n_k, n_j, n_i), filled in
+        NaN where no sample was.
+    """
+    words, means = table.reshape(-1), voxels.reshape(-1)
+    for at in range(words.size):
+        count = np.int64(words[at] >> np.uint64(COUNT_BITS))
+        total = np.int64(words[at] & np.uint64((1 << COUNT_BITS) - 1))
+        means[at] = np.float32((total - count * offset) / count)

@@ -37,7 +37,7 @@ Weights = npt.NDArray[Any] | Images
 
 _COUNTED, _SUMMED = ("uint8", "int16", "uint16", "float32"), ("uint8", "float32")
 """Types that kernels read as they are, counting and otherwise; others become float32."""
-_POSITION_BITS, _SHARE_BITS, _COUNT_BITS, _PLUS_BITS = 40, 10, 40, 14
+_POSITION_BITS, _SHARE_BITS, _PLUS_BITS = 40, 10, 14
 """As the kernels have them."""
 _MOST_COUNTED = 2**23
 """Samples in a voxel for which sum and count fit into one word, and as many to spare."""
@@ -153,16 +153,17 @@ def splat_images(
 
 def _means(table: npt.NDArray[Any], offset: int) -> Float32Array:
     """Means from sums and numbers of samples, in one word or beside each other; NaN where none was."""
+    from speckle3d.kernels.splatting import means_of_counts
+
     voxels = np.empty(table.shape[:3], np.float32)
 
     def work(first: int, stop: int) -> None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            for k in range(first, stop):
-                if table.dtype == np.uint64:
-                    total = table[k] & np.uint64((1 << _COUNT_BITS) - 1)
-                    voxels[k] = total / (table[k] >> np.uint64(_COUNT_BITS)) - offset
-                else:
-                    voxels[k] = table[k, :, :, 0] / table[k, :, :, 1]
+        part = slice(first, stop)
+        if table.dtype == np.uint64:
+            means_of_counts(table[part], offset, voxels[part])
+        else:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                voxels[part] = table[part, :, :, 0] / table[part, :, :, 1]
 
     in_parallel(work, len(voxels))
     return voxels

@@ -14,7 +14,6 @@ from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
-from speckle3d.imaging.voxels.volume import compound
 from speckle3d.kernels.cuts import EDGE_TOLERANCE
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
@@ -133,18 +132,6 @@ def test_as_many_images_of_either_facing_are_told_apart(seed):
     np.testing.assert_allclose(voxels, expected.T, atol=2e-5)
 
 
-def test_a_probe_turned_round_between_passes_interpolates_between_them():
-    there = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
-    turned = RigidTransform.from_components([4.0, 0.0, 2.0], Rotation.from_rotvec([0.0, np.pi, 0.0]))
-    poses = RigidTransform.concatenate([there, turned])
-    images = [np.full((9, 14), level) for level in (10.0, 50.0, 30.0)]
-    grid = VoxelGrid((5, 5, 5), (0.5, 0.5, 1.0), RigidTransform.from_translation([1.0, 1.0, 0.0]))
-    voxels, _ = look_up_voxels(PosedImages(images, GRID, poses), grid, 4.5)
-    np.testing.assert_allclose(
-        voxels, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]], [[40.0]], [[50.0]]], (5, 5, 5))
-    )
-
-
 def test_only_the_region_counts():
     poses = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     source = PosedImages(np.ones((2, 9, 14)), GRID, poses)
@@ -156,17 +143,6 @@ def test_only_the_region_counts():
     inside = (y[:, None] >= 1.0) & (y[:, None] < 2.8) & (x >= 1.0) & (x < 3.0)
     np.testing.assert_array_equal(state != EMPTY, np.broadcast_to(inside, state.shape))
     assert (voxels[state != EMPTY] == 1.0).all()
-
-
-def test_compounding_backward_is_this_in_any_type():
-    rng = np.random.default_rng(5)
-    poses, images = shaken(rng, 6, 1.1), rng.uniform(0.0, 255.0, (6, 9, 14)).astype(np.float32)
-    grid = grid_around(GRID, poses, 0.4)
-    voxels, state = look_up_voxels(PosedImages(images, GRID, poses), grid, 1.7)
-    for voxel_type, expected in (("float32", voxels), ("uint8", np.nan_to_num(np.rint(voxels)))):
-        volume = compound(images, GRID, poses, 0.4, backward_mm=1.7, voxel_type=voxel_type)
-        np.testing.assert_array_equal(volume.voxels, expected.T)
-        np.testing.assert_array_equal(volume.state, state.T)
 
 
 def test_one_image_and_none_near():

@@ -5,12 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from posed_sweeps import GRID, KINDS, corners_in, sweep
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.voxels.grid import grid_around, grid_like, spacing_within
+from speckle3d.imaging.voxels.grid import grid_around, spacing_within
 
 
 @settings(max_examples=8, deadline=None)
@@ -69,15 +68,6 @@ def test_what_is_not_asked_for_holds_the_images():
     inside = around.world_from_grid.apply([3.5, 3.5, 3.5])
     placed = grid_around(GRID, poses, 0.5, world_from_axes=axes, origin_mm=inside)
     assert placed.shape == tuple(n - 7 for n in around.shape)
-
-
-def test_a_grid_like_a_volume_is_its_grid():
-    pose = RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([0.1, 0.7, 0.2]))
-    volume = Volume(np.zeros((3, 4, 5), np.uint8), (0.1, 0.2, 0.3), pose)
-    voxels = grid_like(volume)
-    assert voxels.shape == (3, 4, 5)
-    assert voxels.spacing_mm == (0.1, 0.2, 0.3)
-    np.testing.assert_array_equal(voxels.world_from_grid.as_matrix(), pose.as_matrix())
 
 
 @settings(max_examples=8, deadline=None)
