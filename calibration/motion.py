@@ -143,8 +143,8 @@ def judge(solution: Solution) -> Adequacy:
         )
         return Adequacy(error, condition, (), weakest, True, misfit)
     tied = solution.rival is not None and solution.rival.evidence < TIE
-    there = extents(solution)
-    lacking = [motion for motion, extent in there.items() if extent < _ABSENT]
+    extent_of = extents(solution)
+    lacking = [motion for motion, extent in extent_of.items() if extent < _ABSENT]
     dots = solution.phantom.seen_as == "dot"
     # Dots of wires tell the image's place from a few frames; what they lack is in their errors.
     allowed = _ALLOWED_LACKING if lacking and not dots else 1.0
@@ -153,7 +153,7 @@ def judge(solution: Solution) -> Adequacy:
     unsized &= UP_AND_DOWN in lacking
     refused = bool(excess > allowed or not condition <= MAX_CONDITION or tied or unsized)
     # If none is absent, the one that was there and not far enough.
-    missing = tuple(lacking or [min(there, key=lambda one: there[one])]) if weak or refused else ()
+    missing = tuple(lacking or [min(extent_of, key=lambda one: extent_of[one])]) if weak or refused else ()
     state = f"standard error {_size(error, angular)}" + ("" if angular else " at the image's corners")
     if not angular and errors[1] / REFUSED_RAD > errors[0] / REFUSED_MM:
         state += f" and {_size(errors[1], True)}"
@@ -205,12 +205,12 @@ def extents(solution: Solution) -> dict[str, float]:
     along = ends[:, 0] if solution.angular else ends[:, 1] - ends[:, 0]
     slope = np.arctan(along[:, 1] / along[:, 0])
     # The slope depends on the pixels' shape, which may be wrong; the normal swings as far at least.
-    found = {TILT: np.sqrt(max(swing - slope.var(), 0.0)), ROLL: min(slope.std(), np.sqrt(swing))}
+    spread_of = {TILT: np.sqrt(max(swing - slope.var(), 0.0)), ROLL: min(slope.std(), np.sqrt(swing))}
     if solution.angular and solution.phantom.determined:
         # A plane that is not known to be level has a slope, which turning about its normal tells apart.
         turns = points.world_from_sensor.rotation
-        found[YAW] = ((turns.mean().inv() * turns).as_rotvec() @ middle).std()
-    found = {motion: float(angle / _STEP_RAD) for motion, angle in found.items()}
+        spread_of[YAW] = ((turns.mean().inv() * turns).as_rotvec() @ middle).std()
+    spread_of = {motion: float(angle / _STEP_RAD) for motion, angle in spread_of.items()}
     if not solution.angular:
         centre = ends.mean(axis=1)
         column = np.median(centre[:, 0])
@@ -218,8 +218,8 @@ def extents(solution: Solution) -> dict[str, float]:
         # About the column at which the lines cross: turning the probe there does not change the depth.
         steps = np.column_stack([np.ones(len(slope)), np.tan(slope)])
         left = depth - steps @ np.linalg.lstsq(steps, depth, rcond=None)[0]
-        found[UP_AND_DOWN] = float(left.std() / steps_mm[1])
-    return found
+        spread_of[UP_AND_DOWN] = float(left.std() / steps_mm[1])
+    return spread_of
 
 
 def _bounded(solution: Solution) -> FloatArray:

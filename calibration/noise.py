@@ -160,7 +160,7 @@ def fit_wandering(
     """
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    known = np.zeros((len(scale), len(scale))) if prior is None else prior / np.outer(scale, scale)
+    information = np.zeros((len(scale), len(scale))) if prior is None else prior / np.outer(scale, scale)
     columns = np.ascontiguousarray(np.column_stack([jacobian / scale, residuals]))
     normal, log_determinant = _whitened(columns, np.ascontiguousarray(effects), starts, frame_time_s, grid)
     matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
@@ -173,8 +173,8 @@ def fit_wandering(
     likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
     weight = grid.prior * np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
-    back = np.zeros(len(scale)) if excess is None else known @ (excess * scale)
-    spread = np.linalg.pinv(matrix / variance[:, None, None] + known, rcond=_SINGULAR, hermitian=True)
+    back = np.zeros(len(scale)) if excess is None else information @ (excess * scale)
+    spread = np.linalg.pinv(matrix / variance[:, None, None] + information, rcond=_SINGULAR, hermitian=True)
     steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + back)
     step = weight @ steps
     away = steps - step
@@ -247,7 +247,7 @@ def fit_noise(
     frame_time_s = points.times[starts[:-1] // several]
     beside = np.zeros((equations.offsets.size, 0)) if more is None else more
     further, count = np.zeros(beside.shape[1]), len(free)
-    known, excess = _known(prior, chain, free, count + len(further))
+    information, excess = _known(prior, chain, free, count + len(further))
     corrected, expected, grid = equations, np.zeros(len(beside)), None
     for number in range(_STEPS):
         values, slopes = corrected.at(chain)
@@ -260,12 +260,14 @@ def fit_noise(
         if grid is None:
             lonely = len(starts) - 1 == len(beside)
             grid = make_grid(effects, frame_time_s, _proportions(seen_as), (0.0,) if lonely else JITTER)
-        noise, grid = fit_wandering(jacobian, residuals, effects, starts, frame_time_s, grid, known, excess)
+        noise, grid = fit_wandering(
+            jacobian, residuals, effects, starts, frame_time_s, grid, information, excess
+        )
         sensor, image = _divided(residuals + jacobian @ noise.step, effects, starts, noise)
         step = np.zeros(slopes.shape[-1])
         step[columns] = noise.step[:count]
         chain, further = chain.displaced(step), further + noise.step[count:]
-        known, excess = _known(prior, chain, free, count + len(further))
+        information, excess = _known(prior, chain, free, count + len(further))
         corrected, expected = _corrected(equations, chain, sensor, image)
         if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
             break
@@ -329,8 +331,8 @@ def _corrected(
     in_image = in_world @ points.turns @ chain.sensor_from_image.as_matrix()[:3, :2]
     # The smallest displacement in the image, mm, that explains what is left to it.
     square = in_image @ np.swapaxes(in_image, 1, 2) + 1e-9 * np.eye(several)
-    there = np.linalg.solve(square, image.reshape(n, several, 1))[..., 0]
-    moved_mm = np.einsum("nr,nri->ni", there, in_image)
+    pull = np.linalg.solve(square, image.reshape(n, several, 1))[..., 0]
+    moved_mm = np.einsum("nr,nri->ni", pull, in_image)
     poses = RigidTransform(moved, normalize=False)
     shown = replace(points, world_from_sensor=poses, pixels=points.pixels - moved_mm / chain.pixel_mm)
     corrected = replace(equations, points=shown)

@@ -214,32 +214,37 @@ class Equations:
 
     def at(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Residuals, (n, r), and derivatives by the small displacements of `Chain.displaced`, (n, r, 14)."""
-        turns, place = self._placed(chain)
-        u, v = self.points.pixels.T[..., None]
+        probe, target = (
+            pose.rotation.as_matrix() for pose in (chain.sensor_from_image, chain.target_from_world)
+        )
+        place, (u, v) = self._places(chain), self.points.pixels.T[..., None]
         x, y = u * chain.pixel_mm[0], v * chain.pixel_mm[1]
-        across, down, out = np.moveaxis(self.rows @ turns, 2, 0)  # the rows in the image's axes
-        found = np.empty((*self.offsets.shape, len(CHAIN)))
-        found[..., 0], found[..., 1] = across * u, down * v
-        found[..., 2], found[..., 3], found[..., 4] = across, down, out
-        found[..., 5], found[..., 6], found[..., 7] = x * down - y * across, -x * out, y * out
-        found[..., 8:11] = self.rows
-        found[..., 11:14] = np.cross(place[:, None], self.rows)[..., ::-1]
-        values = np.einsum("nri,ni->nr", self.rows, place) - self.offsets
+        in_world = (self.rows.reshape(-1, 3) @ target).reshape(self.rows.shape)
+        in_sensor = np.einsum("nri,nij->nrj", in_world, self.points.turns)
+        # The rows in the image's axes.
+        across, down, out = (in_sensor.reshape(-1, 3) @ probe).T.reshape(3, *self.offsets.shape)
+        (a, b, c), (p, q, r) = np.moveaxis(self.rows, 2, 0), place.T[..., None]
+        slopes = np.empty((len(CHAIN), *self.offsets.shape))
+        slopes[0], slopes[1] = across * u, down * v
+        slopes[2], slopes[3], slopes[4] = across, down, out
+        slopes[5], slopes[6], slopes[7] = x * down - y * across, -x * out, y * out
+        slopes[8], slopes[9], slopes[10] = a, b, c
+        slopes[11], slopes[12], slopes[13] = p * b - q * a, r * a - p * c, q * c - r * b
+        values = p * a + q * b + r * c - self.offsets
         if self.weights is not None:
-            return values * self.weights, found * self.weights[..., None]
-        return values, found
+            values, slopes = values * self.weights, slopes * self.weights
+        return values, np.moveaxis(slopes, 0, 2)
 
     def residuals(self, chain: Chain) -> FloatArray:
         """What does not vanish, shape (n, r)."""
-        return np.asarray(np.einsum("nri,ni->nr", self.rows, self._placed(chain)[1]) - self.offsets)
+        return np.asarray(np.einsum("nri,ni->nr", self.rows, self._places(chain)) - self.offsets)
 
-    def _placed(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
-        """The images' axes in the phantom's frame, (n, 3, 3), and where the points are in it, (n, 3)."""
+    def _places(self, chain: Chain) -> FloatArray:
+        """Where the points are in the phantom's frame, mm, shape (n, 3)."""
         probe, target = chain.sensor_from_image.as_matrix(), chain.target_from_world.as_matrix()
-        half = target[:3, :3] @ self.points.turns
-        flat = (self.points.pixels * chain.pixel_mm) @ probe[:3, :2].T + probe[:3, 3]
-        there = self.points.shifts_mm @ target[:3, :3].T + target[:3, 3]
-        return half @ probe[:3, :3], np.einsum("nij,nj->ni", half, flat) + there
+        in_sensor = (self.points.pixels * chain.pixel_mm) @ probe[:3, :2].T + probe[:3, 3]
+        in_world = np.einsum("nij,nj->ni", self.points.turns, in_sensor) + self.points.shifts_mm
+        return np.asarray(in_world @ target[:3, :3].T + target[:3, 3])
 
 
 @dataclass(frozen=True)
@@ -309,11 +314,11 @@ def least_squares(
         scaled = normal / np.outer(scale, scale) + damping * np.eye(len(scale))
         moved = np.linalg.solve(scaled, pull / scale) / scale
         step[columns] = -moved
-        there = chain.displaced(step)
-        trial = at(there)
+        moved_chain = chain.displaced(step)
+        trial = at(moved_chain)
         promised = float(moved @ pull)
         if trial[2] <= cost:
-            chain, (normal, pull, cost), damping = there, trial, max(damping / 10.0, 1e-12)
+            chain, (normal, pull, cost), damping = moved_chain, trial, max(damping / 10.0, 1e-12)
         else:
             damping = max(10.0 * damping, 1e-6)
         if promised <= tolerance * cost + count * np.finfo(float).eps ** 2 or damping > 1e6:
@@ -534,19 +539,19 @@ class Problem:
         lines of a plane that is always equally deep do not tell the image from its in-plane mirror.
         """
         few = points.of_some_frames(SOME_FRAMES)
-        found = [chain for start in starts if (chain := self._tried(few, start)) is not None]
-        if not found:
+        chains = [chain for start in starts if (chain := self._tried(few, start)) is not None]
+        if not chains:
             return self.solve(points, starts[0])
-        best = found[int(np.argmin(self._costs(few, found)))]
+        best = chains[int(np.argmin(self._costs(few, chains)))]
         turned = [self._tried(few, start) for start in half_turns(best, few, self.phantom)]
-        found += [chain for chain in turned if chain is not None]
-        costs = self._costs(few, found)
-        best = found[int(np.argmin(costs))]
+        chains += [chain for chain in turned if chain is not None]
+        costs = self._costs(few, chains)
+        best = chains[int(np.argmin(costs))]
         solution = self.solve(points, best)
-        others = [k for k, chain in enumerate(found) if apart(best, chain, few, self.phantom)]
+        others = [k for k, chain in enumerate(chains) if apart(best, chain, few, self.phantom)]
         if not others:
             return solution
-        rival = self._tried(points, found[min(others, key=lambda k: float(costs[k]))])
+        rival = self._tried(points, chains[min(others, key=lambda k: float(costs[k]))])
         if rival is None or not apart(solution.chain, rival, points, self.phantom):
             return solution
         ours, theirs = self._costs(solution.points_used, [solution.chain, rival])
@@ -565,13 +570,17 @@ class Problem:
         """Sums of squared residuals, each cut off, in the variance of an independent one at the least sum."""
         equations = Equations.of(points, self.phantom)
         lines = self.phantom.seen_as == "line"
-        found = [equations.residuals(one) / (one.pixel_mm[1] if lines else 1.0) for one in chains]
-        cut = _CUT * min(sigma_of(one) for one in found)
-        sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in found])
-        best = np.clip(found[int(np.argmin(sums))], -cut, cut)
+        residuals = [equations.residuals(one) / (one.pixel_mm[1] if lines else 1.0) for one in chains]
+        cut = _CUT * min(sigma_of(one) for one in residuals)
+        sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in residuals])
+        best = np.clip(residuals[int(np.argmin(sums))], -cut, cut)
         independent = best.size / together(best, points.frame)
-        known = [0.0 if self.prior is None else np.sum(self.prior.deviation(c.pixel_mm) ** 2) for c in chains]
-        return np.asarray(independent * sums / max(float(sums.min()), np.finfo(float).tiny) + np.array(known))
+        priors = [
+            0.0 if self.prior is None else np.sum(self.prior.deviation(c.pixel_mm) ** 2) for c in chains
+        ]
+        return np.asarray(
+            independent * sums / max(float(sums.min()), np.finfo(float).tiny) + np.array(priors)
+        )
 
 
 def _within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
@@ -659,34 +668,36 @@ def calibrate_plane(
         raise InsufficientDataError(
             f"expected lines in at least {_FEWEST_LINES} frames, got {len(lines) // 2}"
         )
-    probe, held = probe_parameters(s.fixed_pixels, pixel_mm)
+    probe, fixed_mm = probe_parameters(s.fixed_pixels, pixel_mm)
     prior = None
-    if held is None and pixel_mm is not None and np.isfinite(s.pixel_error):
+    if fixed_mm is None and pixel_mm is not None and np.isfinite(s.pixel_error):
         prior = PixelPrior(np.asarray(pixel_mm, dtype=float), s.pixel_error)
-    solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma, prior), held, s.stages)
+    solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma, prior), fixed_mm, s.stages)
     if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
         solution = _without_prior(lines, solution, s)
     return _facing_up(require_adequate(solution))
 
 
-def _from_stages(lines: ImagePoints, problem: Problem, held: FloatArray | None, stages: Stages) -> Solution:
+def _from_stages(
+    lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | None, stages: Stages
+) -> Solution:
     """Angles from line directions, then distances, then all; or all at once from several mountings."""
-    pixel_mm = held if problem.prior is None else problem.prior.pixel_mm
+    pixel_mm = fixed_mm if problem.prior is None else problem.prior.pixel_mm
 
     def starts(size: FloatArray | None) -> list[Chain]:
         few = lines.of_some_frames(SOME_FRAMES)
         directions, ratio = as_directions(few), 1.0 if size is None else float(size[0] / size[1])
         three = stages == "three"
-        found = angle_starts(
+        mountings = angle_starts(
             directions.pixels, directions.turns, ratio, hemisphere(), size is None and three, refine=three
         )
-        return [_with_distances(few, angles, size) for angles in found]
+        return [_with_distances(few, angles, size) for angles in mountings]
 
-    found = problem.best(lines, starts(pixel_mm))
-    if pixel_mm is not None or stages == "one" or not found.adequacy.refused:
-        return found
+    solution = problem.best(lines, starts(pixel_mm))
+    if pixel_mm is not None or stages == "one" or not solution.adequacy.refused:
+        return solution
     # Free pixels may shrink to nothing on the way where the motion is poor.
-    return problem.best(lines, [found.chain, *starts(np.full(2, _PIXEL_MM))])
+    return problem.best(lines, [solution.chain, *starts(np.full(2, _PIXEL_MM))])
 
 
 def _with_distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> Chain:
@@ -702,12 +713,12 @@ def _distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) 
     up, turn = angles.normal @ lines.turns, angles.sensor_from_image
     square = np.array([angles.ratio, 1.0]) if pixel_mm is None else pixel_mm
     height = np.sum(up * ((lines.pixels * square) @ turn.as_matrix()[:, :2].T), axis=1)
-    unknown, wanted = [up, np.ones((len(lines), 1))], -lines.shifts_mm @ angles.normal
+    unknown, target_mm = [up, np.ones((len(lines), 1))], -lines.shifts_mm @ angles.normal
     if pixel_mm is None:
         unknown.append(height[:, None])
     else:
-        wanted = wanted - height
-    fit = robust_linear(np.hstack(unknown), wanted, partial(huber_weights, limit=0.6745), rounds=4)
+        target_mm = target_mm - height
+    fit = robust_linear(np.hstack(unknown), target_mm, partial(huber_weights, limit=0.6745), rounds=4)
     size = square * (fit.parameters[4] if pixel_mm is None else 1.0)
     if size[1] < 0:
         turn, size = in_plane_mirror(turn), -size
@@ -729,10 +740,10 @@ def _without_prior(lines: ImagePoints, solution: Solution, s: PlaneFit) -> Solut
         return alone
     if solution.adequacy.refused or solution.prior is None:
         return solution
-    given, found = solution.prior.pixel_mm, solution.chain.pixel_mm
+    stated, fitted = solution.prior.pixel_mm, solution.chain.pixel_mm
     raise InsufficientDataError(
-        f"expected lines that agree with pixels of {given[0]:.4g} x {given[1]:.4g} mm to "
-        f"{100 * solution.prior.error:g} %, got {found[0]:.4g} x {found[1]:.4g} mm with them, and without "
+        f"expected lines that agree with pixels of {stated[0]:.4g} x {stated[1]:.4g} mm to "
+        f"{100 * solution.prior.error:g} %, got {fitted[0]:.4g} x {fitted[1]:.4g} mm with them, and without "
         f"them {alone.adequacy.verdict}"
     )
 

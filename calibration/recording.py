@@ -118,8 +118,8 @@ def calibrate_recording(
     if offset is not None:
         solution = with_uncertain_offset(solution, recording.readings, offset_s)
     frames = FramesUsed(recording.images.shape[0], (), dropped)
-    known = offset is not None or clock_known or offset_s != 0.0
-    calibration = as_calibration(solution, method, frames, offset_s if known else None)
+    stated = offset is not None or clock_known or offset_s != 0.0
+    calibration = as_calibration(solution, method, frames, offset_s if stated else None)
     return Outcome(solution, calibration, seen, _shots(recording, seen, calibration), offset=offset)
 
 
@@ -139,19 +139,19 @@ def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoin
         If few frames have one.
     """
     times = recording.frame_time_s[seen.frame]
-    there = covered(recording.readings, times, offset_s)
-    if there.sum() < max(1.0, _FEWEST_COVERED * len(times)):
+    with_reading = covered(recording.readings, times, offset_s)
+    if with_reading.sum() < max(1.0, _FEWEST_COVERED * len(times)):
         first, last = recording.readings.time_s[[0, -1]] + offset_s
         raise InsufficientDataError(
-            f"expected sensor readings at the times of the frames, got them for {there.sum()} of "
+            f"expected sensor readings at the times of the frames, got them for {with_reading.sum()} of "
             f"{len(times)} in which something was found: readings span {first:.3f} to {last:.3f} s, frames "
             f"{recording.frame_time_s[0]:.3f} to {recording.frame_time_s[-1]:.3f} s"
         )
-    missing = dict.fromkeys((int(n) for n in np.unique(seen.frame[~there])), _UNREAD)
-    read: RigidTransform | Rotation = recording.readings.at(times[there] - offset_s)
+    missing = dict.fromkeys((int(n) for n in np.unique(seen.frame[~with_reading])), _UNREAD)
+    read: RigidTransform | Rotation = recording.readings.at(times[with_reading] - offset_s)
     poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
     below_origin = replace(seen, pixels=seen.pixels + np.array([0.0, recording.first_row]))
-    return below_origin[there].points(poses, times[there]), {**seen.dropped, **missing}
+    return below_origin[with_reading].points(poses, times[with_reading]), {**seen.dropped, **missing}
 
 
 def choose_crossings(recording: Recording, seen: Seen, offsets_s: Sequence[float]) -> Seen:
@@ -173,16 +173,16 @@ def choose_crossings(recording: Recording, seen: Seen, offsets_s: Sequence[float
         return seen
     tried: list[tuple[Consensus, Seen]] = []
     for offset_s in offsets_s:
-        there = covered(recording.readings, recording.frame_time_s[seen.frame], offset_s)
-        found = find_consensus(paired(recording, seen, offset_s)[0], recording.pixel_mm)
-        tried.append((found, seen[there]))
-    found, candidates = min(tried, key=lambda one: one[0].false_alarms)
-    near = found.require().away_mm <= GATES_MM[-1]
+        with_reading = covered(recording.readings, recording.frame_time_s[seen.frame], offset_s)
+        consensus = find_consensus(paired(recording, seen, offset_s)[0], recording.pixel_mm)
+        tried.append((consensus, seen[with_reading]))
+    consensus, candidates = min(tried, key=lambda one: one[0].false_alarms)
+    near = consensus.require().away_mm <= GATES_MM[-1]
     elsewhere = f"nothing within {GATES_MM[-1]:g} mm of the other frames' crossing"
-    reasons = dict.fromkeys((int(n) for n in candidates.frame[found.nearest[~near]]), elsewhere)
+    reasons = dict.fromkeys((int(n) for n in candidates.frame[consensus.nearest[~near]]), elsewhere)
     unread = np.setdiff1d(seen.frame, candidates.frame)
     reasons |= dict.fromkeys((int(n) for n in unread), _UNREAD)
-    return replace(candidates[found.nearest[near]], dropped={**seen.dropped, **reasons})
+    return replace(candidates[consensus.nearest[near]], dropped={**seen.dropped, **reasons})
 
 
 def _shots(recording: Recording, seen: Seen, calibration: Calibration) -> tuple[Shot, ...]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,9 @@ USED, DROPPED = "#0072B2", "#D55E00"
 
 IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
 """Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
+
+ANGLES_IN_WORDS = ("roll (alpha)", "yaw (beta)", "tilt (gamma)")
+"""About the image's z, y and x axes."""
 
 _LONGEST_REASONS = 6
 _MOST_NAMED = 20
@@ -120,15 +124,13 @@ def _frames_used(solution: Solution, frames: FramesUsed) -> FramesUsed:
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
     """What was found as description, value and unit, angles in degrees."""
     rows = [("method", calibration.method, ""), ("sensor", calibration.sensor, "")]
-    words = dict(zip(ANGLES, ("roll (alpha)", "yaw (beta)", "tilt (gamma)"), strict=True))
-    rows += [replace(one, name=words.get(one.name, one.name)).row() for one in calibration.parameters]
-    if not any(one.name in words for one in calibration.parameters):
-        angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
-        errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
-        rows += [
-            (name, f"{angle:.3f} +- {error:.3f}", "deg")
-            for name, angle, error in zip(words.values(), angles, errors, strict=True)
-        ]
+    rows += [one.row() for one in calibration.parameters if one.name not in ANGLES]
+    angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
+    errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
+    rows += [
+        (name, f"{angle:.3f} +- {error:.3f}", "deg")
+        for name, angle, error in zip(ANGLES_IN_WORDS, angles, errors, strict=True)
+    ]
     used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
     rows += [
         (
@@ -210,14 +212,12 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
     aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
     for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
         _draw_shot(axes, shot, aspect)
-    if len(shots) < panels.shape[1]:
-        _explain(panels[0, -1], calibration)
     _draw_residuals(panels[1, 0], solution)
     _draw_against_tilt(panels[1, 1], solution)
     _draw_motion(panels[1, 2], solution)
     for axes in panels[1]:
         axes.grid(alpha=0.3)
-    figure.suptitle(calibration.verdict, fontsize=10)
+    figure.suptitle(fill(calibration.verdict, 150), fontsize=9)
     figure.supxlabel(_colours(shots), fontsize=8)
     return figure
 
@@ -252,12 +252,6 @@ def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
     axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
 
 
-def _explain(axes: Axes, calibration: Calibration) -> None:
-    """Say in a panel without an image what was found."""
-    told = [f"{name}: {value} {unit}" for name, value, unit in (p.row() for p in calibration.parameters)]
-    axes.text(0.0, 1.0, "\n".join(told), va="top", fontsize=8, transform=axes.transAxes, parse_math=False)
-
-
 def _draw_residuals(axes: Axes, solution: Solution) -> None:
     values, unit = _shown(solution)
     used = solution.used
@@ -285,7 +279,9 @@ def _draw_motion(axes: Axes, solution: Solution) -> None:
     turns = _turns_deg(solution)[solution.used]
     drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
     axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
-    axes.set(xlabel="tilt / deg", ylabel="roll / deg", title="how the probe was turned")
+    title = "\n".join(["how the probe was turned", *filter(None, [solution.assumed])])
+    axes.set(xlabel="tilt / deg", ylabel="roll / deg")
+    axes.set_title(title, fontsize=9)
 
 
 def _shown(solution: Solution) -> tuple[FloatArray, str]:

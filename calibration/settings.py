@@ -61,8 +61,8 @@ class WireFit(PixelSettings):
 
     registration: Literal["auto", "held", "turned", "free"] = Field(
         "auto",
-        description="The place a configuration says: hold it, its middle only, or estimate it; auto: whichever "
-        "explains frames best that were left out.",
+        description="The place a configuration says: hold it, its middle only, or estimate it; auto: "
+        "whichever explains frames best that were left out.",
     )
     beside_mm: float = Field(
         BESIDE_MM,

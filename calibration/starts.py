@@ -164,14 +164,14 @@ def _step(
     system = np.swapaxes(weighted, 1, 2) @ matrix
     lift = _DAMPING * np.einsum("kii->ki", system) + _TINY
     system += lift[:, :, None] * np.eye(len(columns))
-    found = -np.linalg.solve(system, np.einsum("knp,kn->kp", weighted, sines)[..., None])[..., 0]
-    found = np.clip(found, -0.5, 0.5)
-    probe[:] = probe @ Rotation.from_rotvec(found[:, :3]).as_matrix()
+    step = -np.linalg.solve(system, np.einsum("knp,kn->kp", weighted, sines)[..., None])[..., 0]
+    step = np.clip(step, -0.5, 0.5)
+    probe[:] = probe @ Rotation.from_rotvec(step[:, :3]).as_matrix()
     if not level:
-        normal += np.einsum("kt,kti->ki", found[:, 3:5], tangents)
+        normal += np.einsum("kt,kti->ki", step[:, 3:5], tangents)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     if fit_ratio:
-        ratios *= np.exp(found[:, -1])
+        ratios *= np.exp(step[:, -1])
 
 
 def _distinct(left: FloatArray, ratios: FloatArray, probe: FloatArray, normal: FloatArray) -> list[Angles]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import INERTIAL, OrientationSensor
 from speckle3d.io.clarius import READER
-from speckle3d.io.clarius.imu import sensor_notes
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
@@ -42,7 +41,7 @@ def _inside_probe(path: Path) -> ImuLog | None:
         return None
     samples, fit = sensor_of(path)
     clock = timeline_of_times(samples.time_s)
-    found = "is not used: it fits none of its other readings" if fit is None else f"is {fit.meaning}"
+    found = "is not used: it does not agree with gravity" if fit is None else f"is {fit.meaning}"
     log = ImuLog(
         clock.time_s,
         samples.accelerometer_m_s2(fit),
@@ -50,7 +49,7 @@ def _inside_probe(path: Path) -> ImuLog | None:
         samples.magnetometer_gauss,
         world_from_sensor=None if fit is None else fit.world_from_sensor,
         gaps=_pauses(clock.gaps),
-        notes=(*clock.notes, f"the sensor's quaternion {found}", *sensor_notes(samples)),
+        notes=(*clock.notes, f"the sensor's quaternion {found}", *samples.remarks),
         source=path.name,
     )
     return measured(log)

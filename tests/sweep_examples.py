@@ -15,7 +15,9 @@ RF = RFSettings(
 
 def poses(n, seed=0):
     rng = np.random.default_rng(seed)
-    return RigidTransform.from_components(rng.normal(0, 5, (n, 3)), Rotation.random(n, rng=rng))
+    places = rng.normal(0, 5, 3) + np.cumsum(rng.normal(0, 0.1, (n, 3)), axis=0)
+    turns = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.002, (n, 3)), axis=0)) * Rotation.random(rng=rng)
+    return RigidTransform.from_components(places, turns)
 
 
 def rf_sweep(frames=6, vectors=5, samples=40, dtype=np.int16, seed=0):

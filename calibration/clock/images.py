@@ -19,8 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import savgol_filter
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from calibration.clock.offset import (
     SEARCH_S,
@@ -30,6 +29,7 @@ from calibration.clock.offset import (
     minimum_between,
     require_peak,
 )
+from calibration.clock.smoothing import smooth
 from calibration.images.stacks import TrackedImages, block_means
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -63,7 +63,6 @@ COARSE, FINE = 8, 60
 """Images of each way compared to find the peak, and to locate it; the paper takes four. A tracker's jitter of
 0.15 mm is 15 ms at 10 mm/s, and only many images average it out."""
 
-_SMOOTHED_S = 0.2
 _PLACES = 9
 _LEAST_TRAVEL_MM = 2.0
 """About an elevational beam width: over less travel all images look alike."""
@@ -104,7 +103,7 @@ def delay_from_images(
     grid, frame_time_s, readings = tracked.grid, tracked.frame_time_s, tracked.readings
     around_s = tracked.time_offset_s
     there = np.flatnonzero(covered(readings, frame_time_s, around_s, search_s))
-    steady = smoothed(readings, _SMOOTHED_S)
+    steady = smooth(readings)
     ways = _there_and_back(there, steady.at(frame_time_s[there] - around_s) * sensor_from_image, grid)
     source = _Correlations(_Pooled(tracked.images, grid), frame_time_s, steady, sensor_from_image, ways)
     coarse, fine = (source.of(number) for number in (min(COARSE, queries), queries))
@@ -206,26 +205,6 @@ class _Correlations:
         return self.readings.at(self.frame_time_s[frames] - delay_s) * self.sensor_from_image
 
 
-def smoothed(readings: TimedPoses, window_s: float) -> TimedPoses:
-    """Reduce the jitter of readings by local parabolas over `window_s`, which follow a hand's motion.
-
-    Between gaps each stretch is smoothed by itself; one too short for a window stays as it is.
-    """
-    step = float(np.median(np.diff(readings.time_s))) if len(readings) > 1 else window_s
-    width = 2 * round(window_s / step / 2) + 1
-    if width < 5:
-        return readings
-    rotation, translation = readings.world_from_sensor.rotation, readings.world_from_sensor.translation
-    vectors = np.column_stack([translation, (rotation[0].inv() * rotation).as_rotvec()])
-    edges = np.flatnonzero(np.diff(readings.time_s) > readings.max_gap_s) + 1
-    for part in np.split(np.arange(len(readings)), edges):
-        if part.size >= width:
-            vectors[part] = savgol_filter(vectors[part], width, 2, axis=0)
-    turned = rotation[0] * Rotation.from_rotvec(vectors[:, 3:])
-    poses = RigidTransform.from_components(vectors[:, :3], turned)
-    return TimedPoses(readings.time_s, poses, readings.max_gap_s)
-
-
 def _there_and_back(frames: IntArray, poses: RigidTransform, grid: ImageGrid) -> tuple[_Way, _Way]:
     if len(poses) < _FEWEST_FRAMES:
         raise InsufficientDataError(
@@ -293,9 +272,10 @@ def _from_jitter(
     the speed.
     """
     used = (readings.time_s >= times_s[0]) & (readings.time_s <= times_s[-1])
+    times = readings.time_s[used]
     raw, held = (
-        (each.world_from_sensor[used] * sensor_from_image).apply(grid.centre_mm)
-        for each in (readings, steady)
+        (poses * sensor_from_image).apply(grid.centre_mm)
+        for poses in (readings.world_from_sensor[used], steady.at(times))
     )
     along = _direction(held)
     path = float(np.abs(np.diff(held @ along)).sum())

@@ -1,12 +1,13 @@
-"""Readings of a sensor between its samples, by local parabolas instead of straight lines.
+"""Readings of a sensor between its samples, by smoothing splines instead of straight lines.
 
 A straight line between two samples halves the variance of their white noise midway and leaves it at the
-samples, so that a misfit as a function of the clock's offset has a bump at every sample. Parabolas fitted to
-several samples have nearly the same noise at all times, and follow a hand's motion to its third derivative.
+samples, so that a misfit as a function of the clock's offset has a bump at every sample. A smoothing spline
+has nearly the same noise at all times. How stiff it is the samples say themselves: every other one predicts
+those between.
 
 References
 ----------
-.. [1] J. Fan and I. Gijbels, "Local polynomial modelling and its applications", 1996, chapters 3 and 4.
+.. [1] G. Wahba, "Spline models for observational data", SIAM, 1990, chapters 1 and 4.
 """
 
 from __future__ import annotations
@@ -18,178 +19,110 @@ from typing import overload
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import make_smoothing_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
-_LONGEST_S = 0.1
-"""Widest weights tried, s: a tenth of a period of 1.6 Hz, faster than hands swing a probe."""
+Curve = Callable[[FloatArray], FloatArray]
 
-_WIDER = 1.5
-"""Ratio of the widths tried, the least of which is one sampling period."""
+_FEWEST = 6
+"""Samples of a spline; fewer are joined by straight lines."""
 
-_REACH = 4.0
-"""Samples farther than this many standard deviations of the weights do not count: those weigh 0.03 %."""
+_STIFFNESS = 10.0 ** np.arange(-3.0, 4.0)
+"""Tried, in samples to the fourth power: from the samples themselves to waves of 35 samples."""
 
-_FEWEST, _WITHIN = 5, 2.6
-"""Where samples are missing, so many are within so many standard deviations, as with regular ones."""
-
-_MOST_COMPARED = 400
+_MOST_COMPARED = 600
+"""Samples among which stiffness is chosen."""
 
 
 @dataclass(frozen=True)
-class _Parabolas:
-    """Weighted parabolas through vectors near each time.
+class _Curves:
+    """Smoothing splines through columns of samples, one for each stretch without a long gap."""
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-    stretch : ndarray of int, shape (n,)
-        Samples of other stretches, beyond a gap, do not count.
-    """
+    begins_s: FloatArray
+    curves: list[list[Curve]]
 
-    time_s: FloatArray
-    stretch: IntArray
+    @classmethod
+    def of(cls, readings: TimedPoses | TimedRotations) -> _Curves:
+        turns, places = readings.components
+        back = np.sum(turns[1:] * turns[:-1], axis=1) < 0
+        turns = turns * np.where(np.cumsum(np.append(0, back)) % 2, -1.0, 1.0)[:, None]
+        time_s = readings.time_s
+        edges = np.flatnonzero(np.diff(time_s) > readings.max_gap_s) + 1
+        parts = np.split(np.arange(len(time_s)), edges)
+        period = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+        sets = [(columns, _stiffness(time_s / period, columns)) for columns in (turns, places)]
+        return cls(
+            time_s[[part[0] for part in parts]],
+            [
+                [
+                    _curve(time_s[part], one, period, stiff)
+                    for columns, stiff in sets
+                    for one in columns[part].T
+                ]
+                for part in parts
+            ],
+        )
 
-    @property
-    def period_s(self) -> float:
-        return float(np.median(np.diff(self.time_s)))
-
-    def weights(
-        self, times_s: FloatArray, width_s: float, left_out: IntArray | None = None
-    ) -> tuple[IntArray, FloatArray]:
-        """Samples near each time, shape (q, k), and their shares of the value there, which add to one."""
-        nearest = self.nearest(times_s)
-        few = min(_FEWEST, len(self.time_s))
-        around = np.clip(nearest[:, None] + np.arange(-few, few + 1), 0, len(self.time_s) - 1)
-        away = np.abs(self.time_s[around] - times_s[:, None])
-        away[self._doubled(around)] = np.inf
-        width = np.maximum(width_s, np.sort(away, axis=1)[:, few - 1] / _WITHIN)
-        first = np.searchsorted(self.time_s, times_s - _REACH * width)
-        last = np.searchsorted(self.time_s, times_s + _REACH * width, side="right")
-        index = first[:, None] + np.arange(max(int((last - first).max()), 1))
-        there = index < last[:, None]
-        index = np.where(there, index, nearest[:, None])
-        there &= self.stretch[index] == self.stretch[nearest][:, None]
-        if left_out is not None:
-            there &= index != left_out[:, None]
-        x = (self.time_s[index] - times_s[:, None]) / width[:, None]
-        weight = np.where(there, np.exp(-0.5 * x**2), 0.0)
-        powers = np.stack([np.ones_like(x), x, x**2], axis=-1)
-        moments = np.einsum("qk,qki,qkj->qij", weight, powers, powers)
-        # Of fewer than three samples no parabola is determined: the least one through them.
-        solved = np.linalg.pinv(moments, rcond=1e-10, hermitian=True)[:, 0]
-        return index, weight * np.einsum("qi,qki->qk", solved, powers)
-
-    def nearest(self, times_s: FloatArray) -> IntArray:
-        """Sample nearest to each time."""
-        right = np.clip(np.searchsorted(self.time_s, times_s), 1, len(self.time_s) - 1)
-        left = right - 1
-        nearer = times_s - self.time_s[left] < self.time_s[right] - times_s
-        return np.asarray(np.where(nearer, left, right))
-
-    @staticmethod
-    def _doubled(index: IntArray) -> BoolArray:
-        """Places that repeat the one before, at the ends of the samples."""
-        same = np.zeros(index.shape, dtype=bool)
-        same[:, 1:] = index[:, 1:] == index[:, :-1]
-        return same
+    def at(self, times_s: FloatArray) -> FloatArray:
+        """Columns at each time, shape (q, c)."""
+        stretch = np.maximum(np.searchsorted(self.begins_s, times_s, side="right") - 1, 0)
+        found = np.empty((len(times_s), len(self.curves[0])))
+        for number in np.unique(stretch):
+            there = stretch == number
+            found[there] = np.column_stack([curve(times_s[there]) for curve in self.curves[number]])
+        return found
 
 
-@dataclass(frozen=True)
-class _Smooth:
-    """The two parts of a pose, each with the width that predicts left-out samples best."""
+def _stiffness(places: FloatArray, columns: FloatArray) -> float:
+    """Stiffness with which every other sample predicts those between them best."""
+    at, values = places[:_MOST_COMPARED], columns[:_MOST_COMPARED]
+    if len(at) < 2 * _FEWEST:
+        return float(_STIFFNESS[0])
+    inner = slice(1, -1 if len(at) % 2 == 0 else None, 2)
 
-    parabolas: _Parabolas
-    rotation: Rotation
-    translation: FloatArray | None
+    def missed(stiffness: float) -> float:
+        curves = [_curve(at[::2], one, 2.0, stiffness) for one in values[::2].T]
+        return float(np.abs(np.column_stack([curve(at[inner]) for curve in curves]) - values[inner]).sum())
 
-    def turned(self, times_s: FloatArray) -> Rotation:
-        """Rotation at each time."""
-        nearest, vectors = self._rotation_vectors(times_s, self._turning_s)
-        return self.rotation[nearest] * Rotation.from_rotvec(vectors)
-
-    def moved(self, times_s: FloatArray) -> FloatArray:
-        """Translation at each time, shape (q, 3)."""
-        return self._translations(times_s, self._moving_s)
-
-    @cached_property
-    def _turning_s(self) -> float:
-        def missed(width_s: float, tried: IntArray) -> float:
-            times = self.parabolas.time_s[tried]
-            _, vectors = self._rotation_vectors(times, width_s, tried)
-            return float(np.linalg.norm(vectors, axis=1).mean())
-
-        return self._best(missed)
-
-    @cached_property
-    def _moving_s(self) -> float:
-        def missed(width_s: float, tried: IntArray) -> float:
-            assert self.translation is not None
-            found = self._translations(self.parabolas.time_s[tried], width_s, tried)
-            return float(np.linalg.norm(found - self.translation[tried], axis=1).mean())
-
-        return self._best(missed)
-
-    def _best(self, missed: Callable[[float, IntArray], float]) -> float:
-        period = self.parabolas.period_s
-        count = int(np.log(max(_LONGEST_S / period, 1.0)) / np.log(_WIDER)) + 1
-        widths = period * _WIDER ** np.arange(count)
-        last = len(self.parabolas.time_s) - 1
-        tried = np.unique(np.linspace(0, last, min(_MOST_COMPARED, last + 1)).astype(int))
-        return float(widths[int(np.argmin([missed(float(width), tried) for width in widths]))])
-
-    def _rotation_vectors(
-        self, times_s: FloatArray, width_s: float, left_out: IntArray | None = None
-    ) -> tuple[IntArray, FloatArray]:
-        """Nearest sample to each time, and the rotation vector from it, rad."""
-        nearest = self.parabolas.nearest(times_s)
-        index, share = self.parabolas.weights(times_s, width_s, left_out)
-        base = np.repeat(nearest, index.shape[1])
-        vectors = (self.rotation[base].inv() * self.rotation[index.ravel()]).as_rotvec()
-        return nearest, np.einsum("qk,qki->qi", share, vectors.reshape(*index.shape, 3))
-
-    def _translations(
-        self, times_s: FloatArray, width_s: float, left_out: IntArray | None = None
-    ) -> FloatArray:
-        assert self.translation is not None
-        index, share = self.parabolas.weights(times_s, width_s, left_out)
-        return np.asarray(np.einsum("qk,qki->qi", share, self.translation[index]))
+    # Of a wave the filter is the same at half the samples if the stiffness is a sixteenth.
+    return 16.0 * float(min(_STIFFNESS, key=lambda one: missed(float(one))))
 
 
-def _of(readings: TimedPoses | TimedRotations) -> _Smooth:
-    time_s = readings.time_s
-    stretch = np.concatenate([[0], np.cumsum(np.diff(time_s) > readings.max_gap_s)])
-    samples: RigidTransform | Rotation = readings.world_from_sensor
-    if isinstance(samples, Rotation):
-        return _Smooth(_Parabolas(time_s, stretch), samples, None)
-    return _Smooth(_Parabolas(time_s, stretch), samples.rotation, np.asarray(samples.translation))
+def _curve(time_s: FloatArray, values: FloatArray, period: float, stiffness: float) -> Curve:
+    if len(time_s) < _FEWEST or np.ptp(values) == 0.0:
+        return lambda times_s: np.asarray(np.interp(times_s, time_s, values))
+    spline = make_smoothing_spline(time_s / period, values, lam=stiffness)
+    return lambda times_s: np.asarray(spline(times_s / period))
 
 
 class SmoothPoses(TimedPoses):
-    """Poses that are read from local parabolas."""
+    """Poses that are read from smoothing splines."""
 
     @cached_property
-    def _smooth(self) -> _Smooth:
-        return _of(self)
+    def _curves(self) -> _Curves:
+        return _Curves.of(self)
 
     def at(self, times_s: npt.ArrayLike) -> RigidTransform:
         """Pose at each of `times_s`; raises as `TimedPoses.at` does."""
-        times = self.require_covered(times_s)
-        return RigidTransform.from_components(self._smooth.moved(times), self._smooth.turned(times))
+        found = self._curves.at(np.atleast_1d(self.require_covered(times_s)))
+        turns = Rotation.from_quat(found[:, :4])
+        return RigidTransform.from_components(found[:, 4:], turns)
 
 
 class SmoothRotations(TimedRotations):
-    """Rotations that are read from local parabolas."""
+    """Rotations that are read from smoothing splines."""
 
     @cached_property
-    def _smooth(self) -> _Smooth:
-        return _of(self)
+    def _curves(self) -> _Curves:
+        return _Curves.of(self)
 
     def at(self, times_s: npt.ArrayLike) -> Rotation:
         """Rotation at each of `times_s`; raises as `TimedRotations.at` does."""
-        return self._smooth.turned(self.require_covered(times_s))
+        found = self._curves.at(np.atleast_1d(self.require_covered(times_s)))
+        return Rotation.from_quat(found[:, :4])
 
 
 @overload
@@ -197,16 +130,7 @@ def smooth(readings: TimedPoses) -> SmoothPoses: ...
 @overload
 def smooth(readings: TimedRotations) -> SmoothRotations: ...
 def smooth(readings: TimedPoses | TimedRotations) -> SmoothPoses | SmoothRotations:
-    """Read the same samples from local parabolas.
-
-    The weights of the samples are Gaussian in time. Their width is what predicts samples from their
-    neighbours best: wide where noise is large, narrow where the motion is fast.
-
-    Parameters
-    ----------
-    readings : TimedPoses or TimedRotations
-        At least three samples.
-    """
+    """Read the same samples from smoothing splines."""
     if isinstance(readings, TimedPoses):
         return SmoothPoses(readings.time_s, readings.world_from_sensor, readings.max_gap_s)
     return SmoothRotations(readings.time_s, readings.world_from_sensor, readings.max_gap_s)

@@ -77,8 +77,8 @@ class ImageCalibration:
         against the other by, and from the scatter of fits that start beside the answer. It does not know of
         an uncorrected delay of the sensor or a wrong speed of sound.
     condition_number : float
-        Of the similarity's curvature with scaled columns, as a root; a large one means that the sweeps leave
-        some motion of the image undetermined.
+        Of the similarity's curvature with scaled columns, as a root; a large one means that the sweeps
+        leave some motion of the image undetermined.
     alike : float
         Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
         support; see `LEAST_SIMILARITY`.
@@ -178,7 +178,7 @@ def calibrate_from_sweeps(
         scale_errors=np.sqrt(np.diag(covariance)[6:8]),
         pixel_mm=crossing.pixel_mm * found.scales,
         covariance=covariance[:6, :6],
-        condition_number=condition_number(np.linalg.cholesky(curvature).T),
+        condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, np.float64)),
         alike=alike,
         similarity=_improvement(crossing.whole(SHOWN_SIGMA_MM, near, 10), first, found),
         held_out=_improvement(crossing.whole(SHOWN_SIGMA_MM, near), first, found),

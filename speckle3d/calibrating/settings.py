@@ -148,7 +148,7 @@ class ScanSettings(BaseModel):
 
 
 class PlaneSettings(PlaneFit, LineSettings, ScanSettings):
-    """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom."""
+    """A position sensor with a plane."""
 
     method: ClassVar[str] = "plane"
 
@@ -161,7 +161,7 @@ class PlaneSettings(PlaneFit, LineSettings, ScanSettings):
 
 
 class OrientationSettings(OrientationFit, LineSettings, ScanSettings):
-    """Calibrate an orientation sensor with the floor of a water bath; gravity tells the mirror image."""
+    """An orientation sensor with a plane."""
 
     method: ClassVar[str] = "orientation"
 
@@ -171,7 +171,7 @@ class OrientationSettings(OrientationFit, LineSettings, ScanSettings):
 
 
 class WireSettings(WireFit, ScanSettings):
-    """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes."""
+    """A position sensor with wires."""
 
     method: ClassVar[str] = "wires"
 
@@ -182,6 +182,11 @@ class WireSettings(WireFit, ScanSettings):
     validation_points: Path | None = Field(
         None, description="CSV of points picked by hand in that other recording."
     )
+
+
+def model_of(method: str) -> type[ScanSettings]:
+    """The settings of a method, as ``plane``."""
+    return {one.method: one for one in (PlaneSettings, OrientationSettings, WireSettings)}[method]
 
 
 def with_values(settings: Model, values: Mapping[str, Any]) -> Model:

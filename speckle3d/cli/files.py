@@ -96,7 +96,7 @@ def convert(
     unless options give it.
     """
     from speckle3d.io.calibrations import fitted_pixels, resized
-    from speckle3d.io.load import import_notes, load_sweep
+    from speckle3d.io.load import open_recording
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
     from speckle3d.io.voxels.volume_writer import LABELS_ALONE
@@ -121,9 +121,9 @@ def convert(
     given = given_settings(source, options)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
     settings = given.model_copy(update=fitted)
-    sweep = resized(load_sweep(source, settings), fitted)
-    sweep = mount(sweep, calibration or ())
-    for each in import_notes(source, settings):
+    recording = open_recording(source, settings)
+    sweep = mount(resized(recording.sweep, fitted), calibration or ())
+    for each in recording.notes:
         note(each)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:

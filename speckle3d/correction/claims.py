@@ -7,12 +7,14 @@ frame and along its axes, mm and rad.
 from __future__ import annotations
 
 import numpy as np
+from numpy.polynomial import legendre
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
 from speckle3d.correction.settings import FusedSettings
 
+CUBIC = 3
 LEAST_LENGTH_MM = 1e-9
 """Of a sweep that did not move, whose relative error is as good as infinite."""
 
@@ -53,41 +55,29 @@ def correlated_readings(error: FloatArray, shapes: int) -> float:
     return max(total / max(energy, np.finfo(float).tiny) / (1.0 - lost), 1.0)
 
 
-def fitted_covariance(residuals: FloatArray, jacobian: FloatArray, frames: int, axes: int) -> FloatArray:
-    """Covariance of coefficients fitted to readings, from how much the reading of each frame pulls.
+def curve_errors(error: FloatArray, frames: int) -> FloatArray:
+    """Covariance of poses that cubics in time have bent onto readings, by what these leave, shape (n, 6, 6).
+
+    A cubic through m readings of variance s2 errs at t in -1 to 1 by s2 / m times the sum of
+    (2 k + 1) P_k(t)^2 over Legendre's polynomials of order 0 to 3. What it leaves beyond white jitter is an
+    error of single frames.
 
     Parameters
     ----------
-    residuals, jacobian : ndarray, shape (frames * k,) and (frames * k, axes * c)
-        Of the fit; the first of each axis' c coefficients moves all frames alike.
-
-    References
-    ----------
-    .. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", Proc. 5th
-       Berkeley Symp., 1967 (the sandwich).
+    error : ndarray, shape (m, 6)
+        Readings less corrected poses, (x, y, z, tilt, yaw, roll), in the order of frames.
+    frames : int
+        n, nearly all of which have a reading.
     """
-    shapes = jacobian.shape[1] // axes
-    pulls = np.einsum(
-        "frc,fr->fc", *(each.reshape(frames, -1, *each.shape[1:]) for each in (jacobian, residuals))
-    )
-    alike = [
-        correlated_readings(pulls[:, axis : axis + 1], shapes) for axis in range(0, axes * shapes, shapes)
-    ]
-    pulls *= np.sqrt(np.repeat(alike, shapes) * frames / max(frames - shapes, 1))
-    inverse = np.linalg.pinv(jacobian.T @ jacobian)
-    return np.asarray(inverse @ (pulls.T @ pulls) @ inverse)
-
-
-def uncorrected_variance(error: FloatArray) -> FloatArray:
-    """Variance between two frames of what curves leave of each axis beyond the readings' white jitter, (k,).
-
-    Parameters
-    ----------
-    error : ndarray, shape (m, k)
-        Readings less corrected poses, in the order of frames.
-    """
+    order = np.arange(CUBIC + 1)
+    basis = legendre.legvander(np.linspace(-1.0, 1.0, frames), CUBIC) * np.sqrt(2.0 * order + 1.0)
+    against_first = ((basis - basis[0]) ** 2).sum(axis=1) / len(error)
+    alike = [correlated_readings(column[:, None], CUBIC + 1) for column in error.T]
     white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
-    return 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
+    left = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
+    variance = against_first[:, None] * error.var(axis=0) * alike
+    variance[1:] += left
+    return np.asarray(variance[:, :, None] * np.eye(6))
 
 
 def tracker_errors(

@@ -18,7 +18,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt, skew
 from speckle3d.core.leastsquares import Fit, levenberg_marquardt
 from speckle3d.core.shown import shown
-from speckle3d.correction.claims import fitted_covariance, length_sigma, uncorrected_variance
+from speckle3d.correction.claims import curve_errors, length_sigma
 from speckle3d.correction.curves import (
     AXES,
     COEFFICIENTS,
@@ -149,7 +149,7 @@ def correct_pose(
     centre = corners.mean(axis=0)
     left = poses[used].inv() * reference
     error = np.hstack([left.apply(centre) - centre, left.rotation.as_rotvec()])
-    covariance = _claimed(chain, fit, bent, error, centre)
+    covariance = curve_errors(error, len(poses))
     sigma = length_sigma(poses, covariance, centre)
     values = chain.values(fit.parameters)
     return DriftCorrection(poses, fit, values, float(used.mean()), settings, covariance, sigma)
@@ -200,29 +200,12 @@ def correct_orientation(
     fit = _solve(_OrientationProblem(chain, used, target), chain, settings)
     bent = chain.poses(fit.parameters)
     angles = fit.residuals.reshape(-1, 3)[:, ::-1]
-    covariance = _claimed(chain, fit, bent, np.hstack([np.zeros_like(angles), angles]), np.zeros(3))
+    covariance = curve_errors(np.hstack([np.zeros_like(angles), angles]), len(world_from_image))
     centred = RigidTransform.from_matrix(bent)
     turned = RigidTransform.from_rotation(sensor_from_start) * centred * image_from_centred.inv()
     poses = RigidTransform.from_translation(-turned[0].translation) * turned
     sigma, values = length_sigma(poses, covariance, centre), chain.values(fit.parameters)
     return DriftCorrection(poses, fit, values, float(used.mean()), settings, covariance, sigma)
-
-
-def _claimed(
-    chain: CorrectedChain, fit: Fit, poses: FloatArray, error: FloatArray, centre_mm: FloatArray
-) -> FloatArray:
-    """Covariance of every frame's pose by the scatter of the readings about the curves, shape (n, 6, 6).
-
-    Parameters
-    ----------
-    error : ndarray, shape (m, 6)
-        Readings less corrected poses, (x, y, z, tilt, yaw, roll).
-    """
-    coefficients = fitted_covariance(fit.residuals, fit.jacobian, len(error), len(chain.axes))
-    slopes = chain.frame_errors(fit.parameters, poses, centre_mm)
-    covariance = slopes @ coefficients @ slopes.transpose(0, 2, 1)
-    covariance[1:] += np.diag(uncorrected_variance(error))
-    return np.asarray(covariance)
 
 
 @dataclass(frozen=True)

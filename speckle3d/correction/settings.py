@@ -24,8 +24,7 @@ class FusedSettings(BaseModel):
     inclination_sigma_rad: float = Field(
         0.0026, gt=0, description="Slow error of an orientation sensor's inclination: 0.15 degrees."
     )
-    # An MT9-B at rest wanders by half a degree in 40 s; simulated near steel by 0.9 in some seconds.
-    heading_sigma_rad: float = Field(
-        0.013, gt=0, description="Slow error of its heading: three quarters of a degree."
-    )
+    # An MT9-B at rest wanders by so much in 40 s; one near steel, simulated, by 0.9 degrees in seconds:
+    # that is within three deviations.
+    heading_sigma_rad: float = Field(0.0087, gt=0, description="Slow error of its heading: half a degree.")
     wander_s: float = Field(5.0, gt=0, description="Time in which these errors change.")

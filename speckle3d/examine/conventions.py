@@ -79,9 +79,14 @@ class GyroscopeTurns:
         return float(len(self.degrees) / self.lag * np.log(_spread(difference) ** 2 + noise**2).sum())
 
     def gain(self, turned: Rotation, other: Rotation | None = None) -> float:
-        """Log likelihood of `other` readings, or of one that does not turn, over that of `turned`."""
+        """Log likelihood of `other` readings, or of none that turn, over that of `turned`."""
         against = self.degrees if other is None else self.difference(other)
         return self.misfit(self.difference(turned)) - self.misfit(against)
+
+    def gain_reversed(self, turned: Rotation) -> float:
+        """Log likelihood of the readings, were the gyroscope of the other sign, over that as they are."""
+        difference = self.difference(turned)
+        return self.misfit(difference) - self.misfit(difference - 2.0 * self.degrees)
 
     def bias_deg_s(self, turned: Rotation) -> float:
         """Rate by which the gyroscope turns on the whole and the readings do not."""
@@ -105,15 +110,11 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     ]
     gain, name = max(upright, default=(0.0, ""))
     still, bias = turns.gain(readings), turns.bias_deg_s(readings)
-    if gain > LEAST_GAIN:
-        evidence = (
-            f"expected to turn as its own gyroscope, fits worse than so by {gain:.0f} in log likelihood"
-        )
+    if gain > max(LEAST_GAIN, turns.gain_reversed(readings)):
+        evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
     elif still > LEAST_GAIN:
-        evidence = (
-            f"expected to turn as its own gyroscope, no turn fits better by {still:.0f} in log likelihood"
-        )
+        evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
     elif bias > MOST_BIAS_DEG_S:
         evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"

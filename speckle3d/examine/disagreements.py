@@ -27,8 +27,7 @@ LEAST_SIGMA_MM, LEAST_SIGMA_RAD = 0.1, 0.013
 """Errors of place and roll that sensors have beside their jitter: of a mounting off by 1 mm or a third
 of a degree while the probe turns by 5 degrees, and of a heading."""
 SIDEWAYS = 0.05
-"""Motion along x or y that images see for each mm of travel where structure runs across, in simulated
-tissue."""
+"""Motion along x or y that images see for each mm of travel where structure of tissue runs across."""
 
 
 def disagreements(

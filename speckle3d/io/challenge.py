@@ -44,7 +44,7 @@ from speckle3d.io.hdf5 import (
     reading,
     require_dataset,
 )
-from speckle3d.io.lazy import HDF5Slices, Layout, Real
+from speckle3d.io.lazy import HDF5Slices
 from speckle3d.io.readers import Reader
 from speckle3d.io.text import numbers, text_lines
 
@@ -162,8 +162,7 @@ def _frames(scan: Path) -> HDF5Slices:
                 f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
             )
         n, height, width = node.shape
-        turn = Real(Layout((height, width), (1, 0)))
-        return HDF5Slices(scan, ["frames"], 0, turn, (n, width, height), node.dtype)
+        return HDF5Slices(scan, "frames", np.transpose, (n, width, height), node.dtype)
 
 
 def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
 from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
@@ -31,7 +31,7 @@ from speckle3d.io.hdf5 import (
     require_group,
 )
 from speckle3d.io.import_settings import settings_for
-from speckle3d.io.load import kind_of, read_by
+from speckle3d.io.load import kind_of, recording_of
 from speckle3d.io.readers import Reader, Row, find_reader
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volumes import is_volume, read_volume
@@ -66,8 +66,10 @@ def _told(reader: Reader, path: Path) -> list[Row]:
     settings = settings_for(path)
     own = [] if reader.describe is None else reader.describe(path, settings)
     try:
-        return [*own, *sweep_rows(read_by(reader, path, settings))]
-    except InvalidInputError as error:
+        recording = recording_of(reader, path, settings)
+        own += recording.describe()
+        return [*own, *sweep_rows(recording.sweep)]
+    except (InvalidInputError, FileError) as error:
         if not own:
             raise
         return [*own, ("sweep", f"none: {error}", "")]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import re
+import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -43,6 +45,8 @@ _READ_FAILURES = (
 
 _HAS_WRITER = ("already open for write", "unable to lock file")
 """HDF5's words for a file that is being written, or whose writer was killed."""
+
+_HEAPS_BYTES = 2**22
 
 _READ_ATTEMPTS = 20
 """Of what may be half written: a millisecond in all."""
@@ -128,12 +132,39 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
+        _require_sound_texts(path)
         try:
             return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
         except OSError as error:
             if not any(words in str(error) for words in _HAS_WRITER):
                 raise
             return _opened_beside_writer(path)
+
+
+def _require_sound_texts(path: PathLike) -> None:
+    """Refuse a file whose texts have zeros over them, as a broken copy leaves: HDF5 would search without end.
+
+    Texts lie in heaps, which begin with GCOL and go on from length to length [1]_; HDF5 2.0 does not check
+    that a length is above zero. Looked at are those near both ends of a file, where attributes are.
+
+    References
+    ----------
+    .. [1] HDF5 File Format Specification 3.0, III.E.
+    """
+    with open_regular(path) as stream:
+        size = stream.seek(0, os.SEEK_END)
+        for start in {0, max(0, size - _HEAPS_BYTES)}:
+            stream.seek(start)
+            content = stream.read(_HEAPS_BYTES)
+            for heap in re.finditer(rb"GCOL\x01\x00{3}", content):
+                at = heap.start() + 16
+                stop = heap.start() + int.from_bytes(content[heap.end() : heap.end() + 8], "little")
+                while at + 16 <= min(stop, len(content)):
+                    index, length = struct.unpack_from("<H6xQ", content, at)
+                    step = 16 + -(-length // 8) * 8 if index else length
+                    if step < 16:
+                        raise FileError(f"{path}: cannot be read: damaged texts at byte {start + at}")
+                    at += step
 
 
 def _opened_beside_writer(path: PathLike) -> h5py.File:

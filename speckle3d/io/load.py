@@ -7,7 +7,7 @@ from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.files import PathLike
-from speckle3d.core.printable import written_path
+from speckle3d.core.printable import printable, written_path
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
@@ -15,8 +15,8 @@ from speckle3d.io.challenge import Landmarks
 from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file, sha256_of
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
-from speckle3d.io.plausible import require_plausible
 from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
+from speckle3d.io.recordings import Recording
 
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
@@ -58,29 +58,36 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     >>> sweep.grid.centre_mm.round(1).tolist()
     [7.0, 22.0, 0.0]
     """
-    reader = find_reader(path)
-    if reader is None:
-        kind_of(path)  # names a file of no known kind
-        return sweeps.read_sweep(path)  # refuses the family's other formats
-    return read_by(reader, Path(path), settings_for(path, settings))
+    return open_recording(path, settings).sweep
 
 
-def read_by(reader: Reader, path: Path, settings: ImportSettings) -> Sweep:
-    """Read the sweep of a recording that a reader claims; its errors name the recording.
+def open_recording(path: PathLike, settings: ImportSettings | None = None) -> Recording:
+    """Open any recording that a reader claims: its sweep, what it says, and notes on how the sweep is made.
 
     Raises
     ------
-    InvalidInputError
-        Also if a number is none that a scanner has.
+    FileError, InvalidInputError
+        As of `load_sweep`; what a recording lacks is asked for when its sweep is.
     """
+    reader = find_reader(path)
+    if reader is None:
+        kind_of(path)  # names a file of no known kind
+        return Recording(Path(path), ready=sweeps.read_sweep(path))  # refuses the family's other formats
+    return recording_of(reader, Path(path), settings_for(path, settings))
+
+
+def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Recording:
+    """Open a recording that a reader claims; its errors name the recording."""
     if not reader.takes_settings and (own := settings_file(path)) is not None and own.stem == path.name:
         raise InvalidInputError(
             f"{own}: expected none beside a {reader.format}, which says all itself: it would not be read"
         )
-    with naming(str(path)):
-        sweep = reader.read(path, settings)
-        require_plausible(sweep)
-    return sweep
+    with reading(path), naming(str(path)):
+        made = reader.read(path, settings)
+    if isinstance(made, Recording):
+        return made
+    remarks = tuple(reader.notes(path, settings))
+    return Recording(path, settings, ready=made, remarks=remarks)
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:
@@ -90,8 +97,7 @@ def load_landmarks(path: PathLike) -> Landmarks | None:
 
 def import_notes(path: PathLike, settings: ImportSettings | None = None) -> list[str]:
     """Tell what `load_sweep` assumed, measured or left out of a recording."""
-    reader = find_reader(path)
-    return [] if reader is None else list(reader.notes(Path(path), settings_for(path, settings)))
+    return [] if find_reader(path) is None else open_recording(path, settings).notes
 
 
 def companion_files(path: PathLike) -> list[Path]:
@@ -148,6 +154,12 @@ def kind_of(path: PathLike) -> str:
     if sniff(path) == IMAGE:
         return IMAGE
     with reading(path), open_hdf5(path) as file:
+        if "format" not in file.attrs:
+            held = ", ".join(printable(str(name)) for name in file) or "nothing"
+            raise InvalidInputError(
+                f"{path}: HDF5, but none of the kinds that are read: it holds {held[:200]}: "
+                "`speckle3d convert` reads zea, USTB and MATLAB 7.3"
+            )
         return file_format(file)
 
 

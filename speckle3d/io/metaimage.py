@@ -1,34 +1,70 @@
-"""Image sequences in MetaImage and NRRD files, as PLUS, ITK and ultrasound machines write them.
-
-PLUS's names stay in this module, in `headers` and in `plus`.
-"""
+"""Image sequences in MetaImage and NRRD files, as PLUS, ITK, 3D Slicer and ultrasound machines write them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.printable import printable
-from speckle3d.core.sweep import Sweep, Tracker
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.files import PathLike
+from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.io.carrier import sign_of_q
-from speckle3d.io.hdf5 import PathLike
+from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.plus.frames import SequenceFrames
-from speckle3d.io.plus.record import valid_images
-from speckle3d.io.plus.source import Source
-from speckle3d.io.readers import Reader, Row
+from speckle3d.io.plus.device_set import DeviceSet, read_device_set
+from speckle3d.io.plus.layout import Layout
+from speckle3d.io.plus.transforms import (
+    IMAGE,
+    ORIENTATION,
+    Poses,
+    fixed_transform,
+    image_skew_rad,
+    pixel_axes,
+    sensor_from_image,
+    tracked_orientation,
+    tracked_poses,
+)
+from speckle3d.io.plus.write import own_values
+from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Row, Value, differs, rate_of
+
+_SIZE_TOLERANCE = 0.1
+"""How far the pixel of a header and that of its image calibration may differ; a nominal size and a measured
+one were seen to differ by 8 %."""
+_DEVICE = "the device set"
+_OWN = "as this package wrote it"
+_CARRIER = {1: "told by the phase", -1: "turned, as told by the phase", 0: "as stored, not told by the phase"}
 
 
-def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> Sweep:
+@dataclass(frozen=True)
+class SequenceFile:
+    """Opens the images of a sequence."""
+
+    header: SequenceHeader
+    layout: Layout
+
+    def __call__(self) -> ReadFrame:
+        """Map or unpack them."""
+        images = self.header.images()
+        return lambda i: self.layout.frame(images[i])
+
+
+def read_metaimage(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     """Read an image sequence with the poses in its header; the frames stay on disk.
 
     Frames are turned so that vectors run from the unmarked to the marked side and samples away from the
-    probe. Frames whose image status is not OK are left out; their fields are kept with the others'.
+    probe. Frames whose image status is not OK are left out.
 
     Raises
     ------
@@ -39,27 +75,10 @@ def read_metaimage(path: PathLike, overrides: ImportSettings | None = None) -> S
     MissingSettingsError
         Naming all that the file does not say.
     """
-    source = Source.open(path, overrides or ImportSettings())
-    chosen = source.require_images()
-    values = source.settings.over(path, **source.wanted())
-    frames = SequenceFrames(source.header, source.layout, source.record(), chosen)
-    if _sign_of_q(frames, values) == -1:
-        frames.record = source.record(conjugated=True)
-    with naming(str(path)):
-        grid, signal = source.geometry(values, frames.shape)
-        return Sweep(
-            frames=frames,
-            grid=grid,
-            signal=signal,
-            frame_time_s=source.frame_times(values)[chosen],
-            orientation=source.orientation(),
-            tracker=source.tracker(grid),
-            name=printable(Path(path).name.split(".")[0]),
-            probe=source.probe,
-        )
+    return open_sequence(Path(path), settings or ImportSettings()).sweep
 
 
-def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Tracker:
+def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracker:
     """Read the tracked poses in a header, whether or not there are images.
 
     Raises
@@ -67,13 +86,12 @@ def read_poses(path: PathLike, overrides: ImportSettings | None = None) -> Track
     InvalidInputError
         If the header names no such transform, or no sample of it is valid.
     """
-    source = Source.open(path, overrides or ImportSettings())
-    poses = source.poses
-    if poses is None:
+    tracker = _Sequence.open(Path(path), settings or ImportSettings()).tracker(0.0)
+    if tracker is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
         )
-    return Tracker(poses.readings)
+    return tracker
 
 
 def lacking_poses(path: PathLike) -> str:
@@ -83,59 +101,382 @@ def lacking_poses(path: PathLike) -> str:
     return f"{', '.join(header.transforms) or 'none'}{advice}"
 
 
-def _sign_of_q(frames: SequenceFrames, values: Mapping[str, Any]) -> int:
-    """Sign of Q as it is stored: 1, -1, or 0 where the phase does not tell.
+def open_sequence(path: Path, settings: ImportSettings) -> Recording:
+    """Read what a header says of its images and poses.
 
-    It does not of I/Q that were shifted down, which turn either way. In lines that are stored from the far
-    end on, depth runs backwards and so does the phase, unless the writer thought of it.
+    Raises
+    ------
+    FileError, InvalidInputError
+        If it, or the device set beside it, cannot be read or does not make sense.
     """
-    if values.get("demodulation_frequency_hz") != 0:
-        return 0
-    return sign_of_q(frames, values["centre_frequency_hz"], values["sampling_rate_hz"])
-
-
-_SIGNS = {1: "told by the phase", -1: "turned, as told by the phase", 0: "as stored, not told by the phase"}
-
-
-def _sign_rows(source: Source) -> list[Row]:
-    """What is known of the sign of Q; nothing of other samples, or while a sweep cannot be read."""
-    if not source.layout.is_complex:
-        return []
+    sequence = _Sequence.open(path, settings)
     try:
-        chosen = source.require_images()
-        values = source.settings.over(source.path, **source.wanted())
-        frames = SequenceFrames(source.header, source.layout, source.record(), chosen)
-        return [("sign of Q", _SIGNS[_sign_of_q(frames, values)], "")]
-    except InvalidInputError:
-        return []  # Why there is no sweep is told beside these rows.
+        return sequence.recording()
+    except (InvalidInputError, FileError) as error:
+        return Recording(path, settings, rows=tuple(sequence.rows()), fault=error)
 
 
-def describe_sequence(path: PathLike, settings: ImportSettings) -> list[Row]:
-    """Tell what a header says, and what is taken from elsewhere or assumed."""
-    source = Source.open(path, settings)
-    header, layout = source.header, source.layout
-    spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
-    rows = [
-        ("container", header.file_format, ""),
-        ("size", " x ".join(str(n) for n in header.size), ""),
-        ("images", str(header.frame_count), ""),
-        ("images not valid", str(np.count_nonzero(~valid_images(header.frames))), ""),
-        ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
-        ("image type", _said(header, "UltrasoundImageType", layout.kind), ""),
-        ("image orientation", _said(header, "UltrasoundImageOrientation", layout.orientation), ""),
-        ("pixel type", header.pixels.dtype.name, ""),
-        ("packing", header.pixels.packing, ""),
-        ("transforms", ", ".join(header.transforms) or "none", ""),
-        ("time stamps", "yes" if source.has_times else "no", ""),
-    ]
+@dataclass(frozen=True)
+class _Sequence:
+    """A header, and what else says how its images are to be read."""
+
+    header: SequenceHeader
+    settings: ImportSettings
+    device: DeviceSet
+    own: dict[str, Any]
+    layout: Layout
+
+    @classmethod
+    def open(cls, path: Path, settings: ImportSettings) -> _Sequence:
+        header = read_header(path)
+        device = DeviceSet() if settings.plus_config is None else read_device_set(settings.plus_config)
+        own = own_values(str(path), header.fields)
+        return cls(header, settings, device, own, Layout.of(header, device.image_orientation))
+
+    def recording(self) -> Recording:
+        images, times = self._images()
+        first_mm = self.settings.first_sample_depth_mm
+        depth_mm = self.own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm
+        values = self._values()
+        frames = self._frames(images)
+        rows = self.rows()
+        if self.layout.is_complex:
+            sign = self._sign_of_q(frames, values)
+            rows.append(("sign of Q", _CARRIER[sign], ""))
+            if sign == -1:
+                turned = SequenceFile(self.header, replace(self.layout, conjugated=True))
+                frames = FileFrames(
+                    self.header.path, turned, frames.shape, frames.dtype, None, images.tolist()
+                )
+        tracker = self.tracker(depth_mm)
+        return Recording(
+            Path(self.header.path),
+            self.settings,
+            frames,
+            values,
+            time_s=None if times is None else times[images],
+            tracker=tracker,
+            orientation=self._orientation(),
+            chain="" if tracker is None else " * ".join(self._chain()),
+            probe=self.settings.probe or self.own.get("probe") or self.device.scan.probe,
+            full_scale=self.own.get("full_scale", 255.0),
+            assumptions=("parallel lines",) if self.layout.is_rf and not self.own else (),
+            rows=tuple(rows),
+            remarks=tuple(self._remarks(images, times)),
+        )
+
+    @cached_property
+    def poses(self) -> Poses | None:
+        given = self.settings
+        return tracked_poses(
+            self.header.path, self.header.frames, given.tracker_transform, given.reference_transform,
+            self.device.names,
+        )  # fmt: skip
+
+    @cached_property
+    def stamps(self) -> FloatArray | None:
+        """Time of every frame by its stamp or its axis, NaN where it has none."""
+        header = self.header
+        stamps = [_number(frame.get("Timestamp")) for frame in header.frames]
+        if not np.isfinite(stamps).any():
+            return header.index_s
+        return np.array(stamps + [np.nan] * (self._count - len(stamps)))
+
+    @property
+    def _count(self) -> int:
+        images = self.header.frame_count if self.header.pixels.count else 0
+        return max(images, len(self.header.frames))
+
+    @cached_property
+    def times(self) -> FloatArray | None:
+        """Time of every frame: of a rate that is given, or `stamps`."""
+        rate = self.settings.frame_rate_hz
+        return self.stamps if rate is None else np.arange(self._count) / rate
+
+    def _images(self) -> tuple[IntArray, FloatArray | None]:
+        """Numbers of the frames that are images with a time, and the times of all."""
+        header, size = self.header, self.header.size
+        if 0 in size or max(size[:2]) == 1:
+            what = ": the recording of a tracker, for --poses" if header.transforms else ""
+            raise InvalidInputError(
+                f"{header.path}: expected pixels of images, got images of size {size[0]} x {size[1]}{what}"
+            )
+        if header.is_volume and not self.settings.frame_rate_hz:
+            raise InvalidInputError(
+                f"{header.path}: expected a sequence of images, got a volume, whose third axis is in space "
+                "by "
+                "its Kinds; if it is time, say so by --frame-rate-hz"
+            )
+        self.layout.require_lines(header)
+        if header.pixels.packing == "raw":
+            header.images()  # maps them, and refuses a file that ends early
+        valid = self._valid()
+        if self.times is not None:
+            kept = np.flatnonzero(valid)
+            valid[:] = False
+            valid[kept[rising(self.times[kept])]] = True
+        images = np.flatnonzero(valid)
+        if not images.size:
+            raise InvalidInputError(
+                f"{header.path}: ImageStatus: expected a valid frame with a time, got none"
+            )
+        return images, self.times
+
+    def _valid(self) -> BoolArray:
+        """Frames whose image is valid; older files of PLUS say so in Status alone."""
+        count, frames = self.header.frame_count, self.header.frames[: self.header.frame_count]
+        statuses = [{f.get("ImageStatus", "OK"), f.get("Status", "OK")} == {"OK"} for f in frames]
+        return np.array(statuses + [True] * (count - len(statuses)), dtype=bool)
+
+    def _frames(self, images: IntArray) -> FileFrames:
+        """Frames of the pixels' type; wider whole numbers as int16 where it holds them, else float32."""
+        header, layout = self.header, self.layout
+        dtype = header.pixels.dtype.newbyteorder("=")
+        stored: npt.DTypeLike | None = None
+        if layout.is_complex:
+            stored = np.int16 if dtype == np.int16 else None
+            dtype = np.dtype(np.complex64)
+        elif layout.is_rf and dtype != np.int16:
+            limits = np.iinfo(np.int16)
+            fits = dtype.kind in "iu" and all(
+                limits.min <= image.min() and image.max() <= limits.max for image in header.images()[images]
+            )
+            dtype = np.dtype(np.int16 if fits else np.float32)
+        shape = (header.frame_count, *layout.shape(header.size))
+        return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, stored, images.tolist())
+
+    def _values(self) -> dict[str, Value]:
+        """What a sweep of this kind needs, and where file or device set have it."""
+        values = {
+            name: Value(value, _OWN)
+            for name, value in self.own.items()
+            if name not in ("probe", "full_scale")
+        }
+        if self.stamps is not None and (rate := rate_of(self.stamps[np.isfinite(self.stamps)])):
+            values["frame_rate_hz"] = Value(rate, "of its time stamps")
+        sizes = self._pixel_mm()
+        if not self.layout.is_rf:
+            if sizes.value is not None and "column_pitch_mm" not in values:
+                values["column_pitch_mm"] = replace(sizes, value=sizes.value[0])
+                values["row_spacing_mm"] = replace(sizes, value=sizes.value[1])
+            return values
+        if sizes.value is not None and "sampling_rate_hz" not in values:
+            own = values.get("speed_of_sound_m_s", Value(1540.0)).value
+            speed, step = self.settings.speed_of_sound_m_s or own, sizes.value[1]
+            source = f"of samples {step:.6g} mm apart, by {sizes.source}, at {speed:g} m/s"
+            values["sampling_rate_hz"] = Value(1e3 * speed / (2.0 * step), source, sizes.said_by)
+        if "vector_pitch_mm" not in values:
+            values["vector_pitch_mm"] = self._line_pitch(sizes)
+        return values
+
+    def _line_pitch(self, sizes: Value) -> Value:
+        scan = self.device.scan
+        if scan.is_curved and self.settings.vector_pitch_mm is None:
+            raise InvalidInputError(
+                f"{self.header.path}: expected lines of a linear transducer, got a {scan.geometry.lower()} "
+                "one, "
+                "whose lines spread, by the device set: give its scan-converted B-mode, or parallel lines "
+                "with "
+                "--vector-pitch-mm"
+            )
+        if sizes.value is not None:
+            return replace(sizes, value=sizes.value[0])
+        if scan.width_mm is None:
+            return Value()
+        vectors, _ = self.layout.shape(self.header.size)
+        return Value(scan.width_mm / vectors, "ScanConversion of the device set", _DEVICE)
+
+    def _pixel_mm(self) -> Value:
+        """Lateral and axial distance of samples, mm: calibrated, spaced, or of the device set."""
+        spaced, calibrated = self._spaced_mm(), self._calibrated_mm()
+        if (
+            spaced.value is not None
+            and calibrated.value is not None
+            and not self.own
+            and self.settings.image_to_probe is None
+            and not np.allclose(spaced.value, calibrated.value, rtol=_SIZE_TOLERANCE, atol=0)
+        ):
+            given, got = (" x ".join(f"{size:g}" for size in one.value) for one in (spaced, calibrated))
+            raise InvalidInputError(
+                f"{self.header.path}: expected an image calibration for pixels of {given} mm, as "
+                f"ElementSpacing says, got one for {got} mm"
+            )
+        if self.layout.is_rf:  # whose sampling rate is known better than by a calibration
+            return spaced
+        by_device = Value(self.device.pixel_mm(self.header.size), "device set", _DEVICE)
+        return next((one for one in (calibrated, spaced, by_device) if one.value is not None), Value())
+
+    def _spaced_mm(self) -> Value:
+        spacing = self.header.spacing_mm
+        if spacing is None:
+            return Value()
+        if not min(spacing) > 0:
+            raise InvalidInputError(
+                f"{self.header.path}: spacing of pixels: expected above zero, got {spacing}"
+            )
+        return Value(spacing[::-1] if self.layout.has_lines_in_rows else spacing, "ElementSpacing")
+
+    def _calibrated_mm(self) -> Value:
+        calibration = self.image_to_probe()
+        if calibration is None:
+            return Value()
+        matrix, where = calibration
+        name = where.rsplit(": ", 1)[-1]
+        said_by = name if where == name else "the file" if where.startswith(self.header.path) else _DEVICE
+        return Value(pixel_axes(matrix, where), name, said_by)
+
+    def image_to_probe(self) -> tuple[FloatArray, str] | None:
+        """Transform of this image's pixels to mm on the tracked tool, and where it is from."""
+        path, names = self.header.path, self.device.names
+        if self.settings.image_to_probe is not None:
+            return np.asarray(self.settings.image_to_probe, dtype=float), "image_to_probe"
+        if self.poses is not None and self.poses.pixels is not None:
+            return self.poses.pixels, f"{path}: {self.poses.chain[0]}Transform"
+        tool = names.probe if self.poses is None else self.poses.tool
+        for name in (f"{names.image}To{tool}", "Calibration"):  # the second is of Ibis
+            matrix = fixed_transform(path, self.header.fields, self.header.frames, name)
+            if matrix is not None:
+                return matrix, f"{path}: {name}Transform"
+        # The device set's is for the image that the machine shows, not for the lines it was made of.
+        matrix = None if self.layout.is_rf else self.device.transform(names.image, tool)
+        return None if matrix is None else (matrix, f"{self.device.path}: {names.image}To{tool}")
+
+    def _chain(self) -> list[str]:
+        if self.poses is None:
+            return []
+        calibration = (
+            [] if self.poses.pixels is not None else [f"{self.device.names.image}To{self.poses.tool}"]
+        )
+        return [*(calibration if self.image_to_probe() is not None else []), *self.poses.chain]
+
+    def tracker(self, first_sample_depth_mm: float) -> Tracker | None:
+        """The tracker, with the image on it if that is known; None without a pose that has a time."""
+        poses = self.poses
+        if poses is None or self.times is None:
+            return None
+        rows = self._posed(poses)
+        if not rows.size:
+            return None
+        readings = TimedPoses(self.times[rows], poses.poses[rows])
+        calibration = self.image_to_probe()
+        if calibration is None:
+            return Tracker(readings)
+        mounting = sensor_from_image(calibration[0], first_sample_depth_mm, calibration[1])
+        return Tracker(readings, mounting, image_skew_rad=image_skew_rad(*calibration))
+
+    def _posed(self, poses: Poses) -> IntArray:
+        assert self.times is not None
+        rows = np.flatnonzero(poses.valid)
+        return np.asarray(rows[rising(self.times[rows])])
+
+    def _orientation(self) -> OrientationSensor | None:
+        """The orientation sensor that this package wrote; None where there is none."""
+        path, header = self.header.path, self.header
+        poses = tracked_orientation(path, header.frames)
+        if poses is None or self.times is None or not (rows := self._posed(poses)).size:
+            return None
+        matrix = fixed_transform(path, header.fields, header.frames, f"{IMAGE}To{ORIENTATION}")
+        mounting = None if matrix is None else sensor_from_image(matrix, 0.0, path).rotation
+        return OrientationSensor(TimedRotations(self.times[rows], poses.poses[rows].rotation), mounting)
+
+    def _remarks(self, images: IntArray, times: FloatArray | None) -> list[str]:
+        """Tell what is left out, what contradicts, and which poses were not used."""
+        header, device, notes = self.header, self.device, []
+        counts = Counter({"not valid by their status": int(np.sum(~self._valid()))})
+        if times is not None:
+            counts.update(_without_time(times, self._valid(), images))
+            notes += left_out("images", header.frame_count, counts, times[images])
+        if self.poses is not None and times is not None:
+            rows = self._posed(self.poses)
+            reasons = Counter(self.poses.reasons)
+            reasons.update(_without_time(times, self.poses.valid, rows))
+            notes += left_out("poses", len(header.frames), reasons, times[rows])
+        if self.poses is None and header.transforms and self.settings.tracker_transform is None:
+            notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
+        if len(header.frames) not in (0, header.frame_count):
+            notes.append(
+                f"the header has fields of {len(header.frames)} frames for {header.frame_count} images"
+            )
+        if device.scan.is_curved:
+            notes.append(f"the device set calls the transducer {device.scan.geometry}: "
+                         + ("its lines spread and are taken for parallel" if self.layout.is_rf
+                            else "images are taken for scan-converted"))  # fmt: skip
+        if device.clip is not None and device.clip.is_part_of(header.size):
+            notes.append(
+                f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
+            )
+        if header.is_volume:
+            notes.append(
+                "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
+            )
+        given, spaced = self.settings.image_to_probe, self._spaced_mm().value
+        if spaced is not None and given is not None:
+            sizes = pixel_axes(np.asarray(given, dtype=float), "image_to_probe")
+            if differs(sizes, spaced):
+                shown, own = (" x ".join(f"{size:g}" for size in pair) for pair in (sizes, spaced))
+                notes.append(f"pixels of {shown} mm, given by image_to_probe: the file says {own}")
+        return notes
+
+    def rows(self) -> list[Row]:
+        """Facts of the header."""
+        header, layout = self.header, self.layout
+        spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
+        rows = [
+            ("container", header.file_format, ""),
+            ("size", " x ".join(str(n) for n in header.size), ""),
+            ("images", str(header.frame_count), ""),
+            ("images not valid", str(np.count_nonzero(~self._valid())), ""),
+            ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
+            ("image type", self._said("UltrasoundImageType", layout.kind), ""),
+            ("image orientation", self._said("UltrasoundImageOrientation", layout.orientation), ""),
+            ("pixel type", header.pixels.dtype.name, ""),
+            ("packing", header.pixels.packing, ""),
+            ("transforms", ", ".join(header.transforms) or "none", ""),
+            ("time stamps", "yes" if any("Timestamp" in frame for frame in header.frames) else "no", ""),
+        ]
+        try:
+            calibration = self.image_to_probe()
+            chain = " * ".join(self.poses.chain) if self.poses is not None else "none"
+        except InvalidInputError as error:
+            return [*rows, ("poses", f"none: {error}", "")]
+        rows.append(("tracker of", chain, ""))
+        rows.append(("image calibration", "none" if calibration is None else calibration[1], ""))
+        if self.settings.plus_config is not None:
+            rows.append(("device set", self.settings.plus_config, ""))
+        return rows
+
+    def _said(self, name: str, used: str) -> str:
+        return used if name in self.header.fields else f"{used} (assumed)"
+
+    def _sign_of_q(self, frames: FileFrames, values: dict[str, Value]) -> int:
+        """Sign of Q as it is stored: 1, -1, or 0 where the phase does not tell, as of I/Q shifted down.
+
+        In lines that are stored from the far end on, depth runs backwards and so does the phase, unless the
+        writer thought of it.
+        """
+        names = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
+        given = [getattr(self.settings, name) for name in names]
+        shift, centre, rate = (
+            values.get(name, Value()).value if own is None else own
+            for name, own in zip(names, given, strict=True)
+        )
+        return sign_of_q(frames, centre, rate) if shift == 0 and centre and rate else 0
+
+
+def _without_time(times: FloatArray, valid: BoolArray, kept: IntArray) -> dict[str, int]:
+    """How many valid frames have no time, one that is repeated, or one out of order."""
+    dropped = np.setdiff1d(np.flatnonzero(valid), kept)
+    missing = int(np.sum(~np.isfinite(times[dropped])))
+    repeated = int(np.isin(times[dropped], times[kept]).sum())
+    late = dropped.size - missing - repeated
+    return {"without a time": missing, "with a repeated time": repeated, "with a time out of order": late}
+
+
+def _number(text: str | None) -> float:
     try:
-        return [*rows, *source.sources(), *_sign_rows(source)]
-    except InvalidInputError as error:
-        return [*rows, ("poses", f"none: {error}", "")]
-
-
-def _said(header: SequenceHeader, name: str, used: str) -> str:
-    return used if name in header.fields else f"{used} (assumed)"
+        return float(text or "nan")
+    except ValueError:
+        return np.nan
 
 
 def _companions(path: Path) -> Sequence[Path]:
@@ -144,10 +485,5 @@ def _companions(path: Path) -> Sequence[Path]:
 
 
 READER = Reader(
-    "image",
-    lambda _, start: is_metaimage(start) or is_nrrd(start),
-    read_metaimage,
-    describe_sequence,
-    _companions,
-    lambda path, settings: Source.open(path, settings).contradictions(),
+    "image", lambda _, start: is_metaimage(start) or is_nrrd(start), open_sequence, companions=_companions
 )

@@ -1,35 +1,29 @@
-"""Pixels of MetaImage and NRRD files: where they lie, and reading them in no more memory than they take.
+"""Pixels of MetaImage and NRRD files as one array, from the disk or unpacked once.
 
-They are read here and not by the image library, which follows any name in a header, out of its folder and to
-devices too, and believes any size.
+They are read here and not by pynrrd or SimpleITK, which read all of a sequence into memory.
 """
 
 from __future__ import annotations
 
 import bz2
-import math
+import tempfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.files import open_regular, plausible_bytes
-from speckle3d.io.text import numbers
+from speckle3d.core.files import open_regular
 
-_MOST_TIMES_PACKED = 256
-"""The emptiest recording at hand, of a water tank, unpacks to 73 times its size; deflate can claim 1,032."""
-
-_MOST_LENGTH = 2**40
 _PIECE_BYTES = 2**20
+_MEMORY_BYTES = 2**28
+"""Unpacked pixels beyond this size are kept in a temporary file."""
 _ZLIB_OR_GZIP = 47
-"""Told apart by what a stream begins with, in the largest window."""
-_GZIP_SIGNATURE = b"\x1f\x8b"
+"""Window of zlib that tells the two apart by their first bytes."""
 
 _META_TYPES = {
     "CHAR": "i1", "UCHAR": "u1", "SHORT": "i2", "USHORT": "u2", "INT": "i4", "UINT": "u4", "LONG": "i4",
@@ -66,19 +60,6 @@ def nrrd_type(dtype: np.dtype[Any]) -> str:
     return {"float32": "float", "float64": "double"}.get(dtype.name, dtype.name)
 
 
-def type_of_word(word: str) -> np.dtype[Any]:
-    """Type of numbers by MetaImage's word, as MET_SHORT.
-
-    Raises
-    ------
-    InvalidInputError
-    """
-    kind = _META_TYPES.get(word.removeprefix("MET_"))
-    if kind is None:
-        raise InvalidInputError(f"ElementType: expected as MET_SHORT, got {word}")
-    return np.dtype(kind)
-
-
 @dataclass(frozen=True)
 class Pixels:
     """Where the pixels of an image file lie, and how.
@@ -87,235 +68,194 @@ class Pixels:
     ----------
     path : path
         Of the file that holds them: the header's own, or one in its folder.
-    start, stored_bytes : int
-        First byte, and how many the file holds from there on.
+    start : int
+        First byte; -1 where they are the file's last bytes.
     dtype : dtype
         With its byte order.
     count : int
         Numbers there must be.
     packing : str
         ``"raw"``, ``"deflate"``, ``"bzip2"`` or ``"text"``.
+    skipped_lines : int
+        Lines of text before the pixels, from `start` on.
+    frames : int
+        Images that lie one after the other.
     """
 
     path: Path
     start: int
-    stored_bytes: int
     dtype: np.dtype[Any]
     count: int
     packing: str
+    skipped_lines: int = 0
+    frames: int = 1
 
     @property
     def size_bytes(self) -> int:
         """Bytes of the numbers in memory."""
         return self.count * self.dtype.itemsize
 
+    def ends_early(self, got: int) -> FileError:
+        """The error that the file holds so many bytes of pixels, and not all."""
+        if self.frames == 1:
+            return FileError(f"{self.path}: ends early: {got} of {self.size_bytes} bytes of pixels")
+        whole = got * self.frames // self.size_bytes
+        return FileError(f"{self.path}: ends early: {whole} of {self.frames} frames")
 
-def meta_pixels(path: Path, fields: Mapping[str, str], size: tuple[int, ...], start: int) -> Pixels:
+
+def meta_pixels(path: Path, fields: Mapping[str, str], count: int, start: int) -> Pixels:
     """Find the pixels of a MetaImage whose header ends at byte `start`.
 
     Raises
     ------
-    FileError
-        If the file holds fewer bytes than the header announces.
     InvalidInputError
         Naming the field that does not make sense.
     """
-    where = str(path)
-    _, _, word = fields.get("ElementType", "").upper().partition("MET_")
-    if word not in _META_TYPES:
-        raise InvalidInputError(
-            f"{where}: ElementType: expected as MET_SHORT, got {fields.get('ElementType')}"
-        )
-    order = (
-        ">" if any(_flag(fields, name) for name in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")) else "<"
-    )
+    word = fields.get("ElementType", "").removeprefix("MET_")
+    if word not in _META_TYPES and count:
+        raise InvalidInputError(f"{path}: ElementType: expected as MET_UCHAR, got {word or 'none'}")
+    is_big = any(_flag(fields, name) for name in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"))
     packing = "deflate" if _flag(fields, "CompressedData") else "raw"
     if not _flag(fields, "BinaryData", "True"):
         packing = "text"
-    count = _count(where, "DimSize", size) * _whole(where, fields, "ElementNumberOfChannels", 1)
-    skipped = _whole(where, fields, "HeaderSize", 0)
     name = fields["ElementDataFile"]
-    if name in ("LOCAL", "Local", "local"):
-        if skipped:
-            raise InvalidInputError(f"{where}: HeaderSize: expected 0 where pixels are LOCAL, got {skipped}")
-        data = path
-    else:
-        data, start = _beside(path, name, "ElementDataFile"), skipped
-    found = _found(path, data, start)
-    announced = _whole(where, fields, "CompressedDataSize", 0)
-    dtype = np.dtype(order + _META_TYPES[word])
-    return _checked(where, Pixels(data, start, found, dtype, count, packing), announced)
+    skipped = int(fields.get("HeaderSize", "0") or 0)
+    is_local = name.upper() == "LOCAL"
+    data = path if is_local else _beside(path, name, "ElementDataFile")
+    begin = skipped if skipped < 0 or not is_local else start
+    dtype = np.dtype((">" if is_big else "<") + _META_TYPES.get(word, "u1"))
+    return Pixels(data, begin, dtype, count, packing)
 
 
-def nrrd_pixels(path: Path, fields: Mapping[str, str], size: tuple[int, ...], start: int) -> Pixels:
-    """Find the pixels of an NRRD file whose header ends at byte `start`; `fields` are in small letters.
+def nrrd_pixels(path: Path, fields: Mapping[str, str], count: int, start: int) -> Pixels:
+    """Find the pixels of an NRRD file whose header ends at byte `start`; names of `fields` are lower case.
 
     Raises
     ------
-    FileError
-        If the file holds fewer bytes than the header announces.
     InvalidInputError
         Naming the field that does not make sense.
     """
-    where = str(path)
     kind, packing = fields.get("type", "").lower(), fields.get("encoding", "").lower()
     if kind not in _NRRD_TYPES:
-        raise InvalidInputError(f"{where}: type: expected as uint8, got {kind!r}")
+        raise InvalidInputError(f"{path}: type: expected as uint8, got {kind!r}")
     if packing not in _NRRD_PACKINGS:
-        raise InvalidInputError(f"{where}: encoding: expected raw, gzip, bzip2 or text, got {packing!r}")
+        raise InvalidInputError(f"{path}: encoding: expected raw, gzip, bzip2 or text, got {packing!r}")
     order = ">" if fields.get("endian", "").lower() == "big" else "<"
     name = fields.get("data file", fields.get("datafile"))
     data, start = (path, start) if name is None else (_beside(path, name, "data file"), 0)
-    for skip in ("line skip", "lineskip", "byte skip", "byteskip"):
-        if fields.get(skip, "0") != "0":
-            raise InvalidInputError(f"{where}: {skip}: expected 0, got {fields[skip]!r}")
-    count = _count(where, "sizes", size)
-    dtype = np.dtype(order + _NRRD_TYPES[kind])
-    pixels = Pixels(data, start, _found(path, data, start), dtype, count, _NRRD_PACKINGS[packing])
-    return _checked(where, pixels, 0)
+    lines, skipped = (
+        int(fields.get(f"{what} skip", fields.get(f"{what}skip", "0"))) for what in ("line", "byte")
+    )
+    begin = -1 if skipped < 0 else start + skipped
+    return Pixels(data, begin, np.dtype(order + _NRRD_TYPES[kind]), count, _NRRD_PACKINGS[packing], lines)
 
 
 def read_pixels(pixels: Pixels) -> npt.NDArray[Any]:
-    """Read the numbers, shape (count,), in the machine's own byte order.
+    """Read the numbers into memory, shape (count,), in the machine's byte order; as `map_pixels`."""
+    return np.array(map_pixels(pixels))
+
+
+def map_pixels(pixels: Pixels) -> npt.NDArray[Any]:
+    """Map or unpack the numbers, shape (count,); raw ones of the machine's byte order stay on the disk.
 
     Raises
     ------
     FileError
         If the file cannot be read, is damaged, or holds more or fewer.
     """
-    _require_plausible(str(pixels.path), pixels)
-    with open_regular(pixels.path) as stream:
-        stream.seek(pixels.start)
-        if pixels.packing == "raw":
-            values = np.fromfile(stream, pixels.dtype, pixels.count)
-        elif pixels.packing == "text":
-            values = _from_text(stream.read(pixels.stored_bytes), pixels)
-        else:
-            values = _unpacked(stream, pixels).view(pixels.dtype)
-    if values.size != pixels.count:
-        raise FileError(f"{pixels.path}: expected {pixels.count} pixels, got {values.size}")
+    values = _stored(pixels)
     return values.astype(pixels.dtype.newbyteorder("="), copy=False)
 
 
-class _Stream(Protocol):
-    def read(self, size: int, /) -> bytes: ...
+def _stored(pixels: Pixels) -> npt.NDArray[Any]:
+    """The numbers in the file's byte order."""
+    with open_regular(pixels.path) as stream:
+        size = stream.seek(0, 2)
+        start = size - pixels.size_bytes if pixels.start < 0 else pixels.start
+        stream.seek(max(start, 0))
+        for _ in range(pixels.skipped_lines):
+            stream.readline()
+        start = stream.tell()
+        if pixels.packing == "text":
+            return _from_text(stream.read(), pixels)
+        if pixels.packing != "raw":
+            return _unpacked(stream, pixels)
+    if not 0 <= start <= size - pixels.size_bytes:
+        raise pixels.ends_early(size if pixels.start < 0 else max(size - start, 0))
+    if not pixels.count:
+        return np.zeros(0, pixels.dtype)
+    return np.memmap(pixels.path, pixels.dtype, "r", start, (pixels.count,))
 
 
-def _unpacked(stream: _Stream, pixels: Pixels) -> npt.NDArray[np.uint8]:
-    """Unpack piece by piece, never more than one byte beyond what there must be.
-
-    Members of gzip that follow one another, as some tools write them, are one stream.
-    """
-    unpackers, errors = _unpackers(pixels.packing)
-    found = np.empty(pixels.size_bytes, dtype=np.uint8)
-    at, packed, unpacker = 0, b"", unpackers()
-    try:
-        while at < found.size or not unpacker.eof:
-            if unpacker.eof:
-                packed = unpacker.unused_data or stream.read(_PIECE_BYTES)
-                if not packed.startswith(_GZIP_SIGNATURE):
+def _unpacked(stream: BinaryIO, pixels: Pixels) -> npt.NDArray[Any]:
+    """Unpack all, never more than there must be; members of gzip that follow one another are one stream."""
+    size, where = pixels.size_bytes, str(pixels.path)
+    with tempfile.SpooledTemporaryFile(_MEMORY_BYTES) as room:
+        made, packed = 0, b""
+        unpacker, damage = _unpacker(pixels)
+        try:
+            while made <= size:
+                if unpacker.eof:
+                    packed = unpacker.unused_data or stream.read(_PIECE_BYTES)
+                    if packed[:2] != b"\x1f\x8b":
+                        break
+                    unpacker, _ = _unpacker(pixels)
+                packed = packed or stream.read(_PIECE_BYTES)
+                piece = unpacker.decompress(packed, _PIECE_BYTES)
+                rest = getattr(unpacker, "unconsumed_tail", b"")
+                if not piece and rest == packed:
                     break
-                unpacker = unpackers()
-            packed = packed or stream.read(_PIECE_BYTES)
-            piece = unpacker.decompress(packed, min(found.size - at + 1, _PIECE_BYTES))
-            if not (packed or piece):
-                break
-            packed = getattr(unpacker, "unconsumed_tail", b"")
-            if at + len(piece) > found.size:
-                raise FileError(f"{pixels.path}: expected {found.size} bytes of pixels unpacked, got more")
-            found[at : at + len(piece)] = np.frombuffer(piece, dtype=np.uint8)
-            at += len(piece)
-    except errors as error:
-        if isinstance(error, FileError):
-            raise
-        raise FileError(f"{pixels.path}: expected packed pixels, got damaged ones: {error}") from error
-    if at < found.size:
-        raise FileError(f"{pixels.path}: expected {found.size} bytes of pixels unpacked, got {at}")
-    return found
+                packed = rest
+                made += room.write(piece)
+        except damage as error:
+            raise FileError(f"{where}: expected packed pixels, got damaged ones: {error}") from error
+        if made < size:
+            raise pixels.ends_early(made)
+        if made > size:
+            raise FileError(f"{where}: expected {size} bytes of pixels unpacked, got more")
+        room.seek(0)
+        if size <= _MEMORY_BYTES:
+            return np.frombuffer(room.read(), pixels.dtype)
+        return np.memmap(room._file, pixels.dtype, "r", 0, (pixels.count,))
 
 
-def _unpackers(packing: str) -> tuple[Callable[[], Any], tuple[type[Exception], ...]]:
-    """What makes an unpacker, and the errors it raises; of deflate ISA-L's, faster than zlib's."""
-    errors = (zlib.error, OSError, EOFError, ValueError)
-    if packing != "deflate":
-        return bz2.BZ2Decompressor, errors
-    try:
+def _unpacker(pixels: Pixels) -> tuple[Any, tuple[type[Exception], ...]]:
+    """What unpacks, and the errors that it raises of damaged bytes."""
+    damage = (zlib.error, OSError, EOFError, ValueError)
+    if pixels.packing == "bzip2":
+        return bz2.BZ2Decompressor(), damage
+    try:  # four times as fast as zlib
         from isal import isal_zlib
     except ImportError:
-        return partial(zlib.decompressobj, _ZLIB_OR_GZIP), errors
+        return zlib.decompressobj(_ZLIB_OR_GZIP), damage
     own: Any = isal_zlib.error
-    return partial(isal_zlib.decompressobj, _ZLIB_OR_GZIP), (*errors, own)
+    return isal_zlib.decompressobj(_ZLIB_OR_GZIP), (*damage, own)
 
 
 def _from_text(text: bytes, pixels: Pixels) -> npt.NDArray[Any]:
     try:
-        return np.array(text.split(), dtype=np.float64).astype(pixels.dtype)
+        values = np.array(text.split(), dtype=np.float64).astype(pixels.dtype)
     except ValueError as error:
         raise FileError(f"{pixels.path}: expected pixels as text, got other bytes") from error
-
-
-def _checked(where: str, pixels: Pixels, announced: int) -> Pixels:
-    """Refuse what the file cannot hold, before room is made for it."""
-    least = {"raw": pixels.size_bytes, "text": 2 * pixels.count - 1}.get(pixels.packing, announced)
-    if pixels.count and pixels.stored_bytes < least:
-        raise FileError(f"{where}: expected {least} bytes of pixels, got {pixels.stored_bytes}: truncated")
-    _require_plausible(where, pixels)
-    return pixels
-
-
-def _require_plausible(where: str, pixels: Pixels) -> None:
-    most = plausible_bytes(pixels.stored_bytes, _MOST_TIMES_PACKED)
-    if pixels.size_bytes > most:
-        got = f"{pixels.size_bytes} from {pixels.stored_bytes} packed"
-        raise InvalidInputError(f"{where}: expected at most {most} bytes of pixels, got {got}")
-
-
-_PATTERN_NUMBERS = 2
-"""Behind a pattern of files: the first and the last number, and the step."""
+    if values.size != pixels.count:
+        raise FileError(f"{pixels.path}: expected {pixels.count} pixels, got {values.size}")
+    return values
 
 
 def _beside(path: Path, name: str, field: str) -> Path:
-    """Path of a data file in the header's folder, symbolic links followed."""
+    """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
     where = f"{path}: {field}"
-    folder = path.parent.resolve()
-    first, *more = name.split() or [""]
-    if first == "LIST" or ("%" in first and len(more) >= _PATTERN_NUMBERS):
+    if name.split()[:1] == ["LIST"] or ("%" in name and len(name.split()) > 1):
         raise InvalidInputError(
             f"{where}: expected LOCAL or the name of one file, got a list of files ({name!r}), which is not "
             "read: write the images into one file"
         )
-    try:
-        data = (folder / name).resolve()
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InvalidInputError(f"{where}: expected the name of a file, got {name!r}") from error
+    folder = path.parent.resolve()
+    data = (folder / name).resolve()
     if not name or Path(name).is_absolute() or not data.is_relative_to(folder):
         raise InvalidInputError(f"{where}: expected a file in the header's own folder, got {name!r}")
     return data
 
 
-def _found(header: Path, data: Path, start: int) -> int:
-    """Bytes that the file of the pixels holds from `start` on; errors name the header that names it."""
-    try:
-        with open_regular(data) as stream:
-            return max(stream.seek(0, 2) - start, 0)
-    except FileError as error:
-        raise FileError(f"{header}: expected its pixels in a file that is there: {error}") from error
-
-
-def _count(where: str, field: str, size: tuple[int, ...]) -> int:
-    if max(size) > _MOST_LENGTH:
-        raise InvalidInputError(
-            f"{where}: {field}: expected lengths up to {_MOST_LENGTH}, got {max(size):.3g}"
-        )
-    return math.prod(size)
-
-
 def _flag(fields: Mapping[str, str], name: str, default: str = "False") -> bool:
     return fields.get(name, default)[:1] in ("T", "t", "1")
-
-
-def _whole(where: str, fields: Mapping[str, str], name: str, default: int) -> int:
-    (value,) = numbers(fields.get(name, str(default)), 1, f"{where}: {name}")
-    if value != int(value) or not 0 <= value <= _MOST_LENGTH:
-        raise InvalidInputError(f"{where}: {name}: expected a whole number from 0, got {fields[name]}")
-    return int(value)

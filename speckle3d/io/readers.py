@@ -17,9 +17,8 @@ from speckle3d.core.errors import FileError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.import_settings import ImportSettings
-
-Row = tuple[str, str, str]
-"""Description, value, unit."""
+from speckle3d.io.recordings import Recording
+from speckle3d.io.recordings import Row as Row
 
 GROUP = "speckle3d.readers"
 START_BYTES = 4096
@@ -51,9 +50,11 @@ class Reader:
         Whether a recording is of this format, from its path and its first `START_BYTES` bytes, which are
         none for a folder. It raises nothing.
     read : callable
-        The sweep of a recording, with `ImportSettings` for what it does not say.
+        The sweep of a recording, with `ImportSettings` for what it does not say; or a `Recording`, which
+        makes the sweep and describes itself.
     describe : callable, optional
-        Rows of what a recording holds, also where it is no sweep; by default the sweep's.
+        Rows of what a recording holds, also where it is no sweep; by default the sweep's or
+        the `Recording`'s.
     companions : callable
         Other files that the sweep's content depends on.
     notes : callable
@@ -64,7 +65,7 @@ class Reader:
 
     format: str
     claims: Callable[[Path, bytes], bool]
-    read: Callable[[Path, ImportSettings], Sweep]
+    read: Callable[[Path, ImportSettings], Sweep | Recording]
     describe: Callable[[Path, ImportSettings], list[Row]] | None = None
     companions: Callable[[Path], Sequence[Path]] = _nothing_beside
     notes: Callable[[Path, ImportSettings], Sequence[str]] = _nothing_to_say

@@ -46,7 +46,7 @@ from speckle3d.io.hdf5 import (
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.lazy import HDF5Slices, Slices
+from speckle3d.io.lazy import HDF5Slices
 from speckle3d.io.readers import Reader
 from speckle3d.io.records import read_record
 
@@ -83,20 +83,15 @@ class HDF5Frames(HDF5Slices):
     ) -> None:
         in_pairs = len(shape) == 4
         n, vectors, samples = shape[:3]
-        turn = complex_of_pairs if in_pairs else as_stored
+        turn = from_pairs if in_pairs else as_stored
         kind = np.complex64 if in_pairs else dtype
-        super().__init__(path, [name], 0, turn, (n, vectors, samples), kind, grows)
+        super().__init__(path, name, turn, (n, vectors, samples), kind, grows)
         self.stored_dtype = dtype
 
 
-def as_stored(slices: Slices) -> npt.NDArray[Any]:
+def as_stored(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Frame as the file has it."""
-    return slices[0]
-
-
-def complex_of_pairs(slices: Slices) -> npt.NDArray[Any]:
-    """Frame of I and Q in pairs, the last axis."""
-    return from_pairs(slices[0])
+    return values
 
 
 def read_sweep(path: PathLike) -> Sweep:
@@ -260,7 +255,10 @@ def unfinished_note(path: PathLike) -> str | None:
         if not has_format(file, FORMAT) or not is_growing(file):
             return None
         times = _read_rows(file, "frame_time_s", ("frame",))
-    return f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far"
+    return (
+        f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far, of "
+        "which speckle3d convert makes a whole file"
+    )
 
 
 def _notes(path: Path, _: ImportSettings) -> list[str]:

@@ -6,6 +6,7 @@ otherwise; poses in memory are in mm.
 
 from __future__ import annotations
 
+import warnings
 from array import array
 from typing import Literal
 
@@ -13,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import require_finite
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path
+from speckle3d.io.pose_paths import left_out, rising
 from speckle3d.io.text import numbers, text_lines
 
 LengthUnit = Literal["m", "mm"]
@@ -64,32 +65,43 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     FileError
         If the file cannot be read.
     InvalidInputError
-        If a line is not eight finite numbers, a quaternion is not of unit length, or times do not increase;
-        or the file says another unit.
+        If the file says another unit, or most lines are not eight finite numbers. Lines of no use, and poses
+        whose time is not after the one before, are left out with a warning that counts them.
     """
     values, said = array("d"), None
+    faults: list[InvalidInputError] = []
     # Line by line, so that an error names the line: 17 us each, where `np.loadtxt` takes 4.
     for n, text in text_lines(path):
         if not _is_comment(text):
-            values.extend(numbers(text, _COLUMNS, f"{path}: line {n}"))
+            try:
+                values.extend(numbers(text, _COLUMNS, f"{path}: line {n}"))
+            except InvalidInputError as error:
+                faults.append(error)
         elif not values:
             said = said or _unit_of(text)
     rows = np.frombuffer(values).reshape(-1, _COLUMNS)
-    if not rows.size:
-        raise InvalidInputError(f"{path}: expected lines of eight numbers, got none")
+    if len(rows) <= len(faults):
+        raise faults[0] if faults else InvalidInputError(f"{path}: expected lines of eight numbers, got none")
     if length_unit is not None and said is not None and said != length_unit:
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
     mm_per_unit = _mm_per(length_unit or said or "m")
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(rows[:, 4:], axis=1)
         places_mm = rows[:, 1:4] * mm_per_unit
-    if (wrong := np.flatnonzero(np.abs(norms - 1.0) > _UNIT_TOLERANCE)).size:
-        where = f"{path}: pose {wrong[0]}"
-        raise InvalidInputError(f"{where}: expected a unit quaternion, got norm {norms[wrong[0]]:.4g}")
-    require_finite(places_mm, f"{path}: x, y, z in mm")
-    poses = RigidTransform.from_components(places_mm, Rotation.from_quat(rows[:, 4:]))
-    with naming(str(path)):
-        return TimedPoses(rows[:, 0].copy(), poses)
+    sound = (np.abs(norms - 1.0) <= _UNIT_TOLERANCE) & np.isfinite(places_mm).all(axis=1)
+    if not sound.any():
+        raise InvalidInputError(f"{path}: pose 0: expected a unit quaternion, got norm {norms[0]:.4g}")
+    kept = np.flatnonzero(sound)
+    kept = kept[rising(rows[kept, 0])]
+    reasons = {
+        "that are not eight finite numbers": len(faults),
+        "without a unit quaternion": int(np.sum(~sound)),
+        "with a time that is not after the one before": int(np.sum(sound)) - kept.size,
+    }
+    for note in left_out(f"{path}: poses", len(rows) + len(faults), reasons, rows[kept, 0]):
+        warnings.warn(note, stacklevel=2)
+    poses = RigidTransform.from_components(places_mm[kept], Rotation.from_quat(rows[kept, 4:]))
+    return TimedPoses(rows[kept, 0].copy(), poses)
 
 
 def is_tum(path: PathLike) -> bool:

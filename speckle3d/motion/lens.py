@@ -137,7 +137,8 @@ def corrected_curves(
     left = float(
         np.sqrt((weight * (scale - weight @ scale) ** 2).sum() / scale.size + 1.0 / (sigma**-2.0).sum())
     )
-    better = stretched(curves, lens + weight @ scale)
+    # Widened for the attenuation of these sweeps, the curves go with a spectrum that has it.
+    better = replace(stretched(curves, lens + weight @ scale), spectrum=tracked[0].curves.spectrum)
     return replace(better, scale_sigma=float(np.hypot(left, ATTENUATION_SIGMA)), origin="crossing")
 
 

@@ -51,9 +51,6 @@ _LINE_EXCESS = 1.25
 """Variance of a Theil-Sen line's end over that of least squares in white noise: 1.13 to 1.25 for 3 to 25
 samples, in 20,000 trials each."""
 
-_CUBIC = 4.0
-"""Parameters of a cubic: where it ends, its fit to n samples has 4^2 / n of a sample's variance."""
-
 
 class Accumulated(NamedTuple):
     """Motion summed from the first frame, all of shape (n,), zero at frame 0."""
@@ -279,16 +276,6 @@ def jitter_mm(length_mm: FloatArray) -> float:
     if length_mm.size < _FEWEST_READINGS:
         return float("nan")
     return robust_sigma(np.diff(length_mm, 3)) / float(_THIRD_DIFFERENCES)
-
-
-def jitter_percent(length_mm: FloatArray) -> float:
-    """Standard deviation that jitter alone leaves in a length fitted to the tracker, in per cent of it.
-
-    A cubic is fitted to the sweep, as mode `pose` does: its ends have ``4^2 / n`` of a reading's variance.
-    """
-    sigma = jitter_mm(length_mm) * np.sqrt(2.0 * _CUBIC**2 / length_mm.size)
-    length = float(np.abs(length_mm).max())
-    return float(100.0 * sigma / length) if length > 0 else float("nan")
 
 
 def _width(size: int, end_frames: int) -> int:

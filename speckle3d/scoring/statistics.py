@@ -48,18 +48,18 @@ def mean_interval(values: npt.ArrayLike) -> MeanInterval:
     ----------
     .. [1] B. Efron and R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
     """
-    known = np.asarray(values, dtype=float)
-    known = known[np.isfinite(known)]
-    if not known.size:
+    present = np.asarray(values, dtype=float)
+    present = present[np.isfinite(present)]
+    if not present.size:
         raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
     low = high = None
-    if known.size >= FEWEST and np.ptp(known) > 0:
+    if present.size >= FEWEST and np.ptp(present) > 0:
         from scipy import stats  # takes 0.3 s to import, which a single reconstruction does without
 
         rng = np.random.default_rng(_SEED)
-        found = stats.bootstrap((known,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=rng)
-        low, high = map(float, found.confidence_interval)
-    return MeanInterval(known.size, float(known.mean()), low, high)
+        bootstrap = stats.bootstrap((present,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=rng)
+        low, high = map(float, bootstrap.confidence_interval)
+    return MeanInterval(present.size, float(present.mean()), low, high)
 
 
 def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[MeanInterval, float | None]:

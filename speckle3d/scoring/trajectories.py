@@ -19,10 +19,9 @@ from speckle3d.core.geometry import relative_poses
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.io import load
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import file_format, open_hdf5, reading
-from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256, sniff
-from speckle3d.io.readers import find_reader
+from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.tum import LengthUnit, read_tum
 from speckle3d.scoring.displacements import challenge_score, score_row
@@ -93,15 +92,10 @@ def relative_pose_error(poses: RigidTransform, reference: RigidTransform) -> Pos
 
 def kind_of(path: Path) -> str:
     """Kind of a file by its content: "reconstruction", "sweep" or "text" (anything unknown)."""
-    if find_reader(path) is not None:
-        return "sweep"
     try:
-        sniff(path)
+        return "reconstruction" if load.kind_of(path) == FORMAT else "sweep"
     except InvalidInputError:
         return "text"
-    with reading(path), open_hdf5(path) as file:
-        is_reconstruction = "format" in file.attrs and file_format(file) == FORMAT
-    return "reconstruction" if is_reconstruction else "sweep"
 
 
 def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | None = None) -> Trajectory:
@@ -129,9 +123,9 @@ def load_reconstructed(path: Path, mode: str) -> Trajectory:
     InvalidInputError
         If the reconstruction has no such mode.
     """
-    found = read_reconstruction(path, with_pairs=False)
-    name, of = f"{path.name}, mode {mode}", found.provenance.input_sha256
-    return Trajectory(name, found.frame_time_s, poses_of(found, mode), found.grid, sweep_sha256=of)
+    made = read_reconstruction(path, with_pairs=False)
+    name, of = f"{path.name}, mode {mode}", made.provenance.input_sha256
+    return Trajectory(name, made.frame_time_s, poses_of(made, mode), made.grid, sweep_sha256=of)
 
 
 def poses_of(reconstruction: Reconstruction, mode: str) -> RigidTransform:
@@ -162,13 +156,13 @@ def load_reference(
     if kind_of(path) != "sweep":
         return load_estimate(path, mode, length_unit)
     sweep = load_sweep(path)
-    held = find_reference(sweep, wanted)
-    if held is None:
+    poses = find_reference(sweep, wanted)
+    if poses is None:
         raise InsufficientDataError(f"{path}: expected truth or a calibrated tracker, got neither")
-    marks = load_landmarks(path) if held.covered.all() else None
-    times = sweep.frame_time_s[held.covered]
-    name = f"{path.name}, {held.name}"
-    return Trajectory(name, times, held.world_from_image, sweep.grid, marks, recording_sha256(path))
+    marks = load_landmarks(path) if poses.covered.all() else None
+    times = sweep.frame_time_s[poses.covered]
+    name = f"{path.name}, {poses.name}"
+    return Trajectory(name, times, poses.world_from_image, sweep.grid, marks, recording_sha256(path))
 
 
 def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
@@ -203,22 +197,22 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     if (common := int(shared.sum())) < 2:
         both = f"{estimate.name} and {reference.name}"
         raise MismatchError(f"{both}: expected at least 2 times that both have, got {common}")
-    found, true = estimate.poses[shared], stream.at(times[shared])
+    estimated, true = estimate.poses[shared], stream.at(times[shared])
     whole = bool(shared.all()) and len(true) == len(reference.poses)
     marks = reference.landmarks if whole else None
     of = estimate.sweep_sha256, reference.sweep_sha256
-    score = challenge_score(found, true, grid, marks) if grid is not None and marks is not None else None
+    score = challenge_score(estimated, true, grid, marks) if grid is not None and marks is not None else None
     return {
         "estimate": estimate.name,
         "reference": reference.name,
-        "poses": len(found),
+        "poses": len(estimated),
         "left_out": len(shared) - common,
         "association": "the reference interpolated at the estimate's times",
         "alignment": "first poses on each other, lengths as they are",
         "same_sweep": of[0] == of[1] if all(of) else None,
-        "APE": absolute_pose_error(found, true),
-        "RPE": relative_pose_error(found, true),
-        **score_row(found, true, grid, marks),
+        "APE": absolute_pose_error(estimated, true),
+        "RPE": relative_pose_error(estimated, true),
+        **score_row(estimated, true, grid, marks),
         "score": score,
     }
 

@@ -13,7 +13,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -42,50 +42,33 @@ class SweepJob:
 
     Attributes
     ----------
+    planned : SweepOutcome
+        With the name, the input and the key: SHA-256 of the input's bytes, configuration, version, modes,
+        reference, curves and calibrations.
     modes : tuple of str, or None
         Beside `image`; None for all that the sweep has sensors for.
-    key : str
-        SHA-256 of the input's bytes, configuration, version, modes, reference, curves and calibrations.
     crossing : path, optional
         The crossing sweep, if mode `crossed` is asked for.
     """
 
-    name: str
-    path: Path
+    planned: SweepOutcome
     folder: Path
     curves: Path
     settings_toml: str
     modes: tuple[str, ...] | None
     reference: str | None
     calibrations: tuple[Path, ...]
-    sha256: str
-    key: str
-    frames: int
     crossing: Path | None = None
 
-    @property
-    def is_done(self) -> bool:
-        """Whether its folder is there, which is whole then."""
-        return (self.folder / RESULTS.primary).is_file()
+    def failed(self, reason: str) -> SweepOutcome:
+        """What became of it if it failed."""
+        return replace(self.planned, status="failed", reason=reason)
 
-    def outcome(self, reason: str = "", skipped: bool = False) -> SweepOutcome:
-        """What became of it: done, or failed for a reason."""
-        stored = (self.name, self.path, "failed", reason, self.sha256, self.key)
-        if reason:
-            return SweepOutcome(*stored, frames=self.frames)
+    def done(self, skipped: bool = False) -> SweepOutcome:
+        """What became of it if its folder is there, which is whole then."""
         (summary,) = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-        return SweepOutcome(
-            self.name,
-            self.path,
-            "done",
-            "",
-            self.sha256,
-            self.key,
-            f"sweeps/{self.folder.name}",
-            float(summary["details"]["seconds"]),
-            self.frames,
-            skipped,
-        )
+        seconds, folder = float(summary["details"]["seconds"]), f"sweeps/{self.folder.name}"
+        return replace(self.planned, status="done", folder=folder, seconds=seconds, skipped=skipped)
 
 
 @dataclass
@@ -160,24 +143,26 @@ def compare_sweeps(
     if curves is not None:
         read_curves(curves)
     where, settings = scheduler or InProcess(), (config or Config()).to_toml()
-    plan = [
-        plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
+    plan = {
+        name: plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
         for name, path in named(paths)
-    ]
-    outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
+    }
+    outcomes = {name: each for name, each in plan.items() if isinstance(each, SweepOutcome)}
     # The longest first, so that no worker is left with it while the others have nothing to do.
-    jobs = sorted((each for each in plan if isinstance(each, SweepJob)), key=lambda job: -job.frames)
+    jobs = sorted(
+        (each for each in plan.values() if isinstance(each, SweepJob)), key=lambda job: -job.planned.frames
+    )
     if not jobs:
         first = next(iter(outcomes.values()))
         raise InsufficientDataError(
             f"expected a sweep that can be compared, got none of {len(plan)}; {first.name}: {first.reason}"
         )
     make_folder(directory / "sweeps")
-    so_far = StudyProgress(len(jobs), sum(job.frames for job in jobs))
+    so_far = StudyProgress(len(jobs), sum(job.planned.frames for job in jobs))
     tell = progress or (lambda at: None)
     tell(so_far)
     try:
-        for outcome in where.run(run_sweep, jobs, SweepJob.outcome):
+        for outcome in where.run(run_sweep, jobs, SweepJob.failed):
             outcomes[outcome.name] = outcome
             so_far.add(outcome, where.workers)
             tell(so_far)
@@ -185,7 +170,7 @@ def compare_sweeps(
         for folder in (directory / "sweeps", directory):
             with suppress(OSError):  # it holds finished sweeps
                 folder.rmdir()
-    return write_study(directory, [outcomes[each.name] for each in plan], settings)
+    return write_study(directory, [outcomes[name] for name in plan], settings)
 
 
 def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
@@ -235,20 +220,8 @@ def plan_sweep(
     parts = [sha256, settings_toml, version("speckle3d"), modes, reference, used]
     key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
     folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
-    return SweepJob(
-        name,
-        path,
-        folder,
-        curves_file,
-        settings_toml,
-        modes,
-        reference,
-        mounted,
-        sha256,
-        key,
-        frames,
-        crossing,
-    )
+    planned = SweepOutcome(name, path, "planned", sha256=sha256, key=key, frames=frames)
+    return SweepJob(planned, folder, curves_file, settings_toml, modes, reference, mounted, crossing)
 
 
 def crossing_of(path: Path) -> Path:
@@ -259,17 +232,18 @@ def crossing_of(path: Path) -> Path:
 
 def run_sweep(job: SweepJob) -> SweepOutcome:
     """Do a job unless it is done; whatever is wrong with the sweep becomes the outcome's reason."""
-    if job.is_done:
-        return job.outcome(skipped=True)
+    if (job.folder / RESULTS.primary).is_file():
+        return job.done(skipped=True)
+    path = job.planned.path
     try:
-        if recording_sha256(job.path) != job.sha256:
-            raise InvalidInputError(f"{job.path}: expected the file that the study began with, got another")
-        settings, sweep = config_from_toml(job.settings_toml), load_sweep(job.path)
+        if recording_sha256(path) != job.planned.sha256:
+            raise InvalidInputError(f"{path}: expected the file that the study began with, got another")
+        settings, sweep = config_from_toml(job.settings_toml), load_sweep(path)
         mounted, _ = apply_calibrations(sweep, job.calibrations)
         modes = available_modes(mounted, settings) if job.modes is None else job.modes
         run_job(
             sweep,
-            job.path,
+            path,
             read_curves(job.curves),
             job.folder,
             [mode for mode in modes if mode != "image"],
@@ -279,9 +253,9 @@ def run_sweep(job: SweepJob) -> SweepOutcome:
             job.calibrations,
             None if job.crossing is None else (load_sweep(job.crossing), job.crossing),
         )
-        return job.outcome()
+        return job.done()
     except Exception as error:  # noqa: BLE001 - one broken sweep, or one bug that it reveals, stops no other
-        return job.outcome(_reason(error))
+        return job.failed(_reason(error))
 
 
 def _reason(error: Exception) -> str:

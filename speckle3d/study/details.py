@@ -18,6 +18,7 @@ from speckle3d.correction.modes import sensor_of
 from speckle3d.corrections import Correction
 from speckle3d.matching.quality import describe
 from speckle3d.pipeline import Tracked
+from speckle3d.scoring.lengths import TRACKER
 
 
 def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | None:
@@ -36,24 +37,26 @@ def recorded_doubts(path: Path, provenance: Provenance) -> tuple[Doubt, ...] | N
         None if no summary of this reconstruction is there.
     """
     try:
-        (held,) = json.loads((path.parent / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-        made_from = held["details"]["provenance"]["input_sha256"]
-        doubts = tuple(Doubt(**each) for each in held["doubts"])
+        (summary,) = json.loads((path.parent / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+        made_from = summary["details"]["provenance"]["input_sha256"]
+        doubts = tuple(Doubt(**each) for each in summary["doubts"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return doubts if made_from == provenance.input_sha256 else None
 
 
 def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str]) -> dict[str, str]:
-    """What is suspected of the sensor that each mode rests on; images are under all of them."""
-    found = {}
+    """What is suspected of the sensor that each mode rests on; images are under all but the tracker alone."""
+    suspicions = {}
     for mode in modes:
-        sensor = None if mode == "image" else sensor_of(sweep, mode)
-        about = {"images", "curves", "" if sensor is None else sensor.label}
+        sensor = None if mode == "image" else sensor_of(sweep, "pose" if mode == TRACKER else mode)
+        about = {"" if sensor is None else sensor.label}
+        if mode != TRACKER:
+            about |= {"images", "curves"}
         suspected = dict.fromkeys(doubt.suspect for doubt in doubts if doubt.about in about)
         if suspected:
-            found[mode] = ", ".join(suspected)
-    return found
+            suspicions[mode] = ", ".join(suspected)
+    return suspicions
 
 
 def details_of(
@@ -74,13 +77,13 @@ def details_of(
 
 
 def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
-    found = tracked.coherence
-    if found is None:
+    coherence = tracked.coherence
+    if coherence is None:
         return None
     return {
-        "mean_share": float(found.share.mean()),
-        "mean_gain": float(found.gain.mean()),
-        "scale_sigma": found.scale_sigma,
+        "mean_share": float(coherence.share.mean()),
+        "mean_gain": float(coherence.gain.mean()),
+        "scale_sigma": coherence.scale_sigma,
     }
 
 

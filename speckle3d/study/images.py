@@ -238,10 +238,10 @@ def part_at(sweep: Sweep, time_s: FloatArray) -> Sweep:
         If no frames in a row have these times.
     """
     first = int(np.searchsorted(sweep.frame_time_s, time_s[0]))
-    held = sweep.frame_time_s[first : first + len(time_s)]
-    if not np.array_equal(held, time_s):
+    times = sweep.frame_time_s[first : first + len(time_s)]
+    if not np.array_equal(times, time_s):
         raise MismatchError(f"{sweep.name}: expected frames at the times that were reconstructed, got others")
-    return sweep if len(held) == len(sweep) else sweep.part(first, first + len(held))
+    return sweep if len(times) == len(sweep) else sweep.part(first, first + len(times))
 
 
 class Strip:

@@ -35,7 +35,7 @@ from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Tracked, track
 from speckle3d.scoring.displacements import score_row
-from speckle3d.scoring.lengths import TRACKER, ModeError, accumulated, compare_modes, jitter_percent
+from speckle3d.scoring.lengths import TRACKER, ModeError, compare_modes
 from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves, tracker_alone
 from speckle3d.study.crossed import Companion
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
@@ -179,7 +179,7 @@ def run_job(
             doubts,
             doubted_modes(sweep, doubts, every),
             left_out,
-            claims | _jitter(alone, poses, sweep),
+            claims | _own_claim(alone, sweep.grid.centre_mm),
             _drift(every, compared, sweep, source),
         )
         save_figure(figure_drift(moved, _title(summary)), part / PICTURES[0])
@@ -280,19 +280,13 @@ def _title(summary: Summary) -> str:
     return "; ".join([summary.sweep, *doubted, *(f"{mode} left out" for mode in summary.left_out)])
 
 
-def _jitter(
-    alone: RigidTransform | None, poses: Mapping[str, RigidTransform], sweep: Sweep
-) -> dict[str, float]:
-    """Relative standard deviation that jitter alone leaves in the lengths of `tracker` and `pose`."""
+def _own_claim(alone: RigidTransform | None, centre_mm: FloatArray) -> dict[str, float]:
+    """Relative standard deviation of the tracker's own length, by its jitter alone, in the longest part."""
     if alone is None:
         return {}
-    centre = sweep.grid.centre_mm
-    longest = max(compare_modes({TRACKER: alone}, alone, centre), key=lambda row: row.reference_mm)
-    shares = {
-        TRACKER: longest.reference_sigma_mm / max(longest.reference_mm, 1e-9),
-        "pose": 0.01 * jitter_percent(accumulated(alone, centre).length_mm),
-    }
-    return {m: share for m, share in shares.items() if np.isfinite(share) and (m == TRACKER or m in poses)}
+    row = max(compare_modes({TRACKER: alone}, alone, centre_mm), key=lambda row: row.reference_mm)
+    share = row.reference_sigma_mm / max(row.reference_mm, 1e-9)
+    return {TRACKER: share} if np.isfinite(share) else {}
 
 
 def _drift(

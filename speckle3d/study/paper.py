@@ -262,10 +262,10 @@ def _against_truth(study: Study, directory: Path) -> dict[str, list[ModeError]]:
     return rows
 
 
-def _interval(found: MeanInterval, digits: int) -> str:
-    if found.low is None or found.high is None:
-        return f"{found.mean:.{digits}f}"
-    return f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+def _interval(mean: MeanInterval, digits: int) -> str:
+    if mean.low is None or mean.high is None:
+        return f"{mean.mean:.{digits}f}"
+    return f"{mean.mean:.{digits}f} [{mean.low:.{digits}f}, {mean.high:.{digits}f}]"
 
 
 def _pair(published: float, ours: ModeError | None, name: str, digits: int) -> str:

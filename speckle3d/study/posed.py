@@ -201,11 +201,11 @@ def open_posed(
             f"--mode: expected {' or '.join(REFERENCES)} of a recording, got {mode!r}: "
             "make its reconstruction first (speckle3d reconstruct)"
         )
-    given = settings or ImportSettings()
-    sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in given.model_fields_set}
-    sweep, known = _load(path, given.model_copy(update=sizes), dynamic_range_db)
+    stated = settings or ImportSettings()
+    sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in stated.model_fields_set}
+    sweep, range_is_known = _load(path, stated.model_copy(update=sizes), dynamic_range_db)
     mounted, _ = apply_calibrations(resized(sweep, sizes), calibrations)
-    return replace(posed_by_itself(mounted, mode), range_is_known=known)
+    return replace(posed_by_itself(mounted, mode), range_is_known=range_is_known)
 
 
 def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:
@@ -216,8 +216,8 @@ def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) 
         if error.settings != (_RANGE,):
             lacking = tuple(name for name in error.settings if name != _RANGE)
             raise MissingSettingsError(path, lacking) from None
-    given = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
-    return load_sweep(path, given), dynamic_range_db is not None
+    stated = settings.model_copy(update={_RANGE: dynamic_range_db or USUAL_RANGE_DB})
+    return load_sweep(path, stated), dynamic_range_db is not None
 
 
 def posed_by_itself(sweep: Sweep, mode: str | None = None) -> PosedSweep:

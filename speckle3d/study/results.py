@@ -63,8 +63,8 @@ class Summary:
     left_out : mapping of str to str
         Modes that were asked for and refused, and why.
     claims : mapping of str to float
-        Relative standard deviation of the length that a mode claims, where it claims one; of `pose` and
-        `tracker` what the tracker's jitter alone leaves.
+        Relative standard deviation of the length that a mode claims, where it claims one; of `tracker` what
+        its jitter alone leaves.
     details : dict
         Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
     """
@@ -108,10 +108,11 @@ class Summary:
         if self.reference != "truth":
             return []
         errors = {(row.part, row.mode): row.length_error_percent for row in self.rows}
-        jitter = 196 * self.claims.get("pose", 0.0)
+        jitter = 196 * self.claims.get("tracker", 0.0)
         return [
             f"part {part}: {mode} is farther from the truth ({error:+.1f} %) than image "
-            f"({errors[part, 'image']:+.1f} %); the tracker's jitter alone is +- {jitter:.1f} % (95 %)"
+            f"({errors[part, 'image']:+.1f} %); the tracker's jitter is +- {jitter:.1f} % of its length "
+            "(95 %)"
             for (part, mode), error in errors.items()
             if mode in FITTED_TO_TRACKER and jitter and abs(error) > abs(errors[part, "image"])
         ]
@@ -180,9 +181,7 @@ def summary_text(summaries: Sequence[Summary], more: Sequence[str] = ()) -> str:
     """Table of some sweeps, below it what its columns are and what is in doubt, then more lines."""
     records = [record for each in summaries for record in each.records()]
     names = dict.fromkeys(each.reference for each in summaries)
-    lines = [
-        "+- 95 %: of the length, mm, as the mode claims it; of pose and tracker by the tracker's jitter alone"
-    ]
+    lines = ["+- 95 %: of the length, mm, as the mode claims it; of tracker by its jitter alone"]
     if set(names) - {"none"}:
         lines.append(f"reference: {', '.join(names)}; errors are estimate minus reference")
     lines += [*(line for each in summaries for line in each.lines), *more]
@@ -319,10 +318,10 @@ def copy_lines(copies: Mapping[str, str]) -> list[str]:
 def read_summary(folder: Path, name: str) -> Summary:
     """Read a sweep's summary back, without its details; a number that was not finite is NaN again."""
     (stored,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-    known: list[dict[str, Any]] = [
+    records: list[dict[str, Any]] = [
         {key: math.nan if value is None else value for key, value in row.items()} for row in stored["rows"]
     ]
-    rows = [ModeError(**row) for row in known]
+    rows = [ModeError(**row) for row in records]
     doubts = [Doubt(**each) for each in stored["doubts"]]
     return Summary(**stored | {"sweep": name, "rows": rows, "doubts": doubts, "details": {}})
 

@@ -14,7 +14,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 from calibration.detection.lines import detect_lines
-from calibration.job import JobSettings, Recording, orientation_job, plane_job
+from calibration.recording import Recording
+from speckle3d.calibrating.phantoms import solved
+from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.images import GreyImages
@@ -48,7 +50,7 @@ def trial(seed, frames, reflector):
     seen = detect_lines(recording.images, recording.pixel_mm)
     found = {}
     for level in (False, True):
-        outcome = orientation_job(recording_of(sweep, sweep.orientation), seen, JobSettings(), level)
+        outcome = solved(recording, seen, OrientationSettings(level=level))
         turn = simulated.orientation_from_image.inv() * outcome.calibration.rotation
         found[f"orientation sensor, {'level' if level else 'any'} plane"] = (
             np.rad2deg(turn.as_rotvec()),
@@ -56,7 +58,9 @@ def trial(seed, frames, reflector):
             None,
         )
     for fit in (True, False):
-        outcome = plane_job(recording_of(sweep, sweep.tracker), seen, JobSettings(), fit)
+        outcome = solved(
+            recording_of(sweep, sweep.tracker), seen, PlaneSettings(fixed_pixels=not fit, reflector="bar")
+        )
         step = simulated.tracker_from_image.inv() * outcome.calibration.sensor_from_image
         centre = sweep.grid.centre_mm
         found[f"tracker, pixels {'fitted' if fit else 'held'}"] = (

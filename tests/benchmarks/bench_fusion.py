@@ -23,7 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
+# The packages first: `tests/xsens` is not the one to import.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from broad import (
     OFFLINE,
@@ -69,6 +71,8 @@ GROUPS = {
 
 
 def main():
+    if len(sys.argv) < 2 or "--help" in sys.argv:
+        sys.exit(__doc__ if len(sys.argv) < 2 else print(__doc__))
     folder, options = Path(sys.argv[1]), sys.argv[2:]
     if not trials_in(folder):
         sys.exit(f"expected a folder of .mat files, got {folder}")

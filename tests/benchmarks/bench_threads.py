@@ -11,8 +11,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from bench_calibration_accuracy import recording_of
 
-from calibration.job import JobSettings, find_crossings, wires_job
 from calibration.report import IMAGE_POSE
+from speckle3d.calibrating.phantoms import found, solved
+from speckle3d.calibrating.settings import WireSettings
 from speckle3d.simulation.presets import SimulationSettings, simulate
 
 FIRST_SEED = 4001
@@ -23,7 +24,7 @@ def trial(seed, vectors, frames):
     """Errors of one scan: turns about the image's z, y, x and its place, rad and mm, and those claimed."""
     (simulated,) = simulate(SimulationSettings(preset="wires", seed=seed, vectors=vectors, frames=frames))
     recording = recording_of(simulated.sweep, simulated.sweep.tracker)
-    solution = wires_job(recording, find_crossings(recording), JobSettings(), None).solution
+    solution = solved(recording, found(recording, WireSettings()), WireSettings()).solution
     step = simulated.tracker_from_image.inv() * solution.chain.sensor_from_image
     shift, turn = step.as_components()
     # Roll, yaw and tilt are about the image's z, y and x.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, scan_plane
 
-from calibration.beam import bias_along_beam_mm, depth_error_mm, predict_bias
+from calibration.beam import bias_along_beam_mm, predict_bias
 from calibration.plane import calibrate_plane
 from calibration.settings import PlaneFit
 from speckle3d.core.errors import InvalidInputError
@@ -39,21 +39,6 @@ def test_the_closed_form_is_the_integral_for_tilt_alone(width_mm):
     found = bias_along_beam_mm(tilted(angles), width_mm)
     # A sum over 20,001 angles differs from the integral by some 1e-4.
     assert found == pytest.approx(of_uniform_tilt(np.deg2rad(25)) * width_mm, rel=3e-4)
-
-
-def test_the_nearer_edge_of_the_beam_is_as_much_nearer_as_geometry_says():
-    # The two faces of a sheet 2 mm thick, at z = -1 and 1, meet the wall at these depths.
-    rng = np.random.default_rng(0)
-    normal = rng.normal(size=(50, 3)) * [0.3, 1.0, 0.3]
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    normal[:, 1] = -np.abs(normal[:, 1])
-    height = rng.uniform(10, 30, 50)
-    centre, *edges = (-(height + normal[:, 2] * z) / normal[:, 1] for z in (0.0, -1.0, 1.0))
-    np.testing.assert_allclose(depth_error_mm(normal, 2.0), centre - np.minimum(*edges), atol=1e-12)
-
-
-def test_heights_that_never_change_say_nothing():
-    assert np.isnan(bias_along_beam_mm(tilted(np.full(10, 0.1)), 1.0))
 
 
 def test_what_is_predicted_is_what_a_thick_beam_does():

@@ -76,12 +76,6 @@ def test_chance_candidates_are_refused_and_the_statistic_told(frames, each):
         assert "chance gives" in str(refused.value)
 
 
-def test_a_wrong_pixel_size_does_not_hide_the_consensus():
-    points = scan(6)
-    solution = calibrate_cross_wire(points, np.array([1.0, 1.0]))
-    np.testing.assert_allclose(solution.chain.pixel_mm, PIXEL_MM, rtol=0.02)
-
-
 @pytest.mark.slow
 def test_images_of_crossing_wires_calibrate():
     found = []

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform
 from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
 from calibration.detection.dots import Dots, dots_in_frames
@@ -17,7 +16,6 @@ from calibration.nwires import (
     trimmed_mean_mm,
 )
 from calibration.points import ImagePoints, Seen
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage, read_poses
 from speckle3d.io.plus_config import read_wire_phantom
@@ -58,47 +56,6 @@ def test_middle_dots_are_placed_in_the_phantom_whatever_the_pixels(seed, stretch
     np.testing.assert_allclose(phantom_mm, truth, atol=1e-8)
 
 
-def test_an_n_that_lacks_a_dot_says_nothing():
-    shown = scene(1, frames=3)
-    points = points_of(shown)
-    middle, _ = middle_wires(points[~((points.frame == 1) & (points.wire == 5))], shown.phantom)
-    assert sorted(zip(middle.frame, middle.wire, strict=True)) == [
-        (0, 1), (0, 4), (0, 7), (1, 1), (1, 7), (2, 1), (2, 4), (2, 7),
-    ]  # fmt: skip
-
-
-def test_a_shift_of_the_calibration_is_the_error_of_every_n():
-    shown = scene(2)
-    points = points_of(shown)
-    place = shown.phantom.world_from_phantom
-    assert nwire_errors_mm(points, shown.phantom, shown.pixel_matrix, place).max() < 1e-9
-    shifted = shown.pixel_matrix.copy()
-    shifted[:3, 3] += [0.3, -0.4, 1.2]
-    errors = nwire_errors_mm(points, shown.phantom, shifted, place)
-    np.testing.assert_allclose(errors, 1.3)
-    elsewhere = place * RigidTransform.from_translation([0.0, 0.6, 0.8])
-    moved = nwire_errors_mm(points, shown.phantom, shown.pixel_matrix, elsewhere)
-    np.testing.assert_allclose(moved, 1.0)
-
-
-def test_the_largest_errors_can_be_left_out():
-    errors = np.append(np.full(19, 0.5), 80.0)
-    assert trimmed_mean_mm(errors) == (0.5, 0.0)
-    with pytest.raises(InsufficientDataError, match="three dots"):
-        trimmed_mean_mm(np.zeros(0))
-
-
-def test_wrong_wires_hardly_move_the_start():
-    shown = scene(3, frames=40)
-    points = points_of(shown, noise_mm=0.1)
-    clean = start_from_nwires(points, shown.phantom)
-    swapped = points.wire.copy()
-    swapped[:9], swapped[90:99] = swapped[:9][::-1], np.roll(swapped[90:99], 3)
-    spoiled = start_from_nwires(replace(points, wire=swapped), shown.phantom)
-    # Two frames of forty are wrong by tens of millimetres; least squares alone would be off by 1 mm and more.
-    assert apart(spoiled, shown)[0] < apart(clean, shown)[0] + 0.2
-
-
 @pytest.mark.parametrize("seed", [3])
 def test_a_phantom_nobody_registered_is_found_by_turning_the_probe(seed):
     shown = scene(seed, frames=60, degrees=25.0)
@@ -108,29 +65,6 @@ def test_a_phantom_nobody_registered_is_found_by_turning_the_probe(seed):
     # A start: iteration from 20 degrees away finds its way, and from the image's own size.
     assert np.degrees(found.rotation.magnitude()) < 6.0
     assert apart(start, shown)[0] < 6.0
-
-
-def test_a_probe_that_hardly_turned_does_not_say_where_the_phantom_is():
-    shown = scene(3, degrees=2.0)
-    unknown = replace(shown.phantom, world_from_phantom=None)
-    with pytest.raises(InsufficientDataError, match="turned"):
-        start_from_nwires(points_of(shown), unknown, PIXEL_MM)
-    with pytest.raises(InvalidInputError, match="pixel_mm"):
-        start_from_nwires(points_of(shown), unknown)
-
-
-def test_what_is_too_little_or_nameless_is_refused():
-    shown = scene(3)
-    points = points_of(shown)
-    with pytest.raises(InsufficientDataError, match=r"9 .* 6"):
-        start_from_nwires(points[points.frame < 2], shown.phantom)
-    # All dots in one line of the image say nothing about the axis across it.
-    with pytest.raises(InsufficientDataError, match="determine"):
-        start_from_nwires(replace(points, pixels=points.pixels * [1.0, 0.0]), shown.phantom)
-    with pytest.raises(InvalidInputError, match="wire of each"):
-        middle_wires(replace(points, wire=None), shown.phantom)
-    with pytest.raises(InvalidInputError, match="0 to 8"):
-        middle_wires(replace(points, wire=points.wire + 1), shown.phantom)
 
 
 def test_frames_that_lack_wires_are_labelled_by_what_the_others_say():

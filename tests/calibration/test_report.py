@@ -1,7 +1,5 @@
 """What is saved of a solution: parameters with standard errors, frames, units; and what its report shows."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from calibration_examples import PIXEL_MM, TRIAL_1, line_directions, scan_plane, scan_wires
@@ -10,8 +8,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
 from calibration.points import PROBE, ImagePoints
-from calibration.report import Shot, as_calibration, figure_report, rows_of, text_report
-from calibration.settings import OrientationFit, PlaneFit, WireFit
+from calibration.report import as_calibration, rows_of
+from calibration.settings import PlaneFit, WireFit
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.calibration import FramesUsed
 from speckle3d.core.errors import InsufficientDataError
@@ -65,16 +63,6 @@ def test_standard_errors_of_the_published_parameters_are_those_of_repetition(sol
     assert (np.abs(np.mean(scores, axis=0)) < few + 3 / np.sqrt(trials)).all()
 
 
-@pytest.mark.parametrize("fit_pixels", [True, False])
-def test_only_what_was_estimated_is_a_parameter(fit_pixels):
-    solution = of_plane(fixed_pixels=not fit_pixels)
-    found = as_calibration(solution, "plane", ALL)
-    assert [one.name for one in found.parameters] == list(solution.free)
-    assert len(found.parameters) == (11 if fit_pixels else 9)
-    assert all(one.standard_error > 0 for one in found.parameters)
-    np.testing.assert_array_equal(found.pixel_mm, solution.chain.pixel_mm)
-
-
 def test_values_are_those_of_the_pose_and_in_the_units_that_they_name():
     found = as_calibration(of_plane(), "plane", ALL, time_offset_s=0.08)
     named = {one.name: one for one in found.parameters}
@@ -95,25 +83,6 @@ def test_values_are_those_of_the_pose_and_in_the_units_that_they_name():
     told = [row for row in rows_of(found) if row[0].startswith(("roll", "yaw", "tilt", "alpha"))]
     errors = np.rad2deg(np.sqrt(np.diag(found.covariance)[2::-1]))
     assert [float(row[1].split("+- ")[1]) for row in told] == pytest.approx(errors, abs=6e-4)
-
-
-def test_the_covariance_is_of_the_pose_in_the_images_frame():
-    solution = of_plane()
-    found = as_calibration(solution, "plane", ALL)
-    assert found.covariance.shape == (6, 6)
-    np.testing.assert_allclose(found.covariance, found.covariance.T)
-    # Tilt, yaw and roll first, rad; then mm: the plane knows angles to milliradians and places to 0.2 mm.
-    errors = np.sqrt(np.diag(found.covariance))
-    assert (errors[:3] < 0.01).all()
-    assert (errors[3:] > 0.02).all()
-    # Where the chain's angles are small rotations, gamma is about x.
-    assert errors[0] == pytest.approx(np.sqrt(solution.image_covariance(("gamma",))[0, 0]))
-    # Carried to the sensor's frame it is that of the published position.
-    turn = found.rotation.as_matrix()
-    published = np.array([one.standard_error for one in found.parameters if one.name in ("x", "y", "z")])
-    np.testing.assert_allclose(
-        np.sqrt(np.diag(turn @ found.covariance[3:, 3:] @ turn.T)), published, rtol=0.02
-    )
 
 
 def test_an_orientation_sensors_calibration_is_a_rotation():
@@ -151,32 +120,3 @@ def test_every_frame_is_used_or_has_a_reason():
     millimetres = [float(found.dropped[n].split()[-2]) for n in (20, 33, 57)]
     assert all(7.0 < size < 9.0 for size in millimetres)
     assert all(found.dropped[n].endswith(" mm") for n in (20, 33, 57))
-
-
-@pytest.fixture(scope="module")
-def turned():
-    """An orientation sensor's solution and calibration, columns being four times as far apart as rows."""
-    directions, readings, _ = line_directions(np.random.default_rng(3), 60)
-    directions = directions / [0.4, 0.1]
-    solution = calibrate_orientation(
-        directed(directions, readings), np.array([0.4, 0.1]), OrientationFit(level=True)
-    )
-    return solution, as_calibration(solution, "orientation", FramesUsed(60, (), {}))
-
-
-def test_images_have_their_true_proportions_though_only_the_ratio_is_known(turned):
-    shot = Shot(3, np.zeros((20, 80), np.uint8), np.array([[0.0, 10.0], [19.0, 12.0]]), True)
-    figure = figure_report(*turned, [shot])
-    assert figure.axes[0].get_aspect() == pytest.approx(0.25)
-
-
-@pytest.mark.parametrize(("count", "named", "more"), [(0, 0, 0), (20, 20, 0), (23, 20, 3)])
-def test_frames_left_out_are_named_with_their_reasons(turned, count, named, more):
-    dropped = {number: f"no line: {number} of 60" for number in reversed(range(count))}
-    held = replace(turned[1], frames=FramesUsed(60, (59,), dropped))
-    lines = text_report(held).splitlines()
-    assert sum(line.startswith("  ") and ": no line: " in line for line in lines) == named
-    assert ("Frames left out:" in lines) == (count > 0)
-    assert any(f"and {more} more" in line for line in lines) == (more > 0)
-    if count:
-        assert lines[lines.index("Frames left out:") + 1].startswith("  0: ")

@@ -11,7 +11,7 @@ from calibration.motion import MOTIONS
 from calibration.points import ImagePoints
 from calibration.settings import WireFit
 from calibration.wires import calibrate_cross_wire, calibrate_wires
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.wires import WirePhantom, three_wires
 
 CROSSING_MM = np.array([10.0, -20.0, 30.0])
@@ -104,13 +104,6 @@ def test_claims_allow_for_a_hand_that_misses_the_crossing():
     assert np.mean(np.abs(scores) < 1.96) > 0.93
 
 
-def test_the_noise_of_a_crossing_is_found():
-    solution = calibrate_cross_wire(scan_crossing(0, 400, noise_mm=0.3), settings=ALL_FRAMES)
-    # Both components of 0.3 mm lie in the image: over three components it is sqrt(2 / 3) of that. 800 normal
-    # numbers know their spread to 2.5 %.
-    assert solution.rms == pytest.approx(0.3 * np.sqrt(2 / 3), rel=0.08)
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_wrong_points_in_a_tenth_of_the_frames_hardly_move_a_crossing(seed):
     points = scan_crossing(seed, 100, noise_mm=0.3)
@@ -134,20 +127,6 @@ def test_a_crossing_needs_no_more_than_two(held):
     solution = calibrate_cross_wire(scan_crossing(0, noise_mm=0.3, **{held: 0.0}))
     # The standard error is 0.11 to 0.14 mm; four times that.
     assert centre_error_mm(solution) < 0.6
-
-
-def test_too_few_points_and_a_missing_pixel_size_are_refused():
-    with pytest.raises(InsufficientDataError, match="6"):
-        calibrate_cross_wire(scan_crossing(0, 5))
-    with pytest.raises(InvalidInputError, match="pixel_mm"):
-        calibrate_cross_wire(scan_crossing(0), settings=WireFit(fixed_pixels=True))
-
-
-def test_readings_of_other_frames_are_refused():
-    points = scan_crossing(0, 100, noise_mm=0.3)
-    order = np.random.default_rng(1).permutation(100)
-    with pytest.raises(InsufficientDataError):
-        calibrate_cross_wire(replace(points, world_from_sensor=points.world_from_sensor[order]))
 
 
 @pytest.fixture(scope="module")
@@ -228,54 +207,9 @@ def test_exact_dots_give_the_exact_calibration(fit_pixels):
     assert solution.used.all()
 
 
-@pytest.mark.parametrize(("registration", "count"), [("held", 8), ("turned", 11), ("free", 14)])
-def test_a_registered_phantom_is_held_turned_or_found(registration, count):
-    points = scan_phantom(0, SKEW, noise_mm=0.2, world_from_phantom=PLACE)
-    geometry = replace(SKEW, world_from_phantom=PLACE)
-    solution = calibrate_wires(points, geometry, registration=registration)
-    assert len(solution.free) == count
-    # The standard error is 0.06 to 0.08 mm; four times that.
-    assert centre_error_mm(solution) < 0.35
-
-
-def test_a_registration_that_is_turned_by_a_degree_is_put_right_unless_it_is_held():
-    middle = SKEW.ends_mm.reshape(-1, 3).mean(axis=0)
-    turn = Rotation.from_rotvec(np.deg2rad([1.0, -1.0, 1.0]))
-    about_middle = RigidTransform.from_components(middle - turn.apply(middle), turn)
-    points = scan_phantom(0, SKEW, noise_mm=0.2, world_from_phantom=PLACE)
-    wrong = replace(SKEW, world_from_phantom=PLACE * about_middle)
-    turned, held = (calibrate_wires(points, wrong, registration=how) for how in ("turned", "held"))
-    assert centre_error_mm(turned) < 0.35
-    assert held.rms > 2 * turned.rms
-
-
-@pytest.mark.parametrize("share", [0.3])
-def test_labels_swapped_in_some_frames_are_found_out(share):
-    points = scan_phantom(0, three_wires(), noise_mm=0.2)
-    chosen = np.random.default_rng(1).random(len(points)) < share
-    wire = np.where(chosen, SWAPPED[points.wire], points.wire)
-    solution = calibrate_wires(replace(points, wire=wire), three_wires())
-    wrong = wire != points.wire
-    # One dot in a hundred lies where its wires cross, and is on both.
-    assert (wrong & solution.used).sum() <= 1
-    assert (~wrong & ~solution.used).sum() <= 1
-    assert centre_error_mm(solution) < 0.25
-
-
 @pytest.mark.parametrize(("labels", "registered"), [([1, 0, 3, 2], False), ([0, 1, 3, 2], True)])
 def test_labels_swapped_throughout_are_refused(labels, registered):
     points = scan_phantom(0, SKEW, 200, noise_mm=0.2, world_from_phantom=PLACE)
     geometry = replace(SKEW, world_from_phantom=PLACE if registered else None)
     with pytest.raises(InsufficientDataError, match="phantom"):
         calibrate_wires(replace(points, wire=np.array(labels)[points.wire]), geometry)
-
-
-def test_dots_without_wires_too_few_dots_and_unknown_registrations_are_refused():
-    points = scan_phantom(0, three_wires(), noise_mm=0.2)
-    registered = three_wires(RigidTransform.identity())
-    with pytest.raises(InvalidInputError, match="wire"):
-        calibrate_wires(replace(points, wire=None), three_wires())
-    with pytest.raises(InsufficientDataError, match="6"):
-        calibrate_wires(points[:5], registered)
-    with pytest.raises(InvalidInputError, match="registration"):
-        calibrate_wires(points, registered, registration="guessed")

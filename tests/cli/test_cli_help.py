@@ -11,7 +11,7 @@ def commands(command=None, name=()):
     if hasattr(command, "commands"):
         for key, each in command.commands.items():
             yield from commands(each, (*name, key))
-    else:
+    elif not command.hidden:
         yield name, command
 
 
@@ -30,7 +30,7 @@ def test_help_is_not_cut_at_80_columns(run, name, monkeypatch):
     assert "…" not in out
     assert max(map(len, out.splitlines())) <= 80
     for param in COMMANDS[name].params:
-        if param.param_type_name == "option":
+        if param.param_type_name == "option" and not param.hidden:
             assert max(param.opts, key=len) in out
 
 
@@ -39,6 +39,8 @@ def test_every_parameter_is_explained(name):
     if hasattr(command, "describe"):
         command.describe()
     for param in command.params:
+        if getattr(param, "hidden", False):
+            continue
         assert (getattr(param, "help", "") or "").strip(), param.name
 
 

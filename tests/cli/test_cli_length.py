@@ -26,7 +26,7 @@ def test_sweeps_that_do_not_cross_leave_the_mode_out_and_keep_the_others(run, pa
     assert code == 2, err
     (held,) = json.loads(out)["sweeps"]
     assert held["frames"] == 12
-    assert {row["mode"] for row in held["rows"]} == {"image", "fused"}
+    assert {row["mode"] for row in held["rows"]} == {"image", "fused", "tracker"}
     assert list(held["left_out"]) == ["crossed"]
     assert held["claims"]["image"] > held["claims"]["fused"] > 0
     last = err.strip().splitlines()[-1]

@@ -193,7 +193,7 @@ def test_a_missing_motion_is_refused_and_nothing_written(refused, scans, tmp_pat
         (("--region", "1,2 3"), "--region"),
         (("--region", "500,1 600,1 600,9"), "region_px"),
         (("--columns", "2"), "--columns: "),
-        (("--place", "middle"), "--place: "),
+        (("--place", "middle"), "--place"),
         (("--time-offset-s", "soon"), "--time-offset-s"),
         (("--time-offset-s", "nan"), "--time-offset-s"),
         (("--beam-mm", "nan"), "width_mm"),

@@ -242,3 +242,21 @@ def test_inputs_that_do_not_belong_together_are_named():
 def test_settings_are_checked(wrong):
     with pytest.raises(ValidationError, match=next(iter(wrong))):
         DriftSettings(**wrong)
+
+
+def test_the_claims_of_pose_hold():
+    size = []
+    for seed in range(60, 72):
+        truth, estimate, reference = sweep(seed)
+        found = correct_pose(estimate, reference, everywhere(truth), CORNERS_MM)
+        ends = [p[0].inv() * p[-1] for p in (found.poses, truth)]
+        away = np.hstack(
+            [
+                ends[0].apply(CENTRE_MM) - ends[1].apply(CENTRE_MM),
+                (ends[0].rotation * ends[1].rotation.inv()).as_rotvec(),
+            ]
+        )
+        size.append(np.abs(away) / np.sqrt(np.diag(found.covariance[-1])))
+    within = np.array(size)
+    assert within.max() < 4.0
+    assert 0.5 < (within < 1.0).mean() < 0.95

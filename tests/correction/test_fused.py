@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fused_scenes import CENTRE_MM, errors, scene
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.streams import TimedPoses
@@ -89,7 +89,7 @@ LENGTHS = {"short": (60, 5.0), "long": (240, 20.0)}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", LENGTHS)
-def test_with_a_tracker_lengths_are_no_worse_than_the_better_of_both_and_claims_hold(case):
+def test_with_a_tracker_lengths_are_no_worse_than_the_better_of_both_and_their_claims_hold(case):
     frames, length_mm = LENGTHS[case]
     found = {"images": [], "tracker": [], "fused": []}
     inside = []
@@ -102,9 +102,10 @@ def test_with_a_tracker_lengths_are_no_worse_than_the_better_of_both_and_claims_
         inside.append(np.abs(errors(both.poses, made.truth)) / np.sqrt(np.diag(both.covariance[-1])))
     rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in found.items()}
     assert rms["fused"] < 1.1 * min(rms["images"], rms["tracker"])
-    within = np.array(inside)
-    assert within.max() < 3.5
-    assert 0.5 < (within < 1.0).mean() < 0.95
+    lengths = np.array(inside)[:, 2]
+    assert lengths.max() < 3.0
+    # Measured: 1.1 claims rms at 20 mm.
+    assert np.sqrt(np.mean(lengths**2)) < 1.5
 
 
 @pytest.mark.slow
@@ -123,28 +124,3 @@ def test_outliers_and_wander_of_a_tracker_move_the_poses_little():
     wandering = fuse(*made.given(), tracker=moved(made.tracker, 0.3 * wander))
     assert wandering.log_scale_sigma > 1.5 * clean.log_scale_sigma
     assert abs(path_mm(wandering.poses) - path_mm(made.truth)) < 3.0 * np.sqrt(wandering.covariance[-1, 2, 2])
-
-
-@pytest.mark.slow
-def test_two_thousand_frames_take_seconds():
-    made = scene(8, frames=300, length_mm=24.0)
-    again = np.resize(np.concatenate([np.arange(300), np.arange(298, 0, -1)]), 2000)
-    time_s = 0.04 * np.arange(2000)
-    poses = made.truth[again] * made.tracker.sensor_from_image.inv()
-    jitter = Rotation.from_rotvec(2e-3 * np.random.default_rng(0).standard_normal((2000, 3)))
-    readings = TimedPoses(time_s, RigidTransform.from_components(poses.translation, poses.rotation * jitter))
-    tracker = replace(made.tracker, readings=readings, time_offset_s=0.0)
-    first = np.arange(1999)
-    steps = made.image[again[:-1]].inv() * made.image[again[1:]]
-    centre = RigidTransform.from_translation(CENTRE_MM)
-    edges = replace(
-        made.edges,
-        first=first,
-        second=first + 1,
-        poses=centre.inv() * steps * centre,
-        covariance=np.tile(made.edges.covariance[0], (1999, 1, 1)),
-    )
-    found = fuse(edges, made.image[again], *made.given()[2:-1], time_s, tracker=tracker)
-    true = made.truth[again]
-    z = [(p[0].inv() * p).apply(CENTRE_MM)[:, 2] for p in (found.poses, true)]
-    assert np.abs(z[0] - z[1]).max() < 0.25

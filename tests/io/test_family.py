@@ -187,6 +187,16 @@ def test_a_truncated_file_is_a_file_error_wherever_it_ends(kind, kept, tmp_path_
         READ[kind](path)
 
 
+@pytest.mark.parametrize("kind", READ)
+def test_texts_with_zeros_over_them_are_refused_and_not_searched_without_end(tmp_path, kind):
+    content = bytearray((old_files.FOLDER / f"{kind}.h5").read_bytes())
+    at = content.index(b"GCOL") + 16
+    content[at : at + 64] = bytes(64)
+    (tmp_path / "zeros.h5").write_bytes(content)
+    with pytest.raises(FileError, match="damaged texts at byte"):
+        READ[kind](tmp_path / "zeros.h5")
+
+
 @pytest.mark.parametrize("kind", WRITE)
 def test_an_unwritable_place_is_a_file_error(tmp_path, kind):
     for place, message in ((tmp_path / "none" / "a.h5", "folder"), (tmp_path, "ordinary file")):

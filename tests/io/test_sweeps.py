@@ -91,16 +91,6 @@ def test_i_and_q_of_another_stored_type_are_stored_as_they_are_read(tmp_path):
     assert stored_dtype(read_sweep(tmp_path / "s.h5").frames) == np.complex64
 
 
-def test_only_i_and_q_make_a_file_of_version_2(path, tmp_path):
-    with h5py.File(path) as file:
-        assert file.attrs["version"] == 1
-    write_sweep(tmp_path / "b.h5", sweep_examples.bmode_sweep())
-    with h5py.File(tmp_path / "b.h5", "r+") as file:
-        assert file.attrs["version"] == 1
-        file.attrs["version"] = 2
-    assert_same_sweep(read_sweep(tmp_path / "b.h5"), sweep_examples.bmode_sweep())
-
-
 @pytest.fixture
 def iq_path(tmp_path):
     write_sweep(tmp_path / "iq.h5", sweep_examples.iq_sweep())
@@ -121,16 +111,11 @@ def replaced(data):
     [
         (lambda file: file.attrs.__setitem__("version", 3), r"version 1 or 2, got 3$"),
         (lambda file: file.attrs.__setitem__("version", 1), r"data set rf or bmode, got none"),
-        (lambda file: file.move("iq", "other"), r"data set rf, iq or bmode, got none"),
         (lambda file: file.create_dataset("rf", data=np.zeros((6, 5, 40), "i2")), r"got rf and iq"),
         (lambda file: file["iq"].attrs.__delitem__("demodulation_frequency_hz"), r"/iq .*demodulation_freq"),
-        (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", -6e6), r"zero or above"),
         (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", 20e6), r"within half"),
         (replaced(np.zeros((6, 5, 40, 3), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40, 3\)"),
-        (replaced(np.zeros((6, 5, 40), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40\)"),
-        (replaced(np.zeros((6, 5, 40, 2), "c8")), r"\(frame, vector, sample\), got \(6, 5, 40, 2\)"),
         (replaced(np.zeros((6, 5, 40), "c16")), r"complex64 or int16, got complex128"),
-        (replaced(np.zeros((6, 5, 40), "f4")), r"complex64 or int16, got float32"),
     ],
 )
 def test_what_is_wrong_with_i_and_q_is_named(iq_path, change, message):
@@ -171,15 +156,6 @@ def test_pairs_that_int16_does_not_hold_are_refused(tmp_path, value):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nan_in_complex_samples_is_named_when_the_frame_is_read(tmp_path):
-    write_sweep(tmp_path / "s.h5", sweep_examples.iq_sweep(paired=False))
-    with h5py.File(tmp_path / "s.h5", "r+") as file:
-        file["iq"][2, 1, 7] = 1 + 1j * np.nan
-    sweep = read_sweep(tmp_path / "s.h5")
-    with pytest.raises(InvalidInputError, match=r"/iq\[2\]\[\(1, 7\)\]"):
-        sweep.frames[2]
-
-
 def test_bmode_comes_back(tmp_path):
     sweep = sweep_examples.bmode_sweep()
     write_sweep(tmp_path / "s.h5", sweep)
@@ -217,13 +193,15 @@ def test_rounding_in_a_pose_is_forgiven(path):
     )
 
 
-def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path):
-    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(dtype=np.float32))
+@pytest.mark.parametrize("kind", ["rf", "iq"])
+def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path, kind):
+    sweeps = {"rf": sweep_examples.rf_sweep(dtype=np.float32), "iq": sweep_examples.iq_sweep(paired=False)}
+    write_sweep(tmp_path / "s.h5", sweeps[kind])
     with h5py.File(tmp_path / "s.h5", "r+") as file:
-        file["rf"][2, 1, 7] = np.nan
+        file[kind][2, 1, 7] = np.nan
     sweep = read_sweep(tmp_path / "s.h5")
     sweep.frames[1], sweep.frames[3]
-    with pytest.raises(InvalidInputError, match=r"/rf\[2\]\[\(1, 7\)\]"):
+    with pytest.raises(InvalidInputError, match=rf"/{kind}\[2\]\[\(1, 7\)\]"):
         sweep.frames[2]
 
 
@@ -387,13 +365,7 @@ def test_how_a_sweep_was_simulated_is_kept_and_ignored(tmp_path):
 
 def test_the_name_of_the_probe_comes_back(tmp_path):
     sweep = replace(sweep_examples.rf_sweep(), probe="L12-5, 4 cm, focus 2 cm")
-    write_sweep(tmp_path / "named.h5", sweep)
-    assert read_sweep(tmp_path / "named.h5").probe == sweep.probe
-    write_sweep(tmp_path / "again.h5", read_sweep(tmp_path / "named.h5"))
-    assert read_sweep(tmp_path / "again.h5").probe == sweep.probe
-    write_sweep(tmp_path / "nameless.h5", sweep_examples.rf_sweep())
-    assert read_sweep(tmp_path / "nameless.h5").probe == ""
-    with h5py.File(tmp_path / "named.h5", "r+") as file:
-        file.attrs["probe"] = 3.0
-    with pytest.raises(InvalidInputError, match="attribute probe: expected a text"):
-        read_sweep(tmp_path / "named.h5")
+    for _ in range(2):
+        write_sweep(tmp_path / "named.h5", sweep)
+        sweep = read_sweep(tmp_path / "named.h5")
+        assert sweep.probe == "L12-5, 4 cm, focus 2 cm"

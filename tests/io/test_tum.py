@@ -30,9 +30,8 @@ def test_columns_are_metres_and_a_quaternion_scalar_last(tmp_path):
     [
         ("", "eight numbers"),
         ("0 0 0 0 0 0 1\n", "line 1"),
-        ("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n", "line 2"),
+        ("1 nan 0 0 0 0 0 1\n", "line 1"),
         ("0 0 0 0 0 0 0 2\n", "pose 0"),
-        ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "increas"),
     ],
 )
 def test_a_wrong_file_is_named(tmp_path, text, words):
@@ -40,6 +39,27 @@ def test_a_wrong_file_is_named(tmp_path, text, words):
     with pytest.raises(InvalidInputError, match=words) as caught:
         read_tum(tmp_path / "a.tum")
     assert "a.tum" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        "2 nan 0 0 0 0 0 1",
+        "2 0 0",
+        "1 9 9 9 0 0 0 1",
+        "0 9 9 9 0 0 0 1",
+        "2 0 0 0 0 0 0 2",
+        "99 0 0 0 0 0 0 1",
+    ],
+)
+def test_one_bad_line_is_left_out_and_counted(tmp_path, bad):
+    lines = [f"{i} {i} 0 0 0 0 0 1" for i in range(6)]
+    lines.insert(2, bad)
+    (tmp_path / "a.tum").write_text("\n".join(lines))
+    with pytest.warns(UserWarning, match=r"a\.tum: poses: 1 of 7 left out.*longest gap is 1 s"):
+        poses = read_tum(tmp_path / "a.tum", "mm")
+    np.testing.assert_array_equal(poses.time_s, np.arange(6.0))
+    np.testing.assert_array_equal(poses.world_from_sensor.translation[:, 0], np.arange(6.0))
 
 
 def test_missing_files_units_and_times_that_do_not_fit(tmp_path):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import rotation_from_fixed_angles
-from speckle3d.scoring.lengths import accumulated, compare_modes, jitter_mm, jitter_percent, monotone_parts
+from speckle3d.scoring.lengths import accumulated, compare_modes, jitter_mm, monotone_parts
 
 
 def straight(length_mm, tilt_rad=0.0):
@@ -132,15 +132,6 @@ def test_a_trackers_jitter_is_told_from_its_readings(sigma_mm):
     assert np.mean(sigmas) == pytest.approx(sigma_mm, rel=0.12)
     assert jitter_mm(smooth_hand(150, 15.0, 0.0, 0)) < 0.002
     assert np.isnan(jitter_mm(smooth_hand(5, 1.0, 0.1, 0)))
-
-
-def test_its_share_of_a_length_is_what_a_fitted_cubic_leaves():
-    frames, length, sigma = 48, 5.0, 0.15
-    t = np.linspace(-1, 1, frames)
-    noise = [np.random.default_rng(s).normal(0, sigma, frames) for s in range(400)]
-    ends = [np.ptp(np.polyval(np.polyfit(t, each, 3), [-1, 1])) for each in noise]
-    claimed = np.mean([jitter_percent(smooth_hand(frames, length, sigma, seed)) for seed in range(40)])
-    assert claimed == pytest.approx(100 * np.sqrt(np.mean(np.square(ends))) / length, rel=0.2)
 
 
 def test_inputs_that_do_not_belong_together_are_named():

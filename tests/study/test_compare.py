@@ -7,7 +7,6 @@ import re
 import shutil
 from dataclasses import replace
 
-import challenge_examples
 import numpy as np
 import pytest
 
@@ -140,14 +139,6 @@ def test_files_of_one_name_are_told_apart_and_one_given_twice_is_one(tmp_path):
     assert named([tmp_path / "s\x1b[31m.h5"])[0][0] == "s%x1b[31m"
 
 
-def test_a_sweep_that_is_not_there_is_named(sweeps, tmp_path):
-    (tmp_path / "dangling.h5").symlink_to(tmp_path / "gone.h5")
-    study = compare_sweeps([tmp_path / "missing.h5", tmp_path / "dangling.h5", sweeps[0]], tmp_path, ["pose"])
-    reasons = {each.name: each.reason for each in study.outcomes if each.status == "failed"}
-    assert reasons["missing"].startswith(str(tmp_path / "missing.h5"))
-    assert reasons["dangling"].startswith(str(tmp_path / "gone.h5"))
-
-
 def test_copies_of_a_recording_count_once(study, sweeps, tmp_path):
     shutil.copytree(study.directory, tmp_path / "again")
     shutil.copy(sweeps[0], tmp_path / "a.h5")
@@ -178,20 +169,6 @@ def test_landmarks_that_come_with_a_sweep_are_scored(sweeps, tmp_path, monkeypat
     (row,) = [row for row in study.drift if row["mode"] == "pose"]
     expected = landmark_errors(poses, load_sweep(sweeps[0]).truth, marks)
     assert (row["GLE_mm"], row["LLE_mm"]) == pytest.approx(expected)
-
-
-def test_a_scan_is_another_when_a_file_beside_it_is(sweeps, tmp_path):
-    path, *_ = challenge_examples.write_data_set(tmp_path)
-    curves = sweeps[0].parent / "curves.h5"
-
-    def key():
-        return plan_sweep("scan", path, tmp_path, curves, Config().to_toml(), None, None, ()).key
-
-    before = key()
-    assert key() == before
-    csv_path = tmp_path / "calib_matrix.csv"
-    csv_path.write_text(csv_path.read_text().replace("33.0", "34.0"))
-    assert key() != before
 
 
 def test_progress_knows_the_time_left_from_the_first_finished_sweep_on(tmp_path):

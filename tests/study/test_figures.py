@@ -67,17 +67,6 @@ def test_the_reference_has_gaps_and_curves_and_table_have_one_length(sweep):
     assert np.median(whole[-6:]) == pytest.approx(row.reference_mm, abs=1.5)
 
 
-def test_differences_from_the_reference_and_frames_left_out(sweep):
-    image, tracker = sweep
-    curves = curves_of({"image": image}, tracker)
-    frames = np.array([0, 7, 59])
-    panel, *_ = curve_panels(curves, 1, frames, minus_reference=True)
-    reference, mode = panel.series
-    np.testing.assert_array_equal(reference.points, np.column_stack([frames, [0.0, 0.0, 0.0]]))
-    expected = (curves.modes["image"][0] - curves.reference[0])[frames]
-    np.testing.assert_allclose(mode.points[:, 1], expected)
-
-
 def test_a_reference_of_other_frames_is_refused(sweep):
     image, tracker = sweep
     with pytest.raises(MismatchError, match=r"reference.*60.*60.*59"):

@@ -11,7 +11,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Reconstruction, SharedErrors, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.pose_errors import errors_of, measure, posed_errors_of
+from speckle3d.study.pose_errors import errors_of, measure
 
 GRID = ImageGrid(41, 81, 0.5, 0.5)
 N = 61
@@ -75,12 +75,6 @@ def test_the_trackers_mounting_makes_a_path_go_off_at_an_angle():
     more = errors.covariance()[-1] - image.covariance()[-1]
     sideways = (Config().fused.mounting_sigma_rad * 20.0) ** 2
     np.testing.assert_allclose(more.diagonal(), [sideways, sideways, 0, 0, 0, 0], rtol=1e-3, atol=1e-9)
-
-
-def test_errors_come_with_the_poses_they_are_of():
-    posed = posed_errors_of(made(), "fused")
-    np.testing.assert_allclose(posed.world_from_image.translation, (WORLD * IMAGE).translation)
-    np.testing.assert_allclose(posed.centre_mm, GRID.centre_mm)
 
 
 def test_points_of_the_world_are_measured_at_once():

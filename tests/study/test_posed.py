@@ -10,14 +10,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
-from speckle3d.core.sweep import BModeSettings
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.matching.quality import FrameFlag
-from speckle3d.study.images import grey_images, usual_levels
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.study.images import grey_images
 from speckle3d.study.posed import MARK, open_posed, pose_mark, posed_by_itself, require_made_at
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
@@ -47,15 +43,6 @@ def test_bmode_as_it_is_stored_needs_no_dynamic_range(tmp_path):
             posed.source(levels)
 
 
-@pytest.mark.parametrize("range_db", [40.0, 60.0])
-def test_pictures_of_bmode_of_unknown_range_show_its_levels(tmp_path, range_db):
-    images, _ = open_posed(sequence(tmp_path)).images(range_db)
-    stored = grey(4)[1].T.astype(float)
-    lit = (images[1] > 0) & (images[1] < 255)
-    assert lit.sum() > 5
-    assert np.ptp((images[1] - stored)[lit]) < 1e-2
-
-
 @pytest.mark.parametrize(
     "given", [{"dynamic_range_db": 40.0}, {"settings": ImportSettings(dynamic_range_db=40.0)}]
 )
@@ -67,27 +54,6 @@ def test_a_dynamic_range_that_is_given_serves_the_other_levels(tmp_path, given):
     np.testing.assert_allclose(amplitude.images[1], expected, rtol=1e-5)
     _, meaning = posed.source("log", 50.0)
     assert meaning == "log-compressed, 0 to 255 over 50 dB"
-
-
-def test_a_sweep_that_says_its_range_keeps_it(tmp_path):
-    sweep = replace(sweep_examples.bmode_sweep(), signal=BModeSettings(50.0))
-    write_sweep(tmp_path / "a.h5", sweep)
-    posed = open_posed(tmp_path / "a.h5", dynamic_range_db=70.0)
-    assert posed.source("linear")[1] == "echo amplitude, linear, of B-mode over 50 dB; 1 is full scale"
-
-
-def test_what_else_is_missing_is_asked_for_without_it(tmp_path):
-    path = write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
-    with pytest.raises(MissingSettingsError) as found:
-        open_posed(path)
-    assert found.value.settings == ("column_pitch_mm", "row_spacing_mm")
-
-
-def test_echoes_are_no_levels_as_stored():
-    sweep = sweep_examples.rf_sweep()
-    assert usual_levels(sweep) == "log"
-    with pytest.raises(InvalidInputError, match="expected B-mode for levels as stored, got RF or I/Q"):
-        grey_images(sweep, levels="stored")
 
 
 def test_linear_levels_of_echoes_double_with_them():
@@ -146,18 +112,3 @@ def test_a_volume_made_at_other_poses_is_told_apart():
     moved = RigidTransform.from_translation([0.0, 0.0, 0.01]) * poses
     with pytest.raises(MismatchError, match=r"v\.nrrd: expected a volume made at these poses"):
         require_made_at(made, moved, "v.nrrd")
-
-
-def test_frames_whose_poses_are_guesses_are_told(tmp_path):
-    posed = open_posed(sequence(tmp_path))
-    n = len(posed.sweep)
-    flags = np.zeros(n, dtype=int)
-    flags[2] = FrameFlag.LIFTED
-    trust = Trust(np.zeros((n, 6, 6)), flags)
-    still = {"image": RigidTransform.identity(n)}
-    made = Reconstruction(
-        posed.sweep.frame_time_s, posed.sweep.grid, still, Provenance("a.mha", "", ""), trust=trust
-    )
-    assert posed.notes() == []
-    told = replace(posed, reconstruction=made).notes()
-    assert told == ["1 frame with the probe lifted: 2: poses there are guesses"]

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sweep_examples
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.details import recorded_doubts
+from speckle3d.study.details import doubted_modes, recorded_doubts
 from speckle3d.study.results import (
     Summary,
     SweepOutcome,
@@ -96,11 +97,20 @@ def test_what_numbers_do_not_say_stands_below_the_table(reference, mode, doubted
 
 def test_a_length_that_the_tracker_made_worse_is_told_with_the_jitters_share():
     rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-2.6)]
-    text = summary_text([summary("truth", rows, claims={"pose": 0.01})])
+    text = summary_text([summary("truth", rows, claims={"tracker": 0.01})])
     assert "pose is farther from the truth (-2.6 %) than image (+0.6 %)" in text
-    assert "jitter alone is +- 2.0 % (95 %)" in text
+    assert "jitter is +- 2.0 % of its length (95 %)" in text
     rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-0.5)]
     assert "farther" not in summary_text([summary("truth", rows, claims={"pose": 0.01})])
+
+
+def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
+    images = Doubt("images", "frozen", "...", False)
+    modes = ["image", "orientation", "pose", "tracker"]
+    doubted = doubted_modes(sweep_examples.rf_sweep(), [SPIKES, METRES, images], modes)
+    assert doubted == {
+        "image": "frozen", "orientation": "spikes, frozen", "pose": "units, frozen", "tracker": "units",
+    }  # fmt: skip
 
 
 def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(tmp_path):
@@ -127,12 +137,6 @@ def test_doubts_are_found_again_beside_the_reconstruction_they_belong_to(tmp_pat
     assert recorded_doubts(path, Provenance("s.h5", "cd34", "1.0")) is None
     (tmp_path / "summary.json").write_text("[1]")
     assert recorded_doubts(path, made) is None
-
-
-def test_a_directory_that_cannot_be_made_is_one_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(FileError, match="file"):
-        write_summary(tmp_path / "file", summary())
 
 
 def test_a_study_takes_the_place_of_the_one_before_with_all_that_was_made_from_it(tmp_path, monkeypatch):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.kernels.orientation import heading_arrays as at
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.kernels.orientation.heading import BIN
 from xsens.fusion.settings import FusionSettings
 
 if TYPE_CHECKING:
@@ -28,18 +28,9 @@ def lasts_of_bins(steps: FilterSteps, settings: FusionSettings) -> IntArray:
     return np.minimum(np.arange(per_bin, n + per_bin, per_bin), n) - 1
 
 
-def filtered_bins(steps: FilterSteps, settings: FusionSettings) -> tuple[FloatArray, FloatArray]:
-    """Average the steps of each bin as the filter left them.
-
-    Returns
-    -------
-    bins : ndarray, shape (bins, BIN)
-        As of `averaged_bins`, with the filter's corrections of its tilt.
-    bias_rad_s : ndarray, shape (bins, 3)
-        At the end of each bin.
-    """
-    level, bias, bias_sd, sd = steps.start, steps.bias_rad_s, steps.bias_sd_rad_s, steps.sd_rad
-    rows = averaged_bins(steps, level, bias, bias_sd, sd, settings)
+def filtered_bins(steps: FilterSteps, settings: FusionSettings) -> Any:
+    """Average the steps of each bin as the filter left them, with its corrections of its tilt."""
+    bins = averaged_bins(steps, steps.start, steps.bias_rad_s, steps.bias_sd_rad_s, steps.sd_rad, settings)
     lasts = lasts_of_bins(steps, settings)
     firsts = np.append(0, lasts[:-1] + 1)
     corrections = steps.corrected @ np.swapaxes(steps.predicted, 1, 2)
@@ -47,8 +38,8 @@ def filtered_bins(steps: FilterSteps, settings: FusionSettings) -> tuple[FloatAr
     for i in range(1, steps_per_bin(settings)):
         there = firsts + i <= lasts
         turns[there] = corrections[firsts[there] + i] @ turns[there]
-    rows[:, at.CORRECTION : at.CORRECTION + 9] = turns.reshape(-1, 9)
-    return rows, bias[lasts]
+    bins["correction"] = turns
+    return bins
 
 
 def averaged_bins(
@@ -58,7 +49,7 @@ def averaged_bins(
     bias_sd_rad_s: FloatArray,
     sd_rad: FloatArray,
     settings: FusionSettings,
-) -> FloatArray:
+) -> Any:
     """Average the steps of each bin.
 
     Parameters
@@ -74,37 +65,29 @@ def averaged_bins(
 
     Returns
     -------
-    ndarray, shape (bins, BIN)
-        See `heading_arrays`; fields as they were read, not yet over their norm; no corrections.
+    structured ndarray, shape (bins,), of `BIN`
+        Fields as they were read, not yet over their norm; no corrections.
     """
     lasts = lasts_of_bins(steps, settings)
     firsts, counts = np.append(0, lasts[:-1] + 1), np.diff(lasts, prepend=-1)
-    rows = np.zeros((len(lasts), at.BIN))
-    rows[:, at.SPAN] = np.add.reduceat(steps.duration_s, firsts)
-    rows[:, at.RESTS] = np.logical_and.reduceat(steps.resting, firsts)
-    rows[:, at.SLIP] = np.add.reduceat(steps.slip_rad2, firsts)
-    rows[:, at.BIAS_VARIANCE] = (bias_sd_rad_s[lasts] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
-    rows[:, at.SEEN], rows[:, at.READING : at.TILT] = _mean_readings(steps, level, bias_rad_s, firsts, counts)
-    rows[:, at.TILT] = np.add.reduceat((sd_rad[:, :2] ** 2).mean(axis=1), firsts) / counts
-    rows[:, at.CORRECTION : at.CORRECTION + 9] = np.eye(3).ravel()
-    return rows
-
-
-def _mean_readings(
-    steps: FilterSteps, level: FloatArray, bias_rad_s: FloatArray, firsts: IntArray, counts: IntArray
-) -> tuple[BoolArray, FloatArray]:
-    """Bins with a field, and means of field, level axes and the field's rate over the steps that have one."""
+    bins = np.zeros(len(lasts), BIN)
+    bins["span_s"] = np.add.reduceat(steps.duration_s, firsts)
+    bins["resting"] = np.logical_and.reduceat(steps.resting, firsts)
+    bins["slip_rad2"] = np.add.reduceat(steps.slip_rad2, firsts)
+    bins["bias_variance"] = (bias_sd_rad_s[lasts] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
+    bins["tilt_rad2"] = np.add.reduceat((sd_rad[:, :2] ** 2).mean(axis=1), firsts) / counts
+    bins["correction"] = np.eye(3)
     seen = np.asarray(np.isfinite(steps.field_au).all(axis=1))
+    bins["seen"] = np.logical_or.reduceat(seen, firsts)
     field = np.where(seen[:, None], steps.field_au, 0.0)
-    field_rate = np.cross(steps.rate_rad_s - bias_rad_s, field)
-    columns = np.column_stack(
-        [
-            np.einsum("kij,kj->ki", level, field),
-            level.reshape(-1, 9),
-            np.einsum("kij,kj->ki", level, field_rate),
-        ]
-    )
-    any_seen = np.asarray(np.logical_or.reduceat(seen, firsts))
-    weight = np.where(np.repeat(any_seen, counts), seen, 1.0)
-    sums = np.add.reduceat(weight[:, None] * columns, firsts)
-    return any_seen, sums / np.add.reduceat(weight, firsts)[:, None]
+    rate = np.cross(steps.rate_rad_s - bias_rad_s, field)
+    weight = np.where(np.repeat(bins["seen"], counts), seen, 1.0)
+    for name, values in (
+        ("field", np.einsum("kij,kj->ki", level, field)),
+        ("field_rate", np.einsum("kij,kj->ki", level, rate)),
+        ("level", level),
+    ):
+        flat = weight[:, None] * values.reshape(len(values), -1)
+        mean = np.add.reduceat(flat, firsts) / np.add.reduceat(weight, firsts)[:, None]
+        bins[name] = mean.reshape(bins[name].shape)
+    return bins

@@ -1,20 +1,20 @@
-"""Turn level axes, carried by the gyroscope, to magnetic north: a bank of filters with models of the field.
+"""Turn level axes, carried by the gyroscope, to magnetic north: Kalman filters of the field.
 
 The field that a moving sensor reads is the room's, plus what the place adds (another one for each stay at
 rest and for the movement between), plus a stray that changes as it moves on, plus the field of iron on the
-sensor, all as vectors. Norm and dip, which tell nothing of the heading, tell how large those are here: each
-model states other sizes, each filter's evidence tells how well its model explains the readings, and the
-headings are averaged with those weights. So a quiet room's field is followed closely and a poor one's hardly,
-iron that is put on the sensor is found by turning it, and the claimed deviation is that of the room at hand.
-Two properties of the sensor are found on the way: the lag of its magnetometer (its readings are older than
-the gyroscope's), and the gyroscope's bias in movement, which is not quite that at rest.
+sensor, all as vectors. Norm and dip, which tell nothing of the heading, tell how large the stray is here: it
+is followed as the readings come, so that a quiet room's field is followed closely and a poor one's hardly.
+There are three filters: without iron on the sensor, with iron put on it later, and with iron on it from the
+start. Iron must prove itself: a sensor that is turned while it is carried through an uneven field shows
+nearly the same. Each filter's evidence is its weight in the mean.
 
-North is the field's where the sensor was at first.
+Two properties of the sensor are found on the way: the lag of its magnetometer (its readings are older than
+the gyroscope's), and the gyroscope's bias in movement, which is not quite that at rest. North is the field's
+where the sensor was at first.
 
 References
 ----------
-.. [1] D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE TAC 10, 1965 (the
-   bank).
+.. [1] R. K. Mehra, "Approaches to adaptive filtering", IEEE TAC 17, 1972 (the stray's variance).
 .. [2] M. Roth, E. Ozkan, F. Gustafsson, "A Student's t filter for heavy tailed process and measurement
    noise", ICASSP 2013 (readings off the model).
 .. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems",
@@ -25,104 +25,57 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.kernels.orientation import heading_arrays as at
-from speckle3d.kernels.orientation.heading import find_headings, turn_to_north
+from speckle3d.kernels.orientation import heading as kernel
 from xsens.fusion.settings import FusionSettings
 
 
-@dataclass(frozen=True)
-class FieldModel:
-    """One explanation of the field.
+class _Iron(NamedTuple):
+    """Iron on the sensor: deviations of its field at the start and of iron put on later, as fractions.
 
-    Attributes
-    ----------
-    stray : float
-        Deviation of the field from that of its place, as a fraction of the field's norm, per component.
-    stray_s : float
-        How long it persists while the sensor moves.
-    iron : float
-        Deviation of the field of iron on the sensor at the start, as a fraction.
-    iron_put_on : float
-        That of iron put on the sensor later, added in each bin while it is put on (`HOLD_S`); zero if none
-        ever is.
-    after_s : float
-        How long the sensor must have moved before the field is used: the first place may be beside iron.
-    handicap : float
-        Logarithm of the evidence that the others must lack before this one is taken; of iron put on, in
-        recordings that move for no longer than `PROVED_S`.
-    online_handicap : float, optional
-        The same while samples arrive, when evidence is short.
+    `handicap` is the logarithm of the evidence that the filter without iron must lack.
     """
 
-    stray: float
-    stray_s: float = 2.0
-    iron: float = 0.0003
-    iron_put_on: float = 0.0
-    after_s: float = 0.0
+    at_start: float
+    put_on: float = 0.0
     handicap: float = 0.0
-    online_handicap: float | None = None
 
 
-MODELS = (
-    *(FieldModel(stray) for stray in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
-    *(FieldModel(stray, stray_s=8.0, handicap=50.0) for stray in (0.02, 0.05, 0.12, 0.3)),
-    *(
-        FieldModel(stray, after_s=after_s, handicap=100.0)
-        for stray in (0.01, 0.03)
-        for after_s in (3.0, 10.0)
-    ),
-    *(FieldModel(0.1, stray_s=8.0, after_s=after_s, handicap=100.0) for after_s in (3.0, 10.0)),
-    *(
-        FieldModel(stray, iron=0.02, iron_put_on=0.15, handicap=300.0, online_handicap=100.0)
-        for stray in (0.005, 0.01, 0.02, 0.04, 0.08)
-    ),
-    *(
-        FieldModel(stray, iron=0.7, iron_put_on=0.15, handicap=300.0, online_handicap=100.0)
-        for stray in (0.01, 0.03, 0.08)
-    ),
-)
-"""Rooms from a quiet one to a workshop; those that are walked through; a start beside iron; iron put on the
-sensor; and iron on it from the start. The later ones must be proved: a sensor that is turned while it is
-carried through an uneven field shows nearly the same as one with iron on it."""
+_IRON = (_Iron(0.002), _Iron(0.02, 0.15, 100.0), _Iron(0.7, 0.15, 100.0))
+"""None but what a calibration leaves; put on later; from the start. Of BROAD's undisturbed trials, six have
+less than 25 of evidence for iron that is not there, one 240; a magnet of a tenth of the field has 170 in a
+minute of turning."""
 
-PROVED_S = 150.0
-"""Longer movement proves iron by as much more: an uneven field that looks like it does so all the time."""
+_MEMORY_S = 300.0
+"""Time over which evidence is weighed while samples arrive; a recording is weighed as a whole."""
 
-BIAS_S = 10.0
-"""How long what is left of the gyroscope's bias persists."""
+_ROOM = {
+    "stray": 0.01,  # at first: of the norm, per component; a room without iron near
+    "least_stray": 0.005,
+    "most_stray": 0.3,
+    "stray_s": 2.0,  # how long it persists: a hand's length at a hand's speed
+    "adapts_s": 60.0,  # how fast its variance is followed
+    "bias_s": 10.0,  # how long what is left of the gyroscope's bias persists
+    "walk_sqrt_s": 0.0003,  # the room's random walk: 1 % in twenty minutes
+    "freedom": 3.0,  # of Student's distribution of the readings' errors
+    "outlier": 25.0,  # squared misfit that shows iron put on or off: one in 10^5 with normal errors
+    "hold_s": 3.0,  # how long putting it on takes
+}
 
-ROOM = 1.0
-"""Deviation of the room's field from its first reading, as a fraction: nothing is known of it."""
-
-ROOM_WALK_SQRT_S = 0.0003
-"""Its random walk: 1 % in twenty minutes."""
-
-FREEDOM = 3.0
-"""Of Student's distribution of the readings' errors."""
-
-OUTLIER = 25.0
-"""Squared misfit of a reading that shows iron put on or off: one in 10^5 with normal errors."""
-
-HOLD_S = 3.0
-"""How long putting it on takes."""
-
-FIRST_STRAY = 0.25
-"""The first reading's stray while samples arrive, as a fraction of a model's: the first readings are all
-there is, and models of rough rooms would swing the heading about. A recording tells it in full."""
-
-MEMORY_S = 300.0
-"""Time over which models are weighed while samples arrive; a recording is weighed as a whole."""
+_FIRST_STRAY = 0.25
+"""The first reading's stray while samples arrive, as a fraction: the first readings are all there is, and a
+rough room would swing the heading about. A recording tells it in full."""
 
 _DISTRUSTED = 0.5
 _ROUNDING = 1e-12
 """Variance that keeps covariances invertible: (1 microradian)^2, a millionth of the field, 1 microsecond."""
 
 _NEGLIGIBLE = 5.0
-"""Models whose evidence is less by this, in logarithms, are not smoothed: their weight is below 1 %."""
+"""Filters whose evidence is less by this, in logarithms, are not smoothed: their weight is below 1 %."""
 
 
 @dataclass(frozen=True)
@@ -135,10 +88,9 @@ class Headings:
     disturbed : ndarray of bool, shape (n,)
         Where the reading was hardly believed.
     stray : ndarray, shape (n,)
-        How much the field changes from place to place, as the models have it that explain the readings best:
-        a fraction of its norm, per component.
+        How much the field changes from place to place: a fraction of its norm, per component.
     iron : ndarray, shape (n,)
-        Weight of the models that take iron to be on the sensor, 0 to 1.
+        Weight of the filters that take iron to be on the sensor, 0 to 1.
     """
 
     turn_rad: FloatArray
@@ -148,226 +100,108 @@ class Headings:
     iron: FloatArray
 
 
-# -- the bank
+class HeadingFilter:
+    """The three filters, bin by bin; `online` if the readings so far are all there is."""
 
-
-class HeadingBank:
-    """The filters of all models, bin by bin.
-
-    Parameters
-    ----------
-    settings : FusionSettings
-    models : tuple of FieldModel
-    first_stray : float
-        Deviation of the stray in the first reading, as a fraction of that of each model.
-    """
-
-    def __init__(
-        self,
-        settings: FusionSettings,
-        models: tuple[FieldModel, ...] = MODELS,
-        first_stray: float = FIRST_STRAY,
-    ) -> None:
-        self.models = models
-        self._table = np.array([[m.stray, m.stray_s, m.iron, m.iron_put_on, m.after_s] for m in models])
-        self._handicap = np.array([m.handicap for m in models])
-        online = [m.handicap if m.online_handicap is None else m.online_handicap for m in models]
-        self._online_handicap = np.array(online)
-        self._iron_put_on = np.array([m.iron_put_on > 0.0 for m in models])
-        self._moved_s = 0.0
-        self._shared = _shared(settings, first_stray)
-        count = len(models)
-        self._means, self._flags = np.zeros((count, at.STATES)), np.zeros((count, at.FLAGS))
-        self._covariances = np.zeros((count, at.STATES, at.STATES))
-        self._scores = np.full(count, np.nan)
+    def __init__(self, settings: FusionSettings, online: bool = True) -> None:
+        shared = _ROOM | {
+            "place": settings.field_place,
+            "first_place": settings.field_first_place,
+            "white_sqrt_s": settings.field_noise_sqrt_s,
+            "lag_s": settings.magnetometer_lag_s,
+            "first_stray": _FIRST_STRAY if online else 1.0,
+        }
+        self._room = np.array([tuple(shared[name] for name in kernel.ROOMS.names or ())], kernel.ROOMS)
+        self._kept = np.zeros(len(_IRON), kernel.KEPT)
+        self._kept["iron"] = [iron.at_start for iron in _IRON]
+        self._kept["iron_put_on"] = [iron.put_on for iron in _IRON]
+        self._handicap = np.array([iron.handicap for iron in _IRON])
+        self._scores = np.zeros(len(_IRON))
         self._norm = math.nan
         self._bias: FloatArray | None = None
 
     def resume(self) -> None:
-        """Find north again after a pause; keep iron, lag and the weights of the models."""
-        self._flags[:, at.BEGUN] = 0.0
+        """Find north again after a pause; keep iron, lag and the evidence."""
+        self._kept["begun"] = False
         self._bias = None
 
-    def follow(self, bins: FloatArray, bias_rad_s: FloatArray) -> Headings:
+    def follow(self, bins: Any, bias_rad_s: FloatArray) -> Headings:
         """Take in bins; `bias_rad_s`, shape (n, 3), is the bias with which each one's steps ended."""
-        rows = bins.copy()
+        bins = bins.copy()
         before = bias_rad_s[:1] if self._bias is None else self._bias[None]
-        rows[:, at.BIAS_CHANGE : at.BIAS_CHANGE + 3] = np.diff(bias_rad_s, axis=0, prepend=before)
+        bins["bias_change"] = np.diff(bias_rad_s, axis=0, prepend=before)
         self._bias = bias_rad_s[-1].copy()
-        self._know_norm(rows, 1)
-        found = self._run(rows)
-        turns, variances = found[..., at.FOUND_TURN], found[..., at.FOUND_VARIANCE]
-        weights = np.array(
-            [
-                self._weighed(row[at.SPAN], row[at.RESTS] > 0.0, evidence)
-                for row, evidence in zip(rows, found[..., at.EVIDENCE], strict=True)
-            ]
-        )
-        return _mixed(turns, variances, found[..., at.TRUST], weights, rows[:, at.SEEN] > 0.0, self.models)
+        found = self._run(bins, 1)
+        weights = np.array([self._weights(*each) for each in zip(bins, found["evidence"], strict=True)])
+        return _mean(found, weights, bins)
 
-    def evidence(self, bins: FloatArray) -> FloatArray:
-        """Logarithm of each model's evidence in all bins, less its handicap, shape (models,).
+    def smooth(self, bins: Any) -> Headings:
+        """North over a whole stretch, smoothed backward."""
+        n = len(bins)
+        kept = [np.zeros((len(_IRON), n, *rest)) for rest in ((kernel.SIZE,), *3 * [2 * (kernel.SIZE,)])]
+        found = self._run(bins, n, kept)
+        evidence = np.nan_to_num(found["evidence"]).sum(axis=0) - self._handicap
+        likely = np.where(evidence > evidence.max() - _NEGLIGIBLE, evidence, -np.inf)
+        weights = np.tile(_shares(likely), (n, 1))
+        for j in np.flatnonzero(weights[0]):
+            found["turn_rad"][:, j], found["variance"][:, j] = _backward(bins, *(each[j] for each in kept))
+        return _mean(found, weights, bins)
 
-        Of the bins before a model that begins late, it is given the evidence of the best of the others.
-        """
-        each = self._run(bins)[..., at.EVIDENCE]
-        running = np.cumsum(np.nan_to_num(each), axis=0)
-        begun = np.isfinite(each)
-        first = np.where(begun.any(axis=0), begun.argmax(axis=0), len(bins))
-        total = running[-1].copy()
-        early = first == first.min()
-        for late in np.flatnonzero(~early):
-            k = min(first[late], len(bins)) - 1
-            total[late] += running[k, early].max()
-        moved_s = float(bins[bins[:, at.RESTS] == 0.0, at.SPAN].sum())
-        handicap = self._handicap * self._longer(moved_s)
-        return np.asarray(np.where(begun.any(axis=0), total, -np.inf) - handicap)
-
-    def kept(self, bins: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """States, covariances, those before the reading, and what was found, of every bin."""
-        n, m = len(bins), len(self.models)
-        wide = (n, m, at.STATES, at.STATES)
-        states, after, before = np.zeros(wide[:3]), np.zeros(wide), np.zeros(wide)
-        return states, after, before, self._run(bins, states, after, before)
-
-    def _know_norm(self, bins: FloatArray, most: int) -> None:
-        """Take the field's norm from the first readings, unless it is known: wild ones do not count."""
-        readings = bins[bins[:, at.SEEN] > 0.0, at.READING : at.READING + 3][:most]
-        if len(readings) and not math.isfinite(self._norm):
-            self._norm = float(np.median(np.linalg.norm(readings, axis=1)))
-
-    def _run(self, bins: FloatArray, *kept: FloatArray) -> FloatArray:
-        rows = bins.copy()
-        self._know_norm(rows, len(rows))
+    def _run(self, bins: Any, readings: int, kept: list[FloatArray] | None = None) -> Any:
+        """What each filter finds in each bin, shape (n, filters); the norm is that of the first readings."""
+        if not math.isfinite(self._norm) and bins["seen"].any():
+            first = bins["field"][bins["seen"]][:readings]
+            self._norm = float(np.median(np.linalg.norm(first, axis=1)))
         if self._norm > 0.0:
-            rows[:, at.READING : at.READING + 3] /= self._norm
-            rows[:, at.LATE : at.LATE + 3] /= self._norm
-        found = np.empty((len(rows), len(self.models), at.FOUND))
-        wide = (0, len(self.models), at.STATES, at.STATES)
-        into = kept or (np.empty(wide[:3]), np.empty(wide), np.empty(wide))
-        table, shared = self._table, self._shared
-        find_headings(rows, table, shared, self._means, self._covariances, self._flags, found, *into)
-        return found
+            bins["field"] /= self._norm
+            bins["field_rate"] /= self._norm
+        found = np.zeros((len(_IRON), len(bins)), kernel.FOUND)
+        none = [np.zeros((0, kernel.SIZE)), *3 * [np.zeros((0, kernel.SIZE, kernel.SIZE))]]
+        for j in range(len(_IRON)):
+            into = none if kept is None else [each[j] for each in kept]
+            kernel.find_headings(bins, self._room, self._kept[j : j + 1], found[j], *into)
+        return found.T
 
-    def _longer(self, moved_s: float) -> FloatArray:
-        """Factors of the models' handicaps after so long a movement."""
-        return np.where(self._iron_put_on, max(1.0, moved_s / PROVED_S), 1.0)
-
-    def _weighed(self, span_s: float, resting: bool, evidence: FloatArray) -> FloatArray:
-        """Weights of the models after one more bin."""
-        self._moved_s += 0.0 if resting else span_s
-        seen, known = np.isfinite(evidence), np.isfinite(self._scores)
-        late = seen & ~known
-        if late.any():
-            self._scores[late] = self._scores[known].max() if known.any() else 0.0
-        self._scores[seen] = math.exp(-span_s / MEMORY_S) * self._scores[seen] + evidence[seen]
-        handicap = self._online_handicap * self._longer(min(self._moved_s, MEMORY_S))
-        return weights_of(self._scores - handicap)
+    def _weights(self, bin_: Any, evidence: FloatArray) -> FloatArray:
+        """Weights of the filters after one more bin; a sensor at rest repeats itself and proves nothing."""
+        if not bin_["resting"]:
+            self._scores = math.exp(-bin_["span_s"] / _MEMORY_S) * self._scores + np.nan_to_num(evidence)
+        return _shares(self._scores - self._handicap)
 
 
-def weights_of(evidence: FloatArray) -> FloatArray:
-    """Weights of models by the logarithms of their evidence, NaN where a model has none."""
-    if not np.isfinite(evidence).any():
-        return np.full(len(evidence), 1.0 / len(evidence))
-    likely = np.nan_to_num(np.exp(evidence - np.nanmax(evidence)))
+def _shares(evidence: FloatArray) -> FloatArray:
+    """Weights by logarithms of evidence."""
+    likely = np.exp(evidence - evidence.max())
     return np.asarray(likely / likely.sum())
 
 
-def _mixed(
-    turns: FloatArray,
-    variances: FloatArray,
-    trusts: FloatArray,
-    weights: FloatArray,
-    seen: BoolArray,
-    models: tuple[FieldModel, ...],
-) -> Headings:
-    """Mean and deviation of the models' angles, (n, models), by weights, (n, models)."""
-    best = np.take_along_axis(turns, weights.argmax(axis=1)[:, None], axis=1)
-    off = np.angle(np.exp(1j * (turns - best)))
+def _mean(found: Any, weights: FloatArray, bins: Any) -> Headings:
+    """Mean and deviation of the filters' angles by weights, shape (n, filters)."""
+    best = np.take_along_axis(found["turn_rad"], weights.argmax(axis=1)[:, None], axis=1)
+    off = np.angle(np.exp(1j * (found["turn_rad"] - best)))
     mean = (weights * off).sum(axis=1)
-    variance = (weights * (variances + (off - mean[:, None]) ** 2)).sum(axis=1)
-    trust = (weights * trusts).sum(axis=1)
-    stray = weights @ np.array([model.stray for model in models])
-    iron = weights @ np.array([float(model.iron_put_on > 0.0) for model in models])
-    return Headings(best[:, 0] + mean, np.sqrt(variance), seen & (trust < _DISTRUSTED), stray, iron)
-
-
-def _shared(s: FusionSettings, first_stray: float) -> FloatArray:
-    shared = np.full(at.SHARED, np.nan)
-    for place, value in (
-        (at.PLACE, s.field_place),
-        (at.FIRST_PLACE, s.field_first_place),
-        (at.WHITE, s.field_noise_sqrt_s),
-        (at.BIAS_S, BIAS_S),
-        (at.ROOM, ROOM),
-        (at.ROOM_WALK, ROOM_WALK_SQRT_S),
-        (at.FREEDOM, FREEDOM),
-        (at.LAG_S, s.magnetometer_lag_s),
-        (at.OUTLIER, OUTLIER),
-        (at.HOLD_S, HOLD_S),
-        (at.FIRST_STRAY, first_stray),
-    ):
-        shared[place] = value
-    return shared
-
-
-# -- a recording
-
-
-def smooth_headings(bins: FloatArray, settings: FusionSettings) -> Headings:
-    """North over a whole stretch: the models that explain it, smoothed backward."""
-    evidence = HeadingBank(settings, first_stray=1.0).evidence(bins)
-    chosen = np.flatnonzero(evidence > np.nanmax(evidence) - _NEGLIGIBLE)
-    models = tuple(MODELS[k] for k in chosen)
-    states, after, before, found = HeadingBank(settings, models, first_stray=1.0).kept(bins)
-    turns, variances = np.empty((2, len(bins), len(models)))
-    for j, model in enumerate(models):
-        turns[:, j], variances[:, j] = _backward(bins, model, states[:, j], after[:, j], before[:, j])
-    weights = np.tile(weights_of(evidence[chosen]), (len(bins), 1))
-    return _mixed(turns, variances, found[..., at.TRUST], weights, bins[:, at.SEEN] > 0.0, models)
+    variance = (weights * (found["variance"] + (off - mean[:, None]) ** 2)).sum(axis=1)
+    trust, stray = ((weights * found[name]).sum(axis=1) for name in ("trust", "stray"))
+    disturbed = bins["seen"] & (trust < _DISTRUSTED)
+    return Headings(best[:, 0] + mean, np.sqrt(variance), disturbed, stray, 1.0 - weights[:, 0])
 
 
 def _backward(
-    bins: FloatArray,
-    model: FieldModel,
-    states: FloatArray,
-    after: FloatArray,
-    before: FloatArray,
+    bins: Any, states: FloatArray, covariances: FloatArray, transitions: FloatArray, noises: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle and variance of one model, smoothed."""
+    """Angle and variance of one filter, smoothed; before the first reading, back by the gyroscope."""
     from filterpy.kalman import KalmanFilter
 
-    first = int(np.argmax(after[:, at.OF_ROOM, at.OF_ROOM] > 0.0))
-    steps = _transitions(bins[first:], model, states[first:])
-    noise = before[first:] + _ROUNDING * np.eye(at.STATES)
-    noise[1:] -= steps[1:] @ after[first:-1] @ np.swapaxes(steps[1:], 1, 2)
-    smoother = KalmanFilter(dim_x=at.STATES, dim_z=3)
-    means, covariances, _, _ = smoother.rts_smoother(states[first:], after[first:], steps, noise)
-    found = np.array([turn_to_north(x, p) for x, p in zip(means, covariances, strict=True)])
-    turn, variance = np.unwrap(found[:, 0]), found[:, 1]
-    early = bins[1 : first + 1]  # the field was not used yet: back by the gyroscope
-    moving = early[:, at.RESTS] == 0.0
-    up = early[:, at.POSE + 6 : at.POSE + 9]
-    slip = moving * early[:, at.SPAN] * (up @ means[0, at.GYRO_BIAS : at.GYRO_BIAS + 3])
-    spread = early[:, at.SLIP] + moving * early[:, at.SPAN] ** 2 * early[:, at.BIAS_VARIANCE]
+    first = int(np.argmax(covariances[:, 0, 0] > 0.0))
+    smoother = KalmanFilter(dim_x=kernel.SIZE, dim_z=3)
+    noises = noises + _ROUNDING * np.eye(kernel.SIZE)
+    filtered = (each[first:] for each in (states, covariances, transitions, noises))
+    means, spread, _, _ = smoother.rts_smoother(*filtered)
+    found = np.array([kernel.turn_to_north(x, p) for x, p in zip(means, spread, strict=True)])
+    early = bins[1 : first + 1]
+    moving_s = early["span_s"] * ~early["resting"]
+    slip = moving_s * (early["level"][:, 2] @ means[0, kernel.BIAS : kernel.BIAS + 3])
+    grown = early["slip_rad2"] + moving_s**2 * early["bias_variance"]
+    turn = np.unwrap(found[:, 0])
     turn = np.concatenate([turn[0] + np.cumsum(slip[::-1])[::-1], turn])
-    variance = np.concatenate([variance[0] + np.cumsum(spread[::-1])[::-1], variance])
-    return turn, variance
-
-
-def _transitions(rows: FloatArray, model: FieldModel, states: FloatArray) -> FloatArray:
-    """Transition to each bin from the one before, shape (n, STATES, STATES)."""
-    steps = np.tile(np.eye(at.STATES), (len(rows), 1, 1))
-    span, moving = rows[:, at.SPAN], rows[:, at.RESTS] == 0.0
-    keep = np.exp(-span / BIAS_S)
-    fade = np.where(moving, np.exp(-span / model.stray_s), 1.0)
-    stays = np.concatenate([[1.0], rows[1:, at.RESTS] == rows[:-1, at.RESTS]])
-    across, along = np.vstack([states[:1], states[:-1]])[:, at.OF_ROOM : at.OF_ROOM + 2].T
-    for i in range(3):
-        rate = rows[:, at.POSE + 6 + i] * span * keep * moving
-        steps[:, at.GYRO_BIAS + i, at.GYRO_BIAS + i] = keep
-        steps[:, at.OF_ROOM, at.GYRO_BIAS + i] = -rate * along
-        steps[:, at.OF_ROOM + 1, at.GYRO_BIAS + i] = rate * across
-        steps[:, at.OF_STRAY + i, at.OF_STRAY + i] = fade
-        steps[:, at.OF_PLACE + i, at.OF_PLACE + i] = stays
-    return steps
+    return turn, np.concatenate([found[0, 1] + np.cumsum(grown[::-1])[::-1], found[:, 1]])

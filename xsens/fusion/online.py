@@ -14,7 +14,7 @@ from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
 from speckle3d.kernels.orientation.inclination import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
-from xsens.fusion.heading import HeadingBank
+from xsens.fusion.heading import HeadingFilter
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, require_metres
 from xsens.fusion.samples import Samples
@@ -82,7 +82,7 @@ class OnlineFilter:
 
     def __init__(self, settings: FusionSettings | None = None) -> None:
         self._settings = settings or FusionSettings()
-        self._level, self._bank = fresh_filter(self._settings), HeadingBank(self._settings)
+        self._level, self._heading = fresh_filter(self._settings), HeadingFilter(self._settings)
         self._steps: list[FilterSteps] = []
         self._last: FilterSteps | None = None
         self._turn_rad, self._heading_sd_rad = 0.0, math.pi
@@ -191,7 +191,7 @@ class OnlineFilter:
         pause_s = GOES_ON
         if self._last is None or self._pause_s:
             self._find_north()
-            self._bank.resume()
+            self._heading.resume()
             self._heading_sd_rad = math.pi  # until the first bin after it
             pause_s = self._pause_s
         magnetic = self._settings.use_magnetometer
@@ -214,7 +214,7 @@ class OnlineFilter:
         steps = joined(self._steps)
         self._steps = []
         if self._settings.use_magnetometer:
-            found = self._bank.follow(*filtered_bins(steps, self._settings))
+            found = self._heading.follow(filtered_bins(steps, self._settings), steps.bias_rad_s[-1:])
             self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
             self._field = (bool(found.disturbed[0]), float(found.stray[0]), float(found.iron[0]))
 

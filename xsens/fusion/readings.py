@@ -57,7 +57,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     notes = list(log.notes[before:])
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
         raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got none: {notes[-1]}")
-    told = np.isfinite(log.accelerometer_m_s2).all(axis=1)
+    told = np.asarray(np.isfinite(log.accelerometer_m_s2).all(axis=1))
     readable = np.isfinite(log.gyroscope_rad_s).all(axis=1) & _near(log.time_s, told)
     used = np.flatnonzero(readable)
     part = slice(None) if used.size == len(log) else used
@@ -72,8 +72,6 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     require_metres(force if there.all() else force[there], source)
     _require_radians(rate, source)
     notes += _agreement(log, source)
-    if used.size < len(log):
-        notes.append(f"{len(log) - used.size} samples without gyroscope or accelerometer left out")
     if not there.all():
         notes.append(f"{int((~there).sum())} accelerometer readings missing: interpolated")
         force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])

@@ -51,8 +51,8 @@ class FusionSettings:
     field_noise_sqrt_s : float
         Noise of the magnetometer, as a fraction of the field's norm.
     field_first_place, field_place : float
-        What a place adds to the room's field, as a fraction of its norm, per component: 1.5 %, or 2.3 degrees
-        of heading where the field dips by 68 degrees.
+        What a place adds to the room's field, as a fraction of its norm, per component: 5 %, or 8 degrees of
+        heading where the field dips by 68 degrees, but 1 % where north is found at first.
     rest_rate_rad_s, rest_force_m_s2, rest_after_s : float
         The sensor rests if for the last of these neither reading differs by more from its mean of half a
         second.
@@ -81,7 +81,7 @@ class FusionSettings:
     magnetometer_lag_s: float = 0.015
     field_noise_sqrt_s: float = 0.002
     field_first_place: float = 0.01
-    field_place: float = 0.015
+    field_place: float = 0.05
     rest_rate_rad_s: float = 1.0 * _DEG
     rest_force_m_s2: float = 0.3
     rest_after_s: float = 1.5

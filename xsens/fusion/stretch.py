@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from xsens.fusion.bins import averaged_bins, filtered_bins, lasts_of_bins, steps_per_bin
-from xsens.fusion.heading import HeadingBank, Headings, smooth_headings
+from xsens.fusion.heading import HeadingFilter, Headings
 from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
@@ -24,7 +24,7 @@ class StretchFilter:
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
         self._level = fresh_filter(settings)
-        self._bank = HeadingBank(settings)
+        self._heading = HeadingFilter(settings)
 
     def run(self, samples: Samples, pause_s: float) -> Estimate:
         """Orientation of the next stretch, `pause_s` after the last, by the readings so far."""
@@ -34,8 +34,8 @@ class StretchFilter:
         starts, sd = steps.start, steps.claimed_sd_rad
         field = _no_field(len(starts))
         if magnetic:
-            self._bank.resume()
-            found = self._bank.follow(*filtered_bins(steps, settings))
+            self._heading.resume()
+            found = self._heading.follow(filtered_bins(steps, settings), _ends(steps, settings))
             # A step turns by the heading of the last whole bin; those of the first bin by its own.
             known = np.maximum(_bin_of(steps, settings) - 1, 0)
             starts = _turned(found.turn_rad[known], starts)
@@ -53,7 +53,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     if settings.use_magnetometer and np.isfinite(steps.field_au[:, 0]).any():
         bias, bias_sd = level.bias_rad_s[1:], level.bias_sd_rad_s[1:]
         bins = averaged_bins(steps, nodes[:-1], bias, bias_sd, sd[1:], settings)
-        found = smooth_headings(bins, settings)
+        found = HeadingFilter(settings, online=False).smooth(bins)
         turn, heading_sd = _at_nodes(steps, found, settings)
         nodes = _turned(turn, nodes)
         sd = np.column_stack([sd[:, :2], heading_sd])
@@ -62,6 +62,11 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
         sd = np.column_stack([sd[:, :2], np.full(len(sd), np.pi)])
     xyzw = within_steps(steps, nodes[:-1], level.bias_rad_s[:-1], nodes[1:])
     return _each_sample(steps, xyzw, sd[1:], level.bias_rad_s[1:], field)
+
+
+def _ends(steps: FilterSteps, settings: FusionSettings) -> FloatArray:
+    """Bias at the end of each bin."""
+    return steps.bias_rad_s[lasts_of_bins(steps, settings)]
 
 
 def _no_field(count: int) -> _Field:

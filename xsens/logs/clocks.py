@@ -151,7 +151,8 @@ def _order_of(stamps: Stamps) -> IntArray | None:
 def _order_notes(order: IntArray | None) -> tuple[str, ...]:
     if order is None:
         return ()
-    late = int((order < np.maximum.accumulate(order)).sum())
+    rank = np.argsort(order)
+    late = int((rank < np.maximum.accumulate(rank)).sum())
     return (f"{late} samples came out of order and were sorted",)
 
 

@@ -79,7 +79,7 @@ def _by_gravity(log: ImuLog) -> _Turning | None:
     force, rate = log.accelerometer_m_s2, log.gyroscope_rad_s
     if force is None or rate is None:
         return None
-    means = _means(log, np.isfinite(force).all(axis=1), rate, force)
+    means = _means(log, np.asarray(np.isfinite(force).all(axis=1)), rate, force)
     if means is None:
         return None
     time_s, rate, force = means

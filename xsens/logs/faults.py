@@ -35,6 +35,9 @@ _LIMITS = {
 sensor's readings change by less than the second. The field's limits are in its median norm: a magnet at 1 cm
 makes six of it."""
 
+_ABSURD = 1e6
+"""Larger numbers are damage in any unit."""
+
 _SLOW_RAD_S = 0.05
 """Rate that may be repeated at rest: the bias of a gyroscope, and a coarse one's last digits."""
 
@@ -58,6 +61,8 @@ _OTHER = 5.0
 
 _ENOUGH = 50
 _MOST_SENSORS = 8
+_LOOKED_AT = 1000
+"""Rows on either side of the log's middle that tell whether sensors take turns."""
 
 
 def measured(log: ImuLog) -> ImuLog:
@@ -68,18 +73,19 @@ def measured(log: ImuLog) -> ImuLog:
     InvalidInputError
         If its rows are of several sensors in turn.
     """
+    log = _without_damage(log)
     _require_one_sensor(log)
     readings: dict[str, FloatArray | None] = {name: getattr(log, name) for name in VECTORS}
     dead = np.zeros(len(log), dtype=bool)
     notes: list[str] = []
     for name in VECTORS:
         rows = readings[name]
-        if rows is None or np.isnan(rows).any(axis=1).all():
+        if rows is None or not _every(np.isfinite(rows)).any():
             readings[name] = None
             continue
         bad = _bad(name, rows, dead, log)
         if name == VECTORS[0]:
-            dead = bad["zero"] | ~np.isfinite(rows).all(axis=1)
+            dead = bad["zero"] | ~_every(np.isfinite(rows))
         counts = {why: int(mask.sum()) for why, mask in bad.items() if mask.any()}
         if not counts:
             continue
@@ -105,25 +111,39 @@ _WORDS = {
 }
 
 
+def _without_damage(log: ImuLog) -> ImuLog:
+    """The log without numbers that are damage in any unit, counted in its notes."""
+    changed: dict[str, Any] = {}
+    notes = []
+    for name in VECTORS:
+        rows = getattr(log, name)
+        if rows is not None and (np.abs(rows) >= _ABSURD).any():
+            wild = (np.abs(rows) >= _ABSURD).any(axis=1)
+            changed[name] = np.where(wild[:, None], np.nan, rows)
+            notes.append(f"{name.split('_')[0]}: {int(wild.sum())} out of range: taken as missing")
+    return replace(log, **changed, notes=(*log.notes, *notes)) if changed else log
+
+
 def _bad(name: str, rows: FloatArray, dead: BoolArray, log: ImuLog) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
-    limits, finite = _LIMITS[name], np.isfinite(rows).all(axis=1)
-    size = np.abs(np.where(finite[:, None], rows, 0.0)).max(axis=1)
+    limits, finite = _LIMITS[name], _every(np.isfinite(rows))
+    rows = rows if finite.all() else np.where(finite[:, None], rows, np.nan)
+    size = np.fmax.reduce([np.abs(np.where(finite, axis, 0.0)) for axis in rows.T])
     zero, unit = finite & (size == 0.0), 1.0
     if name == VECTORS[2]:
-        zero |= finite & ~((size > 1e-12) & (size < 1e12))
+        zero |= finite & (size < 1e-12)
         some = finite & ~zero
         unit = float(np.median(np.linalg.norm(rows[some], axis=1))) if some.any() else 1.0
     beyond = finite & (size > limits.largest * unit)
-    if beyond.sum() > _FEW * finite.sum() and size.max(initial=0.0) < 1e6:
-        beyond[:] = False  # another unit, which whoever uses the log refuses
+    if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
+        beyond[:] = False
     rows = np.where(beyond[:, None], np.nan, rows) if beyond.any() else rows
     start, length = _runs(rows)
     usual, (before, after) = int(np.median(length)), _jumps(rows, start, length)
     repeat = (length > max(2, 2 * usual)) & ((after > limits.change * unit) | (np.isnan(after) & (start > 0)))
     if name == VECTORS[1]:
         slow = np.linalg.norm(rows[start], axis=1) < _SLOW_RAD_S
-        begun = np.isnan(before) | np.isnan(after) | (before > _SLOW_RAD_S)
+        begun = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
         still = slow & begun & _steady(log.accelerometer_m_s2, start, length)
         repeat &= ~still
         dropped = (np.fmax(before, after) > _DROP_RAD_S) & ~still
@@ -140,8 +160,8 @@ def _steady(force: FloatArray | None, start: IntArray, length: IntArray) -> Bool
     """Runs of one sensor in which the accelerometer shows no turning."""
     if force is None:
         return np.ones(len(start), dtype=bool)
-    spread = np.fmax.reduceat(force, start) - np.fmin.reduceat(force, start)
-    return np.asarray(~(spread.max(axis=1) > _STEADY_M_S2))
+    spread = [np.fmax.reduceat(axis, start) - np.fmin.reduceat(axis, start) for axis in force.T]
+    return np.asarray(~(np.fmax.reduce(spread) > _STEADY_M_S2))
 
 
 def _turning(rate: FloatArray | None, start: IntArray, length: IntArray) -> BoolArray:
@@ -152,9 +172,14 @@ def _turning(rate: FloatArray | None, start: IntArray, length: IntArray) -> Bool
     return np.asarray((total[start + length] - total[start]) / length > _TURNING_RAD_S)
 
 
+def _every(marks: BoolArray) -> BoolArray:
+    """Rows of which each number is marked; many times faster than a reduction over a few columns."""
+    return np.asarray(np.logical_and.reduce(list(marks.T)))
+
+
 def _runs(rows: FloatArray) -> tuple[IntArray, IntArray]:
     """First rows and lengths of runs of one value."""
-    same = (rows[1:] == rows[:-1]).all(axis=1) if rows.ndim > 1 else rows[1:] == rows[:-1]
+    same = _every(rows[1:] == rows[:-1])
     start = np.flatnonzero(np.append(True, ~same))
     return start, np.diff(np.append(start, len(rows)))
 
@@ -178,11 +203,15 @@ def _spread(start: IntArray, length: IntArray, which: BoolArray, skip: int, size
 def _clipped(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
     bad = np.zeros(len(rows), dtype=bool)
-    changes = np.append(0, np.cumsum((rows[1:] != rows[:-1]).any(axis=1)))
+    changes = np.append(0, np.cumsum(~_every(rows[1:] == rows[:-1])))
     for axis in rows.T:
+        if np.isnan(axis).all():
+            continue
+        if max((axis == np.nanmax(axis)).sum(), (axis == np.nanmin(axis)).sum()) < 3:
+            continue
         steps = np.abs(np.diff(axis))
         digit = np.min(steps[steps > 0.0], initial=np.inf)
-        start, length = _runs(axis)
+        start, length = _runs(axis[:, None])
         readings = changes[start + length - 1] - changes[start] + 1
         padded = np.pad(axis, 2, mode="edge")
         into = np.abs(padded[start + 1] - padded[start])
@@ -213,7 +242,10 @@ def _stuck(log: ImuLog) -> BoolArray:
     end = np.minimum(start + length, len(rows) - 1)
     turn = (Rotation.from_quat(rows[start]).inv() * Rotation.from_quat(rows[end])).magnitude()
     usual = int(np.median(length))
-    long = (length > 2) & (length > 2 * usual) & (turn > _STUCK_RAD)
+    goes_on = start + length == len(rows)
+    rate = log.gyroscope_rad_s
+    behind = (turn > _STUCK_RAD) | (goes_on & _turning(None if rate is None else rate[at], start, length))
+    long = (length > max(2, 2 * usual)) & behind
     stuck[at] = _spread(start, length, long, usual, len(rows))
     return stuck
 
@@ -226,22 +258,23 @@ def _require_one_sensor(log: ImuLog) -> None:
     for rows in (log.accelerometer_m_s2, log.magnetometer_au, quaternions):
         if rows is None or len(rows) < _ENOUGH:
             continue
-        apart = [
-            float(np.nanmedian(np.linalg.norm(rows[lag:] - rows[:-lag], axis=1)))
-            if np.isfinite(rows).all(axis=1).any()
-            else np.nan
-            for lag in range(1, _MOST_SENSORS + 1)
-        ]
+        middle = len(rows) // 2
+        rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
+        rows = np.where((rows != 0.0).any(axis=1)[:, None], rows, np.nan)
+        apart = [_median_norm(rows[lag:] - rows[:-lag]) for lag in range(1, _MOST_SENSORS + 1)]
         for sensors in range(2, _MOST_SENSORS + 1):
-            if min(apart[: sensors - 1]) > _OTHER * apart[sensors - 1] + 0.02 * _size(rows):
+            if np.min(apart[: sensors - 1]) > _OTHER * apart[sensors - 1] + 0.02 * _median_norm(rows):
                 raise InvalidInputError(
                     f"expected the rows of one sensor, got those of {sensors} in turn: neighbouring readings "
                     f"differ, and every {sensors}. is alike: split the table"
                 )
 
 
-def _size(rows: FloatArray) -> float:
-    return float(np.nanmedian(np.linalg.norm(rows, axis=1)))
+def _median_norm(rows: FloatArray) -> float:
+    """Median length of the rows that have one; NaN if none has."""
+    norms = np.linalg.norm(rows, axis=1)
+    norms = norms[np.isfinite(norms)]
+    return float(np.median(norms)) if norms.size else float("nan")
 
 
 _RUNS = 9

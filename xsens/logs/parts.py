@@ -115,9 +115,12 @@ def assembled(line: Timeline, parts: Parts) -> ImuLog:
     notes = list(parts.notes)
     if parts.there is not None and not parts.there.all():
         notes.append(f"{int((~parts.there).sum())} samples lack the sensor's own orientation")
+    force, rate, field = (_at(rows, line.rows) for rows in parts.vectors)
     log = ImuLog(
         line.time_s,
-        *(_at(rows, line.rows) for rows in parts.vectors),
+        force,
+        rate,
+        field,
         None if there is None else _at(parts.orientations, line.rows),
         line.counter,
         line.gaps,

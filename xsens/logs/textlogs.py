@@ -112,8 +112,8 @@ def _named(table: TextTable, parts: Parts, hints: Hints) -> ImuLog:
         gaps = _gaps_told(table.header, len(log)) if line.rows is None else None
         return log if gaps is None else replace(log, gaps=gaps)
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
-    line = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
-    return on_clock(line, int(timed.sum()), parts, hints)
+    sent = Stamps(counter, ticks, dialect.counter_span, dialect.tick_s, period_s)
+    return on_clock(sent, int(timed.sum()), parts, hints)
 
 
 def _dialect(table: TextTable, counter: IntArray | None, ticks: IntArray | None) -> _Dialect:
@@ -175,7 +175,8 @@ def _vector(table: TextTable, quantity: str, dialect: _Dialect) -> FloatArray | 
     usual = dialect.gyroscope_to_rad if quantity == "gyr" else 1.0
     scales = [table.scale(f"{quantity}_{axis}") for axis in "xyz"]
     factors = np.array([usual if scale is None else scale for scale in scales])
-    return rows if (factors == 1.0).all() else rows * factors
+    with np.errstate(over="ignore"):  # damage, which is left out as no measurement
+        return rows if (factors == 1.0).all() else rows * factors
 
 
 def _gaps_told(header: Names, samples: int) -> tuple[Gap, ...] | None:

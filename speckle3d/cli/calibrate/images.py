@@ -54,7 +54,7 @@ def calibrate_images(
     ] = None,
     transform: Transform = None,
     pixel_mm: PixelMm = None,
-    method: Annotated[str | None, typer.Option(hidden=True)] = None,
+    method: Annotated[str | None, typer.Option(help="Was removed; there is one optimiser.")] = None,
     scales: Annotated[bool, typer.Option("--scales", help="Estimate the pixel size too.")] = False,
     capture_mm: Annotated[float, typer.Option(help="How far the start may be off, each way.")] = 20.0,
     capture_deg: Annotated[float, typer.Option(help="The same for its turns.")] = 20.0,
@@ -82,7 +82,7 @@ def calibrate_images(
     if time_offset_s is not None and not abs(time_offset_s) < MOST_OFFSET_S:
         raise InvalidInputError(f"--time-offset-s: expected seconds, few of them, got {time_offset_s}")
     if method not in (None, "gauss-newton"):
-        raise InvalidInputError("--method: removed; the search by derivatives reaches what Nelder-Mead did")
+        raise InvalidInputError("--method: was removed; the search by derivatives finds what Nelder-Mead did")
     readings = _one_each(poses)
     require_free(out, first, second, start, clock, *(poses or ()))
     settings = from_options(ImageFit, locals())

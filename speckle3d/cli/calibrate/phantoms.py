@@ -4,17 +4,10 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.calibrating.settings import (
-    OrientationSettings,
-    PlaneSettings,
-    ScanSettings,
-    WireSettings,
-    written_as,
-)
 from speckle3d.cli.calibrations import report_written, require_free
 from speckle3d.cli.common import (
     CalibrationOut,
@@ -26,22 +19,51 @@ from speckle3d.cli.common import (
     from_options,
     note,
 )
+from speckle3d.cli.helping import Command
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
+if TYPE_CHECKING:
+    from speckle3d.calibrating.settings import ScanSettings
 
-def _add_command(model: type[ScanSettings]) -> None:
-    """Add the command of a calibration, whose options are the fields of its settings."""
+METHODS = {
+    "plane": "Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom.",
+    "orientation": "Calibrate an orientation sensor with the floor of a water bath.",
+    "wires": "Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes.",
+}
 
-    def command(images: Path, out: Path, as_json: bool = False, **options: Any) -> None:
-        _calibrate(images, from_options(model, options), out, as_json)
+
+class _OfSettings(Command):
+    """A command whose options are the fields of its settings, loaded when it is asked for them."""
+
+    @property
+    def params(self) -> list[Any]:
+        """Of the command, as click has them."""
+        if "_params" not in vars(self):
+            alone = typer.Typer(add_completion=False)
+            alone.command()(_command_of(str(self.name)))
+            command = typer.main.get_command(alone)
+            self._params, self.callback = list(command.params), command.callback
+        return self._params
+
+    @params.setter
+    def params(self, none: list[Any]) -> None:
+        """Ignore that its stand-in has none."""
+
+
+def _command_of(method: str) -> Any:
+    """The command of a method, with the fields of its settings as parameters."""
+    from speckle3d.calibrating.settings import model_of, written_as
 
     def option(name: str, kind: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
         only = inspect.Parameter.KEYWORD_ONLY
         return inspect.Parameter(name, only, default=default, annotation=kind)
 
+    def command(images: Path, out: Path, as_json: bool, **options: Any) -> None:
+        _calibrate(images, from_options(model_of(method), options), out, as_json)
+
     parameters = [option("images", Images), option("out", CalibrationOut)]
-    for name, field in model.model_fields.items():
+    for name, field in model_of(method).model_fields.items():
         kind, text, default = field.annotation, written_as(field), field.default
         told: dict[str, Any] = {"help": field.description}
         if text is not None:
@@ -53,12 +75,18 @@ def _add_command(model: type[ScanSettings]) -> None:
     parameters.append(option("as_json", Json, False))
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {each.name: each.annotation for each in parameters}
-    command.__doc__ = model.__doc__
-    calibrate.command(model.method)(command)
+    return command
 
 
-for _model in (PlaneSettings, OrientationSettings, WireSettings):
-    _add_command(_model)
+def _add_command(method: str) -> None:
+    def stand_in() -> None: ...
+
+    stand_in.__doc__ = METHODS[method]
+    calibrate.command(method, cls=_OfSettings)(stand_in)
+
+
+for _method in METHODS:
+    _add_command(_method)
 
 
 def _calibrate(images: Path, settings: ScanSettings, out: Path, as_json: bool) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,9 +59,34 @@ def open_sweep_at(modes: Sequence[str | None], source: Path, options: Mapping[st
 
     others = said_of(source, options)
     opened = [open_posed(source, mode, *others) for mode in modes]
-    for line in opened[0].notes():
+    recorded = [] if opened[0].reconstruction is not None else recording_notes(source, others[1])
+    for line in (*recorded, *opened[0].notes()):
         note(line)
     return opened
+
+
+def recording_notes(source: Path, settings: ImportSettings) -> list[str]:
+    """What is to be told of a recording's images and poses; nothing where a calibration gives its pixels."""
+    from speckle3d.io.import_settings import MissingSettingsError
+    from speckle3d.io.load import import_notes
+
+    ranged = settings.model_copy(
+        update={"dynamic_range_db": 60.0}
+    )  # of which grey levels as stored need none
+    with suppress(MissingSettingsError):
+        return [line for line in import_notes(source, ranged) if not line.startswith("dynamic range")]
+    return []
+
+
+def clip_of(source: Path, options: Mapping[str, Any], posed: PosedSweep) -> str | None:
+    """Region of the images that a device set of PLUS clips volumes to; None without one."""
+    from speckle3d.io.import_settings import settings_for
+    from speckle3d.io.plus.device_set import read_device_set
+
+    config = settings_for(source, said_of(source, options)[1]).plus_config
+    clip = None if config is None else read_device_set(config).clip
+    grid = replace(posed.sweep.grid, skew_rad=posed.skew_rad)
+    return None if clip is None else clip.region_text(grid)
 
 
 def said_of(

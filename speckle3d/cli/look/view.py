@@ -126,8 +126,8 @@ def _require_phantom_alone(*others: Path | None) -> None:
 
 def _phantom(file: Path, method: str, options: Mapping[str, Any]) -> Sequence[Page]:
     from speckle3d.app.phantom.pages import phantom_pages
-    from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, WireSettings
+    from speckle3d.calibrating.settings import model_of
 
-    models = {each.method: each for each in (PlaneSettings, OrientationSettings, WireSettings)}
-    given = {name: options[name] for name in _OF_PHANTOMS if name in models[method].model_fields}
-    return phantom_pages(file, from_options(models[method], given))
+    model = model_of(method)
+    given = {name: options[name] for name in _OF_PHANTOMS if name in model.model_fields}
+    return phantom_pages(file, from_options(model, given))

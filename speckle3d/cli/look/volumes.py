@@ -33,6 +33,7 @@ from speckle3d.cli.look.compounding import (
     Rule,
     Splat,
     VoxelMm,
+    clip_of,
     compounding_settings,
     open_sweep_at,
 )
@@ -125,6 +126,8 @@ def volume(
         {"--backward-mm": backward_mm or None},
     )
     settings = compounding_settings(config_file, options)
+    (posed,) = open_sweep_at([mode], source, options)
+    region = region or clip_of(source, options, posed)
     request = VolumeRequest(
         out,
         settings,
@@ -133,7 +136,6 @@ def volume(
         state,
         deviation,
     )
-    (posed,) = open_sweep_at([mode], source, options)
     with progress_bar(f"compounding {out.name}") as progress:
         report = write_voxels(posed, request, progress)
     if as_json:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, MismatchError, Speckle3DError
 from speckle3d.core.shown import shown
 from speckle3d.correction.crossing.certainty import angle_deg, bend_slice, covariance, overlap_mm, terms_of
 from speckle3d.correction.crossing.moved import Parts, rms_mm
@@ -238,48 +238,64 @@ class _Matched:
         return (start, best), margin
 
     def judged(self, best: tuple[Candidate, Refined], margin: float) -> CrossedPair:
+        """The pair, if its length may be claimed."""
         start, end = best
-        names = f"{self.given[0].name} and {self.given[1].name}"
-        mirrored = start.mirrored
-        pair = self.at(self.settings.blurs_mm[-1], mirrored)
+        limits, mirrored = self.settings, start.mirrored
+        pair = self.at(limits.blurs_mm[-1], mirrored)
         angle, overlap = angle_deg(end), overlap_mm(end, pair)
         moved, blur = self.moved_mm(end, mirrored)
         whole = covariance(end, self.prior, moved)
-        if end.correlation < self.settings.least_similarity:
-            raise MismatchError(
-                f"{names}: expected images that agree where the sweeps cross, got a correlation of "
-                f"{end.correlation:.2f}; was the same tissue swept, and did it stay as it was?"
-            )
-        if angle < self.settings.least_angle_deg:
-            raise InsufficientDataError(
-                f"{names}: expected sweeps that cross by {self.settings.least_angle_deg:.0f} degrees or "
-                f"more, got {angle:.0f}; turn the probe by 90 degrees between them"
-            )
-        if overlap < self.settings.least_overlap_mm:
-            raise InsufficientDataError(
-                f"{names}: expected {self.settings.least_overlap_mm:.0f} mm of each sweep to be seen by the "
-                f"other, got {overlap:.0f}; let longer sweeps cross in their middles"
-            )
-        if margin < self.settings.least_margin:
-            raise MismatchError(
-                f"{names}: expected one way of laying the sweeps together, got another that fits almost as "
-                f"well (log likelihood {margin:.0f} less); sweep where vessels or edges tell places apart"
-            )
         terms = np.concatenate([terms_of(pair[k].path, k) for k in (0, 1)])
         joint = terms @ whole @ terms.T
         sigma = float(np.sqrt(joint[[0, 3], [0, 3]].max()))
-        if moved > _FOLLOWED * blur:
-            raise InsufficientDataError(
-                f"{names}: expected tissue that stayed within {_FOLLOWED * blur:.2f} mm rms between sweeps, "
-                f"got some that moved by {moved:.2f} mm rms where they cross; sweep again with less "
-                "pressure, more gel and the breath held"
-            )
-        if sigma > self.settings.largest_sigma:
-            raise InsufficientDataError(
-                f"{names}: expected parts of the tissue to agree on the length to "
-                f"{100 * self.settings.largest_sigma:.1f} %, got {100 * sigma:.1f} %, with {moved:.2f} mm "
-                "rms of movement between the sweeps; sweep again over more texture, with less pressure"
-            )
+        requirements: tuple[tuple[bool, type[Speckle3DError], str], ...] = (
+            (
+                end.correlation >= limits.least_similarity,
+                MismatchError,
+                "images that agree where the sweeps cross, got a correlation of "
+                f"{end.correlation:.2f}; was the "
+                "same tissue swept, and did it stay as it was?",
+            ),
+            (
+                angle >= limits.least_angle_deg,
+                InsufficientDataError,
+                f"sweeps that cross by {limits.least_angle_deg:.0f} degrees or more, got "
+                f"{angle:.0f}; turn the "
+                "probe by 90 degrees between them",
+            ),
+            (
+                overlap >= limits.least_overlap_mm,
+                InsufficientDataError,
+                f"{limits.least_overlap_mm:.0f} mm of each sweep to be seen by the other, got "
+                f"{overlap:.0f}; let "
+                "longer sweeps cross in their middles",
+            ),
+            (
+                margin >= limits.least_margin,
+                MismatchError,
+                "one way of laying the sweeps together, got another that fits almost as well (log likelihood "
+                f"{margin:.0f} less); sweep where vessels or edges tell places apart",
+            ),
+            (
+                moved <= _FOLLOWED * blur,
+                InsufficientDataError,
+                f"tissue that stayed within {_FOLLOWED * blur:.2f} mm rms between sweeps, got "
+                "some that moved by "
+                f"{moved:.2f} mm rms where they cross; sweep again with less pressure, more gel "
+                "and the breath held",
+            ),
+            (
+                sigma <= limits.largest_sigma,
+                InsufficientDataError,
+                f"parts of the tissue to agree on the length to {100 * limits.largest_sigma:.1f} %, got "
+                f"{100 * sigma:.1f} %, with {moved:.2f} mm rms of movement between the sweeps; "
+                "sweep again over more "
+                "texture, with less pressure",
+            ),
+        )
+        for holds, error, words in requirements:
+            if not holds:
+                raise error(f"{self.given[0].name} and {self.given[1].name}: expected {words}")
         scaled = [self._scaled(k, mirrored[k], end, whole, moved) for k in (0, 1)]
         to_world = [
             s.poses[0]
@@ -329,23 +345,20 @@ class _Matched:
             world = (given.sensed * path_from_image.rotation.inv()).mean()
             poses = RigidTransform.from_rotation(world) * path_from_image
             poses = RigidTransform.from_translation(-poses.translation[0]) * poses
-        terms = terms_of(straight.path, which)
-        values = np.array([float(terms[0, bend_slice(which)] @ bends), bends[3], bends[5]])
+        terms, ours = terms_of(straight.path, which), bend_slice(which)
+        values = np.array([float(terms[0, ours] @ bends), bends[3], bends[5]])
         own = terms @ whole @ terms.T
-        prior = (
-            terms[:, bend_slice(which)]
-            @ np.linalg.inv(self.prior.information)[
-                which * len(BENDS) : (which + 1) * len(BENDS), which * len(BENDS) : (which + 1) * len(BENDS)
-            ]
-            @ terms[:, bend_slice(which)].T
-        )
+        # Both sweeps' bends come first among the prior's parameters.
+        bends_of = slice(which * len(BENDS), (which + 1) * len(BENDS))
+        before = np.linalg.inv(self.prior.information)[bends_of, bends_of]
+        prior = terms[:, ours] @ before @ terms[:, ours].T
         information = _positive(np.linalg.inv(own) - np.linalg.inv(prior))
         evidence = ScaleEvidence(
             "crossing", np.linalg.pinv(information) @ (np.linalg.inv(own) @ values), information
         )
         return ScaledPoses(
             poses,
-            _pose_covariance(straight, bends, whole[bend_slice(which), bend_slice(which)], path_from_image),
+            _pose_covariance(straight, bends, whole[ours, ours], path_from_image),
             float(values[0]),
             float(np.sqrt(own[0, 0])),
             (evidence,),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -200,9 +200,9 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
         )
     at = np.asarray(low + np.arange(1 + int((high - low) / SPACING_MM)) * SPACING_MM, dtype=np.float64)
     middle = len(at) // 2
-    smooth = _Smooth(travel[good], centred[good])
-    to_path = smooth.at(at[middle : middle + 1])[0].inv()
-    planes, base = to_path * smooth.at(at), to_path * smooth.at(travel)
+    smooth = partial(_smoothed, travel[good], centred[good])
+    to_path = smooth(at[middle : middle + 1])[0].inv()
+    planes, base = to_path * smooth(at), to_path * smooth(travel)
     frames = to_path * centred
     away = base.inv() * frames
     travel = travel + away.translation[:, 2]
@@ -223,25 +223,25 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
     return StraightSweep(path, volume, pixels, frames, travel - at[middle])
 
 
-class _Smooth:
+def _smoothed(travel: FloatArray, poses: RigidTransform, at: FloatArray) -> RigidTransform:
     """Poses as a smooth function of travel: local straight lines."""
+    mean = poses.rotation.mean()
+    values = np.concatenate([poses.translation, (mean.inv() * poses.rotation).as_rotvec()], axis=1)
+    away = travel[None, :] - at[:, None]
+    # Far from all frames the nearest still count.
+    reach = np.maximum(_SMOOTH_MM, np.abs(away).min(axis=1, keepdims=True))
+    weight = _on_lines(np.exp(-0.5 * (away / reach) ** 2), away, 1e-6)
+    found = weight @ values / weight.sum(axis=1, keepdims=True)
+    return RigidTransform.from_components(found[:, :3], mean * Rotation.from_rotvec(found[:, 3:]))
 
-    def __init__(self, travel: FloatArray, poses: RigidTransform) -> None:
-        self._travel, self._mean = travel, poses.rotation.mean()
-        turns = (self._mean.inv() * poses.rotation).as_rotvec()
-        self._values = np.concatenate([poses.translation, turns], axis=1)
 
-    def at(self, travel: FloatArray) -> RigidTransform:
-        away = self._travel[None, :] - travel[:, None]
-        # Far from all frames the nearest still count.
-        reach = np.maximum(_SMOOTH_MM, np.abs(away).min(axis=1, keepdims=True))
-        weight = np.exp(-0.5 * (away / reach) ** 2)
-        s0, s1, s2 = ((weight * away**k).sum(axis=1) for k in (0, 1, 2))
-        # A little stiffness keeps the slope finite where all frames are in one place.
-        slope = s0 * (s2 + 1e-6) - s1**2
-        at = weight * (s2[:, None] + 1e-6 - s1[:, None] * away) / slope[:, None]
-        values = at @ self._values
-        return RigidTransform.from_components(values[:, :3], self._mean * Rotation.from_rotvec(values[:, 3:]))
+def _on_lines(weight: FloatArray, away: FloatArray, stiffness: float | FloatArray) -> FloatArray:
+    """Weights whose sums are the values at zero of straight lines fitted with the weights given, (k, n).
+
+    A little stiffness, mm2, keeps the slope finite where all frames are in one place.
+    """
+    total, first, second = ((weight * away**k).sum(axis=1, keepdims=True) for k in (0, 1, 2))
+    return np.asarray(weight * (1.0 - first / (second + stiffness * total) * away))
 
 
 def _moved(image: Float32Array, plane_from_frame: RigidTransform, pixels: FloatArray) -> Float32Array:
@@ -264,11 +264,8 @@ def _onto_planes(images: Float32Array, travel: FloatArray, at: FloatArray) -> Fl
     crowd = np.exp(-0.5 * ((travel[None, :] - travel[:, None]) / _EACH_MM) ** 2).sum(axis=1)
     weight = np.exp(-0.5 * (away / reach[:, None]) ** 2) / crowd
     weight[weight < 0.02 * weight.max(axis=1, keepdims=True)] = 0.0
-    # Local straight lines: what a plane shows is centred on it.
-    first, second = ((weight * off**k).sum(axis=1, keepdims=True) for k in (1, 2))
-    total = weight.sum(axis=1, keepdims=True)
-    stiff = 0.01 * reach[:, None] ** 2 * total
-    weight = (weight * (1.0 - first / (second + stiff) * off)).astype(np.float32)
+    # What a plane shows is centred on it.
+    weight = _on_lines(weight, off, 0.01 * reach[:, None] ** 2).astype(np.float32)
     there = np.isfinite(images).reshape(len(images), -1)
     flat = np.where(there, images.reshape(len(images), -1), np.float32(0.0))
     share = weight @ there.astype(np.float32)

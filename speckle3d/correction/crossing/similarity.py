@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.geometry import skew
 from speckle3d.correction.crossing.path import BENDS, Path, StraightSweep
 from speckle3d.kernels.crossing import look_up
 
@@ -88,7 +89,7 @@ class OneWay:
     values, found : ndarray, shape (n,)
         Of the points, and what the other sweep shows there; NaN where it shows nothing.
     rows : ndarray, shape (n, 20)
-        Change of `found` with the parameters; empty if it was not wanted.
+        Change of `found` with the parameters.
     points_mm : ndarray, shape (n, 3)
         In the first path's frame.
     """
@@ -119,52 +120,44 @@ class OneWay:
         return float(_normalised(self.values[chosen])[0] @ _normalised(self.found[chosen])[0])
 
 
-def compared(pair: Sequence[Textured], placing: Placing, slopes: bool = True) -> tuple[OneWay, OneWay]:
-    """Look up either sweep's points in the other."""
-    bent = [one.path.bent(bends) for one, bends in zip(pair, placing.bends, strict=True)]
-    twists = None
-    if slopes:
-        twists = [
-            one.path.twists(b, planes) for one, b, planes in zip(pair, placing.bends, bent, strict=True)
-        ]
-    first_from = [np.eye(4), placing.first_from_second.as_matrix()]
-    return _looked_up(pair, bent, twists, first_from, 0), _looked_up(pair, bent, twists, first_from, 1)
+def compared(pair: Sequence[Textured], placing: Placing) -> tuple[OneWay, OneWay]:
+    """Look up either sweep's points in the other, all in the first path's frame."""
+    planes, twists = [], []
+    into_first = (RigidTransform.identity(), placing.first_from_second)
+    for sweep, bends, into in zip(pair, placing.bends, into_first, strict=True):
+        bent = sweep.path.bent(bends)
+        planes.append(into.as_matrix() @ bent)
+        twists.append(_carrying(into) @ sweep.path.twists(bends, bent))
+    return _looked_up(pair, planes, twists, 0), _looked_up(pair, planes, twists, 1)
+
+
+def _carrying(into: RigidTransform) -> FloatArray:
+    """Matrix that takes (shift, turn) of one frame into another, shape (6, 6)."""
+    rotation = into.rotation.as_matrix()
+    carried = np.zeros((6, 6))
+    carried[:3, :3] = carried[3:, 3:] = rotation
+    carried[:3, 3:] = skew(into.translation) @ rotation
+    return carried
 
 
 def _looked_up(
-    pair: Sequence[Textured],
-    bent: Sequence[FloatArray],
-    twists: Sequence[FloatArray] | None,
-    first_from: Sequence[FloatArray],
-    which: int,
+    pair: Sequence[Textured], planes: Sequence[FloatArray], twists: Sequence[FloatArray], which: int
 ) -> OneWay:
     ours, other = pair[which], pair[1 - which]
-    poses = (first_from[which] @ bent[which])[ours.plane]
+    poses = planes[which][ours.plane]
     points = np.einsum("nij,nj->ni", poses[:, :3, :3], ours.local_mm) + poses[:, :3, 3]
-    other_from = np.linalg.inv(first_from[1 - which])
-    there = points @ other_from[:3, :3].T + other_from[:3, 3]
-    planes = np.ascontiguousarray(np.linalg.inv(bent[1 - which])[:, :3])
-    found, place = np.empty(len(points)), np.empty(len(points))
-    slopes = np.empty((len(points) if twists is not None else 0, 3))
-    look_up(there, other.volume, planes, other.pixels, found, slopes, place)
-    if twists is None:
-        return OneWay(ours.values, found, np.empty((0, PARAMETERS)), points)
+    found, place, slopes = np.empty(len(points)), np.empty(len(points)), np.empty((len(points), 3))
+    from_first = np.ascontiguousarray(np.linalg.inv(planes[1 - which])[:, :3])
+    look_up(points, other.volume, from_first, other.pixels, found, slopes, place)
     valid = np.isfinite(found)
-    rows = np.zeros((len(points), PARAMETERS))
-    # What the level found changes by as the point moves, as force and torque in each frame.
-    pull = slopes[valid]
-    in_other = np.concatenate([pull, np.cross(there[valid], pull)], axis=1)
-    pull = pull @ other_from[:3, :3]
-    in_first = np.concatenate([pull, np.cross(points[valid], pull)], axis=1)
-    own = np.linalg.inv(first_from[which])
-    own_point = points[valid] @ own[:3, :3].T + own[:3, 3]
-    pull = pull @ own[:3, :3].T
-    in_own = np.concatenate([pull, np.cross(own_point, pull)], axis=1)
-    columns = [slice(RIGID + k * len(BENDS), RIGID + (k + 1) * len(BENDS)) for k in (0, 1)]
-    rows[valid, :RIGID] = in_first if which == 1 else -in_first
-    rows[valid, columns[which]] = np.einsum("ni,nij->nj", in_own, twists[which][ours.plane[valid]])
+    # What the level found changes by as the point shifts and turns about the origin.
+    pull = np.concatenate([slopes[valid], np.cross(points[valid], slopes[valid])], axis=1)
     near = np.round(place[valid]).astype(int)
-    rows[valid, columns[1 - which]] = -np.einsum("ni,nij->nj", in_other, twists[1 - which][near])
+    columns = [slice(RIGID + k * len(BENDS), RIGID + (k + 1) * len(BENDS)) for k in (0, 1)]
+    rows = np.zeros((len(points), PARAMETERS))
+    rows[valid, :RIGID] = pull if which == 1 else -pull
+    rows[valid, columns[which]] = np.einsum("ni,nij->nj", pull, twists[which][ours.plane[valid]])
+    rows[valid, columns[1 - which]] = -np.einsum("ni,nij->nj", pull, twists[1 - which][near])
     return OneWay(ours.values, found, rows, points)
 
 

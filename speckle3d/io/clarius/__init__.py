@@ -4,8 +4,7 @@ What is read, what is assumed and why is in ``docs/howto/clarius.md``, and with 
 """
 
 from speckle3d.io.clarius.package import is_package
-from speckle3d.io.clarius.reader import FORMAT, package_files, read_package
-from speckle3d.io.clarius.told import describe_package, package_notes
+from speckle3d.io.clarius.reader import FORMAT, open_package, package_files
 from speckle3d.io.readers import Reader
 
-READER = Reader(FORMAT, is_package, read_package, describe_package, package_files, package_notes)
+READER = Reader(FORMAT, is_package, open_package, companions=package_files)

@@ -7,11 +7,9 @@ in rad/s is seen in the two public recordings: its readings differ by multiples 
 say deg/s [1]_). The accelerometer's norm at rest is 0.92 and 0.96 there, not 1: its scale is not
 calibrated, and is left so. The magnetometer's is 1.19 and 1.14, twice the earth's field.
 
-The quaternion is documented by its names, q0 to q3, alone. In every recording it is taken as each of four
-candidates: scalar first or last, ``world_from_sensor`` or its inverse. A candidate fits if it turns the
-measured acceleration to the world's vertical, and turns as much between samples as the gyroscope says; of
-those that fit, the first is used unless another fits twice as well. In both recordings scalar first,
-``world_from_sensor`` fits to 0.7 deg. They are too still for the gyroscope to tell.
+The quaternion is documented by its names, q0 to q3, alone. It is taken scalar first, ``world_from_sensor``,
+and believed where it turns the measured acceleration to the world's vertical: within 0.7 deg in both public
+recordings.
 
 With it, the measured acceleration points along the world's -z in both. Either z is down and the sensor
 measures specific force (up at rest), or z is up and it gives the direction of gravity. The second is
@@ -33,9 +31,8 @@ References
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections import Counter
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,40 +42,27 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import RIGID_TOLERANCE
 from speckle3d.core.streams import DEFAULT_MAX_GAP_S, TimedRotations
 from speckle3d.core.sweep import OrientationSensor
-from speckle3d.io.clarius.documents import documents_of, quantity, shown
 from speckle3d.io.clarius.package import Member
+from speckle3d.io.clarius.sidecars import Fields, fields_of
+from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.recordings import Row
 
 G_M_S2 = 9.80665
+MEANING = "scalar first, world from sensor"
 
-MEANINGS = (
-    "scalar first, world from sensor",
-    "scalar first, sensor from world",
-    "scalar last, world from sensor",
-    "scalar last, sensor from world",
-)
-"""What a quaternion q0 to q3 may mean, the likeliest first."""
-
-_AXES = "xyz"
-_STAMP = re.compile(r"[0-9]{1,19}")
+_NAMES = [f"{name} {axis}" for name in ("accelerometer", "gyroscope", "magnetometer") for axis in "xyz"]
+_BREAK = re.compile(r"^---.*$", re.MULTILINE)
 _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
-
 _LEAST_G, _MOST_G = 0.8, 1.2
 """0.92 and 0.96 in the recordings at hand."""
-
-_SURE_DEG = 1.0
-_WINDOW_S = 0.25
-_STILL_DEG = 2.0
-"""Below this rotation in a window, noise and the gaps between samples hide what the gyroscope tells: both
-recordings at hand have 0.2 to 1 deg, by the quaternion, that is not in the gyroscope's readings."""
-
 _PAUSE_S = 0.03
 """Longer than two periods at 80 Hz: a burst has ended."""
 
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Samples of the sensor in the file's order, repeated ones dropped.
+    """Samples of the sensor; those of no use are left out.
 
     Attributes
     ----------
@@ -89,17 +73,16 @@ class SensorSamples:
     magnetometer_gauss : ndarray, shape (m, 3), optional
     quaternion : ndarray, shape (m, 4), optional
         q0 to q3.
-    repeated : int
-        Samples left out.
+    remarks : tuple of str
+        Samples left out, and what is odd of the others.
     """
 
-    where: str
     time_s: FloatArray
     accelerometer_g: FloatArray
     gyroscope_rad_s: FloatArray
     magnetometer_gauss: FloatArray | None
     quaternion: FloatArray | None
-    repeated: int
+    remarks: tuple[str, ...]
 
     def __len__(self) -> int:
         return int(self.time_s.size)
@@ -107,14 +90,14 @@ class SensorSamples:
     def accelerometer_m_s2(self, fit: Fit | None) -> FloatArray:
         """Specific force, shape (m, 3): what is measured, or against it, as the quaternion's z tells.
 
-        Against it where no quaternion fits, as in both public recordings.
+        Against it where the quaternion is not believed, as in both public recordings.
         """
         return (-1.0 if fit is None else fit.vertical) * G_M_S2 * self.accelerometer_g
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How well one meaning of the quaternion agrees with the sensor's other readings.
+    """The quaternion's rotations, and how well they agree with gravity.
 
     Attributes
     ----------
@@ -122,32 +105,12 @@ class Fit:
         1 where the measured acceleration points along the world's z, -1 where against it.
     off_vertical_deg : float
         RMS angle of the acceleration from it.
-    off_gyroscope_deg, turned_deg : float
-        RMS difference from the gyroscope in windows of 0.25 s, and what the gyroscope says; NaN without such.
     """
 
-    meaning: str
     world_from_sensor: Rotation
     vertical: float
     off_vertical_deg: float
-    off_gyroscope_deg: float
-    turned_deg: float
-
-    @property
-    def still(self) -> bool:
-        """Whether the recording turns too little for the gyroscope to tell."""
-        return not self.turned_deg > _STILL_DEG
-
-    @property
-    def fits(self) -> bool:
-        """Whether it may be what is meant."""
-        agrees = self.still or self.off_gyroscope_deg < self.turned_deg / 2
-        return self.off_vertical_deg < _MOST_OFF_DEG and agrees
-
-    @property
-    def off_deg(self) -> float:
-        """Both differences together."""
-        return float(np.hypot(self.off_vertical_deg, 0.0 if self.still else self.off_gyroscope_deg))
+    meaning: str = MEANING
 
 
 def read_samples(member: Member) -> SensorSamples:
@@ -158,66 +121,70 @@ def read_samples(member: Member) -> SensorSamples:
     FileError
         If the file cannot be read.
     InvalidInputError
-        Naming the sample whose clock goes back, or whose field is missing.
+        If no sample is of use.
     """
     where = member.where
-    rows: list[FloatArray] = []
-    times: list[int] = []
-    seen: dict[int, int] = {}
-    repeated = 0
-    for i, fields in enumerate(documents_of(member.text(), where)):
-        stamp = fields.get("timestamp")
-        if not isinstance(stamp, str) or _STAMP.fullmatch(stamp) is None or int(stamp) >= 2**63:
-            raise InvalidInputError(
-                f"{where}: sample {i}: timestamp: expected nanoseconds, got {shown(stamp)}"
-            )
-        time_ns = int(stamp)
-        row = _row(fields, f"{where}: sample {i}")
-        known = seen.get(time_ns, len(rows) - 1 if rows else None)
-        if known is not None and np.array_equal(rows[known], row, equal_nan=True):
-            repeated += 1
-            continue
-        if times and time_ns <= times[-1]:
-            raise InvalidInputError(
-                f"{where}: sample {i}: timestamp: expected one after {times[-1]} ns, got {time_ns} ns: the "
-                "clock was reset, or samples are out of order"
-            )
-        seen[time_ns] = len(rows)
-        rows.append(row)
-        times.append(time_ns)
-    if not rows:
-        raise InvalidInputError(f"{where}: expected samples of the sensor, got none")
-    table = np.array(rows)
-    _require_alike(where, table)
-    magnetometer, quaternion = table[:, 6:9], table[:, 9:]
+    documents = [text for text in _BREAK.split(member.text()) if text.strip()]
+    table = np.full((len(documents), 13), np.nan)
+    stamps = np.full(len(documents), np.nan)
+    reasons: Counter[str] = Counter()
+    fault: InvalidInputError | None = None
+    start_ns: int | None = None
+    for i, text in enumerate(documents):
+        try:
+            fields = Fields(fields_of(text, f"{where}: sample {i}"), f"{where}: sample {i}")
+            time_ns = fields.whole("timestamp")
+            start_ns = time_ns if start_ns is None else start_ns
+            table[i] = _row(fields)
+            stamps[i] = time_ns - start_ns  # exact, which seconds since 1970 would not be
+        except InvalidInputError as error:
+            fault = fault or error
+            reasons["that cannot be read"] += 1
+    wanted = np.isfinite(table).mean(axis=0) > 0.5  # a magnetometer and a quaternion are in some files alone
+    table[:, ~wanted] = 0.0
+    sound = np.isfinite(stamps) & np.isfinite(table).all(axis=1)
+    if wanted[9:].all():
+        sound &= np.abs(np.linalg.norm(table[:, 9:], axis=1) - 1.0) < RIGID_TOLERANCE
+    reasons["without a value, or a quaternion of unit length"] = int(np.sum(np.isfinite(stamps) & ~sound))
+    rows = np.flatnonzero(sound)
+    again = np.r_[False, (np.diff(table[rows], axis=0) == 0).all(axis=1)] if rows.size else rows.astype(bool)
+    reasons["with the values of the one before"] = int(again.sum())
+    rows = rows[~again]
+    kept = rows[rising(stamps[rows])]
+    reasons["with a time that is not after the one before"] = rows.size - kept.size
+    if not kept.size or start_ns is None or not wanted[:6].all():
+        raise fault or InvalidInputError(f"{where}: expected samples of the sensor, got none of use")
+    table, time_s = table[kept], (start_ns + stamps[kept].astype(np.int64)) / 1e9
+    remarks = left_out("samples of the sensor", len(documents), reasons, time_s)
+    norm_g = _norm(table[:, :3])
+    if not _LEAST_G <= norm_g <= _MOST_G:
+        guess = " (in m/s^2?)" if _LEAST_G <= norm_g / G_M_S2 <= _MOST_G else ""
+        remarks.append(
+            f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale "
+            "is "
+            f"another than assumed{guess}"
+        )
     return SensorSamples(
-        where=where,
-        time_s=np.array(times, dtype=np.int64) / 1e9,
-        accelerometer_g=table[:, :3],
-        gyroscope_rad_s=table[:, 3:6],
-        magnetometer_gauss=None if np.isnan(magnetometer).all() else magnetometer,
-        quaternion=None if np.isnan(quaternion).all() else _unit(where, quaternion),
-        repeated=repeated,
+        time_s,
+        table[:, :3],
+        table[:, 3:6],
+        table[:, 6:9] if wanted[6:9].all() else None,
+        table[:, 9:] if wanted[9:].all() else None,
+        tuple(remarks),
     )
 
 
-def fits_of(samples: SensorSamples) -> tuple[Fit, ...]:
-    """Try each meaning of the quaternion, the likeliest first; none where there is no quaternion."""
-    if samples.quaternion is None:
-        return ()
-    first, last = (Rotation.from_quat(samples.quaternion, scalar_first=order) for order in (True, False))
-    candidates = (first, first.inv(), last, last.inv())
-    return tuple(_fit(samples, *each) for each in zip(MEANINGS, candidates, strict=True))
-
-
-def meaning_of(fits: tuple[Fit, ...]) -> Fit | None:
-    """Choose what the quaternion means; None where nothing fits."""
-    fitting = [each for each in fits if each.fits]
-    if not fitting:
+def fit_of(samples: SensorSamples) -> Fit | None:
+    """Check the quaternion against gravity; None where there is none, or it does not agree."""
+    norms = np.linalg.norm(samples.accelerometer_g, axis=1)
+    felt = norms > 0
+    if samples.quaternion is None or not felt.any():
         return None
-    best = min(fitting, key=lambda each: each.off_deg)
-    likely = fitting[0]
-    return likely if likely.off_deg < max(2 * best.off_deg, _SURE_DEG) else best
+    turned = Rotation.from_quat(samples.quaternion, scalar_first=True)
+    along = turned[felt].apply(samples.accelerometer_g[felt])[:, 2] / norms[felt]
+    sign = 1.0 if along.mean() >= 0 else -1.0
+    off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
+    return Fit(turned, sign, float(off)) if off < _MOST_OFF_DEG else None
 
 
 def orientation_sensor(samples: SensorSamples, fit: Fit) -> OrientationSensor:
@@ -230,130 +197,42 @@ def orientation_sensor(samples: SensorSamples, fit: Fit) -> OrientationSensor:
     )
 
 
-def sensor_rows(samples: SensorSamples, fits: tuple[Fit, ...]) -> list[tuple[str, str, str]]:
-    """Tell what the sensor recorded, and what its quaternion was found to mean."""
+def sensor_rows(samples: SensorSamples, fit: Fit | None) -> list[Row]:
+    """Tell what the sensor recorded, and whether its quaternion agrees with gravity."""
     steps = np.diff(samples.time_s)
-    pauses = steps[steps > _PAUSE_S]
+    unbridged = f"over {DEFAULT_MAX_GAP_S:g} s"
     rows = [
         ("sensor samples", str(len(samples)), ""),
-        ("sensor samples repeated, left out", str(samples.repeated), ""),
-        ("sensor pauses", str(pauses.size), f"over {1e3 * _PAUSE_S:g} ms"),
-        (
-            "sensor pauses not bridged",
-            str(np.sum(pauses > DEFAULT_MAX_GAP_S)),
-            f"over {DEFAULT_MAX_GAP_S:g} s",
-        ),
+        ("sensor pauses", str(np.sum(steps > _PAUSE_S)), f"over {1e3 * _PAUSE_S:g} ms"),
+        ("sensor pauses not bridged", str(np.sum(steps > DEFAULT_MAX_GAP_S)), unbridged),
         ("sensor, longest pause", f"{steps.max(initial=0.0):.3f}", "s"),
         ("accelerometer, median norm", f"{_norm(samples.accelerometer_g):.3f}", "g"),
     ]
     if samples.magnetometer_gauss is not None:
         rows.append(("magnetometer, median norm", f"{_norm(samples.magnetometer_gauss):.3f}", "gauss"))
+    if fit is None:
+        words = "none in the file" if samples.quaternion is None else "none that agrees with gravity"
+        return [*rows, ("quaternion", f"{words}: see `speckle3d imu orient`", "")]
+    sign = "specific force" if fit.vertical > 0 else "gravity (against the world's z): negated"
     rows += [
-        (f"quaternion as {each.meaning}, off the vertical", f"{each.off_vertical_deg:.2f}", "deg RMS")
-        for each in fits
+        ("quaternion", f"{fit.meaning} (checked against the accelerometer)", ""),
+        ("quaternion, off the vertical", f"{fit.off_vertical_deg:.2f}", "deg RMS"),
+        ("accelerometer taken as", sign, ""),
     ]
-    chosen = meaning_of(fits)
-    if chosen is None:
-        said = "none that the sensor's other readings agree with" if fits else "none in the file"
-        return [*rows, ("quaternion", f"{said}: see `speckle3d imu orient`", "")]
-    rows.append(("quaternion", f"{chosen.meaning} (checked against the accelerometer)", ""))
-    told = (
-        "too still to tell" if chosen.still else f"{chosen.off_gyroscope_deg:.2f} of {chosen.turned_deg:.2f}"
-    )
-    rows.append(("quaternion, off the gyroscope", told, "" if chosen.still else "deg RMS in 0.25 s"))
-    sign = "specific force" if chosen.vertical > 0 else "gravity (against the world's z): negated"
-    rows.append(("accelerometer taken as", sign, ""))
     if samples.magnetometer_gauss is not None:
-        x, y, z = chosen.world_from_sensor.apply(samples.magnetometer_gauss).mean(axis=0)
+        x, y, z = fit.world_from_sensor.apply(samples.magnetometer_gauss).mean(axis=0)
         rows.append(("magnetic field, from the world's x", f"{np.rad2deg(np.arctan2(y, x)):.0f}", "deg"))
         rows.append(("magnetic field, dip", f"{np.rad2deg(np.arctan2(-z, np.hypot(x, y))):.0f}", "deg"))
     return rows
 
 
-def sensor_notes(samples: SensorSamples) -> list[str]:
-    """Say what a hand cannot feel: another acceleration than about 1 g."""
-    norm_g = _norm(samples.accelerometer_g)
-    if _LEAST_G <= norm_g <= _MOST_G:
-        return []
-    guess = " (in m/s^2?)" if _LEAST_G <= norm_g / G_M_S2 <= _MOST_G else ""
-    return [
-        f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale is "
-        f"another than assumed{guess}"
-    ]
-
-
-def _row(fields: Mapping[str, Any], where: str) -> FloatArray:
-    values = [
-        quantity(fields.get(f"{name} {axis}"), "", f"{where}: {name} {axis}")
-        for name in ("accelerometer", "gyroscope")
-        for axis in _AXES
-    ]
-    values += [
-        np.nan if (value := fields.get(f"magnetometer {axis}")) is None else quantity(value, "", where)
-        for axis in _AXES
-    ]
-    quaternion = fields.get("orientation")
-    if quaternion is None:
-        return np.array([*values, *[np.nan] * 4])
-    if not isinstance(quaternion, dict):
-        raise InvalidInputError(f"{where}: orientation: expected q0 to q3, got {shown(quaternion)}")
-    turn = [quantity(quaternion.get(f"q{i}"), "", f"{where}: orientation: q{i}") for i in range(4)]
-    return np.array([*values, *turn])
-
-
-def _require_alike(where: str, table: FloatArray) -> None:
-    """Refuse samples of which some have a magnetometer or a quaternion and some not."""
-    for name, columns in (("magnetometer", table[:, 6:9]), ("orientation", table[:, 9:])):
-        lacking = np.isnan(columns).any(axis=1)
-        if lacking.any() and not lacking.all():
-            first = int(np.argmax(lacking))
-            raise InvalidInputError(f"{where}: sample {first}: {name}: expected one, got none")
-
-
-def _unit(where: str, quaternion: FloatArray) -> FloatArray:
-    norms = np.linalg.norm(quaternion, axis=1)
-    if (bad := np.flatnonzero(np.abs(norms - 1) > RIGID_TOLERANCE)).size:
-        raise InvalidInputError(
-            f"{where}: sample {bad[0]}: orientation: expected a unit quaternion, got norm {norms[bad[0]]:.6g}"
-        )
-    return quaternion
-
-
-def _fit(samples: SensorSamples, meaning: str, world_from_sensor: Rotation) -> Fit:
-    norms = np.linalg.norm(samples.accelerometer_g, axis=1)
-    felt = norms > 0
-    if not felt.any():
-        return Fit(meaning, world_from_sensor, 1.0, np.inf, np.nan, np.nan)
-    along = world_from_sensor[felt].apply(samples.accelerometer_g[felt])[:, 2] / norms[felt]
-    sign = 1.0 if along.mean() >= 0 else -1.0
-    off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
-    turned = _turns(samples, world_from_sensor)
-    off_gyroscope, gyroscope = (np.nan, np.nan) if turned is None else turned
-    return Fit(meaning, world_from_sensor, sign, float(off), off_gyroscope, gyroscope)
-
-
-def _turns(samples: SensorSamples, world_from_sensor: Rotation) -> tuple[float, float] | None:
-    """RMS difference of quaternion and gyroscope in windows without long pauses, and RMS rotation, deg."""
-    time_s, rate = samples.time_s, samples.gyroscope_rad_s
-    steps = np.diff(time_s)
-    turns = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * steps[:, None])
-    apart, by_gyroscope = [], []
-    first = 0
-    while first < steps.size:
-        stop = int(np.searchsorted(time_s, time_s[first] + _WINDOW_S))
-        stop = min(max(stop, first + 1), steps.size)
-        if steps[first:stop].max() <= DEFAULT_MAX_GAP_S:
-            turned = Rotation.identity()
-            for each in turns[first:stop]:
-                turned = turned * each
-            found = world_from_sensor[first].inv() * world_from_sensor[stop]
-            apart.append((turned.inv() * found).magnitude())
-            by_gyroscope.append(turned.magnitude())
-        first = stop
-    if not apart:
-        return None
-    rms = (float(np.rad2deg(np.sqrt(np.mean(np.square(values))))) for values in (apart, by_gyroscope))
-    return next(rms), next(rms)
+def _row(fields: Fields) -> list[float]:
+    """Accelerometer, gyroscope, magnetometer and quaternion of a sample; NaN of what it lacks."""
+    values = [fields.optional(name) for name in _NAMES]
+    turn = fields.values.get("orientation")
+    inner = Fields(turn if isinstance(turn, dict) else {}, f"{fields.where}: orientation")
+    values += [inner.optional(f"q{i}") for i in range(4)]
+    return [np.nan if value is None else value for value in values]
 
 
 def _norm(vectors: FloatArray) -> float:

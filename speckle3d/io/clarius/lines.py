@@ -100,36 +100,21 @@ def place_of(said: Description, cropped: bool) -> Place:
     """
     if said.radius_mm:
         raise InvalidInputError(_polar(said.where, f"a curved array of {said.radius_mm:g} mm radius"))
-    _require_straight(said)
+    if (steered := np.flatnonzero(said.angle_deg)).size:
+        i = int(steered[0])
+        raise InvalidInputError(
+            f"{said.where}: lines[{i}]: angle: expected 0 (lines that are not steered), got "
+            f"{said.angle_deg[i]:g} deg, and {steered.size} of {said.lines} lines steered: record without "
+            "steering and Doppler"
+        )
     lines, samples = slice(0, said.lines), slice(0, said.samples)
     if cropped and said.roi is not None:
         roi = said.roi
         lines, samples = slice(roi.start_line, roi.end_line + 1), slice(roi.start_sample, roi.end_sample + 1)
-    elements = said.geometry.receive_element[lines]
-    step = _step(said, elements, lines.start)
+    elements = said.receive_element[lines]
+    step = _step(f"{said.where}: lines", elements, lines.start)
     first_sample = None if said.delay_samples is None else said.delay_samples + samples.start
     return Place(lines, samples, float(elements[0]), float(elements[-1]), step, first_sample)
-
-
-def require_roi(said: Description) -> None:
-    """Refuse a region of interest that is not inside the frame.
-
-    Raises
-    ------
-    InvalidInputError
-        Naming the field.
-    """
-    roi = said.roi
-    if roi is None:
-        return
-    for what, first, last, count in (
-        ("line", roi.start_line, roi.end_line, said.lines),
-        ("sample", roi.start_sample, roi.end_sample, said.samples),
-    ):
-        if not first < last < count:
-            raise InvalidInputError(
-                f"{said.where}: roi: expected {what}s from 0 to {count - 1}, got {first} to {last}"
-            )
 
 
 def probe_name(said: Description, probe: str | None) -> str:
@@ -139,51 +124,41 @@ def probe_name(said: Description, probe: str | None) -> str:
     return f"Clarius {model}" if model in ELEMENT_PITCH_MM else named
 
 
-def _model(named: str) -> str:
-    return re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
-
-
-@dataclass(frozen=True)
-class Pitch:
-    """Distance between lines, between elements, and where they are from."""
-
-    vector_mm: float
-    element_mm: float
-    source: str
-
-
-def pitch_of(said: Description, place: Place, settings: ImportSettings) -> Pitch | None:
-    """Find the distance between lines; None where nothing tells.
+def pitch_of(said: Description, place: Place, settings: ImportSettings) -> tuple[float, str] | None:
+    """Find the distance between lines, mm, and where it is from; None where nothing tells.
 
     Raises
     ------
     InvalidInputError
         If two sources contradict each other, the model's lines are not parallel, or it is not known.
     """
-    model_mm = _model_pitch_mm(said, settings)
     per_line = place.elements_per_line
-    given_mm, line_mm = settings.element_pitch_mm, settings.vector_pitch_mm
-    if given_mm is not None and line_mm is not None:
-        _require_alike(said, "--vector-pitch-mm", line_mm / per_line, "--element-pitch-mm", given_mm)
-    option = None if line_mm is None else line_mm / per_line
-    option = given_mm if option is None else option
-    named = "--element-pitch-mm" if line_mm is None else f"--vector-pitch-mm / {per_line:g} elements a line"
-    if settings.probe is not None and model_mm is not None:
-        if option is not None:
-            _require_alike(said, named, option, f"--probe {settings.probe}", model_mm)
-        if said.element_pitch_mm is not None:
-            _require_alike(said, "probe: pitch", said.element_pitch_mm, f"--probe {settings.probe}", model_mm)
-    if line_mm is not None:
-        return Pitch(line_mm, line_mm / per_line, "as given")
-    for element_mm, source in (
-        (given_mm, "as given"),
-        (said.element_pitch_mm, "its yml"),
-        (model_mm, f"the maker's table, {_model(settings.probe or said.probe)}"),
-    ):
+    given = {
+        "--element-pitch-mm": settings.element_pitch_mm,
+        f"--vector-pitch-mm / {per_line:g} elements a line": (
+            None if settings.vector_pitch_mm is None else settings.vector_pitch_mm / per_line
+        ),
+        f"--probe {settings.probe}": None if settings.probe is None else _model_pitch_mm(said, settings),
+    }
+    _require_alike(said, given)
+    if settings.probe is not None and settings.element_pitch_mm is None and settings.vector_pitch_mm is None:
+        _require_alike(said, {**given, "probe: pitch of the yml": said.element_pitch_mm})
+    if settings.vector_pitch_mm is not None:
+        return settings.vector_pitch_mm, "as given"
+    model_mm = _model_pitch_mm(said, settings)
+    sources = {
+        "as given": settings.element_pitch_mm,
+        "its yml": said.element_pitch_mm,
+        f"the maker's table, {_model(settings.probe or said.probe)}": model_mm,
+    }
+    for source, element_mm in sources.items():
         if element_mm is not None:
-            whole = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
-            return Pitch(element_mm * per_line, element_mm, whole)
+            return element_mm * per_line, f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
     return None
+
+
+def _model(named: str) -> str:
+    return re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
 
 
 def _model_pitch_mm(said: Description, settings: ImportSettings) -> float | None:
@@ -196,56 +171,43 @@ def _model_pitch_mm(said: Description, settings: ImportSettings) -> float | None
         raise InvalidInputError(_polar(said.where, f"the probe {named}"))
     if settings.element_pitch_mm or settings.vector_pitch_mm or said.element_pitch_mm:
         return None
-    known = ", ".join(ELEMENT_PITCH_MM)
     raise InvalidInputError(
-        f"{said.where}: --probe: expected a model whose element pitch is published ({known}), got "
-        f"{named[:40]!r}: give --element-pitch-mm"
+        f"{said.where}: --probe: expected a model whose element pitch is published "
+        f"({', '.join(ELEMENT_PITCH_MM)}), got {named[:40]!r}: give --element-pitch-mm"
     )
 
 
-def _require_alike(said: Description, one: str, one_mm: float, other: str, other_mm: float) -> None:
-    """Refuse two element pitches that are not of one array."""
-    if abs(one_mm - other_mm) > _ALIKE * other_mm:
-        raise InvalidInputError(
-            f"{said.where}: expected one distance between elements, got {one_mm:.4g} mm ({one}) and "
-            f"{other_mm:.4g} mm ({other})"
-        )
+def _require_alike(said: Description, pitches: dict[str, float | None]) -> None:
+    """Refuse element pitches that are not of one array."""
+    known = [(name, pitch) for name, pitch in pitches.items() if pitch is not None]
+    for name, pitch in known[1:]:
+        if abs(pitch - known[0][1]) > _ALIKE * pitch:
+            raise InvalidInputError(
+                f"{said.where}: expected one distance between elements, got {known[0][1]:.4g} mm "
+                f"({known[0][0]}) and {pitch:.4g} mm ({name})"
+            )
 
 
-def _require_straight(said: Description) -> None:
-    angles = said.geometry.angle_deg
-    if (steered := np.flatnonzero(angles)).size:
-        i = int(steered[0])
-        raise InvalidInputError(
-            f"{said.where}: lines[{i}]: angle: expected 0 (lines that are not steered), got {angles[i]:g} "
-            f"deg, and {steered.size} of {angles.size} lines steered: record without steering and Doppler"
-        )
-
-
-def _step(said: Description, elements: FloatArray, first: int) -> float:
+def _step(where: str, elements: FloatArray, first: int) -> float:
     """Distance between lines, in elements."""
-    where = f"{said.where}: lines"
     if elements.size < 2:
         raise InvalidInputError(f"{where}: expected two lines or more, got {elements.size}")
     steps = np.diff(elements)
-    if (again := np.flatnonzero(steps == 0)).size:
-        raise InvalidInputError(
-            f"{where}[{first + int(again[0]) + 1}]: rx element: expected one line a place, got several at "
-            f"{elements[again[0]]:g}: packets of a Doppler mode are no image"
-        )
     step = float((elements[-1] - elements[0]) / (elements.size - 1))
-    if step <= 0:
-        i = 1 + int(np.argmax(steps < 0))
+    if not (steps > 0).all():
+        i = int(np.argmax(steps <= 0))
+        got = "again" if steps[i] == 0 else f"after {elements[i]:g}"
         raise InvalidInputError(
-            f"{where}[{first + i}]: rx element: expected lines from the lowest element up, got "
-            f"{elements[i]:g} after {elements[i - 1]:g}"
+            f"{where}[{first + i + 1}]: rx element: expected lines from the lowest element up, one a place, "
+            "got "
+            f"{elements[i + 1]:g} {got}: packets of a Doppler mode are no image"
         )
     off = np.abs(elements - elements[0] - step * np.arange(elements.size))
     if off.max() > _EVEN * step:
         i = int(np.argmax(off))
         raise InvalidInputError(
-            f"{where}[{first + i}]: rx element: expected evenly spaced lines, got "
-            f"{elements[i]:g} where {elements[0] + step * i:g} is even"
+            f"{where}[{first + i}]: rx element: expected evenly spaced lines, got {elements[i]:g} where "
+            f"{elements[0] + step * i:g} is even"
         )
     return step
 

@@ -17,21 +17,16 @@ from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
+from speckle3d.io.hdf5 import one_line, reading
 
 KINDS = ("rf", "iq", "env")
 """Names of raw files, the preferred one first."""
 
-_RAW = re.compile(r"(?:(?P<name>.*)_)?(?P<kind>rf|iq|env)\.raw(?:\.lzo)?")
-_SIDE = re.compile(r"(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<what>tgc\.yml|tgc|yml|yaml)")
-
+_NAME = re.compile(
+    r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<what>raw|raw\.lzo|tgc\.yml|tgc|yml|yaml)"
+)
 _FIELD = re.compile(rb"^(?:# raw data parameters|# tgc curves|sampling rate:|size:|timestamp:)", re.MULTILINE)
 _LOOKED_AT = 4096
-
-_MOST_MEMBERS = 10_000
-"""A package has a dozen."""
-
-_MOST_TEXT_BYTES = 2**26
-"""An hour of the sensor at 80 Hz."""
 
 
 @dataclass(frozen=True)
@@ -58,35 +53,23 @@ class Member:
         """Name for messages: the file, and the member where it is one."""
         return str(self.path) if self.path.name == Path(self.name).name else f"{self.path}: {self.name}"
 
-    def begins(self, size: int) -> bytes:
-        """Read its first bytes."""
-        with open_regular(self.path) as stream:
-            stream.seek(self.start)
-            return stream.read(min(size, self.size))
+    def read(self, start: int = 0, size: int | None = None) -> bytes:
+        """Read bytes from `start` on, all by default; fewer where the member ends."""
+        count = max(self.size - start, 0) if size is None else max(min(size, self.size - start), 0)
+        with reading(self.where), open_regular(self.path) as stream:
+            stream.seek(self.start + start)
+            return stream.read(count)
 
     def text(self) -> str:
-        """Read all of it as text in UTF-8.
-
-        Raises
-        ------
-        FileError
-            If it cannot be read, or is far too long.
-        InvalidInputError
-            If it is no text.
-        """
-        if self.size > _MOST_TEXT_BYTES:
-            raise FileError(f"{self.where}: expected at most {_MOST_TEXT_BYTES} bytes, got {self.size}")
-        with open_regular(self.path) as stream:
-            stream.seek(self.start)
-            content = stream.read(self.size)
+        """All of it as text in UTF-8."""
         try:
-            return content.decode("utf-8-sig")
+            return self.read().decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise InvalidInputError(f"{self.where}: expected text in UTF-8, got other bytes") from error
 
 
 @dataclass(frozen=True)
-class Recording:
+class Files:
     """Files of one recording.
 
     Attributes
@@ -99,7 +82,7 @@ class Recording:
         By `KINDS`: samples, their description (yml), and gain by frame (tgc).
     sensor : Member, optional
         Samples of the sensor (imu).
-    cut : bool
+    is_cut : bool
         Whether a tar file ends without the blocks that close one: what came after may be missing.
     """
 
@@ -109,7 +92,7 @@ class Recording:
     settings: Mapping[str, Member] = field(default_factory=dict)
     gains: Mapping[str, Member] = field(default_factory=dict)
     sensor: Member | None = None
-    cut: bool = False
+    is_cut: bool = False
 
     @property
     def members(self) -> tuple[Member, ...]:
@@ -119,37 +102,23 @@ class Recording:
 
 
 def is_package(path: Path, start: bytes) -> bool:
-    """Whether a file or folder looks like a package, or one raw file of one."""
+    """Whether a file or folder looks like a package, or one file of one."""
     try:
         if path.is_dir():
-            return any(_is_own(each, each.name) for each in path.iterdir())
-        if _SIDE.fullmatch(path.name):
-            return _is_own(path, path.name)
-        if _RAW.fullmatch(path.name):
-            return bool(_sidecar(path, "yml"))
+            return any(map(_is_own, _folder_members(path)))
+        if (name := _NAME.fullmatch(path.name)) is not None:
+            beside = {member.name for member in _folder_members(path.parent)}
+            stem = path.name.removesuffix(".lzo").removesuffix(".raw")
+            is_raw = name["what"].startswith("raw")
+            return bool({f"{stem}.yml", f"{stem}.yaml"} & beside) if is_raw else _is_own(_whole(path))
         if path.suffix.lower() != ".tar" and start[257:262] != b"ustar":
             return False
-        with open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
-            return any(
-                _is_own(path, Path(each.name).name, each.offset_data) for each in archive if each.isfile()
-            )
-    except (OSError, ValueError, tarfile.TarError, EOFError, MemoryError):
+        return any(map(_is_own, _tar_members(path)[0]))
+    except (OSError, ValueError):
         return False
 
 
-def _is_own(file: Path, name: str, start: int = 0) -> bool:
-    """Whether a file is one of a package by its name and, but for raw files, its content."""
-    if _parsed(name) is None:
-        return False
-    return _RAW.fullmatch(name) is not None or _has_fields(Member(file, name, start, _LOOKED_AT))
-
-
-def _has_fields(member: Member) -> bool:
-    """Whether a sidecar begins as the scanner writes them, unlike others' ``my_env.yml``."""
-    return _FIELD.search(member.begins(_LOOKED_AT)) is not None
-
-
-def find_recording(path: Path) -> Recording:
+def find_files(path: Path) -> Files:
     """Find the files of a recording.
 
     Parameters
@@ -162,159 +131,99 @@ def find_recording(path: Path) -> Recording:
     FileError
         If the package cannot be read.
     InvalidInputError
-        If it holds several recordings or none, or members that reach outside it.
+        If it holds several recordings or none.
     """
     if path.is_dir():
         return _only(path, _folder_members(path))
-    if (named := _parsed(path.name)) is None:
-        members, cut = _tar_members(path)
-        return replace(_only(path, members), cut=cut)
-    prefix, kind = named
-    beside = [each for each in _folder_members(path.parent) if _parsed(Path(each.name).name) == named]
-    kinds = (kind,) if kind != "imu" else (*KINDS, kind)
-    others = [
-        each
-        for each in _folder_members(path.parent)
-        if (other := _parsed(Path(each.name).name)) is not None
-        and other[0] == prefix
-        and other[1] not in kinds
-        and (other[1] == "imu" or _is_gain(each))
-    ]
-    return _only(path, [*beside, *others])
+    name = _NAME.fullmatch(path.name)
+    if name is None:
+        members, is_cut = _tar_members(path)
+        return replace(_only(path, members), is_cut=is_cut)
+    members = []
+    for member in _folder_members(path.parent):
+        other = _parts(member)
+        if other["name"] == name["name"] and (
+            name["kind"] in (other["kind"], "imu")
+            or other["kind"] == "imu"
+            or other["what"].startswith("tgc")
+        ):
+            members.append(member)
+    return _only(path, members)
 
 
-def _is_gain(member: Member) -> bool:
-    return member.name.endswith((".tgc", ".tgc.yml"))
+def _parts(member: Member) -> dict[str, str]:
+    """Recording, kind and content of a file, by its name."""
+    name = _NAME.fullmatch(Path(member.name).name)
+    assert name is not None
+    return {key: value or "" for key, value in name.groupdict().items()} | {"name": name["name"] or ""}
 
 
-def _parsed(name: str) -> tuple[str, str] | None:
-    """Recording and kind of a file by its name; None for other files, and those that file managers hide."""
-    found = None if name.startswith(".") else _RAW.fullmatch(name) or _SIDE.fullmatch(name)
-    return None if found is None else (found["name"] or "", found["kind"])
+def _is_own(member: Member) -> bool:
+    """Whether a file is one that the scanner wrote, unlike others' ``my_env.yml``."""
+    return _parts(member)["what"].startswith("raw") or _FIELD.search(member.read(0, _LOOKED_AT)) is not None
 
 
-def _sidecar(raw: Path, what: str) -> Path | None:
-    stem = raw.name.removesuffix(".lzo").removesuffix(".raw")
-    found = (raw.with_name(f"{stem}.{end}") for end in (what, what.replace("yml", "yaml")))
-    return next((each for each in found if each.is_file()), None)
+def _whole(path: Path) -> Member:
+    with open_regular(path) as stream:
+        return Member(path, path.name, 0, stream.seek(0, 2))
 
 
 def _folder_members(folder: Path) -> list[Member]:
-    inside = folder.resolve()
-    members = []
-    try:
-        names = sorted(each.name for each in folder.iterdir() if _parsed(each.name))
-    except OSError as error:
-        raise FileError(f"{folder}: cannot be read: {error.strerror}") from error
-    for name in names:
-        file = folder / name
-        if not file.resolve().is_relative_to(inside):
-            raise InvalidInputError(
-                f"{file}: expected a file in the package's own folder, got a link out of it"
-            )
-        with open_regular(file) as stream:
-            members.append(Member(file, name, 0, stream.seek(0, 2)))
-    return members
+    with reading(folder):
+        return [
+            _whole(folder / name)
+            for name in sorted(p.name for p in folder.iterdir() if _NAME.fullmatch(p.name))
+        ]
 
 
 def _tar_members(path: Path) -> tuple[list[Member], bool]:
     """Members that are files of packages, and whether the archive lacks its end."""
     members = []
-    try:
-        with open_regular(path) as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
+    with open_regular(path) as stream:
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        try:
             with tarfile.open(fileobj=stream, mode="r:") as archive:
-                for count, entry in enumerate(archive):
-                    if count >= _MOST_MEMBERS:
-                        raise InvalidInputError(f"{path}: expected at most {_MOST_MEMBERS} members, got more")
-                    _require_inside(path, entry)
-                    if not entry.isfile() or _parsed(Path(entry.name).name) is None:
+                for entry in archive:
+                    if not entry.isfile() or _NAME.fullmatch(Path(entry.name).name) is None:
                         continue
                     if entry.offset_data + entry.size > size:
                         raise FileError(
-                            f"{path}: {entry.name}: expected {entry.size} bytes, got "
-                            f"{size - entry.offset_data}: truncated"
+                            f"{path}: {entry.name}: ends early: {size - entry.offset_data} of {entry.size} "
+                            "bytes"
                         )
                     members.append(Member(path, entry.name, entry.offset_data, entry.size))
-                return members, _is_cut(path, archive.offset, size)
-    except (tarfile.TarError, EOFError, ValueError, OverflowError) as error:
-        if isinstance(error, InvalidInputError):
-            raise
-        raise FileError(f"{path}: expected a tar file, got a damaged one: {error}") from error
+                return members, size <= archive.offset
+        except (tarfile.TarError, EOFError, ValueError, OverflowError) as error:
+            raise FileError(f"{path}: expected a tar file, got a damaged one: {one_line(error)}") from error
 
 
-def _is_cut(path: Path, end: int, size: int) -> bool:
-    """Whether nothing closes an archive whose members end at `end`, as some writers leave it.
-
-    Raises
-    ------
-    FileError
-        If part of a header is there, or something that is none: `tarfile` ends in silence.
-    """
-    if size <= end:
-        return True
-    with open_regular(path) as stream:
-        stream.seek(end)
-        block = stream.read(tarfile.BLOCKSIZE)
-    if len(block) < tarfile.BLOCKSIZE:
-        raise FileError(
-            f"{path}: expected a member or the archive's end at byte {end}, got {len(block)} bytes: truncated"
-        )
-    if any(block):
-        raise FileError(f"{path}: expected a member or the archive's end at byte {end}, got other bytes")
-    return False
-
-
-def _require_inside(path: Path, entry: tarfile.TarInfo) -> None:
-    """Refuse members that are not plain files in the archive, or name a place outside it."""
-    parts = re.split(r"[/\\]", entry.name)
-    if ".." in parts or not parts[0] or parts[0].endswith(":"):
-        raise InvalidInputError(f"{path}: expected members inside the package, got {entry.name!r}")
-    if entry.issym() or entry.islnk():
-        raise InvalidInputError(f"{path}: {entry.name}: expected a file, got a link to {entry.linkname!r}")
-    if not (entry.isfile() or entry.isdir()) or entry.issparse():
-        raise InvalidInputError(f"{path}: {entry.name}: expected a plain file, got a device or sparse file")
-
-
-def _only(path: Path, members: list[Member]) -> Recording:
+def _only(path: Path, members: list[Member]) -> Files:
     """Sort members by recording, of which there must be one; others' sidecars alone are none."""
-    found: dict[tuple[str, str], list[tuple[str, Member]]] = {}
-    for each in members:
-        folder, file = str(Path(each.name).parent), Path(each.name).name
-        prefix, kind = _parsed(file) or ("", "")
-        found.setdefault((folder, prefix), []).append((kind, each))
-    found = {name: parts for name, parts in found.items() if any(map(_is_of_package, parts))}
-    if not found:
+    recordings: dict[tuple[str, str], list[Member]] = {}
+    for member in members:
+        place = str(Path(member.name).parent), _parts(member)["name"]
+        recordings.setdefault(place, []).append(member)
+    recordings = {place: parts for place, parts in recordings.items() if any(map(_is_own, parts))}
+    if not recordings:
         raise InvalidInputError(
             f"{path}: expected files like 2024-05-01_rf.raw, _iq.raw, _env.raw and their .yml, got none"
         )
-    if len(found) > 1:
-        names = ", ".join(f"{folder}/{prefix}".removeprefix("./") for folder, prefix in sorted(found))
+    if len(recordings) > 1:
+        names = ", ".join(f"{folder}/{name}".removeprefix("./") for folder, name in sorted(recordings))
         raise InvalidInputError(
-            f"{path}: expected one recording, got {len(found)}: {names}: give the raw file of one (of a tar "
+            f"{path}: expected one recording, got {len(recordings)}: {names}: give the raw file of one (of "
+            "a tar "
             "file: unpack it first)"
         )
-    ((_, prefix), parts), *_ = found.items()
-    return _sorted(path, prefix, parts)
-
-
-def _is_of_package(part: tuple[str, Member]) -> bool:
-    return _RAW.fullmatch(Path(part[1].name).name) is not None or _has_fields(part[1])
-
-
-def _sorted(path: Path, prefix: str, parts: list[tuple[str, Member]]) -> Recording:
-    tables: dict[str, dict[str, Member]] = {"raw": {}, "settings": {}, "gains": {}}
-    sensor = None
-    for kind, each in parts:
-        if kind == "imu":
-            if sensor is not None:
-                raise InvalidInputError(f"{path}: expected one of {sensor.name} and {each.name}, got both")
-            sensor = each
-            continue
-        table = "raw" if ".raw" in each.name[-8:] else "gains" if _is_gain(each) else "settings"
-        if kind in tables[table]:
-            first = tables[table][kind].name
-            raise InvalidInputError(f"{path}: expected one of {first} and {each.name}, got both")
-        tables[table][kind] = each
-    return Recording(path, prefix, tables["raw"], tables["settings"], tables["gains"], sensor)
+    (((_, name), parts),) = recordings.items()
+    tables: dict[str, dict[str, Member]] = {"raw": {}, "tgc": {}, "yml": {}}
+    for member in parts:
+        part = _parts(member)
+        table = tables[part["what"][:3].replace("yam", "yml")]
+        if part["kind"] in table:
+            first = table[part["kind"]].name
+            raise InvalidInputError(f"{path}: expected one of {first} and {member.name}, got both")
+        table[part["kind"]] = member
+    sensor = tables["yml"].pop("imu", None)
+    return Files(path, name, tables["raw"], tables["yml"], tables["tgc"], sensor)

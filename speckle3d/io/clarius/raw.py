@@ -1,54 +1,46 @@
 """Raw files of Clarius scanners: a header of five numbers, then each frame's time and samples.
 
 Header: five uint32 (id, frames, lines, samples of a line, bytes of a sample); then, by frame, a uint64 time
-in nanoseconds and its samples, line by line; all little-endian [1]_.
+in nanoseconds and its samples, line by line; all little-endian [1]_. They may be packed by the program lzop,
+whose blocks are unpacked by lzallright when they are asked for [2]_.
 
 References
 ----------
 .. [1] clariusdev/research, "Raw Data Format" (docs/raw-data-format.md), ".raw binary layout".
+.. [2] M. F. X. J. Oberhumer, lzop 1.04, "File format" (lzop.c, `write_header` and `lzo_compress`).
 """
 
 from __future__ import annotations
 
-import operator
 import struct
-import threading
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from speckle3d.core.arrays import ComplexArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.files import open_regular
-from speckle3d.io.clarius.lzop import Unpacker
+from speckle3d.core.extras import extra_module
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.hdf5 import reading
+from speckle3d.io.clarius.sidecars import Curve, Description
+from speckle3d.io.frames import ReadFrame
 
 HEADER = struct.Struct("<5I")
 _TIME_BYTES = 8
-_MOST_FRAMES = 2**20
-"""Ten hours at 30 frames/s; the scanner's memory holds seconds."""
+_MAGIC = b"\x89LZO\x00\r\n\x1a\n"
+_KEPT_BLOCKS = 8
 
-SAMPLES: dict[str, tuple[np.dtype[Any], int, np.dtype[Any]]] = {
-    "RF": (np.dtype("<i2"), 1, np.dtype(np.int16)),
-    "IQ": (np.dtype("<i2"), 2, np.dtype(np.complex64)),
-    "envelope": (np.dtype("u1"), 1, np.dtype(np.uint8)),
-}
-"""By kind: type of the numbers in the file, how many make a sample, and type of the frames."""
-
-
-class Factors(Protocol):
-    """Factors of the samples of each frame, or of one for all; an array, or made when they are asked for."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: int, /) -> Any: ...
+_SAMPLES = {"RF": ("<i2", 1), "IQ": ("<i2", 2), "envelope": ("u1", 1)}
+"""By kind: type of the numbers in the file, and how many make a sample."""
 
 
 @dataclass(frozen=True)
 class RawHeader:
-    """What a raw file says of itself."""
+    """What a raw file says of itself, checked against its yml."""
 
     frames: int
     lines: int
@@ -56,167 +48,191 @@ class RawHeader:
     sample_bytes: int
 
     @property
-    def frame_bytes(self) -> int:
-        """Bytes of a frame without its time."""
-        return self.lines * self.samples * self.sample_bytes
-
-    @property
-    def file_bytes(self) -> int:
-        """Bytes of the whole file."""
-        return HEADER.size + self.frames * (_TIME_BYTES + self.frame_bytes)
+    def step_bytes(self) -> int:
+        """Bytes from frame to frame."""
+        return _TIME_BYTES + self.lines * self.samples * self.sample_bytes
 
 
-class RawFile:
-    """A raw file, packed or not: any run of its bytes. It is open only while it is read."""
-
-    def __init__(self, member: Member) -> None:
-        self.member = member
-        self._unpacker = Unpacker(member) if member.name.endswith(".lzo") else None
-        self._lock = threading.Lock()
-
-    @property
-    def size(self) -> int:
-        """Bytes, unpacked."""
-        if self._unpacker is None:
-            return self.member.size
-        with self._lock:
-            return self._unpacker.size
-
-    def read(self, start: int, size: int) -> bytes:
-        """Read bytes from `start` on.
-
-        Raises
-        ------
-        FileError
-            If there are fewer, or they are damaged.
-        """
-        if self._unpacker is not None:
-            with self._lock:
-                return self._unpacker.read(start, size)
-        with reading(self.member.where), open_regular(self.member.path) as stream:
-            stream.seek(self.member.start + start)
-            found = stream.read(max(min(size, self.member.size - start), 0))
-        if len(found) != size:
-            raise FileError(f"{self.member.where}: expected {start + size} bytes, got {start + len(found)}")
-        return found
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.member,)
+def open_bytes(member: Member) -> Callable[[int, int], bytes]:
+    """Open a raw file, packed or not; the function reads bytes from a place on, fewer where they end."""
+    return _Unpacker(member).read if member.name.endswith(".lzo") else member.read
 
 
-def read_header(raw: RawFile) -> RawHeader:
-    """Read the header and check it against the file's length.
+def read_header(member: Member, said: Description) -> tuple[RawHeader, npt.NDArray[np.int64]]:
+    """Read the header and the time of every frame, nanoseconds of the scanner's clock.
 
     Raises
     ------
     FileError
-        If the file is shorter or longer than the header says.
+        If the file ends early.
     InvalidInputError
-        If the header announces no samples.
+        If the header contradicts the yml.
     """
-    where = raw.member.where
-    if raw.size < HEADER.size:
-        raise FileError(f"{where}: expected a header of {HEADER.size} bytes, got {raw.size}")
-    _, frames, lines, samples, sample_bytes = HEADER.unpack(raw.read(0, HEADER.size))
-    header = RawHeader(frames, lines, samples, sample_bytes)
-    if 0 in (frames, lines, samples, sample_bytes) or frames > _MOST_FRAMES:
-        raise InvalidInputError(
-            f"{where}: expected frames, up to {_MOST_FRAMES}, of lines and samples, got {frames} x "
-            f"{lines} x {samples} of {sample_bytes} bytes"
-        )
-    if raw.size != header.file_bytes:
-        raise FileError(
-            f"{where}: expected {header.file_bytes} bytes for {frames} frames of {lines} lines of {samples} "
-            f"samples of {sample_bytes} bytes, got {raw.size}"
-        )
-    return header
+    read, where = open_bytes(member), member.where
+    head = read(0, HEADER.size)
+    if len(head) < HEADER.size:
+        raise FileError(f"{where}: expected a header of {HEADER.size} bytes, got {len(head)}")
+    header = RawHeader(*HEADER.unpack(head)[1:])
+    _, parts = _SAMPLES[said.kind]
+    size = np.dtype(_SAMPLES[said.kind][0]).itemsize * parts
+    for name, expected, got in (
+        ("frames", said.frames, header.frames),
+        ("number of lines", said.lines, header.lines),
+        ("samples per line", said.samples, header.samples),
+        ("sample size", said.sample_bytes, header.sample_bytes),
+        (f"bytes of a sample of type {said.kind}", size, header.sample_bytes),
+    ):
+        if expected != got:
+            raise InvalidInputError(f"{where}: header: expected {name} {expected} as in the yml, got {got}")
+    if 0 in (header.frames, header.lines, header.samples):
+        raise InvalidInputError(f"{where}: expected frames of lines and samples, got {header}")
+    stamps = [read(HEADER.size + i * header.step_bytes, _TIME_BYTES) for i in range(header.frames)]
+    ends = [HEADER.size + (i + 1) * header.step_bytes - 1 for i in range(header.frames)]
+    if not read(ends[-1], 1):
+        whole = sum(len(read(end, 1)) for end in ends)
+        raise FileError(f"{where}: ends early: {whole} of {header.frames} frames")
+    return header, np.frombuffer(b"".join(stamps), dtype="<u8").astype(np.int64)
 
 
-def read_times_ns(raw: RawFile, header: RawHeader) -> npt.NDArray[np.int64]:
-    """Read the time of every frame, shape (frame,), nanoseconds of the scanner's clock.
-
-    Raises
-    ------
-    InvalidInputError
-        If they do not rise.
-    """
-    step = _TIME_BYTES + header.frame_bytes
-    read = (raw.read(HEADER.size + i * step, _TIME_BYTES) for i in range(header.frames))
-    times = np.frombuffer(b"".join(read), dtype="<u8")
-    bad = np.flatnonzero(times[1:] <= times[:-1])
-    if bad.size or times[-1] > np.iinfo(np.int64).max:
-        i = int(bad[0]) + 1 if bad.size else len(times) - 1
-        raise InvalidInputError(
-            f"{raw.member.where}: frame {i}: expected a time after {times[i - 1]} ns, got {times[i]} ns"
-        )
-    return times.astype(np.int64)
-
-
-class RawFrames:
-    """Frames of a raw file, read one at a time; shape (frame, vector, sample).
+@dataclass(frozen=True)
+class ClariusFile:
+    """Opens the frames of a raw file.
 
     Attributes
     ----------
-    stored_dtype : dtype
-        Of the numbers in the file: int16 for RF and for the pairs of I/Q, uint8 for envelopes; that of the
-        frames where samples are multiplied by factors.
-
-    Parameters
-    ----------
     lines, samples : slice
-        Kept.
-    factors : Factors, optional
-        What the samples kept are multiplied by; complex or real for I/Q, else real.
+        Kept of each frame.
+    turns : ndarray, shape (sample,), optional
+        Complex factors of the samples kept, the same in all frames.
+    gain : Gain, optional
+        By which frames differ.
     """
 
-    def __init__(
-        self,
-        raw: RawFile,
-        header: RawHeader,
-        kind: str,
-        lines: slice,
-        samples: slice,
-        factors: Factors | None = None,
-    ) -> None:
-        self.raw, self.header, self.kind = raw, header, kind
-        self.lines, self.samples, self.factors = lines, samples, factors
-        self.stored_dtype, self._parts, self.dtype = SAMPLES[kind]
-        if factors is not None:
-            self.dtype = np.dtype(np.complex64 if self._parts == 2 else np.float32)
-            self.stored_dtype = self.dtype
+    member: Member
+    header: RawHeader
+    kind: str
+    lines: slice
+    samples: slice
+    turns: ComplexArray | None = None
+    gain: Gain | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
-        kept = (len(range(self.header.lines)[self.lines]), len(range(self.header.samples)[self.samples]))
-        return self.header.frames, *kept
-
-    def __len__(self) -> int:
-        return self.header.frames
-
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        i = operator.index(index)
-        if not -len(self) <= i < len(self):
-            raise IndexError(f"frame {i} of {len(self)}")
-        i %= len(self)
-        values = self.whole(i)[self.lines, self.samples]
-        if self._parts == 2:
-            frame: npt.NDArray[Any] = values.astype(np.float32).view(np.complex64)[..., 0]
-        else:
-            frame = np.ascontiguousarray(values, dtype=SAMPLES[self.kind][2])
-        if self.factors is None:
-            return frame
-        multiplied: npt.NDArray[Any] = frame * self.factors[i % len(self.factors)]
-        return multiplied.astype(self.dtype)
-
-    def whole(self, i: int) -> npt.NDArray[Any]:
-        """Read a frame as it is in the file, shape (line, sample) or (line, sample, 2)."""
         header = self.header
-        start = HEADER.size + i * (_TIME_BYTES + header.frame_bytes) + _TIME_BYTES
-        flat = np.frombuffer(self.raw.read(start, header.frame_bytes), dtype=SAMPLES[self.kind][0])
-        shape = (header.lines, header.samples)
-        whole: npt.NDArray[Any] = flat.reshape(shape if self._parts == 1 else (*shape, 2))
-        return whole
+        kept = len(range(header.lines)[self.lines]), len(range(header.samples)[self.samples])
+        return header.frames, *kept
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.raw, self.header, self.kind, self.lines, self.samples, self.factors)
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the frames."""
+        if self.kind == "IQ":
+            return np.dtype(np.complex64)
+        return np.dtype(np.float32 if self.gain else np.uint8 if self.kind == "envelope" else np.int16)
+
+    def __call__(self) -> ReadFrame:
+        """Open the file."""
+        read, header = open_bytes(self.member), self.header
+        dtype, parts = _SAMPLES[self.kind]
+
+        def frame(i: int) -> npt.NDArray[Any]:
+            start = HEADER.size + i * header.step_bytes + _TIME_BYTES
+            content = read(start, header.step_bytes - _TIME_BYTES)
+            if len(content) < header.step_bytes - _TIME_BYTES:
+                raise FileError(f"{self.member.where}: ends early: {i} of {header.frames} frames")
+            values = np.frombuffer(content, dtype).reshape(header.lines, header.samples, parts)
+            kept: npt.NDArray[Any] = values[self.lines, self.samples]
+            kept = kept.astype(np.float32).view(np.complex64)[..., 0] if parts == 2 else kept[..., 0]
+            if self.turns is not None:
+                kept = kept * self.turns
+            return kept if self.gain is None else kept * self.gain.factors(i)
+
+        return frame
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Gain that differs between frames.
+
+    Attributes
+    ----------
+    depth_mm : ndarray, shape (sample,)
+    curves : tuple of Curve
+        Of each frame.
+    """
+
+    depth_mm: FloatArray
+    curves: tuple[Curve, ...]
+
+    def factors(self, i: int) -> FloatArray:
+        """The first frame's gain over that of frame i, shape (sample,)."""
+        return np.asarray(10.0 ** ((self._db(self.curves[0]) - self._db(self.curves[i])) / 20.0))
+
+    def _db(self, curve: Curve) -> FloatArray:
+        return np.asarray(np.interp(self.depth_mm, *np.array(curve).T))
+
+
+class _Unpacker:
+    """Reads runs of bytes of a file of lzop; the blocks last used are kept."""
+
+    def __init__(self, member: Member) -> None:
+        self._member = member
+        self._lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)")
+        self._blocks: list[tuple[int, int, int, int, bytes]] = []  # first byte, place, lengths, check sum
+        at, self._flags = self._header()
+        plain, packs = (sum(bool(self._flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
+        first = 0
+        while True:
+            lengths = member.read(at, 8).ljust(8, b"\0")
+            unpacked, packed = struct.unpack(">II", lengths)
+            if not unpacked:
+                break
+            check = member.read(at + 8, 4)
+            at += 8 + 4 * (plain + (packs if packed < unpacked else 0))
+            self._blocks.append((first, at, packed, unpacked, check))
+            first, at = first + unpacked, at + packed
+        self._firsts = np.array([block[0] for block in self._blocks])
+        self._block = lru_cache(_KEPT_BLOCKS)(self._unpacked)
+
+    def read(self, start: int, size: int) -> bytes:
+        """Unpack bytes from `start` on, fewer where they end."""
+        k = max(int(np.searchsorted(self._firsts, start, "right")) - 1, 0)
+        parts, at = [], start
+        while at < start + size and k < len(self._blocks):
+            first = self._blocks[k][0]
+            part = self._block(k)[at - first : start + size - first]
+            parts.append(part)
+            at, k = at + len(part), k + 1
+            if not part:
+                break
+        return b"".join(parts)
+
+    def _unpacked(self, k: int) -> bytes:
+        _, place, packed, unpacked, check = self._blocks[k]
+        content, where = self._member.read(place, packed), f"{self._member.where}: block {k}"
+        plain = content
+        if packed != unpacked:
+            try:
+                plain = bytes(self._lzo.LZOCompressor.decompress(content, unpacked))
+            except (self._lzo.LZOError, ValueError, MemoryError) as error:
+                raise FileError(f"{where}: expected packed bytes, got damaged ones: {error}") from error
+        method = zlib.adler32 if self._flags & 0x1 else zlib.crc32
+        is_right = not self._flags & 0x101 or struct.pack(">I", method(plain)) == check
+        if len(plain) != unpacked or not is_right:
+            raise FileError(f"{where}: expected {unpacked} bytes unpacked, got damaged ones")
+        return plain
+
+    def _header(self) -> tuple[int, int]:
+        """Place of the first block, and the flags, which say which check sums there are."""
+        head = self._member.read(0, 1024)
+        if not head.startswith(_MAGIC):
+            raise FileError(f"{self._member.where}: expected a file of lzop (.lzo), got another")
+        try:
+            at = len(_MAGIC)
+            is_newer = struct.unpack_from(">H", head, at)[0] >= 0x0940
+            at += 8 if is_newer else 5
+            (flags,) = struct.unpack_from(">I", head, at)
+            at += 4 + (4 if flags & 0x800 else 0) + (12 if is_newer else 8)
+            return at + 1 + head[at] + 4, flags
+        except (struct.error, IndexError):
+            raise FileError(f"{self._member.where}: header: ends early") from None

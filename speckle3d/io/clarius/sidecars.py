@@ -1,26 +1,29 @@
 """Descriptions of raw files (yml) and their gain by frame (tgc).
 
 The yml is YAML but for its gain curve, ``tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }``, which is read apart.
-Every number is read with its unit.
+Scalars stay the text that is in the file, so that ``010`` is ten, and every number is read with its unit.
 
 References
 ----------
 .. [1] clariusdev/research, "Raw Data Format" (docs/raw-data-format.md), ".yml metadata".
+.. [2] clariusdev/research, "Low-Level Parameters" (docs/low-level-parameters.md): `rxFreqShallow`, "start
+   demodulation frequency", and `rxFreqDeep`.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.io.clarius.documents import documents_of, quantity, shown
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.extras import extra_module
+from speckle3d.core.printable import printable
 from speckle3d.io.clarius.package import Member
 
 Curve = tuple[tuple[float, float], ...]
@@ -30,10 +33,15 @@ _KINDS = {"rf": "RF", "iq": "IQ", "b pre-scan": "envelope", "envelope": "envelop
 _KNOT = re.compile(r"\{\s*([-+.\deE]+)\s*mm\s*,\s*([-+.\deE]+)\s*dB\s*\}")
 _GAIN_LINE = re.compile(r"^tgc:.*(?:\n[ \t]+-.*)*$", re.MULTILINE)
 _STAMP = re.compile(r"timestamp:\s*(\d{1,19})(?!\d)")
-
-_MOST_YAML_BYTES = 2**24
-"""A description of 1,248 lines takes 68 kB."""
-
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d]*)\s*")
+_UNITS = {
+    "": {"": 1.0},
+    "Hz": {"hz": 1.0, "khz": 1e3, "mhz": 1e6},
+    "mm": {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3},
+    "m/s": {"m/s": 1.0},
+    "bytes": {"bytes": 1.0, "byte": 1.0},
+    "deg": {"°": 1.0, "deg": 1.0},
+}
 _USED = frozenset(
     {
         "frames", "frame rate", "transmit frequency", "imaging depth", "focal depth", "tgc", "size", "type",
@@ -41,23 +49,70 @@ _USED = frozenset(
         "focus",
     }
 )  # fmt: skip
+_LONGEST = 60
+"""Letters of a wrong value that a message shows."""
+
+
+def fields_of(text: str, where: str) -> Mapping[str, Any]:
+    """Parse a YAML document of fields; their values are text, lists, or mappings.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is no YAML or holds other things, or PyYAML is not installed.
+    """
+    yaml = extra_module("yaml", "clarius", "a package of a Clarius scanner")
+    try:
+        document = yaml.load(text, Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        words = " ".join(str(error).split())[:200]
+        raise InvalidInputError(f"{where}: expected YAML, got an error: {words}") from error
+    if not isinstance(document, dict):
+        raise InvalidInputError(f"{where}: expected fields, got {_shown(document)}")
+    return document
 
 
 @dataclass(frozen=True)
-class Lines:
-    """Where the lines of a frame are received, in elements of the array, and how they are steered.
+class Fields:
+    """Fields of a mapping, read with their units; errors name the file and the field."""
 
-    Attributes
-    ----------
-    receive_element, transmit_element, angle_deg : ndarray, shape (line,)
-    interpolated : bool
-        True where the file gives the first line and the last.
-    """
+    values: Mapping[str, Any]
+    where: str
 
-    receive_element: FloatArray
-    transmit_element: FloatArray
-    angle_deg: FloatArray
-    interpolated: bool = False
+    def below(self, name: str) -> Fields:
+        """Fields of a field."""
+        inner = self.values.get(name)
+        if not isinstance(inner, dict):
+            raise InvalidInputError(f"{self.where}: {name}: expected fields, got {_shown(inner)}")
+        return Fields(inner, f"{self.where}: {name}")
+
+    def number(self, name: str, unit: str = "", least: float = -math.inf) -> float:
+        """A number with its unit, as ``"60 MHz"``, in the base unit `unit`."""
+        value = self.values.get(name)
+        parts = _NUMBER.fullmatch(value) if isinstance(value, str) and len(value) < _LONGEST else None
+        factor = None if parts is None else _UNITS[unit].get(parts[2].lower())
+        if parts is None or factor is None or not least <= float(parts[1]) < math.inf:
+            above = f" from {least:g}" if least > -math.inf else ""
+            expected = f"a number{f' of {unit}' if unit else ''}{above}"
+            raise InvalidInputError(f"{self.where}: {name}: expected {expected}, got {_shown(value)}")
+        return float(parts[1]) * factor
+
+    def optional(self, name: str, unit: str = "") -> float | None:
+        """A number, or None where there is none."""
+        return None if self.values.get(name) in (None, "", "~") else self.number(name, unit)
+
+    def whole(self, name: str, unit: str = "") -> int:
+        """A whole number from 0."""
+        value = self.number(name, unit, 0.0)
+        if value != int(value):
+            raise InvalidInputError(f"{self.where}: {name}: expected a whole number, got {value:g}")
+        return int(value)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, str):
+        return repr(printable(value[:_LONGEST])) + ("..." if len(value) > _LONGEST else "")
+    return "fields" if isinstance(value, dict) else "a list" if isinstance(value, list) else "nothing"
 
 
 @dataclass(frozen=True)
@@ -72,16 +127,15 @@ class Roi:
 
 @dataclass(frozen=True)
 class Receive:
-    """Demodulation frequency at depth 0, at `filter_depth_mm`, and on a straight line between."""
+    """Demodulation frequency at depth 0, at `filter_depth_mm`, and on a straight line between [2]_."""
 
     shallow_hz: float
     deep_hz: float
     filter_depth_mm: float
 
-    def at_hz(self, depth_mm: float) -> float:
-        """Demodulation frequency at a depth."""
-        ends = ([0.0, self.filter_depth_mm], [self.shallow_hz, self.deep_hz])
-        return float(np.interp(depth_mm, *ends))
+    def at_hz(self, depth_mm: FloatArray | float) -> FloatArray:
+        """Demodulation frequency at depths."""
+        return np.asarray(np.interp(depth_mm, [0.0, self.filter_depth_mm], [self.shallow_hz, self.deep_hz]))
 
 
 @dataclass(frozen=True)
@@ -92,6 +146,8 @@ class Description:
     ----------
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
+    receive_element, angle_deg : ndarray, shape (line,)
+        Where lines are received, in elements of the array, and how they are steered.
     delay_samples : float, optional
         Samples between transmission and the first sample.
     gain : tuple of pairs
@@ -109,21 +165,20 @@ class Description:
     samples: int
     sample_bytes: int
     sampling_rate_hz: float
+    receive_element: FloatArray
+    angle_deg: FloatArray
     delay_samples: float | None
-    geometry: Lines
-    compression: str = "none"
-    frame_rate_hz: float | None = None
-    transmit_frequency_hz: float | None = None
-    imaging_depth_mm: float | None = None
-    focal_depth_mm: float | None = None
-    speed_of_sound_m_s: float | None = None
-    element_pitch_mm: float | None = None
-    radius_mm: float | None = None
-    probe: str = ""
-    gain: Curve = ()
-    roi: Roi | None = None
-    receive: Receive | None = None
-    unused: tuple[str, ...] = field(default=())
+    frame_rate_hz: float | None
+    transmit_frequency_hz: float | None
+    imaging_depth_mm: float | None
+    speed_of_sound_m_s: float | None
+    element_pitch_mm: float | None
+    radius_mm: float | None
+    probe: str
+    gain: Curve
+    roi: Roi | None
+    receive: Receive | None
+    unused: tuple[str, ...]
 
 
 def read_description(member: Member) -> Description:
@@ -132,49 +187,49 @@ def read_description(member: Member) -> Description:
     Raises
     ------
     FileError
-        If it cannot be read, or is longer than any scanner writes.
+        If it cannot be read.
     InvalidInputError
         Naming the field that is missing or has another unit.
     """
-    where = member.where
-    if member.size > _MOST_YAML_BYTES:
-        raise FileError(f"{where}: expected at most {_MOST_YAML_BYTES} bytes, got {member.size}")
-    text = member.text()
+    where, text = member.where, member.text()
     gain_text = "".join(_GAIN_LINE.findall(text))
-    documents = list(documents_of(_GAIN_LINE.sub(lambda found: "\n" * found[0].count("\n"), text), where))
-    if len(documents) != 1:
-        raise InvalidInputError(f"{where}: expected one document of fields, got {len(documents)}")
-    fields = _Fields(documents[0], where)
+    fields = Fields(fields_of(_GAIN_LINE.sub("", text), where), where)
     size = fields.below("size")
-    lines = size.whole("number of lines")
     word = fields.values.get("type")
     if not isinstance(word, str) or word.strip().lower() not in _KINDS:
-        raise InvalidInputError(f"{where}: type: expected RF, IQ or B pre-scan, got {shown(word)}")
+        raise InvalidInputError(f"{where}: type: expected RF, IQ or B pre-scan, got {_shown(word)}")
+    packing = fields.values.get("compression", "none")
+    if str(packing).lower() != "none":
+        raise InvalidInputError(
+            f"{where}: compression: expected none, got {_shown(packing)}: frames are not decoded"
+        )
     probe = fields.values.get("probe")
-    probe_fields = _Fields(probe, f"{where}: probe") if isinstance(probe, dict) else None
+    of_probe = Fields(probe if isinstance(probe, dict) else {}, f"{where}: probe")
+    lines = size.whole("number of lines")
+    samples = size.whole("samples per line")
+    element, angle = _lines(fields, lines)
     return Description(
         where=where,
         kind=_KINDS[word.strip().lower()],
         frames=fields.whole("frames"),
         lines=lines,
-        samples=size.whole("samples per line"),
+        samples=samples,
         sample_bytes=size.whole("sample size", "bytes"),
-        sampling_rate_hz=fields.positive("sampling rate", "Hz"),
-        delay_samples=fields.optional("delay samples", ""),
-        geometry=_read_lines(fields, lines),
-        compression=_compression(fields),
+        sampling_rate_hz=fields.number("sampling rate", "Hz", 1.0),
+        receive_element=element,
+        angle_deg=angle,
+        delay_samples=fields.optional("delay samples"),
         frame_rate_hz=fields.optional("frame rate", "Hz"),
         transmit_frequency_hz=fields.optional("transmit frequency", "Hz"),
         imaging_depth_mm=fields.optional("imaging depth", "mm"),
-        focal_depth_mm=fields.optional("focal depth", "mm"),
         speed_of_sound_m_s=fields.optional("vsound", "m/s") or fields.optional("speed of sound", "m/s"),
-        element_pitch_mm=None if probe_fields is None else probe_fields.optional("pitch", "mm"),
-        radius_mm=None if probe_fields is None else probe_fields.optional("radius", "mm"),
+        element_pitch_mm=of_probe.optional("pitch", "mm"),
+        radius_mm=of_probe.optional("radius", "mm"),
         probe=probe if isinstance(probe, str) else "",
-        gain=tuple(_knots(gain_text, where)),
-        roi=_read_roi(fields),
-        receive=_read_receive(fields),
-        unused=tuple(sorted(set(fields.values) - _USED)),
+        gain=_knots(gain_text, where),
+        roi=_roi(fields, lines, samples),
+        receive=_receive(fields),
+        unused=tuple(sorted(set(map(str, fields.values)) - _USED)),
     )
 
 
@@ -186,111 +241,66 @@ def read_gains(member: Member) -> dict[int, Curve]:
     FileError
         If the file cannot be read.
     InvalidInputError
-        If a time stamp or a curve makes no sense.
+        If a curve makes no sense.
     """
     text, where = member.text(), member.where
-    stamps = list(_STAMP.finditer(text))
-    stops = [*(stamp.start() for stamp in stamps), len(text)][1:]
+    _, *parts = _STAMP.split(text)
     curves: dict[int, Curve] = {}
     alike: dict[Curve, Curve] = {}
-    for stamp, after in zip(stamps, stops, strict=bool(stamps)):
-        time_ns = int(stamp[1])
-        if time_ns in curves:
-            raise InvalidInputError(f"{where}: expected one curve at {time_ns} ns, got two")
-        curve = tuple(_knots(text[stamp.end() : after], f"{where}: timestamp {time_ns}"))
-        curves[time_ns] = alike.setdefault(curve, curve)
+    for stamp, part in zip(parts[::2], parts[1::2], strict=True):
+        curve = _knots(part, f"{where}: timestamp {stamp}")
+        curves[int(stamp)] = alike.setdefault(curve, curve)
     return curves
 
 
-@dataclass(frozen=True)
-class _Fields:
-    """Fields of a mapping, read with their units; errors name the file and the field."""
-
-    values: Mapping[str, Any]
-    where: str
-
-    def below(self, name: str) -> _Fields:
-        inner = self.values.get(name)
-        if not isinstance(inner, dict):
-            raise InvalidInputError(f"{self.where}: {name}: expected fields, got {shown(inner)}")
-        return _Fields(inner, f"{self.where}: {name}")
-
-    def number(self, name: str, unit: str = "") -> float:
-        return quantity(self.values.get(name), unit, f"{self.where}: {name}")
-
-    def positive(self, name: str, unit: str) -> float:
-        value = self.number(name, unit)
-        if value <= 0:
-            raise InvalidInputError(f"{self.where}: {name}: expected above zero, got {value:g}")
-        return value
-
-    def optional(self, name: str, unit: str) -> float | None:
-        return None if self.values.get(name) is None else self.number(name, unit)
-
-    def whole(self, name: str, unit: str = "") -> int:
-        value = self.number(name, unit)
-        if value != int(value) or not 0 <= value < 2**32:
-            raise InvalidInputError(f"{self.where}: {name}: expected a whole number from 0, got {value:g}")
-        return int(value)
-
-
-def _compression(fields: _Fields) -> str:
-    held = fields.values.get("compression", "none")
-    if not isinstance(held, str):
-        raise InvalidInputError(f"{fields.where}: compression: expected none, got {shown(held)}")
-    return held
-
-
-def _read_lines(fields: _Fields, count: int) -> Lines:
+def _lines(fields: Fields, count: int) -> tuple[FloatArray, FloatArray]:
+    """Places and angles of the lines; files may give the first and the last alone."""
     where, entries = f"{fields.where}: lines", fields.values.get("lines")
-    if not isinstance(entries, list) or not entries:
-        raise InvalidInputError(f"{where}: expected a list of lines, got {shown(entries)}")
-    names = (("rx element", ""), ("tx element", ""), ("angle", "deg"))
-    rows = np.empty((len(entries), 3))
+    if not isinstance(entries, list) or len(entries) not in (2, count) or not entries:
+        got = len(entries) if isinstance(entries, list) else _shown(entries)
+        raise InvalidInputError(f"{where}: expected {count} lines, got {got}")
+    rows = np.empty((len(entries), 2))
     for i, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise InvalidInputError(f"{where}[{i}]: expected fields, got {shown(entry)}")
-        line = _Fields(entry, f"{where}[{i}]")
-        rows[i] = [line.number(name, unit) for name, unit in names]
-    if len(entries) == count:
-        return Lines(*rows.T)
-    if len(entries) != 2:
-        raise InvalidInputError(f"{where}: expected {count} lines, got {len(entries)}")
-    places = np.linspace(0.0, 1.0, count)[:, None]
-    receive, transmit, angle = (rows[0] + places * (rows[1] - rows[0])).T
-    return Lines(receive, transmit, angle, interpolated=True)
+        line = Fields(entry if isinstance(entry, dict) else {}, f"{where}[{i}]")
+        rows[i] = line.number("rx element"), line.number("angle", "deg")
+    if len(rows) != count:
+        rows = rows[0] + np.linspace(0.0, 1.0, count)[:, None] * (rows[1] - rows[0])
+    return rows[:, 0], rows[:, 1]
 
 
-def _read_roi(fields: _Fields) -> Roi | None:
-    if fields.values.get("roi") is None:
+def _roi(fields: Fields, lines: int, samples: int) -> Roi | None:
+    if fields.values.get("roi") in (None, ""):
         return None
-    roi = fields.below("roi")
-    return Roi(*(roi.whole(name) for name in ("start line", "end line", "start sample", "end sample")))
+    below = fields.below("roi")
+    roi = Roi(*(below.whole(name) for name in ("start line", "end line", "start sample", "end sample")))
+    if not (roi.start_line < roi.end_line < lines and roi.start_sample < roi.end_sample < samples):
+        raise InvalidInputError(
+            f"{below.where}: expected one within {lines} lines of {samples} samples, got {roi}"
+        )
+    return roi
 
 
-def _read_receive(fields: _Fields) -> Receive | None:
+def _receive(fields: Fields) -> Receive | None:
     """Read the demodulation frequency; None in older files, and where it differs between foci or filters."""
     foci = fields.values.get("focus")
-    found = set()
+    ends = set()
     for i, focus in enumerate(foci if isinstance(foci, list) else ()):
         filters = focus.get("receive") if isinstance(focus, dict) else None
         for entry in filters if isinstance(filters, list) else ():
-            part = _Fields(entry if isinstance(entry, dict) else {}, f"{fields.where}: focus[{i}]: receive")
-            ends = part.positive("shallowfreq", "Hz"), part.positive("deepfreq", "Hz")
-            found.add(Receive(*ends, part.positive("filterdepth", "mm")))
-    return found.pop() if len(found) == 1 else None
+            part = Fields(entry if isinstance(entry, dict) else {}, f"{fields.where}: focus[{i}]: receive")
+            names = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
+            ends.add(Receive(*(part.number(name, unit, 1e-6) for name, unit in names)))
+    return ends.pop() if len(ends) == 1 else None
 
 
-def _knots(text: str, where: str) -> Iterator[tuple[float, float]]:
-    last_mm = -math.inf
-    if text.count("{") != len(_KNOT.findall(text)):
-        raise InvalidInputError(f"{where}: expected a gain as {{ 40.00mm, 26.00dB }}, got {text[:60]!r}")
-    for found in _KNOT.finditer(text):
-        depth_mm = quantity(f"{found[1]} mm", "mm", where)
-        gain_db = quantity(found[2], "", where)
-        if depth_mm <= last_mm:
-            raise InvalidInputError(
-                f"{where}: expected depths that rise, got {depth_mm:g} mm after {last_mm:g}"
-            )
-        last_mm = depth_mm
-        yield depth_mm, gain_db
+def _knots(text: str, where: str) -> Curve:
+    try:
+        knots = tuple((float(depth), float(gain)) for depth, gain in _KNOT.findall(text))
+    except ValueError:
+        knots = ()
+    depths = [depth for depth, _ in knots]
+    if len(knots) != text.count("{") or sorted(set(depths)) != depths:
+        raise InvalidInputError(
+            f"{where}: expected a gain as {{ 40.00mm, 26.00dB }} at depths that rise, got {text[:_LONGEST]!r}"
+        )
+    return knots

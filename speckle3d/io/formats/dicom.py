@@ -8,31 +8,32 @@ patient are never loaded.
 
 from __future__ import annotations
 
+import struct
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.files import open_regular, plausible_bytes
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.extras import extra_module
+from speckle3d.core.files import open_regular
 from speckle3d.core.printable import printable
-from speckle3d.core.sweep import Sweep
-from speckle3d.io.formats.dicom_elements import read_header, reading_dicom, text_of, whole_of
-from speckle3d.io.formats.recordings import Recording
-from speckle3d.io.found import Found, differs
+from speckle3d.io.frames import FileFrames, ReadFrame
+from speckle3d.io.hdf5 import one_line, reading
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.lazy import LazyFrames, OpenFrames, Unpack
-from speckle3d.io.readers import Reader, Row
+from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Row, Value, differs
 
 FORMAT = "DICOM"
 
 _MARK, _MARK_BYTE = b"DICM", 128
-_MOST_TIMES_PACKED = 256
-"""As of image sequences: what is empty packs well."""
-
 _SPATIAL = {0: "no image", 1: "2-D", 2: "M-mode", 3: "spectrum", 4: "wave form", 5: "graphics"}
 _DATA = {
     0: "no data", 1: "tissue", 2: "colour flow", 3: "pulsed Doppler", 4: "continuous Doppler",
@@ -41,10 +42,19 @@ _DATA = {
     15: "integrated backscatter", 16: "area trace",
 }  # fmt: skip
 _UNIT_CM = 3
-
 _LOSSY_SPREAD = 12
 """Levels by which the colours of a grey pixel may differ after lossy packing; the tint of a colour map is
 more."""
+_LONGEST = 64
+"""Letters of an element that are shown: those of a name of a kind; DICOM allows no more."""
+_TAGS = (
+    "SOPClassUID", "Modality", "Manufacturer", "ManufacturerModelName", "TransducerData", "TransducerType",
+    "ProcessingFunction", "NumberOfFrames", "FrameIncrementPointer", "FrameTime", "FrameTimeVector",
+    "RecommendedDisplayFrameRate", "SamplesPerPixel", "PhotometricInterpretation", "Rows", "Columns",
+    "CineRate", "PlanarConfiguration", "BitsAllocated", "BitsStored", "PixelRepresentation", "PixelSpacing",
+    "LossyImageCompression", "SequenceOfUltrasoundRegions",
+)  # fmt: skip
+"""All that is loaded."""
 
 
 @dataclass(frozen=True)
@@ -57,158 +67,154 @@ class _Region:
     top: int
     right: int
     bottom: int
-    units: tuple[int, int]
-    delta_cm: tuple[float, float]
-    reference_y: tuple[float, float] | None
+    units: tuple[int, int] = (_UNIT_CM, _UNIT_CM)
+    delta_cm: tuple[float, float] = (1.0, 1.0)
+    reference_y: tuple[float, float] | None = None
 
     def __str__(self) -> str:
         kind = f"{_SPATIAL.get(self.spatial, self.spatial)} {_DATA.get(self.data, self.data)}"
         return f"{kind} (columns {self.left} to {self.right}, rows {self.top} to {self.bottom})"
 
 
-class DicomFrames(LazyFrames):
-    """Grey frames of a region, decoded one at a time."""
+@dataclass(frozen=True)
+class DicomFile:
+    """Decodes grey frames of a region, one at a time."""
 
-    def __init__(self, path: Path, count: int, region: _Region, inverted: bool, spread: int) -> None:
-        size = region.right - region.left + 1, region.bottom - region.top + 1
-        super().__init__(path, (count, *size), np.uint8)
-        self.region, self.inverted, self.spread = region, inverted, spread
+    path: Path
+    region: _Region
+    inverted: bool
+    spread: int
 
-    def _opened(self) -> OpenFrames:
-        return _OpenImages(self)
+    def __call__(self) -> ReadFrame:
+        """Open nothing: each frame is read from the file anew."""
+        return self.read
 
-
-class _OpenImages:
-    def __init__(self, frames: DicomFrames) -> None:
-        self._frames = frames
-
-    def read(self, i: int) -> Unpack:
-        return partial(self._frame, i)
-
-    def _frame(self, i: int) -> npt.NDArray[Any]:
-        from pydicom.pixels.utils import pixel_array
-
-        path, region = self._frames.path, self._frames.region
-        with reading_dicom(f"{path}: frame {i}"), open_regular(path) as stream:
-            image = np.asarray(pixel_array(stream, index=i))
-        image = image[region.top : region.bottom + 1, region.left : region.right + 1]
-        grey = _grey(image, self._frames.spread).T
-        if self._frames.inverted:
-            grey = 255 - grey
+    def read(self, i: int) -> npt.NDArray[Any]:
+        """Decode frame i, shape (column, row)."""
+        region = self.region
+        image = _decoded(self.path, i)[region.top : region.bottom + 1, region.left : region.right + 1]
+        grey = _grey(image, self.spread).T
+        grey = 255 - grey if self.inverted else grey
         return grey[:, ::-1] if region.delta_cm[1] < 0 else grey
-
-    def close(self) -> None:
-        """Nothing stays open between frames."""
-
-
-def read_dicom(path: Path, settings: ImportSettings | None = None) -> Sweep:
-    """Read grey images of eight bits; they stay in the file until they are asked for.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, or what unpacks it is not installed.
-    InvalidInputError
-        Naming what is recorded, if it is no such image.
-    MissingSettingsError
-        Naming all that the file does not say: always the dynamic range.
-    """
-    given = settings or ImportSettings()
-    return _recording(path, given).sweep(given)
 
 
 def _claims(_: Path, start: bytes) -> bool:
     return start[_MARK_BYTE : _MARK_BYTE + len(_MARK)] == _MARK
 
 
-def _describe(path: Path, settings: ImportSettings) -> list[Row]:
+def open_dicom(path: Path, settings: ImportSettings) -> Recording:
+    """Read grey images of eight bits; they stay in the file until they are asked for."""
+    header, syntax = _header(path)
+    rows = _facts(header, syntax)
     try:
-        return _recording(path, settings).rows(settings)
-    except InvalidInputError:
-        # Why there is no sweep is told beside these rows.
-        try:
-            with open_regular(path) as stream:
-                return list(_notes(*read_header(path, stream)))
-        except InvalidInputError:
-            return [("elements", "not read", "")]
+        return _recording(path, settings, header, rows)
+    except (InvalidInputError, FileError) as error:
+        return Recording(path, settings, rows=tuple(rows), fault=error)
 
 
-def _recording(path: Path, settings: ImportSettings) -> Recording:
-    with open_regular(path) as stream:
-        header, syntax = read_header(path, stream)
-        _require_decoder(path, syntax)
-        size = stream.seek(0, 2)
-    count = _require_grey(path, header, syntax, size)
-    region, found, notes = _place(path, header)
-    times, rate = _clock(path, header, count, settings.frame_rate_hz is not None)
-    lossy = text_of(header, "LossyImageCompression") == "01" or "YBR" in text_of(
-        header, "PhotometricInterpretation"
-    )
-    inverted = text_of(header, "PhotometricInterpretation") == "MONOCHROME1"
-    frames = DicomFrames(path, count, region, inverted, _LOSSY_SPREAD if lossy else 0)
-    with naming(str(path)):
-        _ = frames[count // 2]  # colour, and what cannot be unpacked, is told before a reconstruction begins
-    frames.close()
+def _recording(path: Path, settings: ImportSettings, header: Any, rows: list[Row]) -> Recording:
+    count = _require_grey(path, header)
+    region, values, notes = _place(path, header)
+    kind = _text(header, "PhotometricInterpretation")
+    lossy = _text(header, "LossyImageCompression") == "01" or "YBR" in kind
+    source = DicomFile(path, region, kind == "MONOCHROME1", _LOSSY_SPREAD if lossy else 0)
+    shape = (count, region.right - region.left + 1, region.bottom - region.top + 1)
+    _require_all_frames(path, count)
+    times, rate, remarks = _clock(header, count)
+    chosen = np.arange(count) if times is None or settings.frame_rate_hz else rising(times)
+    if times is not None:
+        times = times[chosen]
+        remarks += left_out("images", count, {"with a repeated time": count - chosen.size}, times)
+    frames = FileFrames(path, source, shape, np.uint8, None, chosen.tolist())
+    _ = frames[len(frames) // 2]  # colour is told before a reconstruction begins
     return Recording(
-        path, frames, {**found, "frame_rate_hz": rate}, time_s=times, notes=(*_notes(header, syntax), *notes)
-    )
+        path, settings, frames, {**values, "frame_rate_hz": rate}, time_s=times,
+        rows=(*rows, *notes), remarks=tuple(remarks),
+    )  # fmt: skip
 
 
-def _require_decoder(path: Path, syntax: Any) -> None:
-    from pydicom.pixels.decoders.base import get_decoder
+def _header(path: Path) -> tuple[Any, Any]:
+    """Elements beside the pixels, and the transfer syntax."""
+    pydicom = extra_module("pydicom", "dicom", f"{path}: DICOM")
+    with _reading(str(path)), open_regular(path) as stream:
+        meta = pydicom.filereader.read_file_meta_info(path)
+        syntax = meta.get("TransferSyntaxUID")
+        if syntax is None:
+            raise InvalidInputError(f"{path}: expected a transfer syntax, got none")
+        header = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=list(_TAGS))
+        for name in _TAGS:  # elements are read from their bytes when first asked for
+            header.get(name)
+    return header, syntax
 
-    with reading_dicom(str(path)):
-        name = printable(str(syntax.name))
+
+@contextmanager
+def _reading(where: str) -> Iterator[None]:
+    """Turn what pydicom raises on damaged files into one line, and keep its warnings to itself."""
+    import pydicom.config
+    from pydicom.errors import BytesLengthException, InvalidDicomError
+
+    damage = (AttributeError, IndexError, EOFError, AssertionError, struct.error)
+    with reading(where), warnings.catch_warnings(), pydicom.config.disable_value_validation():
+        warnings.simplefilter("ignore")
         try:
-            decoder = get_decoder(syntax)
-        except NotImplementedError:
-            raise InvalidInputError(f"{path}: expected pixels that pydicom unpacks, got {name}") from None
-    if not decoder.is_available:
-        needs = ", or ".join(printable(each) for each in decoder.missing_dependencies)
-        raise InvalidInputError(f"{path}: {name}: expected a package that unpacks it: {needs}")
+            yield
+        except (*damage, BytesLengthException, InvalidDicomError) as error:
+            raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
-def _require_grey(path: Path, header: Any, syntax: Any, file_bytes: int) -> int:
+def _decoded(path: Path, i: int) -> npt.NDArray[Any]:
+    from pydicom.pixels.utils import pixel_array
+
+    with _reading(f"{path}: frame {i}"), open_regular(path) as stream:
+        return np.asarray(pixel_array(stream, index=i))
+
+
+def _require_all_frames(path: Path, count: int) -> None:
+    """Refuse a file that ends before its last frame, telling how many are whole."""
+    _decoded(path, 0)
+    try:
+        _decoded(path, count - 1)
+    except FileError as error:
+        low, high = 0, count - 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            try:
+                _decoded(path, middle)
+                low = middle
+            except FileError:
+                high = middle
+        raise FileError(f"{path}: ends early: {low + 1} of {count} frames") from error
+
+
+def _require_grey(path: Path, header: Any) -> int:
     """Refuse what is no sequence of grey images of eight bits; returns the number of frames."""
-    if (modality := text_of(header, "Modality")) != "US":
+    if (modality := _text(header, "Modality")) != "US":
         raise InvalidInputError(f"{path}: Modality: expected US, got {modality or 'none'}")
-    count = whole_of(path, header, "NumberOfFrames", 1)
+    count = _whole(path, header, "NumberOfFrames", 1)
     if count < 2:
         raise InvalidInputError(f"{path}: NumberOfFrames: expected several frames, got a single image")
-    rows, columns = (whole_of(path, header, name, 0) for name in ("Rows", "Columns"))
-    samples = whole_of(path, header, "SamplesPerPixel", 1)
-    kind = text_of(header, "PhotometricInterpretation")
-    greys = (
-        ("MONOCHROME1", "MONOCHROME2")
-        if samples == 1
-        else ("RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT")
-    )
+    samples = _whole(path, header, "SamplesPerPixel", 1)
+    kind = _text(header, "PhotometricInterpretation")
+    colours = ("RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT")
+    greys = ("MONOCHROME1", "MONOCHROME2") if samples == 1 else colours
     if samples not in (1, 3) or kind not in greys:
         raise InvalidInputError(
             f"{path}: PhotometricInterpretation: expected {' or '.join(greys)}, got {kind or 'none'}"
         )
     for name, expected in (("BitsAllocated", 8), ("BitsStored", 8), ("PixelRepresentation", 0)):
-        if (got := whole_of(path, header, name, expected)) != expected:
+        if (got := _whole(path, header, name, expected)) != expected:
             raise InvalidInputError(f"{path}: {name}: expected {expected}, got {got}")
-    frame_bytes = rows * columns * samples
-    if not frame_bytes:
-        raise InvalidInputError(f"{path}: expected an image, got {columns} columns and {rows} rows")
-    # YBR_FULL_422 leaves out a third of its bytes.
-    needed = 0 if syntax.is_compressed else count * frame_bytes * 2 // 3
-    most = plausible_bytes(file_bytes, _MOST_TIMES_PACKED) if syntax.is_compressed else file_bytes
-    if max(needed, count) > file_bytes or frame_bytes > most:
-        asked = f"{count} frames of {columns} x {rows} x {samples} bytes"
-        raise FileError(f"{path}: expected {asked}, got {file_bytes} bytes")
+    if not _whole(path, header, "Rows", 0) * _whole(path, header, "Columns", 0):
+        raise InvalidInputError(f"{path}: expected an image, got no columns or no rows")
     return count
 
 
-def _place(path: Path, header: Any) -> tuple[_Region, dict[str, Found], list[Row]]:
+def _place(path: Path, header: Any) -> tuple[_Region, dict[str, Value], list[Row]]:
     """The part of the image to take, the size of its pixels, and what is to be said of it."""
     rows, columns = int(header.Rows), int(header.Columns)
-    with reading_dicom(str(path)):
-        regions = [
-            _region(path, i, item) for i, item in enumerate(header.get("SequenceOfUltrasoundRegions") or ())
-        ]
+    with _reading(str(path)):
+        items = header.get("SequenceOfUltrasoundRegions") or ()
+        regions = [_region(f"{path}: SequenceOfUltrasoundRegions[{i}]", item) for i, item in enumerate(items)]
     if not regions:
         return _without_regions(path, header, columns, rows)
     tissue = [one for one in regions if (one.spatial, one.data) == (1, 1)]
@@ -224,121 +230,95 @@ def _place(path: Path, header: Any) -> tuple[_Region, dict[str, Found], list[Row
             f"{one.units}: a polar image has to be scan-converted first"
         )
     x_mm, y_mm = (10.0 * abs(delta) for delta in one.delta_cm)
-    if not (np.isfinite([x_mm, y_mm]).all() and x_mm > 0 and y_mm > 0):
+    if not min(x_mm, y_mm) > 0:
         raise InvalidInputError(
             f"{path}: PhysicalDeltaX, PhysicalDeltaY: expected other than 0, got {one.delta_cm}"
         )
-    found = {
-        "column_pitch_mm": Found(x_mm, "PhysicalDeltaX"),
-        "row_spacing_mm": Found(y_mm, "PhysicalDeltaY"),
+    values = {
+        "column_pitch_mm": Value(x_mm, "PhysicalDeltaX"),
+        "row_spacing_mm": Value(y_mm, "PhysicalDeltaY"),
     }
     if one.reference_y is not None:
-        found["first_sample_depth_mm"] = Found(
-            _first_depth_mm(one), "ReferencePixelY0 and its physical value"
-        )
+        pixel, value_cm = one.reference_y
+        # The first row taken is the region's last where y falls.
+        row = one.bottom - one.top if one.delta_cm[1] < 0 else 0
+        depth_mm = 10.0 * (value_cm + (row - pixel) * one.delta_cm[1])
+        values["first_sample_depth_mm"] = Value(depth_mm, "ReferencePixelY0 and its physical value")
     notes: list[Row] = [("region read", str(one), "")]
     notes += [("region left out", str(other), "") for other in regions if other is not one]
     if one.delta_cm[0] < 0:
-        notes.append(
-            ("columns", "run against the file's x (PhysicalDeltaX below 0): left as they are shown", "")
-        )
+        notes.append(("columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""))
     if one.delta_cm[1] < 0:
         notes.append(("rows", "turned over: the file's y falls (PhysicalDeltaY below 0)", ""))
-    return one, found, notes
+    return one, values, notes
 
 
 def _without_regions(
     path: Path, header: Any, columns: int, rows: int
-) -> tuple[_Region, dict[str, Found], list[Row]]:
-    whole = _Region(1, 1, 0, 0, columns - 1, rows - 1, (_UNIT_CM, _UNIT_CM), (1.0, 1.0), None)
-    found = {}
-    with reading_dicom(str(path)):
+) -> tuple[_Region, dict[str, Value], list[Row]]:
+    with _reading(str(path)):
         spacing = [float(value) for value in header.get("PixelSpacing") or ()]
+    values = {}
     if len(spacing) == 2 and min(spacing) > 0 and np.isfinite(spacing).all():
-        found = {
-            "row_spacing_mm": Found(spacing[0], "PixelSpacing"),
-            "column_pitch_mm": Found(spacing[1], "PixelSpacing"),
+        values = {
+            "row_spacing_mm": Value(spacing[0], "PixelSpacing"),
+            "column_pitch_mm": Value(spacing[1], "PixelSpacing"),
         }
-    return (
-        whole,
-        found,
-        [("region read", "the whole image, taken for Cartesian tissue: the file names none", "")],
-    )
+    words = "the whole image, taken for Cartesian tissue: the file names none"
+    return _Region(1, 1, 0, 0, columns - 1, rows - 1), values, [("region read", words, "")]
 
 
-def _first_depth_mm(region: _Region) -> float:
-    """Depth of the first row taken, which is the region's last where y falls."""
-    assert region.reference_y is not None
-    pixel, value_cm = region.reference_y
-    row = region.bottom - region.top if region.delta_cm[1] < 0 else 0
-    return 10.0 * (value_cm + (row - pixel) * region.delta_cm[1])
-
-
-def _region(path: Path, index: int, item: Any) -> _Region:
-    where = f"{path}: SequenceOfUltrasoundRegions[{index}]"
-
+def _region(where: str, item: Any) -> _Region:
     def number(name: str) -> float:
-        value = item.get(name)
         try:
-            made = float(value)
+            value = float(item.get(name))
         except (TypeError, ValueError):
-            made = np.nan
-        if not np.isfinite(made):
-            raise InvalidInputError(f"{where}: {name}: expected a number, got {printable(str(value))}")
-        return made
+            value = np.nan
+        if not np.isfinite(value):
+            got = printable(str(item.get(name)))
+            raise InvalidInputError(f"{where}: {name}: expected a number, got {got}")
+        return value
 
-    box = [int(number(f"RegionLocation{name}")) for name in ("MinX0", "MinY0", "MaxX1", "MaxY1")]
-    is_image = int(number("RegionSpatialFormat")) == 1
-    reference = None
-    if (
-        is_image
-        and item.get("ReferencePixelY0") is not None
-        and item.get("ReferencePixelPhysicalValueY") is not None
-    ):
-        reference = number("ReferencePixelY0"), number("ReferencePixelPhysicalValueY")
-    left, top, right, bottom = box
-    return _Region(
-        spatial=int(number("RegionSpatialFormat")),
-        data=int(number("RegionDataType")),
-        left=left,
-        top=top,
-        right=right,
-        bottom=bottom,
-        units=(int(number("PhysicalUnitsXDirection")), int(number("PhysicalUnitsYDirection"))),
-        delta_cm=(number("PhysicalDeltaX"), number("PhysicalDeltaY")) if is_image else (1.0, 1.0),
-        reference_y=reference,
-    )
+    spatial, data = int(number("RegionSpatialFormat")), int(number("RegionDataType"))
+    corners = ("MinX0", "MinY0", "MaxX1", "MaxY1")
+    left, top, right, bottom = (int(number(f"RegionLocation{name}")) for name in corners)
+    units = int(number("PhysicalUnitsXDirection")), int(number("PhysicalUnitsYDirection"))
+    if spatial != 1:
+        return _Region(spatial, data, left, top, right, bottom, units)
+    names = ("ReferencePixelY0", "ReferencePixelPhysicalValueY")
+    has_reference = all(item.get(name) is not None for name in names)
+    reference = (number(names[0]), number(names[1])) if has_reference else None
+    delta = number("PhysicalDeltaX"), number("PhysicalDeltaY")
+    return _Region(spatial, data, left, top, right, bottom, units, delta, reference)
 
 
-def _clock(
-    path: Path, header: Any, count: int, rate_is_given: bool
-) -> tuple[npt.NDArray[np.float64] | None, Found]:
-    """Times of the frames where each has its own and no rate is given, else their rate."""
-    with reading_dicom(str(path)):
+def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, list[str]]:
+    """Times of the frames where each has its own, else their rate; and what contradicts."""
+    with _reading("frame times"):
         vector = header.get("FrameTimeVector")
         steps = np.atleast_1d(np.asarray([] if vector is None else vector, dtype=float))
-        frame_time = header.get("FrameTime")
-        rates = [
-            ("FrameTime", 1e3 / float(frame_time) if frame_time else 0.0),
-            ("CineRate", float(header.get("CineRate") or 0.0)),
-            (
-                "RecommendedDisplayFrameRate, which is for display",
-                float(header.get("RecommendedDisplayFrameRate") or 0),
+        interval = header.get("FrameTime")
+        rates = {
+            "FrameTime": 1e3 / float(interval) if interval else 0.0,
+            "CineRate": float(header.get("CineRate") or 0.0),
+            "RecommendedDisplayFrameRate, which is for display": float(
+                header.get("RecommendedDisplayFrameRate") or 0
             ),
-        ]
-    if steps.size and not rate_is_given:
-        if steps.size != count or not np.isfinite(steps).all() or not (steps[1:] > 0).all():
-            raise InvalidInputError(
-                f"{path}: FrameTimeVector: expected {count} times above 0 after the first, got {steps.size} "
-                "(--frame-rate-hz replaces them)"
-            )
-        return np.cumsum(np.concatenate([[0.0], steps[1:]])) / 1e3, Found()
-    said = [(name, rate) for name, rate in rates if np.isfinite(rate) and rate > 0]
-    if not said:
-        return None, Found()
-    name, rate = said[0]
-    others = [f"{other} says {each:.4g}" for other, each in said[1:2] if differs(rate, each)]
-    return None, Found(rate, ", ".join([name, *others]))
+        }
+    said = [(name, rate) for name, rate in rates.items() if np.isfinite(rate) and rate > 0]
+    rate = Value()
+    if said:
+        others = [f"{name} says {other:.4g}" for name, other in said[1:2] if differs(said[0][1], other)]
+        rate = Value(said[0][1], ", ".join([said[0][0], *others]))
+    if not steps.size:
+        return None, rate, []
+    steps = steps if steps.size != count - 1 else np.concatenate([[0.0], steps])
+    if steps.size != count or not (steps[1:] >= 0).all():
+        words = (
+            f"FrameTimeVector: {steps.size} steps for {count} frames, not all of them 0 or above: not used"
+        )
+        return None, rate, [words]
+    return np.cumsum(np.concatenate([[0.0], steps[1:]])) / 1e3, rate, []
 
 
 def _grey(image: npt.NDArray[Any], spread: int) -> npt.NDArray[np.uint8]:
@@ -354,27 +334,43 @@ def _grey(image: npt.NDArray[Any], spread: int) -> npt.NDArray[np.uint8]:
             f"expected grey, got {int(coloured.sum())} pixels of a colour, the first at column {column}, "
             f"row {row} of the region: colour Doppler or an overlay"
         )
-    grey: npt.NDArray[np.uint8] = np.rint(image.mean(axis=2)).astype(np.uint8)
-    return grey
+    return np.asarray(np.rint(image.mean(axis=2)), dtype=np.uint8)
 
 
-def _notes(header: Any, syntax: Any) -> tuple[Row, ...]:
-    named = {
+def _facts(header: Any, syntax: Any) -> list[Row]:
+    names = {
         "scanner": ("Manufacturer", "ManufacturerModelName"),
         "transducer": ("TransducerType", "TransducerData"),
     }
     rows: list[Row] = []
-    for spoken, names in named.items():
-        if text := " ".join(filter(None, (text_of(header, name) for name in names))):
-            rows.append((spoken, text, ""))
+    for words, elements in names.items():
+        if text := " ".join(filter(None, (_text(header, element) for element in elements))):
+            rows.append((words, text, ""))
     rows.append(("transfer syntax", printable(str(syntax.name)), ""))
-    if text_of(header, "LossyImageCompression") == "01":
+    if _text(header, "LossyImageCompression") == "01":
         rows.append(("pixels", "packed with loss, which smooths speckle", ""))
-    return tuple(rows)
+    return rows
 
 
-def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
-    return _recording(path, settings).contradictions(settings)
+def _text(header: Any, name: str) -> str:
+    """Words of an element, as they may be shown; none where there is no such element."""
+    value = header.get(name)
+    if value is None:
+        return ""
+    words = value if isinstance(value, list | tuple) or type(value).__name__ == "MultiValue" else [value]
+    text = " ".join(printable(" ".join(str(word).split())) for word in words).strip()
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
 
 
-READER = Reader(FORMAT, _claims, read_dicom, _describe, notes=_contradictions)
+def _whole(path: Path, header: Any, name: str, default: int) -> int:
+    """Whole number of an element, or `default` where there is no such element."""
+    value = header.get(name)
+    try:
+        return default if value is None else int(value)
+    except (TypeError, ValueError):
+        raise InvalidInputError(
+            f"{path}: {name}: expected a whole number, got {printable(str(value))}"
+        ) from None
+
+
+READER = Reader(FORMAT, _claims, open_dicom)

@@ -20,12 +20,10 @@ import numpy as np
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
-from speckle3d.core.sweep import Sweep
-from speckle3d.io.formats.recordings import Recording
-from speckle3d.io.found import Found
+from speckle3d.io.frames import FileFrames, RawFile
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.lazy import Layout, RawFrames, Real
-from speckle3d.io.readers import Reader, Row
+from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Row, Value
 
 FORMAT = "Ultrasonix"
 
@@ -53,79 +51,71 @@ class _Header:
     width: int
     height: int
     bits: int
-    corners: tuple[int, ...]
     probe: int
     transmit_hz: int
     sampling_hz: int
     frame_rate_hz: int
     line_density: int
 
+    @classmethod
+    def unpacked(cls, content: bytes) -> _Header:
+        values = _HEADER.unpack_from(content)
+        return cls(*values[:5], *values[13:18])
+
     @property
     def frame_bytes(self) -> int:
         return self.width * self.height * self.bits // 8
 
     def is_sound(self) -> bool:
+        sides = 0 < self.width <= _MOST_LENGTH and 0 < self.height <= _MOST_LENGTH
         return (
             self.kind in _TYPES
             and 0 <= self.frames <= _MOST_FRAMES
-            and 0 < self.width <= _MOST_LENGTH
-            and 0 < self.height <= _MOST_LENGTH
+            and sides
             and self.bits in (8, 16, 24, 32)
         )
 
     def tag_bytes(self, size: int) -> int | None:
         """Bytes before each frame, by the file's size; None if it fits neither."""
-        for tag in (0, _TAG_BYTES):
-            if size == _HEADER.size + self.frames * (tag + self.frame_bytes):
-                return tag
-        return None
-
-
-def read_ultrasonix(path: Path, settings: ImportSettings | None = None) -> Sweep:
-    """Read RF or B-mode of a linear probe; frames stay on disk until they are asked for.
-
-    The header has no line pitch and no band; of B-mode no pixel size and no dynamic range.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read or is not as long as its header says.
-    InvalidInputError
-        Naming what is recorded, if it is neither.
-    MissingSettingsError
-        Naming all that the header does not say.
-    """
-    return _recording(path).sweep(settings or ImportSettings())
+        sizes = {_HEADER.size + self.frames * (tag + self.frame_bytes): tag for tag in (_TAG_BYTES, 0)}
+        return sizes.get(size)
 
 
 def _claims(path: Path, start: bytes) -> bool:
     if len(start) < _HEADER.size:
         return False
-    header = _unpacked(start)
-    return header.is_sound() and (
-        path.suffix.lower() in _SUFFIXES or header.tag_bytes(path.stat().st_size) is not None
-    )
+    header = _Header.unpacked(start)
+    named = path.suffix.lower() in _SUFFIXES
+    return header.is_sound() and (named or header.tag_bytes(path.stat().st_size) is not None)
 
 
-def _describe(path: Path, settings: ImportSettings) -> list[Row]:
-    try:
-        return _recording(path).rows(settings)
-    except InvalidInputError:
-        # Why there is no sweep is told beside these rows.
-        return _notes(_header(path)[0])
+def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:
+    """Read RF or B-mode of a linear probe.
 
-
-def _notes(header: _Header) -> list[Row]:
-    return [
+    The header has no line pitch and no band; of B-mode no pixel size and no dynamic range.
+    """
+    with open_regular(path) as stream:
+        header = _Header.unpacked(stream.read(_HEADER.size))
+        size = stream.seek(0, 2)
+    rows: tuple[Row, ...] = (
         ("recorded", _TYPES[header.kind], ""),
         ("probe's number", str(header.probe), ""),
         ("line density", str(header.line_density), "lines"),
-        ("lines", "taken for parallel, as of a linear probe: the file does not say", ""),
-    ]
+    )
+    try:
+        frames = _frames(path, header, size)
+    except (InvalidInputError, FileError) as error:
+        return Recording(path, settings, rows=rows, fault=error)
+    values = {
+        "sampling_rate_hz": Value(float(header.sampling_hz) or None, "in the header"),
+        "centre_frequency_hz": Value(float(header.transmit_hz) or None, "in the header: transmitted"),
+        "frame_rate_hz": Value(max(header.frame_rate_hz, 0) or None, "in the header"),
+    }
+    lines = () if header.kind == 4 else ("parallel lines",)
+    return Recording(path, settings, frames, values, assumptions=lines, rows=rows)
 
 
-def _recording(path: Path) -> Recording:
-    header, size = _header(path)
+def _frames(path: Path, header: _Header, size: int) -> FileFrames:
     if header.kind not in _BITS:
         raise InvalidInputError(f"{path}: expected RF or B-mode of 8 bits, got {_TYPES[header.kind]}")
     if header.bits != _BITS[header.kind]:
@@ -137,59 +127,17 @@ def _recording(path: Path) -> Recording:
     tag = header.tag_bytes(size)
     if tag is None:
         expected = _HEADER.size + header.frames * header.frame_bytes
+        if size < expected:
+            whole = (size - _HEADER.size) // header.frame_bytes
+            raise FileError(f"{path}: ends early: {whole} of {header.frames} frames")
         longer = expected + header.frames * _TAG_BYTES
         raise FileError(f"{path}: expected {expected} bytes, or {longer} with frame numbers, got {size}")
-    scan_converted = header.kind == 4
-    shape = (header.height, header.width) if scan_converted else (header.width, header.height)
-    layout = Layout(shape, (1, 0) if scan_converted else (0, 1))
+    is_image = header.kind == 4
+    shape = (header.height, header.width) if is_image else (header.width, header.height)
     dtype = np.dtype("<i2" if header.kind == 16 else "u1")
-    return Recording(
-        path,
-        RawFrames(
-            path,
-            _HEADER.size + tag,
-            tag + header.frame_bytes,
-            dtype,
-            Real(layout),
-            (header.frames, header.width, header.height),
-            dtype.newbyteorder("="),
-        ),
-        {
-            "sampling_rate_hz": Found(float(header.sampling_hz) or None, "in the header"),
-            "centre_frequency_hz": Found(float(header.transmit_hz) or None, "in the header: transmitted"),
-            "frame_rate_hz": Found(
-                header.frame_rate_hz if header.frame_rate_hz > 0 else None, "in the header"
-            ),
-        },
-        notes=tuple(_notes(header)),
-    )
+    turn = np.transpose if is_image else np.asarray
+    source = RawFile(path, _HEADER.size + tag, tag + header.frame_bytes, dtype, shape, turn)
+    return FileFrames(path, source, (header.frames, header.width, header.height), dtype.newbyteorder("="))
 
 
-def _header(path: Path) -> tuple[_Header, int]:
-    with open_regular(path) as stream:
-        content = stream.read(_HEADER.size)
-        size = stream.seek(0, 2)
-    if len(content) < _HEADER.size:
-        raise FileError(f"{path}: expected a header of {_HEADER.size} bytes, got {len(content)}")
-    header = _unpacked(content)
-    if not header.is_sound():
-        raise InvalidInputError(
-            f"{path}: expected a header of Ultrasonix, got type {header.kind}, {header.frames} frames of "
-            f"{header.width} x {header.height}, {header.bits} bits"
-        )
-    return header, size
-
-
-def _unpacked(content: bytes) -> _Header:
-    kind, frames, width, height, bits, *rest = _HEADER.unpack_from(content)
-    probe, transmit_hz, sampling_hz, rate, density, _ = rest[8:]
-    return _Header(
-        kind, frames, width, height, bits, tuple(rest[:8]), probe, transmit_hz, sampling_hz, rate, density
-    )
-
-
-def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
-    return _recording(path).contradictions(settings)
-
-
-READER = Reader(FORMAT, _claims, read_ultrasonix, _describe, notes=_contradictions)
+READER = Reader(FORMAT, _claims, open_ultrasonix)

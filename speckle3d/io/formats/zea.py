@@ -1,59 +1,57 @@
-"""zea's HDF5 files, the format of the OpenH-RF data sets (zea documentation, "Data", ``zea.data.spec``).
+"""Recordings of zea, a toolbox of TU Eindhoven (HDF5) [1]_.
 
 ``/data``, or ``/tracks/NAME/data`` where several sequences were interleaved, holds what was recorded and
 made of it; ``scan`` beside it says how. Of ``beamformed_data`` (frame, z, x, channel), one channel is RF and
 two are I and Q; ``envelope_data`` (frame, z, x) are amplitudes; ``image`` (frame, z, x) is in decibels, or
 grey levels of eight bits. Since version 0.0.12 each is a group of ``values`` and ``coordinates``, the
 position (x, y, z) of each pixel in metres, by which the axes are told; before, a plain data set without
-positions.
+positions. ``metadata/probe_pose`` is the tracker: poses of the transducer's tip, in metres, on a clock
+whose zero is the first transmission; its axes are x lateral, y elevational and z axial.
 
 zea's I/Q come both ways, by version: shifted down by ``demodulation_frequency``, or carrying their frequency
 again after delays were corrected. The phase of the data tells, see `carrier`.
+
+References
+----------
+.. [1] zea documentation, "Data", ``zea.data.spec``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.streams import TimedPoses
+from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.greys import grey_frames
-from speckle3d.io.formats.hdf5_values import single
-from speckle3d.io.formats.recordings import Recording, step_of
-from speckle3d.io.found import Found
-from speckle3d.io.hdf5 import (
-    find_group,
-    find_member,
-    has_member,
-    hdf5_claim,
-    locate,
-    open_hdf5,
-    read_checked,
-    read_text,
-    reading,
-    require_dataset,
-    require_group,
-)
+from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, member, single, text_attribute
+from speckle3d.io.frames import FileFrames
+from speckle3d.io.hdf5 import hdf5_claim, open_hdf5, reading
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
-from speckle3d.io.lazy import HDF5Slices, Layout, Pairs, Real
-from speckle3d.io.readers import Reader, Row
+from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Row, Value, step_of, where_of
 
 FORMAT = "zea"
 
 _READ = ("beamformed_data", "envelope_data", "image", "image_sc")
 _NOT_BEAMFORMED = ("raw_data", "aligned_data")
-_MOST_TRACKS = 64
+_POSES = "metadata/probe_pose"
 _FRAMES_CHECKED = 8
 """Whose pixels must lie where the first frame's do."""
 _TOLERANCE_MM = 1e-3
 """Of a pixel's place: single precision in metres keeps 1e-5 mm of a depth of 150 mm."""
+_TIP_FROM_IMAGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Axes of the image (x lateral, y axial, z = x cross y) along zea's of the transducer's tip."""
+_ROTATIONS = ("quaternion_wxyz", "quaternion_xyzw", "euler_xyz")
 
 
 @dataclass(frozen=True)
@@ -78,67 +76,104 @@ class _Array:
     coordinates: str | None
 
 
-def read_zea(path: Path, settings: ImportSettings | None = None) -> Sweep:
-    """Read beamformed RF or I/Q, else an envelope, else images; they stay on disk until asked for.
+@dataclass(frozen=True)
+class _Pixels:
+    """Lateral positions and depths of pixels, and whether the file's first axis of an image is lateral."""
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
-    InvalidInputError
-        If it holds channel data alone, or pixels that lie on no even grid.
-    MissingSettingsError
-        Naming all that the file does not say.
-    """
-    settings = settings or ImportSettings()
-    return _recording(path, settings).sweep(settings)
+    x_mm: FloatArray
+    z_mm: FloatArray
+    x_first: bool
 
 
 def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
-    if "format" in file.attrs:
-        return False
-    homes = _homes(file)
-    known = (*_READ, *_NOT_BEAMFORMED)
-    return any(has_member(file, f"{home}data/{name}") for home in homes for name in known)
+    names = (*_READ, *_NOT_BEAMFORMED)
+    return "format" not in file.attrs and any(
+        member(file, f"{home}data/{name}") is not None for home in _homes(file) for name in names
+    )
 
 
-def _describe(path: Path, settings: ImportSettings) -> list[Row]:
-    try:
-        return _recording(path, settings).rows(settings)
-    except InvalidInputError:
-        # Why there is no sweep is told beside these rows.
-        with reading(path), open_hdf5(path) as file:
-            return _notes(file)
+def open_zea(path: Path, settings: ImportSettings) -> Recording:
+    """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
+    with reading(path), open_hdf5(path) as file:
+        rows = _facts(file)
+        try:
+            return _recording(path, settings, file, rows)
+        except InvalidInputError as error:
+            return Recording(path, settings, rows=tuple(rows), fault=error)
+
+
+def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
+    array = _chosen(file, path, settings)
+    rows.append(("read", array.name, ""))
+    node = dataset(file, array.name)
+    count, first, second, channels = _shape(path, node, array)
+    pixels = None if array.coordinates is None else _pixels(path, file, array, (count, first, second))
+    values = _scan(file, array)
+    x_first = pixels is not None and pixels.x_first
+    shape = (count, first, second) if x_first else (count, second, first)
+    trailing = node.shape[3:] if channels == 1 else ()
+    grid = Grid((first, second, *trailing), (0, 1) if x_first else (1, 0), channels == 2)
+    source = HDF5File(path, (array.name,), 0, grid)
+    if array.kind == "beamformed_data" or node.dtype == np.uint8:
+        dtype = np.complex64 if channels == 2 else np.uint8 if node.dtype == np.uint8 else np.float32
+        frames = source.frames(shape, dtype)
+    else:
+        decibels, given = array.kind != "envelope_data", settings.dynamic_range_db
+        frames, top, span = source.grey_frames(shape, grid, decibels, given)
+        values["dynamic_range_db"] = Value(span, f"of grey levels made here below {top:g}")
+    spacing = None
+    if pixels is not None:
+        where, source_text = where_of(path, str(array.coordinates)), "of the coordinates"
+        pitch, spacing = step_of(pixels.x_mm, f"{where} x"), step_of(pixels.z_mm, f"{where} z")
+        values |= {
+            "vector_pitch_mm": Value(pitch, source_text),
+            "column_pitch_mm": Value(pitch, source_text),
+            "row_spacing_mm": Value(spacing, source_text),
+            "first_sample_depth_mm": Value(float(pixels.z_mm[0]), source_text),
+        }
+        if channels == 2:
+            values["demodulation_frequency_hz"] = _demodulation(path, file, frames, values, settings, spacing)
+    tracker, remarks = _tracker(path, file, pixels)
+    return Recording(
+        path,
+        settings,
+        frames,
+        values,
+        sample_spacing_mm=spacing,
+        time_s=_times(path, file, array, count),
+        tracker=tracker,
+        chain=_POSES,
+        probe=settings.probe or text_attribute(file, "probe_name") or text_attribute(file, "probe"),
+        assumptions=() if pixels is not None else ("parallel lines",),
+        rows=tuple(rows),
+        remarks=tuple(remarks),
+    )
 
 
 def _homes(file: h5py.File) -> list[str]:
     """Groups that hold ``data``: the root as an empty text, or tracks with a slash at the end."""
-    if isinstance(find_member(file, "data"), h5py.Group):
+    if isinstance(member(file, "data"), h5py.Group):
         return [""]
-    tracks = find_member(file, "tracks")
-    if not isinstance(tracks, h5py.Group):
-        return []
-    return [
-        f"tracks/{name}/"
-        for name in sorted(each for each in tracks if isinstance(each, str))[:_MOST_TRACKS]
-        if isinstance(find_member(tracks, f"{name}/data"), h5py.Group)
-    ]
+    tracks = member(file, "tracks")
+    names = sorted(map(str, tracks)) if isinstance(tracks, h5py.Group) else []
+    return [f"tracks/{name}/" for name in names if isinstance(member(tracks, f"{name}/data"), h5py.Group)]
 
 
 def _arrays(file: h5py.File) -> list[_Array]:
     """All that could be read."""
-    found = []
+    arrays = []
     for home in _homes(file):
         for kind in _READ:
-            member = find_member(file, f"{home}data/{kind}")
             name = f"{home}data/{kind}"
-            if isinstance(member, h5py.Dataset):
-                found.append(_Array(name, home, kind, None))
-            elif isinstance(member, h5py.Group) and has_member(member, "values"):
-                placed = has_member(member, "coordinates")
-                found.append(_Array(f"{name}/values", home, kind, f"{name}/coordinates" if placed else None))
-    return found
+            node = member(file, name)
+            if isinstance(node, h5py.Dataset):
+                arrays.append(_Array(name, home, kind, None))
+            elif member(file, f"{name}/values") is not None:
+                placed = member(file, f"{name}/coordinates") is not None
+                places = f"{name}/coordinates" if placed else None
+                arrays.append(_Array(f"{name}/values", home, kind, places))
+    return arrays
 
 
 def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> _Array:
@@ -164,183 +199,163 @@ def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> _Array:
 
 
 def _held(file: h5py.File) -> str:
-    names = [
-        f"{home}data/{printable(name)}"
-        for home in _homes(file)
-        for name in require_group(file, f"{home}data")
-        if isinstance(name, str)
-    ]
+    names = [f"{home}data/{printable(str(name))}" for home in _homes(file) for name in file[f"{home}data"]]
     text = ", ".join(names) or "nothing"
     if any(name.endswith(_NOT_BEAMFORMED) for name in names):
         return f"{text}: channel data need beamforming, by zea's Pipeline, and its result written"
-    if any(has_member(file, f"{name}/pixels") for name in names):
+    if any(member(file, f"{name}/pixels") is not None for name in names):
         return f"{text}: pixels with an extent, whose axes are not certain: write it by zea 0.0.12 or later"
     return text
 
 
-def _recording(path: Path, settings: ImportSettings) -> Recording:
-    with reading(path), open_hdf5(path) as file:
-        array = _chosen(file, path, settings)
-        node = require_dataset(file, array.name)
-        count, first, second, channels = _shape(node, array)
-        grid = None if array.coordinates is None else _grid(path, file, array, (count, first, second))
-        found, times = _scan(file, array), _times(file, array, count)
-        is_grey, trailing = node.dtype == np.uint8, node.shape[3:]
-        notes, probe = tuple(_notes(file, array)), _probe(file)
-    x_first = grid is not None and grid.x_first
-    order = (0, 1) if x_first else (1, 0)
-    shape = (count, first, second) if x_first else (count, second, first)
-    layout = Layout((first, second, *(trailing if channels == 1 else ())), order)
-    if channels == 2:
-        frames = HDF5Slices(path, [array.name], 0, Pairs(layout), shape, np.complex64)
-    elif array.kind == "beamformed_data" or is_grey:
-        frames = HDF5Slices(path, [array.name], 0, Real(layout), shape, np.uint8 if is_grey else np.float32)
-    else:
-        decibels, given = array.kind != "envelope_data", settings.dynamic_range_db
-        frames, top, span = grey_frames(path, [array.name], 0, layout, shape, decibels, given)
-        found["dynamic_range_db"] = Found(span, f"of grey levels made here below {top:g}")
-    if grid is None:
-        notes += (("lines", "taken for parallel: the file does not say where pixels lie", ""),)
-        return Recording(path, frames, found, time_s=times, probe=probe, notes=notes)
-    found |= _placed(path, array, grid)
-    spacing = float(found["row_spacing_mm"].value)
-    if channels == 2:
-        found["demodulation_frequency_hz"] = _demodulation(path, frames, found, settings, spacing)
-    return Recording(path, frames, found, sample_spacing_mm=spacing, time_s=times, probe=probe, notes=notes)
-
-
-def _shape(node: h5py.Dataset, array: _Array) -> tuple[int, int, int, int]:
+def _shape(path: Path, node: h5py.Dataset, array: _Array) -> tuple[int, int, int, int]:
     """Frames, the two axes of the image, and channels."""
-    channelled = array.kind == "beamformed_data" and node.ndim == 4
-    is_image = array.kind in ("image", "image_sc")
-    sound = node.dtype.kind == "f" or (is_image and node.dtype == np.uint8)
-    shaped = node.ndim == 3 or (channelled and node.shape[3] in (1, 2))
+    is_beamformed = array.kind == "beamformed_data"
+    is_channelled = is_beamformed and node.ndim == 4
+    sound = node.dtype.kind == "f" or (array.kind.startswith("image") and node.dtype == np.uint8)
+    shaped = node.ndim == 3 or (is_channelled and node.shape[3] in (1, 2))
     if not sound or not shaped or 0 in node.shape:
-        expected = "(frame, z, x, 1 or 2)" if array.kind == "beamformed_data" else "(frame, z, x)"
+        expected = "(frame, z, x, 1 or 2)" if is_beamformed else "(frame, z, x)"
         raise InvalidInputError(
-            f"{locate(node)}: expected echoes of shape {expected}, got {node.shape} {node.dtype}"
+            f"{where_of(path, array.name)}: expected echoes of shape {expected}, got {node.shape} "
+            f"{node.dtype}"
         )
     count, first, second = node.shape[:3]
-    return count, first, second, node.shape[3] if channelled else 1
+    return count, first, second, node.shape[3] if is_channelled else 1
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """Lateral positions and depths of pixels, and whether the file's first axis of an image is lateral."""
-
-    x_mm: FloatArray
-    z_mm: FloatArray
-    x_first: bool
-
-
-def _grid(path: Path, file: h5py.File, array: _Array, shape: tuple[int, int, int]) -> _Grid:
+def _pixels(path: Path, file: h5py.File, array: _Array, shape: tuple[int, int, int]) -> _Pixels:
     """Axes of the pixels, whose positions must be those of a Cartesian grid, the same in all frames."""
     assert array.coordinates is not None
-    where = f"{path}: /{array.coordinates}"
-    count, first, second = shape
-    node = require_dataset(file, array.coordinates)
+    where = where_of(path, array.coordinates)
+    node = dataset(file, array.coordinates)
     if node.shape != (*shape, 3) or node.dtype.kind != "f":
         raise InvalidInputError(f"{where}: expected shape {(*shape, 3)}, got {node.shape} {node.dtype}")
-    flat = Real(Layout((first * second, 3), (0, 1)))
-    positions = HDF5Slices(path, [array.coordinates], 0, flat, (count, first * second, 3), np.float64)
-    start = positions[0]
-    for i in np.unique(np.linspace(0, count - 1, _FRAMES_CHECKED).astype(int)):
-        if np.abs(positions[int(i)] - start).max() > _TOLERANCE_MM / 1e3:
+    start = np.asarray(node[0], dtype=np.float64)
+    for i in np.unique(np.linspace(0, shape[0] - 1, _FRAMES_CHECKED).astype(int)).tolist():
+        if not np.abs(node[i] - start).max() <= _TOLERANCE_MM / 1e3:
             raise InvalidInputError(f"{where}[{i}]: expected pixels where the first frame's are, got others")
-    positions.close()
-    x, y, z = 1e3 * start.reshape(first, second, 3).transpose(2, 0, 1)
+    x, y, z = 1e3 * start.transpose(2, 0, 1)
     for x_first in (False, True):
         columns, depths = (x.T, z.T) if x_first else (x, z)
-        grid = _Grid(columns[0], depths[:, 0], x_first)
-        off = max(np.abs(columns - grid.x_mm).max(), np.abs(depths.T - grid.z_mm).max(), np.ptp(y))
-        if off <= _TOLERANCE_MM and np.ptp(grid.x_mm) > 0 and np.ptp(grid.z_mm) > 0:
-            return grid
+        pixels = _Pixels(columns[0], depths[:, 0], x_first)
+        off = max(np.abs(columns - pixels.x_mm).max(), np.abs(depths.T - pixels.z_mm).max(), np.ptp(y))
+        if off <= _TOLERANCE_MM and np.ptp(pixels.x_mm) > 0 and np.ptp(pixels.z_mm) > 0:
+            return pixels
     raise InvalidInputError(
         f"{where}: expected pixels on a Cartesian grid in one plane, got others, as of a polar image: "
         "beamform onto zea's cartesian_pixel_grid, or scan-convert and write that"
     )
 
 
-def _placed(path: Path, array: _Array, grid: _Grid) -> dict[str, Found]:
-    pitch = step_of(grid.x_mm, f"{path}: /{array.coordinates} x")
-    spacing = step_of(grid.z_mm, f"{path}: /{array.coordinates} z")
-    return {
-        "vector_pitch_mm": Found(pitch, "of the coordinates"),
-        "column_pitch_mm": Found(pitch, "of the coordinates"),
-        "row_spacing_mm": Found(spacing, "of the coordinates"),
-        "first_sample_depth_mm": Found(float(grid.z_mm[0]), "of the coordinates"),
-    }
-
-
-def _scan(file: h5py.File, array: _Array) -> dict[str, Found]:
+def _scan(file: h5py.File, array: _Array) -> dict[str, Value]:
     """What ``scan`` says of the echoes; its sampling frequency is that of channel data."""
-    scan = find_group(file, f"{array.home}scan")
-    if scan is None:
-        return {}
-    found = {}
-    for name, member in (("speed_of_sound_m_s", "sound_speed"), ("centre_frequency_hz", "center_frequency")):
-        if value := single(scan, member):
-            found[name] = Found(value, f"in {array.home}scan/{member}")
-    percent, centre = single(scan, "bandwidth_percent"), found.get("centre_frequency_hz")
+    values, home = {}, f"{array.home}scan"
+    for name, field in (("speed_of_sound_m_s", "sound_speed"), ("centre_frequency_hz", "center_frequency")):
+        if value := single(file, f"{home}/{field}"):
+            values[name] = Value(value, f"in {home}/{field}")
+    percent, centre = single(file, f"{home}/bandwidth_percent"), values.get("centre_frequency_hz")
     if percent and centre is not None:
         half = centre.value * percent / 200.0
         band = (centre.value - half, centre.value + half)
-        found["bandwidth_hz"] = Found(band, f"in {array.home}scan/bandwidth_percent")
-    return found
+        values["bandwidth_hz"] = Value(band, f"in {home}/bandwidth_percent")
+    return values
 
 
 def _demodulation(
-    path: Path, frames: HDF5Slices, found: dict[str, Found], settings: ImportSettings, spacing_mm: float
-) -> Found:
+    path: Path,
+    file: h5py.File,
+    frames: FileFrames,
+    values: dict[str, Value],
+    settings: ImportSettings,
+    spacing_mm: float,
+) -> Value:
     """Frequency that I/Q were shifted down by, as their phase tells."""
-    with reading(path), open_hdf5(path) as file:
-        homes = _homes(file)
-        named = [single(file, f"{home}scan/demodulation_frequency") for home in homes]
-    middle = named[0] if len(set(named)) == 1 else None
-    if settings.demodulation_frequency_hz is not None or not middle:
-        return Found()
-    speed = settings.speed_of_sound_m_s or found.get("speed_of_sound_m_s", Found(SPEED_OF_SOUND_M_S)).value
+    named = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
+    shift_hz = named.pop() if len(named) == 1 else None
+    if settings.demodulation_frequency_hz is not None or not shift_hz:
+        return Value()
+    own = values.get("speed_of_sound_m_s", Value(SPEED_OF_SOUND_M_S)).value
+    rate_hz = 1e3 * (settings.speed_of_sound_m_s or own) / (2.0 * spacing_mm)
     with naming(str(path)):
-        told = demodulation_of(frames, middle, 1e3 * speed / (2.0 * spacing_mm))
-    frames.close()
-    return Found(told, "of scan/demodulation_frequency and the phase of the data")
+        by_phase = demodulation_of(frames, shift_hz, rate_hz)
+    return Value(by_phase, "of scan/demodulation_frequency and the phase of the data")
 
 
-def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:
-    """Start of each frame, of the times between transmissions; None where the file has none."""
+def _times(path: Path, file: h5py.File, array: _Array, count: int) -> FloatArray | None:
+    """Time of each frame after the first transmission: of the data, or of the times between transmissions."""
+    group = array.name.removesuffix("/values")
+    if array.coordinates is not None and member(file, f"{group}/timestamps") is not None:
+        stamps = np.asarray(dataset(file, f"{group}/timestamps")[()], dtype=np.float64)
+        if stamps.shape == (count,) and (np.diff(stamps) > 0).all():
+            return stamps + (single(file, f"{group}/start_time_offset") or 0.0)
     name = f"{array.home}scan/time_to_next_transmit"
-    if len(_homes(file)) > 1 or not has_member(file, name):
+    if len(_homes(file)) > 1 or member(file, name) is None:
         return None
-    steps = read_checked(file, name, (count, "transmission"))
+    steps = np.asarray(dataset(file, name)[()], dtype=np.float64)
+    if steps.ndim != 2 or len(steps) != count:
+        raise InvalidInputError(f"{where_of(path, name)}: expected {count} rows, got shape {steps.shape}")
     # The last transmission of all has no next one.
     last = steps[:-1].sum(axis=1)
-    if not np.isfinite(last).all() or not (last > 0).all():
-        raise InvalidInputError(f"{locate(file, name)}: expected times above 0, got others")
+    if not (last > 0).all():
+        raise InvalidInputError(f"{where_of(path, name)}: expected times above 0, got others")
     return np.concatenate([[0.0], np.cumsum(last)])
 
 
-def _probe(file: h5py.File) -> str:
-    for name in ("probe_name", "probe"):
-        if name in file.attrs:
-            return printable(read_text(file, name))
-    return ""
+def _tracker(path: Path, file: h5py.File, pixels: _Pixels | None) -> tuple[Tracker | None, list[str]]:
+    """The probe's poses, with the image on the probe where the file says where its pixels lie."""
+    node = member(file, _POSES)
+    if node is None:
+        return None, []
+    kind = _text(member(node, "rotation_representation")) if isinstance(node, h5py.Group) else ""
+    if kind not in _ROTATIONS:
+        return None, [
+            f"{_POSES}: not read: expected a rotation_representation of zea ({', '.join(_ROTATIONS)})"
+        ]
+    places, turns = (np.asarray(dataset(node, name)[()], float) for name in ("translation", "rotation"))
+    rate = single(node, "sampling_frequency")
+    count = len(places)
+    stamps = np.arange(count) / rate if rate else np.asarray(dataset(node, "timestamps")[()], dtype=float)
+    if not places.shape == (count, 3) or turns.shape != (count, 3 if kind == "euler_xyz" else 4):
+        raise InvalidInputError(
+            f"{where_of(path, _POSES)}: expected as many translations as rotations ({kind}), got shapes "
+            f"{places.shape} and {turns.shape}"
+        )
+    sound = np.isfinite(places).all(axis=1) & np.isfinite(turns).all(axis=1)
+    if kind != "euler_xyz":
+        sound &= np.linalg.norm(turns, axis=1) > 0
+    kept = np.flatnonzero(sound)
+    kept = kept[rising(stamps[kept])]
+    late = int(sound.sum()) - kept.size
+    reasons = {"not finite": count - int(sound.sum()), "without a time after the one before": late}
+    times = stamps[kept] + (single(node, "start_time_offset") or 0.0)
+    remarks = left_out("poses", count, reasons, times)
+    if not kept.size:
+        return None, [*remarks, f"{_POSES}: no pose is of use"]
+    if kind == "euler_xyz":
+        turned = Rotation.from_euler("xyz", turns[kept])
+        remarks.append(f"{_POSES}: euler_xyz is taken for radians about fixed axes x, y, z: zea does not say")
+    else:
+        turned = Rotation.from_quat(turns[kept], scalar_first=kind == "quaternion_wxyz")
+    mounting = None
+    if pixels is not None:
+        place = [float(pixels.x_mm[0]), 0.0, 0.0]
+        mounting = RigidTransform.from_components(place, Rotation.from_matrix(_TIP_FROM_IMAGE))
+    readings = TimedPoses(times, RigidTransform.from_components(1e3 * places[kept], turned))
+    return Tracker(readings, mounting), remarks
 
 
-def _notes(file: h5py.File, array: _Array | None = None) -> list[Row]:
+def _text(node: Any) -> str:
+    value = node[()] if isinstance(node, h5py.Dataset) else ""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _facts(file: h5py.File) -> list[Row]:
     rows: list[Row] = []
-    for name, spoken in (("zea_version", "written by zea"), ("us_machine", "scanner")):
-        if name in file.attrs:
-            rows.append((spoken, printable(read_text(file, name)), ""))
-    rows.append(("holds", _held(file), ""))
-    if array is not None:
-        rows.append(("read", array.name, ""))
-    if has_member(file, "metadata/probe_pose"):
-        rows.append(("probe's poses", "there, not read", ""))
-    return rows
+    for name, words in (("zea_version", "written by zea"), ("us_machine", "scanner")):
+        if text := text_attribute(file, name):
+            rows.append((words, text, ""))
+    return [*rows, ("holds", _held(file), "")]
 
 
-def _contradictions(path: Path, settings: ImportSettings) -> list[str]:
-    return _recording(path, settings).contradictions(settings)
-
-
-READER = Reader(FORMAT, hdf5_claim(is_zea), read_zea, _describe, notes=_contradictions)
+READER = Reader(FORMAT, hdf5_claim(is_zea), open_zea)

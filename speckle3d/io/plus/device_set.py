@@ -1,10 +1,11 @@
-"""What a device set of PLUS says about images: where they are on the probe, and how large their pixels are.
+"""What a device set of PLUS says about images: their place on the probe, their pixels, their clip.
 
 A result of PLUS's probe calibration, whose transforms are in ``CalibrationResults``, is read alike.
 
 References
 ----------
-.. [1] PLUS user manual, "Device set configuration", "Transformation matrix definition".
+.. [1] PLUS user manual, "Device set configuration", "Transformation matrix definition", "Volume
+   reconstruction".
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
-from speckle3d.io.plus.transforms import pixel_axes
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.plus.transforms import Names, pixel_axes
 from speckle3d.io.plus.xml import read_xml, vector
 
 _PLACES = (".//CoordinateDefinitions/Transform", ".//CalibrationResults/Transform")
@@ -26,6 +28,70 @@ _INVERSE_TOLERANCE = 0.1
 """How far the product of a transform and its inverse, both of some digits, may be from the identity, mm or
 pixels."""
 _ALGORITHMS = (".//vtkPlusProbeCalibrationAlgo", ".//vtkProbeCalibrationAlgo", ".//fCal")
+_HAIR = 0.1
+"""Pixels by which a rectangle is wider, so that rounding loses none of its own."""
+_ARC_POINTS = 128
+"""Of a fan's arc in a polygon: 0.02 pixels off the circle at a radius of 1,000 pixels and 90 degrees."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The part of the images that PLUS puts into volumes, in pixels of the standard orientation.
+
+    Attributes
+    ----------
+    columns, rows : tuple of float, optional
+        First and last.
+    fan : tuple of float, optional
+        Column and row of the apex, the radii, and the angles in degrees from straight down.
+    """
+
+    columns: tuple[float, float] | None = None
+    rows: tuple[float, float] | None = None
+    fan: tuple[float, float, float, float, float, float] | None = None
+
+    def __str__(self) -> str:
+        parts = []
+        if self.columns is not None and self.rows is not None:
+            parts.append("columns {:g} to {:g}, rows {:g} to {:g}".format(*self.columns, *self.rows))
+        if self.fan is not None:
+            parts.append(
+                "fan about {:g}, {:g} from {:g} to {:g} pixels, {:g} to {:g} degrees".format(*self.fan)
+            )
+        return "; ".join(parts)
+
+    def is_part_of(self, size: tuple[int, ...]) -> bool:
+        """Whether something of images of a size (x, y) is left out."""
+        sides = zip((self.columns, self.rows), size, strict=False)
+        return self.fan is not None or any(
+            side is not None and (side[0] > 0 or side[1] < length - 1) for side, length in sides
+        )
+
+    def region_text(self, grid: ImageGrid) -> str | None:
+        """The part as a region of images in mm; None where it is all of them."""
+        parts = []
+        if not self.is_part_of((grid.vectors, grid.samples)):
+            return None
+        if self.columns is not None and self.rows is not None:
+            (left, right), (top, bottom) = self.columns, self.rows
+            corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
+            outward = _HAIR * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+            parts.append(_polygon(grid, np.asarray(corners) + outward))
+        if self.fan is not None:
+            x, y, inner, outer, first, stop = self.fan
+            angles = np.deg2rad(np.linspace(first, stop, _ARC_POINTS))
+            arc = np.column_stack([np.sin(angles), np.cos(angles)])
+            outline = np.concatenate([outer * arc, inner * arc[::-1]])
+            # PLUS moves both halves a pixel towards the middle (vtkIGSIOPasteSliceIntoVolume).
+            outline[:, 0] -= (1 - _HAIR) * np.sign(outline[:, 0])
+            parts.append(_polygon(grid, outline + np.array([x, y])))
+        return " and ".join(parts)
+
+
+def _polygon(grid: ImageGrid, pixels: FloatArray) -> str:
+    """A polygon whose corners are given in pixels, in mm of the image."""
+    places = np.column_stack([pixels, np.ones(len(pixels))]) @ grid.image_from_sample[:2].T
+    return "polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in places)
 
 
 @dataclass(frozen=True)
@@ -50,6 +116,11 @@ class ScanConversion:
     output_size: tuple[float, ...] | None = None
     output_mm: tuple[float, float] | None = None
 
+    @property
+    def is_curved(self) -> bool:
+        """Whether the transducer's lines spread."""
+        return self.geometry not in ("", "LINEAR")
+
 
 @dataclass(frozen=True)
 class DeviceSet:
@@ -57,8 +128,8 @@ class DeviceSet:
 
     Attributes
     ----------
-    image_frame, probe_frame, tracker_frame : str
-        Names of the coordinate frames.
+    names : Names
+        Of the coordinate frames.
     origin_frame : str
         Frame of the transducer's face, in mm.
     transforms : dict
@@ -66,16 +137,16 @@ class DeviceSet:
     image_orientation : str, optional
         Of the machine's own images, as UF.
     scan : ScanConversion
+    clip : Clip, optional
     """
 
     path: str = ""
-    image_frame: str = "Image"
-    probe_frame: str = "Probe"
-    tracker_frame: str = "Tracker"
+    names: Names = field(default_factory=Names)
     origin_frame: str = "TransducerOrigin"
     transforms: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
     image_orientation: str | None = None
     scan: ScanConversion = ScanConversion()
+    clip: Clip | None = None
 
     def transform(self, start: str, end: str) -> FloatArray | None:
         """Product of the transforms, or their inverses, on the shortest way between two frames, if any.
@@ -85,44 +156,27 @@ class DeviceSet:
         InvalidInputError
             If a transform on the way that is needed the other way round has no inverse.
         """
-        start = self.image_frame if start == "Image" else start
         reached: dict[str, FloatArray] = {start: np.eye(4)}
         waiting = deque([start])
         while waiting and end not in reached:
-            here = waiting.popleft()
+            place = waiting.popleft()
             for (a, b), matrix in self.transforms.items():
                 for source, target, inverted in ((a, b, False), (b, a, True)):
-                    if source == here and target not in reached:
+                    if source == place and target not in reached:
                         step = _inverse(matrix, f"{self.path}: Transform {a} to {b}") if inverted else matrix
-                        reached[target] = step @ reached[here]
+                        reached[target] = step @ reached[place]
                         waiting.append(target)
         return reached.get(end)
 
     def pixel_mm(self, size: tuple[float, ...] | None) -> tuple[float, float] | None:
         """Distances of columns and rows of the image, whose size is (x, y), mm; None if unknown."""
-        for end in (self.probe_frame, self.origin_frame):
-            found = self.transform(self.image_frame, end)
-            if found is not None:
-                return pixel_axes(found, f"{self.path}: {self.image_frame} to {end}")
+        for end in (self.names.probe, self.origin_frame):
+            matrix = self.transform(self.names.image, end)
+            if matrix is not None:
+                return pixel_axes(matrix, f"{self.path}: {self.names.image} to {end}")
         made = self.scan.output_size
         is_of_size = made is None or (size is not None and tuple(size[:2]) == made)
         return self.scan.output_mm if is_of_size else None
-
-    def line_pitch_mm(self, path: PathLike, lines: int) -> float | None:
-        """Distance between the lines of which PLUS makes an image: the transducer's width over their number.
-
-        Raises
-        ------
-        InvalidInputError
-            If the transducer is curved, so that its lines are not parallel.
-        """
-        scan = self.scan
-        if scan.geometry not in ("", "LINEAR"):
-            raise InvalidInputError(
-                f"{path}: expected lines of a linear transducer, got a {scan.geometry.lower()} one, whose "
-                "lines spread, by the device set: give its scan-converted B-mode, or parallel lines"
-            )
-        return None if scan.width_mm is None else scan.width_mm / lines
 
 
 def read_device_set(path: PathLike) -> DeviceSet:
@@ -142,45 +196,44 @@ def read_device_set(path: PathLike) -> DeviceSet:
             f"got {root.tag}"
         )
     with naming(str(path)):
-        usual = DeviceSet()
+        usual = Names()
         named: dict[str, str] = {}
         for place in _ALGORITHMS:
-            for each in root.iterfind(place):
-                named |= each.attrib
+            for element in root.iterfind(place):
+                named |= element.attrib
         return DeviceSet(
-            path=str(path),
-            image_frame=named.get("ImageCoordinateFrame", usual.image_frame),
-            probe_frame=named.get("ProbeCoordinateFrame", usual.probe_frame),
-            tracker_frame=_attribute(root, "ToolReferenceFrame") or usual.tracker_frame,
-            origin_frame=named.get("TransducerOriginCoordinateFrame", usual.origin_frame),
-            transforms=_transforms(root),
-            image_orientation=_attribute(root, "PortUsImageOrientation"),
-            scan=_scan_conversion(root.find(".//ScanConversion")),
+            str(path),
+            Names(
+                named.get("ImageCoordinateFrame", usual.image),
+                named.get("ProbeCoordinateFrame", usual.probe),
+                _attribute(root, "ToolReferenceFrame") or usual.tracker,
+            ),
+            named.get("TransducerOriginCoordinateFrame", "TransducerOrigin"),
+            _transforms(root),
+            _attribute(root, "PortUsImageOrientation"),
+            _scan_conversion(root.find(".//ScanConversion")),
+            _clip(root.find(".//VolumeReconstruction")),
         )
 
 
 def _transforms(root: Element) -> dict[tuple[str, str], FloatArray]:
     """Transforms by their ends; what is said twice, or both ways round, must be said alike."""
-    found: dict[tuple[str, str], FloatArray] = {}
+    transforms: dict[tuple[str, str], FloatArray] = {}
     for place in _PLACES:
-        for each in root.iterfind(place):
-            a, b = each.get("From", ""), each.get("To", "")
-            matrix = np.reshape(vector(each, "Matrix", 16), (4, 4))
-            if (a, b) in found and not np.array_equal(found[a, b], matrix):
+        for element in root.iterfind(place):
+            a, b = element.get("From", ""), element.get("To", "")
+            matrix = np.reshape(vector(element, "Matrix", 16), (4, 4))
+            same, back = transforms.get((a, b), matrix), transforms.get((b, a))
+            is_inverse = back is None or np.allclose(back @ matrix, np.eye(4), 0, _INVERSE_TOLERANCE)
+            if not np.array_equal(same, matrix) or not is_inverse:
+                expected = "one, or the same again" if is_inverse else f"the inverse of From={b} To={a}"
+                other = same if is_inverse or back is None else back
                 raise InvalidInputError(
-                    f"Transform From={a} To={b}: expected one, or the same again, got two: "
-                    f"{_text(found[a, b])} and {_text(matrix)}"
+                    f"Transform From={a} To={b}: expected {expected}, got another: {_text(other)} and "
+                    f"{_text(matrix)}"
                 )
-            back = found.get((b, a))
-            if back is not None and not np.allclose(
-                back @ matrix, np.eye(4), rtol=0, atol=_INVERSE_TOLERANCE
-            ):
-                raise InvalidInputError(
-                    f"Transform From={a} To={b}: expected the inverse of From={b} To={a}, got another: "
-                    f"{_text(matrix)} and {_text(back)}"
-                )
-            found[a, b] = matrix
-    return found
+            transforms[a, b] = matrix
+    return transforms
 
 
 def _text(matrix: FloatArray) -> str:
@@ -201,6 +254,28 @@ def _scan_conversion(element: Element | None) -> ScanConversion:
     )
 
 
+def _clip(element: Element | None) -> Clip | None:
+    """Clip and fan of a volume reconstruction; names without a unit are those of older versions [1]_."""
+    if element is None:
+        return None
+
+    def values(count: int, *names: str) -> tuple[float, ...] | None:
+        return next((vector(element, name, count) for name in names if name in element.attrib), None)
+
+    origin, size = values(2, "ClipRectangleOrigin"), values(2, "ClipRectangleSize")
+    columns = rows = None
+    if origin is not None and size is not None and min(size) > 0:
+        # PLUS counts the pixel behind the rectangle, too (vtkIGSIOPasteSliceIntoVolume).
+        columns, rows = ((first, first + count) for first, count in zip(origin, size, strict=True))
+    angles, apex = values(2, "FanAnglesDeg", "FanAngles"), values(2, "FanOriginPixel", "FanOrigin")
+    outer = values(1, "FanRadiusStopPixel", "FanDepth")
+    inner = values(1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
+    fan = None
+    if angles is not None and apex is not None and outer is not None and angles[0] != angles[1]:
+        fan = (apex[0], apex[1], inner[0], outer[0], min(angles), max(angles))
+    return None if columns is None and fan is None else Clip(columns, rows, fan)
+
+
 def _positive(element: Element, attribute: str, count: int) -> tuple[float, ...] | None:
     if attribute not in element.attrib:
         return None
@@ -212,7 +287,7 @@ def _positive(element: Element, attribute: str, count: int) -> tuple[float, ...]
 
 def _attribute(root: Element, name: str) -> str | None:
     """Value of an attribute that all elements with it share; None where none has it, or they differ."""
-    values = {each.get(name) for each in root.iter() if name in each.attrib}
+    values = {element.get(name) for element in root.iter() if name in element.attrib}
     return values.pop() if len(values) == 1 else None
 
 

@@ -7,35 +7,32 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import Sweep
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.device_set import read_device_set
 from speckle3d.io.plus.xml import read_xml, vector
-from speckle3d.io.readers import Reader, Row
-
-_CONFIG = "--plus-config of convert"
+from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Row
 
 
 def _device_rows(path: Path, root: Element) -> list[Row]:
     device = read_device_set(path)
     pixel = device.pixel_mm(device.scan.output_size)
-    devices = [_device(each) for each in root.iterfind(".//Device")]
+    devices = [
+        f"{element.get('Id', 'one without a name')} ({element.get('Type')})".removesuffix(" (None)")
+        for element in root.iterfind(".//Device")
+    ]
     wires = len(root.findall(".//PhantomDefinition/Geometry/Pattern/Wire"))
-    rows = [
+    option = "--plus-config of convert" + (", --phantom of calibrate wires" if wires else "")
+    return [
         ("devices", ", ".join(devices) or "none", ""),
         *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
         ("pixel", *(("unknown", "") if pixel is None else (" x ".join(f"{mm:.5f}" for mm in pixel), "mm"))),
         ("image orientation", device.image_orientation or "not said", ""),
         ("transducer", " ".join((device.scan.probe, device.scan.geometry)).strip() or "not said", ""),
+        ("clip of volumes", "none" if device.clip is None else str(device.clip), ""),
         ("wires of a phantom", str(wires), ""),
+        ("for", option, ""),
     ]
-    return [*rows, ("for", _CONFIG + (", --phantom of calibrate wires" if wires else ""), "")]
-
-
-def _device(element: Element) -> str:
-    """Name and type of a device, as far as the set says them."""
-    name, kind = element.get("Id", "one without a name"), element.get("Type")
-    return name if kind is None else f"{name} ({kind})"
 
 
 def _lag_rows(_: Path, root: Element) -> list[Row]:
@@ -48,8 +45,8 @@ def _lag_rows(_: Path, root: Element) -> list[Row]:
 
 
 def _line_rows(_: Path, root: Element) -> list[Row]:
-    found = sum(each.get("SegmentationStatus") == "OK" for each in root.iterfind("Frame"))
-    return [("lines found", str(found), "frames"), ("for", "comparison alone, as lines are found anew", "")]
+    count = sum(element.get("SegmentationStatus") == "OK" for element in root.iterfind("Frame"))
+    return [("lines found", str(count), "frames"), ("for", "comparison alone, as lines are found anew", "")]
 
 
 _KINDS: dict[str, tuple[str, Callable[[Path, Element], list[Row]]]] = {
@@ -65,22 +62,14 @@ def _claims(_: Path, start: bytes) -> bool:
     return text.startswith(b"<") and any(f"<{name}".encode() in text for name in _KINDS)
 
 
-def _told(path: Path) -> tuple[str, list[Row]]:
+def _open(path: Path, settings: ImportSettings) -> Recording:
     root = read_xml(path)
     if root.tag not in _KINDS:
         raise InvalidInputError(f"{path}: expected a document of PLUS ({', '.join(_KINDS)}), got {root.tag}")
-    what, rows = _KINDS[root.tag]
-    return what, rows(path, root)
+    what, rows_of = _KINDS[root.tag]
+    rows = rows_of(path, root)
+    fault = InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {rows[-1][1]}")
+    return Recording(path, settings, rows=(("content", what, ""), *rows), fault=fault)
 
 
-def _describe(path: Path, _: ImportSettings) -> list[Row]:
-    what, rows = _told(path)
-    return [("content", what, ""), *rows]
-
-
-def _read(path: Path, _: ImportSettings) -> Sweep:
-    what, rows = _told(path)
-    raise InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {rows[-1][1]}")
-
-
-READER = Reader("PLUS document", _claims, _read, _describe)
+READER = Reader("PLUS document", _claims, _open)

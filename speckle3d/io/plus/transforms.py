@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -14,9 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.geometry import nearest_rotation, require_increasing, transforms_from_matrices
-from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.io.plus.record import valid_frames
+from speckle3d.core.geometry import nearest_rotation
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
@@ -31,6 +30,9 @@ _INVERSE_TOLERANCE_MM = 1.0
 """How far poses and their inverses, both in a header, may be apart: rotations rounded by up to
 `ROUNDING_TOLERANCE` move a place 1,000 mm off by so much."""
 
+_FIXED_TOLERANCE = 1e-4
+"""How far entries of a transform that all frames share may differ: six written digits of tens of mm."""
+
 IMAGE = "Image"
 ORIENTATION = "OrientationSensor"
 """Name of the frame of an orientation sensor, which PLUS's devices do not use: its transform to World is a
@@ -41,34 +43,42 @@ Fields = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of a tool in a header.
+    """Poses of a tool in the frames of a header.
 
     Attributes
     ----------
-    tool, world : str
-        Names of their frames; the world is the reference's where one is tracked.
-    names : tuple of str
-        Of the tool's transform and the reference's, or "none", as they can be asked for.
-    readings : TimedPoses
-        Of the frames in which all of these are valid.
+    tool : str
+        Name of its frame.
+    chain : tuple of str
+        Transforms from the tool to the world, in the order in which they are applied.
+    poses : RigidTransform, length n
+        The identity where not valid.
+    valid : ndarray of bool, shape (n,)
+    reasons : Counter
+        How many are not valid, by why.
     pixels : ndarray, shape (4, 4), optional
         Where the tool is the image itself, whose transforms take pixels to mm: pixels to mm in the image.
     """
 
     tool: str
-    world: str
-    names: tuple[str, str]
-    readings: TimedPoses
+    chain: tuple[str, ...]
+    poses: RigidTransform
+    valid: BoolArray
+    reasons: Counter[str]
     pixels: FloatArray | None = None
 
 
+@dataclass(frozen=True)
+class Names:
+    """Names of coordinate frames, by default PLUS's own."""
+
+    image: str = IMAGE
+    probe: str = "Probe"
+    tracker: str = "Tracker"
+
+
 def tracked_poses(
-    path: str,
-    frames: Sequence[Fields],
-    tool: str | None,
-    reference: str | None,
-    usual: str = "ProbeToTracker",
-    image: str = IMAGE,
+    path: str, frames: Sequence[Fields], asked: str | None, reference: str | None, names: Names
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
 
@@ -76,62 +86,61 @@ def tracked_poses(
 
     Parameters
     ----------
-    tool, reference : str, optional
-        Names of transforms, or ``"none"``; by default `usual` and that of ``Reference`` in the same world,
-        where the frames hold them.
-    image : str
-        Name of the image's frame.
+    asked, reference : str, optional
+        Names of transforms, or ``"none"``; by default the probe's, in the tracker or in the only frame that
+        it is tracked in, else the image's; and that of ``Reference`` in the same world.
+
+    Returns
+    -------
+    Poses or None
+        None where the frames hold none, or none by these names.
 
     Raises
     ------
     InvalidInputError
-        If a transform that was asked for is not there, or none of it is valid.
+        If a transform that was asked for is not there.
     """
-    sensor = _find(path, frames, tool, usual)
-    if sensor is None:
+    there = names_of(frames)
+    name = _usual(there, names) if asked is None else asked.removesuffix("Transform")
+    if name is None or name == "none":
         return None
-    # Poses may be asked for by any name; a reference counts if both are tracked in the same world.
-    moving, world = ends(sensor.name)
-    fixed = _find(path, frames, reference, "none" if moving == "Reference" else f"ReferenceTo{world}")
-    both = (sensor,) if fixed is None else (sensor, fixed)
-    valid = valid_frames(frames, *(f"{one.held}TransformStatus" for one in both))
-    if not valid.any():
-        raise InvalidInputError(f"{path}: {sensor.held}TransformStatus: expected a valid one, got none")
+    tool, world = ends(name)
+    held = [_held(path, there, name, is_asked=asked is not None)]
+    # A reference counts if both are tracked in the same world.
+    fixed = f"ReferenceTo{world}" if reference is None else reference.removesuffix("Transform")
+    if tool == "Reference" and reference is None:
+        fixed = "none"
+    if fixed != "none" and (reference is not None or _either(there, fixed)):
+        held.append(_held(path, there, fixed, is_asked=reference is not None))
+    columns = [_Column.read(path, frames, each) for each in held if each is not None]
+    if not columns:
+        return None
     pixels = None
-    if moving == image:
-        poses, pixels = _poses_of_pixels(path, frames, sensor, valid)
+    if tool == names.image:
+        first, pixels = _poses_of_pixels(path, name, columns[0])
     else:
-        poses = _poses(path, frames, sensor, valid)
-    if fixed is not None:
-        poses = _poses(path, frames, fixed, valid).inv() * poses
-        world = ends(fixed.name)[0]
-    names = sensor.name, "none" if fixed is None else fixed.name
-    return Poses(moving, world, names, TimedPoses(time_stamps(path, frames)[valid], poses[valid]), pixels)
+        first = columns[0].rigid()
+        _require_inverse(path, frames, there, name)
+    columns = [first, *(column.rigid() for column in columns[1:])]
+    valid = np.logical_and.reduce([column.valid for column in columns])
+    reasons: Counter[str] = Counter()
+    for i in np.flatnonzero(~valid):
+        reasons[next(column.reasons[i] for column in columns if not column.valid[i])] += 1
+    matrices = columns[0].matrices
+    chain = [name]
+    if len(columns) > 1:
+        matrices = np.asarray(np.linalg.inv(columns[1].matrices) @ matrices)
+        chain.append("To".join(reversed(ends(fixed))))
+    poses = RigidTransform.from_matrix(np.where(valid[:, None, None], matrices, np.eye(4)))
+    return Poses(tool, tuple(chain), poses, valid, reasons, pixels)
 
 
-def tracked_orientation(path: str, frames: Sequence[Fields]) -> TimedRotations | None:
+def tracked_orientation(path: str, frames: Sequence[Fields]) -> Poses | None:
     """Read the orientation sensor's stream that this package writes; None where there is none."""
-    found = _find(path, frames, None, f"{ORIENTATION}ToWorld")
-    if found is None:
+    name = f"{ORIENTATION}ToWorld"
+    if name not in names_of(frames):
         return None
-    valid = valid_frames(frames, f"{found.held}TransformStatus")
-    if not valid.any():
-        return None
-    turned = _poses(path, frames, found, valid)[valid].rotation
-    return TimedRotations(time_stamps(path, frames)[valid], turned)
-
-
-def time_stamps(path: str, frames: Sequence[Fields]) -> FloatArray:
-    """Read the times of all frames, s.
-
-    Raises
-    ------
-    InvalidInputError
-        Naming the first that is missing or not after the one before.
-    """
-    where = f"{path}: Timestamp"
-    times = [numbers(each.get("Timestamp", ""), 1, f"{where}[{i}]")[0] for i, each in enumerate(frames)]
-    return require_increasing(times, where)
+    return tracked_poses(path, frames, name, "none", Names())
 
 
 def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: str) -> FloatArray | None:
@@ -145,18 +154,16 @@ def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: s
     key = f"{name}Transform"
     if key in fields:
         return np.reshape(numbers(fields[key], 16, f"{path}: {key}"), (4, 4))
-    texts = {
-        each[key]: i
-        for i, each in reversed(list(enumerate(frames)))
-        if key in each and each.get(f"{key}Status", "OK") == "OK"
-    }
-    if not texts:
+    column = _Column.read(path, frames, (name, False))
+    if not column.valid.any():
         return None
-    if len(texts) > 1:
-        i = sorted(texts.values())[1]
-        raise InvalidInputError(f"{path}: {key}[{i}]: expected that of the frames before, got another")
-    ((text, i),) = texts.items()
-    return np.reshape(numbers(text, 16, f"{path}: {key}[{i}]"), (4, 4))
+    matrices = column.matrices[column.valid]
+    off = np.abs(matrices - np.median(matrices, axis=0)).max(axis=(1, 2))
+    if off.max() > _FIXED_TOLERANCE * max(1.0, np.abs(matrices).max()):
+        i = int(np.flatnonzero(column.valid)[np.argmax(off)])
+        raise InvalidInputError(f"{path}: {key}[{i}]: expected that of the other frames, got another")
+    first: FloatArray = matrices[0]
+    return first
 
 
 def pixel_axes(matrix: FloatArray, where: str) -> tuple[float, float]:
@@ -189,7 +196,15 @@ def sensor_from_image(matrix: FloatArray, first_sample_depth_mm: float, where: s
     cosine = float(axes[:, 0] @ axes[:, 1])
     if abs(cosine) > SKEW_TOLERANCE:
         raise InvalidInputError(f"{where}: expected square axes, got cosine {cosine:.3f}")
-    _require_right_handed(matrix[:3, :3], where)
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    # PLUS writes z = x cross y as the third column (vtkPlusProbeCalibrationAlgo); zeros say nothing.
+    volume = float(np.linalg.det(matrix[:3, :3] / lengths)) if lengths[2] else 1.0
+    if volume < 0:
+        raise InvalidInputError(
+            f"{where}: expected right-handed axes (x to the marked side, y away from the probe, z = x cross "
+            f"y), got mirrored ones (determinant {volume:.3g}): an axis has the wrong sign, or images were "
+            "flipped before they were calibrated; if the third column was never measured, make it zeros"
+        )
     turned = nearest_rotation(axes)
     return RigidTransform.from_components(
         matrix[:3, 3] - turned[:, 1] * first_sample_depth_mm, Rotation.from_matrix(turned)
@@ -204,27 +219,6 @@ def image_skew_rad(matrix: FloatArray, where: str) -> float:
     """
     across, down = (matrix[:3, :2] / pixel_axes(matrix, where)).T
     return float(np.arcsin(across @ down))
-
-
-def _require_right_handed(axes: FloatArray, where: str) -> None:
-    """Refuse a mirrored calibration: a plane alone does not show it, its third column does.
-
-    PLUS's calibrations write z = x cross y there [1]_; a column of zeros says nothing.
-
-    References
-    ----------
-    .. [1] PLUS, vtkPlusProbeCalibrationAlgo.
-    """
-    lengths = np.linalg.norm(axes, axis=0)
-    if lengths[2] == 0:
-        return
-    volume = float(np.linalg.det(axes / lengths))
-    if volume < 0:
-        raise InvalidInputError(
-            f"{where}: expected right-handed axes (x to the marked side, y away from the probe, z = x cross "
-            f"y), got mirrored ones (determinant {volume:.3g}): an axis has the wrong sign, or images were "
-            "flipped before they were calibrated; if the third column was never measured, make it zeros"
-        )
 
 
 def image_matrix(
@@ -247,55 +241,8 @@ def image_matrix(
 
 def ends(name: str) -> tuple[str, str]:
     """Split ``XToY`` as PLUS does, before a capital: ``ToolToTracker`` is of ``Tool`` in ``Tracker``."""
-    found = re.fullmatch(r"(.+?)To([A-Z].*)", name)
-    return (found[1], found[2]) if found else (name, "")
-
-
-@dataclass(frozen=True)
-class _Transform:
-    """A tracked transform by the name asked for, and the one the header holds: that, or its inverse."""
-
-    name: str
-    held: str
-
-
-def _find(path: str, frames: Sequence[Fields], given: str | None, default: str) -> _Transform | None:
-    """Find ``XToY``, which takes points of X to Y, or ``YToX``, its inverse."""
-    name = default if given is None else given.removesuffix("Transform")
-    if name == "none":
-        return None
-    moving, world = ends(name)
-    there = [
-        held for held in (name, f"{world}To{moving}") if any(f"{held}Transform" in frame for frame in frames)
-    ]
-    if len(there) == 2 and IMAGE not in (moving, world):  # whose transforms count pixels
-        _require_inverse(path, frames, *there)
-    if there:
-        return _Transform(name, there[0])
-    if given is not None:
-        known = ", ".join(names_of(frames)) or "none"
-        raise InvalidInputError(f"{path}: expected a transform {name}, got {known}")
-    return None
-
-
-def _require_inverse(path: str, frames: Sequence[Fields], name: str, back: str) -> None:
-    """Refuse poses that a header holds both ways round, where the two are not each other's inverses."""
-    valid = valid_frames(frames, f"{name}TransformStatus", f"{back}TransformStatus")
-    valid &= [f"{name}Transform" in each and f"{back}Transform" in each for each in frames]
-    if not valid.any():
-        return
-    there, again = (_poses(path, frames, _Transform(held, held), valid)[valid] for held in (name, back))
-    product = there * again
-    off = np.flatnonzero(
-        (product.rotation.magnitude() > ROUNDING_TOLERANCE)
-        | (np.linalg.norm(product.translation, axis=-1) > _INVERSE_TOLERANCE_MM)
-    )
-    if off.size:
-        i = int(np.flatnonzero(valid)[off[0]])
-        raise InvalidInputError(
-            f"{path}: {back}Transform[{i}]: expected the inverse of {name}Transform, got another: "
-            "one of the two is wrong"
-        )
+    parts = re.fullmatch(r"(.+?)To([A-Z].*)", name)
+    return (parts[1], parts[2]) if parts else (name, "")
 
 
 def names_of(frames: Sequence[Fields]) -> list[str]:
@@ -304,63 +251,122 @@ def names_of(frames: Sequence[Fields]) -> list[str]:
     return sorted(name.removesuffix("Transform") for name in names)
 
 
-def _poses(path: str, frames: Sequence[Fields], asked: _Transform, valid: BoolArray) -> RigidTransform:
-    where = f"{path}: {asked.held}Transform"
-    poses = transforms_from_matrices(_squared(_matrices(path, frames, asked, valid)), where)
-    return poses if asked.held == asked.name else poses.inv()
+def _usual(there: Sequence[str], names: Names) -> str | None:
+    """The probe's pose, else the image's, in the tracker, or in the only frame where it is tracked."""
+    if _either(there, f"{names.probe}To{names.tracker}"):
+        return f"{names.probe}To{names.tracker}"
+    for tool in (names.probe, names.image):
+        worlds = {b if a == tool else a for a, b in map(ends, there) if tool in (a, b)}
+        worlds -= {names.probe, names.image, "TransducerOrigin", "TransducerOriginPixel", ""}
+        if names.tracker in worlds:
+            return f"{tool}To{names.tracker}"
+        if "Reference" in worlds or len(worlds) == 1:
+            return f"{tool}To{'Reference' if 'Reference' in worlds else worlds.pop()}"
+    return None
 
 
-def _matrices(path: str, frames: Sequence[Fields], asked: _Transform, valid: BoolArray) -> FloatArray:
-    """Matrices as the header holds them, shape (n, 4, 4); the identity where they are not valid."""
-    matrices = np.tile(np.eye(4), (len(frames), 1, 1))
+def _either(there: Sequence[str], name: str) -> bool:
+    return name in there or "To".join(reversed(ends(name))) in there
+
+
+def _held(path: str, there: Sequence[str], name: str, is_asked: bool) -> tuple[str, bool] | None:
+    """The transform that the frames hold, ``XToY`` or its inverse ``YToX``, and whether it is that."""
+    back = "To".join(reversed(ends(name)))
+    if name in there:
+        return name, False
+    if back in there:
+        return back, True
+    if is_asked:
+        raise InvalidInputError(f"{path}: expected a transform {name}, got {', '.join(there) or 'none'}")
+    return None
+
+
+def _require_inverse(path: str, frames: Sequence[Fields], there: Sequence[str], name: str) -> None:
+    """Refuse poses that a header holds both ways round, where the two are not each other's inverses."""
+    back = "To".join(reversed(ends(name)))
+    if name not in there or back not in there:
+        return
+    one, other = (_Column.read(path, frames, (held, False)).rigid() for held in (name, back))
+    valid = one.valid & other.valid
+    if not valid.any():
+        return
+    product = RigidTransform.from_matrix((one.matrices @ other.matrices)[valid])
+    far = (product.rotation.magnitude() > ROUNDING_TOLERANCE) | (
+        np.linalg.norm(product.translation, axis=-1) > _INVERSE_TOLERANCE_MM
+    )
+    if far.any():
+        i = int(np.flatnonzero(valid)[np.argmax(far)])
+        raise InvalidInputError(
+            f"{path}: {back}Transform[{i}]: expected the inverse of {name}Transform, got another: "
+            "one of the two is wrong"
+        )
+
+
+@dataclass(frozen=True)
+class _Column:
+    """One transform by frame: matrices, the identity where not valid, and why those are not."""
+
+    matrices: FloatArray
+    valid: BoolArray
+    reasons: list[str]
+
+    @classmethod
+    def read(cls, path: str, frames: Sequence[Fields], held: tuple[str, bool]) -> _Column:
+        """Read a transform, or the inverse of the one that is held."""
+        name, is_inverse = held
+        matrices = np.tile(np.eye(4), (len(frames), 1, 1))
+        reasons = [""] * len(frames)
+        for i, frame in enumerate(frames):
+            text = frame.get(f"{name}Transform")
+            if text is None or frame.get(f"{name}TransformStatus", "OK") != "OK":
+                reasons[i] = "without a valid pose"
+                continue
+            try:
+                matrices[i] = np.reshape(numbers(text, 16, path), (4, 4))
+            except InvalidInputError:
+                reasons[i] = "whose pose is not 16 finite numbers"
+        if is_inverse:
+            for i in np.flatnonzero(~(np.abs(np.linalg.det(matrices)) > 0)).tolist():
+                matrices[i], reasons[i] = np.eye(4), "whose pose has no inverse"
+            matrices = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+        return cls(matrices, np.array([not reason for reason in reasons], dtype=bool), reasons)
+
+    def rigid(self) -> _Column:
+        """Make rounded rotations exact; a matrix farther off is not valid."""
+        r = self.matrices[:, :3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            near = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
+            near &= np.abs(self.matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ROUNDING_TOLERANCE
+        near[near] = np.linalg.det(r[near]) > 0
+        matrices = np.tile(np.eye(4), (len(r), 1, 1))
+        matrices[near, :3, 3] = self.matrices[near, :3, 3]
+        matrices[near, :3, :3] = nearest_rotation(r[near])
+        reasons = [reason or ("" if ok else "whose pose is not rigid") for reason, ok in
+                   zip(self.reasons, near, strict=True)]  # fmt: skip
+        return _Column(matrices, self.valid & near, reasons)
+
+
+def _poses_of_pixels(path: str, name: str, column: _Column) -> tuple[_Column, FloatArray | None]:
+    """Split transforms of pixels to mm into the image's poses and its pixels, the same in all frames."""
+    matrices, valid, reasons = column.matrices, column.valid.copy(), list(column.reasons)
+    rigid = np.tile(np.eye(4), (len(matrices), 1, 1))
+    sizes = np.ones((len(matrices), 3))
+    fault: InvalidInputError | None = None
     for i in np.flatnonzero(valid).tolist():
-        text = frames[i].get(f"{asked.held}Transform", "")
-        where = f"{path}: {asked.held}Transform[{i}]"
-        matrices[i] = np.reshape(numbers(text, 16, where), (4, 4))
-    return matrices
-
-
-def _poses_of_pixels(
-    path: str, frames: Sequence[Fields], asked: _Transform, valid: BoolArray
-) -> tuple[RigidTransform, FloatArray]:
-    """Split transforms of pixels to mm into the image's poses and its pixels, which are those of all frames.
-
-    Raises
-    ------
-    InvalidInputError
-        If a frame's pixels are of another size, or its axes are not about square.
-    """
-    matrices = _matrices(path, frames, asked, valid)
-    if asked.held != asked.name:
-        singular = valid & ~(np.abs(np.linalg.det(matrices)) > 0)
-        if singular.any():
-            i = int(np.argmax(singular))
-            raise InvalidInputError(f"{path}: {asked.held}Transform[{i}]: expected a matrix to invert")
-        matrices = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-    names = [f"{path}: {asked.held}Transform[{i}]" for i in range(len(frames))]
-    used = np.flatnonzero(valid).tolist()
-    poses = [RigidTransform.identity() for _ in frames]
-    sizes = np.zeros((len(frames), 3))
-    for i in used:
-        poses[i] = sensor_from_image(matrices[i], 0.0, names[i])
-        sizes[i] = *pixel_axes(matrices[i], names[i]), 1.0 + image_skew_rad(matrices[i], names[i])
-    mean = sizes[used].mean(axis=0)
-    other = valid & (np.abs(sizes / mean - 1.0) > ROUNDING_TOLERANCE).any(axis=1)
-    if other.any():
-        i = int(np.argmax(other))
-        shown = (f"{column:.6g} x {row:.6g} mm" for column, row, _ in (mean, sizes[i]))
-        raise InvalidInputError("{}: expected pixels as of all frames, {}, got {}".format(names[i], *shown))
-    column_mm, row_mm, leaning = mean.tolist()
+        where = f"{path}: {name}Transform[{i}]"
+        try:
+            rigid[i] = sensor_from_image(matrices[i], 0.0, where).as_matrix()
+            sizes[i] = *pixel_axes(matrices[i], where), 1.0 + image_skew_rad(matrices[i], where)
+        except InvalidInputError as error:
+            fault, valid[i], reasons[i] = fault or error, False, "whose pixels make no sense"
+    if not valid.any():
+        if fault is not None:
+            raise fault
+        return _Column(rigid, valid, reasons), None
+    middle = np.median(sizes[valid], axis=0)
+    other = valid & (np.abs(sizes / middle - 1.0) > ROUNDING_TOLERANCE).any(axis=1)
+    for i in np.flatnonzero(other).tolist():
+        valid[i], reasons[i] = False, f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
+    column_mm, row_mm, leaning = sizes[valid].mean(axis=0).tolist()
     pixels = image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning - 1.0)
-    return RigidTransform.concatenate(poses), pixels
-
-
-def _squared(matrices: FloatArray) -> FloatArray:
-    """Make rounded rotations exact; matrices farther off stay, for `transforms_from_matrices` to refuse."""
-    r = matrices[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        rounded = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
-    rounded[rounded] = np.linalg.det(r[rounded]) > 0
-    squared = matrices.copy()
-    squared[rounded, :3, :3] = nearest_rotation(r[rounded])
-    return squared
+    return _Column(rigid, valid, reasons), pixels

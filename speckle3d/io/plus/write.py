@@ -17,20 +17,22 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike
 from speckle3d.core.parts import cannot_write
 from speckle3d.core.progress import Progress
-from speckle3d.core.sweep import Sweep, stored_dtype
+from speckle3d.core.sweep import RFSettings, Sweep, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
 from speckle3d.io.headers import NRRD_NAMES, read_header
-from speckle3d.io.pixels import meta_type, nrrd_type, type_of_word
+from speckle3d.io.pixels import meta_type, nrrd_type
 from speckle3d.io.plus.layout import Layout
-from speckle3d.io.plus.rows import Rows, number_of, rows_of, rows_without_images
+from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
+from speckle3d.io.text import numbers
 
 SUFFIXES = (".mha", ".mhd", ".nrrd")
 """Of the files that `write_sequence` writes, as .igs.mha."""
@@ -45,7 +47,54 @@ _ZLIB, _GZIP = 15, 31
 """Windows of deflate, and by them what is around it."""
 
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
-_META_ONLY = ("NDims", "ElementType", "ElementSpacing")
+
+_PREFIX = "Speckle3D_"
+_COUNTS = {
+    "sampling_rate_hz": 1, "vector_pitch_mm": 1, "speed_of_sound_m_s": 1, "centre_frequency_hz": 1,
+    "bandwidth_hz": 2, "demodulation_frequency_hz": 1, "first_sample_depth_mm": 1, "column_pitch_mm": 1,
+    "row_spacing_mm": 1, "dynamic_range_db": 1, "full_scale": 1,
+}  # fmt: skip
+"""Numbers in each field of this package's own, so that reading a sequence back asks for nothing."""
+
+
+def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
+    """Read the values that this package wrote; by name, without the prefix.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the field that does not make sense.
+    """
+    own: dict[str, Any] = {}
+    for name, count in _COUNTS.items():
+        if (text := fields.get(_PREFIX + name)) is not None:
+            values = numbers(text, count, f"{path}: {_PREFIX}{name}")
+            own[name] = values[0] if count == 1 else values
+    if (probe := fields.get(f"{_PREFIX}probe")) is not None:
+        own["probe"] = probe
+    return own
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Fields of the header to be written: of the whole file, and of each frame."""
+
+    fields: dict[str, str]
+    frames: list[dict[str, str]]
+
+    @classmethod
+    def of_times(cls, times_s: FloatArray) -> _Rows:
+        return cls({}, [{"Timestamp": _text(time)} for time in times_s.tolist()])
+
+    def add(self, name: str, matrices: FloatArray, valid: BoolArray | None = None) -> None:
+        """Give each frame a transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
+        if matrices.shape != (len(self.frames), 4, 4):
+            raise InvalidInputError(
+                f"{name}: expected shape ({len(self.frames)}, 4, 4), got {matrices.shape}"
+            )
+        for i, (frame, matrix) in enumerate(zip(self.frames, matrices, strict=True)):
+            frame[f"{name}Transform"] = " ".join(map(_text, matrix.ravel()))
+            frame[f"{name}TransformStatus"] = "OK" if valid is None or valid[i] else "INVALID"
 
 
 def write_sequence(
@@ -57,9 +106,7 @@ def write_sequence(
 ) -> list[str]:
     """Write a sweep as a sequence of PLUS, of the container that the suffix names; memory stays flat.
 
-    A sweep that was read from a sequence gets all of its fields back: transforms, status, times and custom
-    fields of every frame, also of those without a valid image, which are written as black. Of others, a
-    tracker becomes ``ProbeToTrackerTransform`` and an orientation sensor
+    A tracker becomes ``ProbeToTrackerTransform`` and an orientation sensor
     ``OrientationSensorToWorldTransform``, interpolated at the frames' times, with status INVALID where
     readings do not reach.
 
@@ -90,25 +137,25 @@ def write_sequence(
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}, got {suffix!r}")
-    rows = rows_of(sweep)
+    rows, omitted = _rows_of(sweep)
     for name, matrices in (transforms or {}).items():
-        rows.add_transforms(name, matrices)
+        rows.add(name, matrices)
+        rows.fields["ElementSpacing"] = "1 1 1"
     images = _Images.of(sweep, rows, progress)
     if suffix == ".mhd":
         _write_two_files(target, images, rows, compressed)
-    elif suffix == ".nrrd":
-        is_slicers = target.name.lower().endswith(_OF_SLICER)
-        with atomic_path(target) as part, part.open("wb") as file:
-            file.write(_nrrd_header(images, rows, "gzip" if compressed else "raw", is_slicers))
-            images.write(file, _GZIP if compressed else None)
+        return omitted
+    is_slicers = target.name.lower().endswith(_OF_SLICER)
+    if suffix == ".nrrd":
+        head = _nrrd_header(images, rows, "gzip" if compressed else "raw", is_slicers)
     else:
         head = _meta_header(images, rows, "LOCAL", 0 if compressed else None)
-        with atomic_path(target) as part, part.open("wb") as file:
-            file.write(head)
-            size = images.write(file, _ZLIB if compressed else None)
-            if compressed:
-                put_packed_size(file, head, size)
-    return rows.left_out
+    with atomic_path(target) as part, part.open("wb") as file:
+        file.write(head)
+        size = images.write(file, (_GZIP if suffix == ".nrrd" else _ZLIB) if compressed else None)
+        if compressed and suffix == ".mha":
+            put_packed_size(file, head, size)
+    return omitted
 
 
 def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[str, FloatArray]) -> None:
@@ -127,15 +174,15 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     FileError
         If the file cannot be written.
     """
-    rows = rows_without_images(times_s)
+    rows = _Rows.of_times(times_s)
     for name, matrices in transforms.items():
-        rows.add_transforms(name, matrices)
+        rows.add(name, matrices)
     lines = [
         *meta_start(3, None),
-        f"DimSize = 0 0 {len(times_s)}",
-        "Kinds = domain domain list",
+        f"DimSize = 0 0 {len(rows.frames)}",
         "ElementSpacing = 1 1 1",
         "ElementType = MET_UCHAR",
+        "Kinds = domain domain list",
         *_frame_lines(rows, " = "),
         "ElementDataFile = LOCAL",
     ]
@@ -143,36 +190,83 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
         part.write_bytes(header_bytes(lines))
 
 
-def _write_two_files(target: Path, images: _Images, rows: Rows, compressed: bool) -> None:
-    """Write a MetaImage's header, and its pixels into a file beside it; both appear, or neither."""
-    beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
-    _require_own(target, target.with_name(beside))
-    with FileSet(target.name, (beside,), _left_by(target, beside)).replaced(target.parent) as part:
-        try:
-            with (part / beside).open("wb") as file:
-                size = images.write(file, _ZLIB if compressed else None)
-            header = _meta_header(images, rows, beside, size if compressed else None)
-            (part / target.name).write_bytes(header)
-        except Speckle3DError:
-            raise
-        except OSError as error:
-            raise cannot_write(target, error) from error
+def _rows_of(sweep: Sweep) -> tuple[_Rows, list[str]]:
+    """Fields of a sweep's sequence, and what a sequence does not hold of it."""
+    times, grid, tracker, sensor = sweep.frame_time_s, sweep.grid, sweep.tracker, sweep.orientation
+    rows = _Rows.of_times(times)
+    omitted = []
+    for frame in rows.frames:
+        frame["ImageStatus"] = "OK"
+    sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
+    count = len(sweep)
+    if tracker is not None:
+        at = times - tracker.time_offset_s
+        covered = tracker.readings.covers(at)
+        matrices = np.tile(np.eye(4), (count, 1, 1))
+        if covered.any():
+            matrices[covered] = tracker.readings.at(at[covered]).as_matrix()
+        rows.add("ProbeToTracker", matrices, covered)
+        if not np.array_equal(tracker.readings.time_s, at[covered]):
+            omitted.append(
+                f"the tracker's {len(tracker.readings)} readings, of which {np.count_nonzero(covered)} "
+                f"interpolated ones are at the times of {count} frames"
+            )
+        if tracker.sensor_from_image is not None:
+            matrix = image_matrix(tracker.sensor_from_image, *sizes, tracker.image_skew_rad)
+            rows.add(f"{IMAGE}ToProbe", np.tile(matrix, (count, 1, 1)))
+    if sensor is not None:
+        at = times - sensor.time_offset_s
+        covered = sensor.readings.covers(at)
+        matrices = np.tile(np.eye(4), (count, 1, 1))
+        if covered.any():
+            matrices[covered, :3, :3] = sensor.readings.at(at[covered]).as_matrix()
+        rows.add(f"{ORIENTATION}ToWorld", matrices, covered)
+        if sensor.sensor_from_image is not None:
+            matrix = image_matrix(RigidTransform.from_rotation(sensor.sensor_from_image), *sizes)
+            rows.add(f"{IMAGE}To{ORIENTATION}", np.tile(matrix, (count, 1, 1)))
+        omitted.append(
+            f"the orientation sensor's {len(sensor.readings)} readings with what else it measured, of which "
+            f"{np.count_nonzero(covered)} interpolated rotations are at the times of {count} frames"
+        )
+    if sweep.truth is not None:
+        omitted.append("the true poses")
+    rows.fields.update(_standard_fields(sweep))
+    return rows, omitted
 
 
-def _require_own(header: Path, data: Path) -> None:
-    """Refuse to write over pixels that are not those of the header that is replaced."""
-    if not data.exists():
-        return
-    if not header.exists() or read_header(header).pixels.path != data.resolve():
-        raise InvalidInputError(f"{data}: is there and no part of {header.name}: give another name")
+def _standard_fields(sweep: Sweep) -> dict[str, str]:
+    """Fields of PLUS, and this package's own.
+
+    Spacing is 1 where transforms count pixels, as in PLUS: a viewer that knew both would apply it twice.
+    """
+    grid, signal = sweep.grid, sweep.signal
+    is_rf = isinstance(signal, RFSettings)
+    kind = "BRIGHTNESS" if not is_rf else "RF_IQ_LINE" if sweep.frames.dtype.kind == "c" else "RF_REAL"
+    sizes = (grid.vector_pitch_mm, grid.sample_spacing_mm)
+    calibrated = sweep.tracker is not None and sweep.tracker.sensor_from_image is not None
+    spacing = (1.0, 1.0, 1.0) if calibrated else (*(sizes[::-1] if is_rf else sizes), 1.0)
+    own: dict[str, Any] = {name: value for name, value in vars(signal).items() if value is not None}
+    own["first_sample_depth_mm"] = grid.first_sample_depth_mm
+    names = ("vector_pitch_mm",) if is_rf else ("column_pitch_mm", "row_spacing_mm")
+    own.update(zip(names, sizes, strict=False))
+    texts = {name: " ".join(map(_text, np.ravel(value))) for name, value in own.items()}
+    if sweep.probe:
+        texts["probe"] = " ".join(sweep.probe.split())
+    return {
+        "UltrasoundImageOrientation": "FM" if is_rf else "MF",
+        "UltrasoundImageType": kind,
+        "ElementSpacing": " ".join(map(_text, spacing)),
+        "Offset": "0 0 0",
+        "TransformMatrix": "1 0 0 0 1 0 0 0 1",
+        "CenterOfRotation": "0 0 0",
+        "AnatomicalOrientation": "RAI",
+        **{_PREFIX + name: text for name, text in texts.items()},
+    }
 
 
-def _left_by(header: Path, beside: str) -> tuple[str, ...]:
-    """Name of the pixels that a header leaves behind which is replaced by one with other pixels."""
-    if not header.exists():
-        return ()
-    names = {f"{header.stem}.{suffix}" for suffix in ("raw", "zraw")} - {beside}
-    return tuple(names & {read_header(header).pixels.path.name})
+def _text(value: float) -> str:
+    """Write a number so that reading gives it back exactly."""
+    return repr(float(value)).removesuffix(".0")
 
 
 @dataclass(frozen=True)
@@ -180,32 +274,25 @@ class _Images:
     """Pixels to write."""
 
     sweep: Sweep
-    rows: Rows
     layout: Layout
     dtype: np.dtype[Any]
     shape: tuple[int, int]
     progress: Progress | None
 
     @classmethod
-    def of(cls, sweep: Sweep, rows: Rows, progress: Progress | None) -> _Images:
+    def of(cls, sweep: Sweep, rows: _Rows, progress: Progress | None) -> _Images:
         layout = Layout(rows.fields["UltrasoundImageType"], rows.fields["UltrasoundImageOrientation"])
-        dtype = _narrowest(sweep, rows)
-        word = rows.fields.get("ElementType", "")
-        if word and np.can_cast(dtype, type_of_word(word), "safe"):
-            dtype = type_of_word(word)
-        shape = layout.pixels(sweep.frames[0]).shape
-        return cls(sweep, rows, layout, dtype, (shape[0], shape[1]), progress)
+        dtype = sweep.frames.dtype
+        if dtype.kind == "c":
+            dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
+        y, x = layout.pixels(sweep.frames[0]).shape
+        return cls(sweep, layout, dtype, (y, x), progress)
 
     def __iter__(self) -> Iterator[npt.NDArray[Any]]:
-        written = 0
-        for number in self.rows.images:
-            if number is None:
-                yield np.zeros(self.shape, self.dtype)
-                continue
-            yield self.layout.pixels(self.rows.stored(self.sweep.frames[number]))
-            written += 1
+        for i in range(len(self.sweep)):
+            yield self.layout.pixels(self.sweep.frames[i])
             if self.progress is not None:
-                self.progress(written, len(self.sweep))
+                self.progress(i + 1, len(self.sweep))
 
     def write(self, file: BinaryIO, window: int | None) -> int:
         """Write all images, packed if there is a window, and return how many bytes that took."""
@@ -215,6 +302,11 @@ class _Images:
             raw = image.astype(self.dtype.newbyteorder("<"), order="C").data.cast("B")
             size += file.write(raw if packer is None else packer.compress(raw))
         return size if packer is None else size + file.write(packer.flush())
+
+    @property
+    def lengths(self) -> str:
+        """Lengths of the axes, fastest first."""
+        return f"{self.shape[1]} {self.shape[0]} {len(self.sweep)}"
 
 
 def _packer(window: int) -> Any:
@@ -226,40 +318,37 @@ def _packer(window: int) -> Any:
     return isal_zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
 
 
-def _narrowest(sweep: Sweep, rows: Rows) -> np.dtype[Any]:
-    """Type that holds all samples; of I and Q, int16 if all are whole numbers within it."""
-    if sweep.frames.dtype.kind != "c":
-        return sweep.frames.dtype
-    if stored_dtype(sweep.frames) == np.int16 and not rows.conjugated:
-        return np.dtype(np.int16)
-    limit = np.iinfo(np.int16)
-    for i in range(len(sweep)):
-        parts = np.ascontiguousarray(rows.stored(sweep.frames[i])).view(np.float32)
-        if parts.min() < limit.min or parts.max() > limit.max or (parts != np.rint(parts)).any():
-            return np.dtype(np.float32)
-    return np.dtype(np.int16)
+def _write_two_files(target: Path, images: _Images, rows: _Rows, compressed: bool) -> None:
+    """Write a header and the file of its pixels, both or none."""
+    beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
+    data = target.with_name(beside)
+    if data.exists() and not (target.exists() and read_header(target).pixels.path == data.resolve()):
+        raise InvalidInputError(f"{data}: is there and no part of {target.name}: give another name")
+    others = {f"{target.stem}.{suffix}" for suffix in ("raw", "zraw")} - {beside}
+    old = tuple(others & ({read_header(target).pixels.path.name} if target.exists() else set()))
+    with FileSet(target.name, (beside,), old).replaced(target.parent) as part:
+        try:
+            with (part / beside).open("wb") as file:
+                size = images.write(file, _ZLIB if compressed else None)
+            (part / target.name).write_bytes(_meta_header(images, rows, beside, size if compressed else None))
+        except Speckle3DError:
+            raise
+        except OSError as error:
+            raise cannot_write(target, error) from error
 
 
-def _lengths(images: _Images, rows: Rows) -> str:
-    y, x = images.shape
-    return f"{x} {y}" if rows.is_plane else f"{x} {y} {len(rows.images)}"
-
-
-def _frame_lines(rows: Rows, sign: str) -> Iterator[str]:
+def _frame_lines(rows: _Rows, sign: str) -> Iterator[str]:
     for i, frame in enumerate(rows.frames):
         yield from (f"Seq_Frame{i:04d}_{name}{sign}{value}" for name, value in frame.items())
 
 
-def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> bytes:
+def _meta_header(images: _Images, rows: _Rows, data: str, packed: int | None) -> bytes:
     fields = dict(rows.fields)
-    fields.pop("NDims", None)
-    spacing = fields.pop("ElementSpacing")
-    fields.pop("ElementType", None)
     lines = [
-        *meta_start(2 if rows.is_plane else 3, packed),
-        f"DimSize = {_lengths(images, rows)}",
-        f"Kinds = {'domain domain' if rows.is_plane else 'domain domain list'}",
-        f"ElementSpacing = {spacing}",
+        *meta_start(3, packed),
+        f"DimSize = {images.lengths}",
+        "Kinds = domain domain list",
+        f"ElementSpacing = {fields.pop('ElementSpacing')}",
         f"ElementType = MET_{meta_type(images.dtype)}",
         *(f"{name} = {value}" for name, value in fields.items()),
         *_frame_lines(rows, " = "),
@@ -268,18 +357,16 @@ def _meta_header(images: _Images, rows: Rows, data: str, packed: int | None) -> 
     return header_bytes(lines)
 
 
-def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -> bytes:
+def _nrrd_header(images: _Images, rows: _Rows, encoding: str, is_slicers: bool) -> bytes:
+    fields = dict(rows.fields)
+    x, y, *_ = fields.pop("ElementSpacing").split()
     lines = [
         "NRRD0004",
         f"type: {nrrd_type(images.dtype)}",
-        *(_slicers_axes if is_slicers else _axes)(images, rows),
+        *(_slicers_axes if is_slicers else _axes)(images, x, y),
         "endian: little",
         f"encoding: {encoding}",
-        *(
-            f"{_NRRD_NAMES.get(name, name)}:={value}"
-            for name, value in rows.fields.items()
-            if name not in _META_ONLY
-        ),
+        *(f"{_NRRD_NAMES.get(name, name)}:={value}" for name, value in fields.items()),
         *_frame_lines(rows, ":="),
         # Slicer reads the transforms up to the first line of more than 1,000 characters.
         *(_slicers_index(rows) if is_slicers else ()),
@@ -288,39 +375,38 @@ def _nrrd_header(images: _Images, rows: Rows, encoding: str, is_slicers: bool) -
     return header_bytes(lines)
 
 
-def _axes(images: _Images, rows: Rows) -> Iterator[str]:
+def _axes(images: _Images, x: str, y: str) -> list[str]:
     """Axes of an image, and one of frames, in a plane: as PLUS writes them."""
-    x, y, *_ = rows.fields["ElementSpacing"].split()
-    apart = "" if rows.is_plane else " none"
-    yield f"dimension: {2 if rows.is_plane else 3}"
-    yield "space dimension: 2"
-    yield f"sizes: {_lengths(images, rows)}"
-    yield f"space directions: ({x},0) (0,{y}){apart}"
-    yield f"kinds: {'domain domain' if rows.is_plane else 'domain domain list'}"
-    yield f"space origin: ({','.join(rows.fields.get('Offset', '0 0').split()[:2])})"
+    return [
+        "dimension: 3",
+        "space dimension: 2",
+        f"sizes: {images.lengths}",
+        f"space directions: ({x},0) (0,{y}) none",
+        "kinds: domain domain list",
+        "space origin: (0,0)",
+    ]
 
 
-def _slicers_axes(images: _Images, rows: Rows) -> Iterator[str]:
+def _slicers_axes(images: _Images, x: str, y: str) -> list[str]:
     """Axes of images one pixel thick in space, and one of frames; transforms count pixels from its origin."""
-    y, x = images.shape
-    sx, sy, *_ = rows.fields["ElementSpacing"].split()
-    yield "dimension: 4"
-    yield "space: right-anterior-superior"
-    yield f"sizes: {x} {y} 1 {len(rows.images)}"
-    yield f"space directions: ({sx},0,0) (0,{sy},0) (0,0,1) none"
-    yield "kinds: domain domain domain list"
-    yield 'labels: "" "" "" "time"'
-    yield 'units: "" "" "" "s"'
-    yield "space origin: (0,0,0)"
+    return [
+        "dimension: 4",
+        "space: right-anterior-superior",
+        f"sizes: {images.shape[1]} {images.shape[0]} 1 {len(images.sweep)}",
+        f"space directions: ({x},0,0) (0,{y},0) (0,0,1) none",
+        "kinds: domain domain domain list",
+        'labels: "" "" "" "time"',
+        'units: "" "" "" "s"',
+        "space origin: (0,0,0)",
+    ]
 
 
-def _slicers_index(rows: Rows) -> Iterator[str]:
+def _slicers_index(rows: _Rows) -> Iterator[str]:
     """Frames' times, by which Slicer finds what belongs together; it rounds those of transforms to 1 ms."""
     yield "DataNodeClassName:=vtkMRMLScalarVolumeNode"
-    times = [f"{number_of(frame.get('Timestamp')):.3f}" for frame in rows.frames]
-    values = times if len({*times}) == len(times) and "nan" not in times else map(str, range(len(times)))
-    told = " ".join(values)
+    times = [f"{float(frame['Timestamp']):.3f}" for frame in rows.frames]
+    index = " ".join(times if len({*times}) == len(times) else map(str, range(len(times))))
     # Up to version 5.6 Slicer knew the axis of frames as the first.
     for axis in (3, 0):
         yield f"axis {axis} index type:=numeric"
-        yield f"axis {axis} index values:={told}"
+        yield f"axis {axis} index values:={index}"

@@ -1,4 +1,4 @@
-"""XML documents of PLUS: read with bounds, and told by their first element."""
+"""XML documents of PLUS: read, and told by their first element."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import one_line, reading
 from speckle3d.io.text import numbers
 
-_SIZE_LIMIT_BYTES = 2**22
-"""Five hundred times the size of a device set; in memory a document takes many times its length."""
-
 
 def read_xml(path: PathLike) -> Element:
     """Read a document's first element.
@@ -22,13 +19,10 @@ def read_xml(path: PathLike) -> Element:
     FileError
         If the file cannot be read.
     InvalidInputError
-        If it is no XML, or too long. A document with a type declaration is refused, because the entities it
-        may declare can grow without bounds.
+        If it is no XML, or has a type declaration: the entities it may declare can grow without bounds.
     """
     with reading(path), open_regular(path) as stream:
-        text = stream.read(_SIZE_LIMIT_BYTES + 1)
-    if len(text) > _SIZE_LIMIT_BYTES:
-        raise InvalidInputError(f"{path}: expected at most {_SIZE_LIMIT_BYTES} bytes of XML, got more")
+        text = stream.read()
     try:
         return ElementTree.fromstring(text, ElementTree.XMLParser(target=_PlainTree()))
     except (ElementTree.ParseError, ValueError, LookupError) as error:

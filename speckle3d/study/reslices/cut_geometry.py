@@ -88,8 +88,8 @@ def require_same_poses(
     frames = np.arange(len(world_from_image)) if numbers is None else numbers
     for number, pose in shown.anchors.items():
         at = np.flatnonzero(frames == number)
-        known = at.size == 1
-        if not (known and np.abs(world_from_image[int(at[0])].as_matrix() - pose).max() <= _SAME_POSE):
+        is_there = at.size == 1
+        if not (is_there and np.abs(world_from_image[int(at[0])].as_matrix() - pose).max() <= _SAME_POSE):
             raise InvalidInputError(
                 f"{where}: expected a picture of these poses of mode {shown.mode!r}, got one of another "
                 f"reconstruction, whose frame {number} lies elsewhere: cut this one again (speckle3d reslice)"
@@ -129,7 +129,7 @@ def save_cuts(
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     height = canvas.get_width_height()[1]
-    told = [
+    records = [
         {
             "mode": mode,
             **_as_record(cut),
@@ -138,7 +138,7 @@ def save_cuts(
         }
         for mode, cut in cuts.items()
     ]
-    record = json.dumps({"version": VERSION, **(words or {}), "cuts": told})
+    record = json.dumps({"version": VERSION, **(words or {}), "cuts": records})
     with atomic_path(path) as part:
         drawn = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
         imsave(part, drawn, format="png", dpi=DOTS_PER_INCH, metadata={KEYWORD: record},
@@ -184,11 +184,11 @@ def read_plane(path: PathLike, mode: str | None = None) -> PicturedCut:
         As `read_cuts`, and if the picture does not show that mode.
     """
     cuts = read_cuts(path)
-    found = [each for each in cuts if mode is None or each.mode == mode]
-    if not found:
+    wanted = [each for each in cuts if mode is None or each.mode == mode]
+    if not wanted:
         shown = ", ".join(each.mode for each in cuts)
         raise InvalidInputError(f"{path}: expected a cut of mode {mode!r}, got {shown or 'none'}")
-    return found[0]
+    return wanted[0]
 
 
 def _box(axes: Axes, height_px: int) -> Box:
@@ -215,7 +215,7 @@ def _pictured(record: Any, where: str) -> PicturedCut:
         (placed,) = transforms_from_matrices([record["world_from_plane"]], where)
         cut = ReslicePlane(placed, float(record["width_mm"]), height, pixel, (first_x, first_y))
     boxes = [(float(a), float(b), float(c), float(d)) for a, b, c, d in record["boxes_px"]]
-    told = {int(number): np.array(pose, dtype=float) for number, pose in record.get("anchors", {}).items()}
-    if any(pose.shape != (4, 4) for pose in told.values()):
+    anchors = {int(number): np.array(pose, dtype=float) for number, pose in record.get("anchors", {}).items()}
+    if any(pose.shape != (4, 4) for pose in anchors.values()):
         raise ValueError("anchors: expected matrices of shape (4, 4)")
-    return PicturedCut(str(record["mode"]), cut, boxes, told)
+    return PicturedCut(str(record["mode"]), cut, boxes, anchors)

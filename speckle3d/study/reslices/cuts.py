@@ -172,8 +172,8 @@ def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None
 
 def _known_reference(sweep: Sweep, asked: Sequence[str]) -> str:
     """What several modes are compared with, if nobody says."""
-    known = find_reference(sweep) if len(asked) > 1 else None
-    return known.name if known is not None and known.covered.all() else asked[0]
+    reference = find_reference(sweep) if len(asked) > 1 else None
+    return reference.name if reference is not None and reference.covered.all() else asked[0]
 
 
 def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
@@ -221,18 +221,18 @@ def cut_posed(
         # B-mode that does not say its range stays in grey levels.
         step_db = dynamic_range_db / 255 if opened.posed.range_is_known else 1.0
         white = 255 if opened.posed.range_is_known else 0
-        found = [((each - white) * step_db).astype(np.float32) for each in levels]
+        images_of_modes = [((each - white) * step_db).astype(np.float32) for each in levels]
     else:
-        found = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
+        images_of_modes = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
     there = opened.poses[opened.reference]
-    if not any(np.isfinite(each).any() for each in found):
+    if not any(np.isfinite(each).any() for each in images_of_modes):
         raise InvalidInputError(
             f"cut: expected one that meets the sweep, which lies {sweep_extent(there, grid)}, got one that "
             "shows nothing"
         )
     cuts = {
         mode: DrawnCut.of_sweep(image, cut, grid, opened.poses[mode])
-        for (mode, cut), image in zip(placed.items(), found, strict=True)
+        for (mode, cut), image in zip(placed.items(), images_of_modes, strict=True)
     }
     shown = placed[opened.reference]
     where = ", ".join(filter(None, [place.words(grid), view_of(shown, there)]))
@@ -293,8 +293,8 @@ def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | 
 
 def _unit_of(volume: Volume) -> str:
     """What a volume's levels are, as far as its file says."""
-    told = volume.fields.get("levels", "")
-    return f"level, {told}" if told else "level"
+    levels = volume.fields.get("levels", "")
+    return f"level, {levels}" if levels else "level"
 
 
 def cut_as_volume(picture: CutPicture) -> Volume:

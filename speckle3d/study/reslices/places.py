@@ -117,10 +117,10 @@ class Place:
             return self
         at = np.flatnonzero(numbers == self.frame)
         if not at.size:
-            held = f"{numbers[0]} to {numbers[-1]}" + (
+            there = f"{numbers[0]} to {numbers[-1]}" + (
                 ", with gaps" if np.ptp(numbers) >= len(numbers) else ""
             )
-            raise InvalidInputError(f"--frame: expected one with a pose, {held}, got {self.frame}")
+            raise InvalidInputError(f"--frame: expected one with a pose, {there}, got {self.frame}")
         return replace(self, frame=int(at[0]))
 
     def cut_of_box(self, volume: Volume) -> AnyCut:
@@ -245,8 +245,8 @@ def view_of(cut: AnyCut, world_from_image: RigidTransform) -> str:
 def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
     """Lines in which frames cross a cut, by its axes, shape (n, m, 2), mm; NaN where they do not."""
     if not isinstance(cut, CurvedSheet):
-        found = crossings(frame_outlines(grid, world_from_image), cut.world_from_plane)
-        return np.asarray(found + np.array(cut.first_mm))
+        lines = crossings(frame_outlines(grid, world_from_image), cut.world_from_plane)
+        return np.asarray(lines + np.array(cut.first_mm))
     heights = np.linspace(0.0, cut.height_mm, _SHEET_ROWS)
     columns = sheet_crossings(grid, world_from_image, cut.base_mm, cut.down, heights)
     y = np.broadcast_to(cut.first_mm[1] + heights, columns.shape)

@@ -141,7 +141,7 @@ def draw_cuts(picture: CutPicture) -> tuple[Figure, dict[str, Axes]]:
     grids = [(1, len(cuts)), (len(cuts), 1)]
     scales = [min(_ACROSS_IN / (c * size[0]), _DOWN_IN / (r * size[1])) for r, c in grids]
     (down, across), scale = grids[int(np.argmax(scales))], max(scales)
-    wide = max(across * (scale * size[0] + 0.6) + 1.6, 6.0)
+    wide = max(across * (scale * size[0] + 0.6) + 1.6, 5.0)
     tall, below = down * (scale * size[1] + 0.7) + 0.7, (0.9 + _ROW_IN * len(rows)) if rows else 0.0
     figure = new_figure(wide, tall + below)
     above: FigureBase = figure
@@ -189,10 +189,13 @@ def save_outlines(opened: OpenedModes, path: Path) -> Path:
         points.append(lines.reshape(-1, 3))
     low, high = np.min(np.vstack(points), axis=0), np.max(np.vstack(points), axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(high[2], low[2]))
-    axes.set(xlabel="lateral / mm", ylabel="along the sweep / mm", zlabel="depth / mm")
-    axes.set_box_aspect(np.maximum(high - low, 1e-3), zoom=0.85)
+    axes.set_xlabel("lateral / mm", labelpad=12)
+    axes.set_ylabel("along the sweep / mm", labelpad=12)
+    axes.set_zlabel("depth / mm", labelpad=8)
+    axes.tick_params(labelsize="small")
+    axes.set_box_aspect(np.maximum(high - low, 1e-3), zoom=0.72)
     axes.view_init(elev=22.0, azim=-35.0)
-    axes.locator_params(nbins=5)
+    axes.locator_params(nbins=4)
     axes.legend(frameon=False, fontsize="small")
     name_figure(figure, f"{opened.posed.sweep.name}: frames, all from the first one's place")
     return save_figure(figure, path)

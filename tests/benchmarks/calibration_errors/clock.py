@@ -10,10 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from calibration.job import JobSettings, Recording, plane_job
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.points import Seen
+from calibration.recording import Recording
+from speckle3d.calibrating.phantoms import solved
+from speckle3d.calibrating.settings import PlaneSettings
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.streams import TimedPoses
 
@@ -88,12 +90,12 @@ def row_of(rate: float, errors: str, found: list[Found]) -> Row:
 def run(trial: Trial) -> Found:
     """Simulate a recording and estimate its clock."""
     recording, seen, offset_s = simulate(trial)
-    free = bool(trial.seed % 2)
+    settings = PlaneSettings(fixed_pixels=trial.seed % 2 == 0, reflector="bar")
     try:
-        outcome = plane_job(recording, seen, JobSettings(estimate_offset=True), free)
+        outcome = solved(recording, seen, settings.model_copy(update={"time_offset_s": "estimate"}))
     except Speckle3DError as error:
         try:
-            plane_job(replace(recording, time_offset_s=offset_s), seen, JobSettings(), free)
+            solved(replace(recording, time_offset_s=offset_s), seen, settings)
         except Speckle3DError:
             return Found(np.nan, np.nan, MOTION)
         return Found(np.nan, np.nan, str(error))

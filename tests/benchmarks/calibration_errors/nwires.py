@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.points import ChainSolution, ImagePoints
+from calibration.plane import Solution
+from calibration.points import ImagePoints
 from calibration.registration import REGISTRATIONS, calibrate_registered
 from calibration.wires import calibrate_wires
 from speckle3d.core.errors import InsufficientDataError
@@ -91,7 +92,7 @@ def run(trial: Trial) -> Found:
     return Found(errors, chosen)
 
 
-def apart_mm(solution: ChainSolution, truth: np.ndarray, corners_px: np.ndarray) -> float:
+def apart_mm(solution: Solution, truth: np.ndarray, corners_px: np.ndarray) -> float:
     """Root mean square distance of an image's corners from where they truly are in the sensor's frame."""
     size = np.diag([*solution.chain.pixel_mm, 1.0, 1.0])
     step = solution.chain.sensor_from_image.as_matrix() @ size - truth

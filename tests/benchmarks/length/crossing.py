@@ -168,7 +168,7 @@ def _against_simplex(seed):
 
     def cost(unit):
         there = start.stepped(unit * size)
-        ways = compared(textured, there, slopes=False)
+        ways = compared(textured, there)
         return ours.weight * sum(1 - way.correlation(way.valid) for way in ways) + prior.pull(there)[2]
 
     began = time.process_time()

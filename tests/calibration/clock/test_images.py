@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import RigidTransform
 
-from calibration.clock.images import delay_from_images, smoothed
+from calibration.clock.images import delay_from_images
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
@@ -69,62 +68,19 @@ def test_a_delay_outside_the_range_is_refused(recording):
         delay_from_images(tracked(recording, 0.2), RigidTransform.identity(), 0.08)
 
 
-def rolled(images):
-    """The way back first: what was seen at every place was seen more than a second before or after."""
-    return np.roll(images, 30, axis=0)
-
-
 def noise(images):
     return np.random.default_rng(0).standard_normal(images.shape)
-
-
-def smooth_noise(images):
-    """As alike from frame to frame as images are."""
-    return gaussian_filter(noise(images), (2.0, 1.0, 4.0))
 
 
 def reversed_in_time(images):
     return images[::-1]
 
 
-def mixed(images):
-    return images[np.random.default_rng(0).permutation(len(images))]
-
-
-def one_alone(images):
-    return np.repeat(images[:1], len(images), axis=0)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        rolled,
-        noise,
-        *(
-            pytest.param(each, marks=pytest.mark.slow)
-            for each in (smooth_noise, reversed_in_time, mixed, one_alone)
-        ),
-    ],
-)
+@pytest.mark.parametrize("change", [noise, pytest.param(reversed_in_time, marks=pytest.mark.slow)])
 def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change):
     whole = tracked(recording, 0.0)
     with pytest.raises(InsufficientDataError, match="--search-s"):
         delay_from_images(replace(whole, images=change(whole.images)), RigidTransform.identity(), 0.4, 20)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("offset_s", [0.6, -0.6])
-def test_a_delay_far_outside_the_range_is_refused(recording, offset_s):
-    with pytest.raises(InsufficientDataError):
-        delay_from_images(tracked(recording, offset_s), RigidTransform.identity(), 0.3, 20)
-
-
-@pytest.mark.slow
-def test_noise_twice_the_picture_hides_no_delay(recording):
-    whole = tracked(recording, 0.03)
-    rough = whole.images + 2.0 * whole.images.std() * noise(whole.images)
-    found = delay_from_images(replace(whole, images=rough), RigidTransform.identity(), 0.15)
-    assert found.seconds == pytest.approx(0.03, abs=0.006)
 
 
 def test_images_of_one_plane_are_refused_at_once(recording):
@@ -136,35 +92,3 @@ def test_images_of_one_plane_are_refused_at_once(recording):
     readings = TimedPoses(times, RigidTransform.from_translation(path))
     with pytest.raises(InsufficientDataError, match=r"0.9 mm"):
         delay_from_images(replace(whole, readings=readings, images=None), RigidTransform.identity(), 0.05)
-
-
-def test_a_motion_one_way_is_refused(recording):
-    whole = tracked(recording, 0.0)
-    half = replace(whole, images=whole.images[:25], frame_time_s=whole.frame_time_s[:25])
-    with pytest.raises(InsufficientDataError, match="forward and back"):
-        delay_from_images(half, RigidTransform.identity(), 0.05)
-
-
-@pytest.mark.slow
-def test_a_periodic_motion_is_refused_where_its_period_is_in_range(recording):
-    sweep, images, grid = recording
-    there = np.concatenate([np.arange(25), np.arange(24, -1, -1)])
-    index = np.tile(there, 5)
-    times = 0.04 * np.arange(index.size)
-    again = TrackedImages(images[index], grid, times, TimedPoses(times, sweep.truth[index]))
-    with pytest.raises(InsufficientDataError, match=r"[+-]\d\.\d+ and [+-]\d\.\d+ s"):
-        delay_from_images(again, RigidTransform.identity(), 2.2, queries=10)
-
-
-def test_smoothing_takes_jitter_away_and_leaves_the_motion():
-    times = np.arange(0.0, 4.0, 0.02)
-    path = np.column_stack([10.0 * np.sin(times), 0.5 * times**2, np.zeros_like(times)])
-    clean = TimedPoses(times, RigidTransform.from_translation(path))
-    left = smoothed(clean, 0.2).world_from_sensor.translation - path
-    # What a parabola misses of 10 sin t over 0.1 s either way: 10 * 0.1**3 / 6 = 0.002 mm, at the ends more.
-    assert np.abs(left).max() < 0.005
-    rng = np.random.default_rng(0)
-    noisy = TimedPoses(times, RigidTransform.from_translation(path + rng.normal(0, 0.1, path.shape)))
-    # Eleven readings, a parabola: the middle's variance is 9/4 of the mean's, 0.1 * sqrt(0.207) = 0.046.
-    scatter = (smoothed(noisy, 0.2).world_from_sensor.translation - path).std()
-    assert 0.035 < scatter < 0.06

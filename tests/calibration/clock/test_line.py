@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.clock import line as clock
 from calibration.clock.line import delay_from_lines, line_signal
 from calibration.detection.lines import detect_lines
 from speckle3d.core.errors import InsufficientDataError
@@ -78,29 +77,6 @@ def test_a_line_that_does_not_follow_or_stands_still_is_refused():
         delay_from_lines(np.zeros_like(signal), frames, poses)
 
 
-def one_axis(height, times):
-    """A tracker that goes straight up and down, on the images' clock."""
-    return TimedPoses(times, RigidTransform.from_translation(np.outer(height(times), [0.0, 0.0, 1.0])))
-
-
-def test_a_motion_that_does_not_return_is_called_that():
-    rng = np.random.default_rng(0)
-    times, frames = np.arange(-1.0, 13.0, 1 / 256.0), np.arange(0.0, 12.0, 0.04)
-    readings = one_axis(lambda t: 2.0 * t, times)
-    for error in (0.1 * np.sin(31.0 * frames), 0.1 * rng.standard_normal(frames.size)):
-        signal = np.column_stack([10.0 + 2.0 * frames + error, np.zeros(frames.size)])
-        with pytest.raises(InsufficientDataError, match="one way"):
-            delay_from_lines(signal, frames, readings)
-
-
-def test_an_error_that_is_no_better_than_the_range_is_refused(monkeypatch):
-    signal, frames, poses, _ = recorded(0)
-    for error in (float("inf"), float("nan"), 0.6):
-        monkeypatch.setattr(clock, "curvature_error", lambda *_, error=error: error)
-        with pytest.raises(InsufficientDataError, match=r"0.5 s"):
-            delay_from_lines(signal, frames, poses)
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_a_short_slow_motion_that_anything_explains_is_refused(seed):
     _, frames, poses, _ = recorded(seed, noise_mm=0.01, jitter_mm=0.01)
@@ -108,14 +84,6 @@ def test_a_short_slow_motion_that_anything_explains_is_refused(seed):
     few = frames < 1.2
     with pytest.raises(InsufficientDataError):
         delay_from_lines(other[few], frames[few], poses)
-
-
-def test_rounding_is_not_taken_for_motion():
-    signal, frames, poses, _ = recorded(0)
-    # A mean of many equal numbers is not quite that number.
-    still = np.full_like(signal, 1.4) + 1e-15 * np.arange(len(signal))[:, None]
-    with pytest.raises(InsufficientDataError, match="stands still"):
-        delay_from_lines(still, frames, poses)
 
 
 def test_a_delay_beyond_the_range_and_missing_readings_are_refused():
@@ -126,13 +94,6 @@ def test_a_delay_beyond_the_range_and_missing_readings_are_refused():
     assert found.seconds == pytest.approx(DELAY_S, abs=0.002)
     with pytest.raises(InsufficientDataError, match=r"20 .* 0 of"):
         delay_from_lines(signal, frames + 100.0, poses)
-
-
-def test_a_line_has_its_depth_and_slope_in_the_image():
-    points = np.array([[[10.0, 40.0], [30.0, 50.0]]])
-    depth, slope = line_signal(points, np.array([0.3, 0.1]), 20.0)[0]
-    assert depth == pytest.approx(4.5)
-    assert slope == pytest.approx(np.arctan2(1.0, 6.0))
 
 
 @pytest.mark.slow

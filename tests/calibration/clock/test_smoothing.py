@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.clock.smoothing import smooth
@@ -59,22 +57,6 @@ def test_noise_is_reduced_and_motion_is_not():
     exact = smooth(TimedPoses(TIMES, moving(TIMES)))
     # A width of one period misses a fourth derivative: 22 mm (0.02 s pi)^4 / 8 = 0.00004 mm.
     assert max(np.abs(each).max() for each in errors(exact, inside)) < 2e-4
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=5)
-def test_parabolas_are_followed_exactly_with_irregular_samples(seed):
-    rng = np.random.default_rng(seed)
-    times = np.cumsum(rng.uniform(0.01, 0.03, 60))
-    bend = rng.uniform(-50, 50, (3, 3))
-
-    def place(t):
-        return bend[0] + np.outer(t, bend[1]) + np.outer(t**2, bend[2])
-
-    readings = smooth(TimedPoses(times, RigidTransform.from_translation(place(times))))
-    at = np.sort(rng.uniform(times[0], times[-1], 30))
-    np.testing.assert_allclose(readings.at(at).translation, place(at), atol=1e-7)
-    np.testing.assert_allclose(readings.at(at).rotation.magnitude(), 0.0, atol=1e-7)
 
 
 def test_samples_beyond_a_gap_do_not_count_and_gaps_are_refused():

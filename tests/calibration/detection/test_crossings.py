@@ -1,10 +1,9 @@
 """Candidates for crossings: in simulated scans of wires, at beads, and not at edges."""
 
 import numpy as np
-import pytest
 from crossing_images import Look, Probe, crossing_world
 from scipy.ndimage import gaussian_filter
-from wire_scenes import PIXEL_MM, SHAPE, picture
+from wire_scenes import PIXEL_MM, picture
 
 from calibration.detection.crossings import crossings_in_frames
 
@@ -77,23 +76,3 @@ def test_long_wires_a_third_of_a_right_angle_apart_are_found_in_speckle():
             image = np.maximum(image, 40.0 + level * np.exp(-0.5 * (off / 4.0) ** 2))
         pixels = crossings_in_frames(np.clip(image, 0, 255).astype(np.uint8)[None], (0.25, 0.25)).pixels
         assert np.min(np.hypot(*((pixels - true) * 0.25).T)) < 2.0
-
-
-def test_a_region_bounds_what_counts_and_blank_frames_are_told():
-    image = picture([(100.0, 100.0), (300.0, 200.0)], seed=1)
-    region = [(200, 100), (439, 100), (439, 319), (200, 319)]
-    pixels = crossings_in_frames(image[None], PIXEL_MM, region).pixels
-    np.testing.assert_allclose(pixels[0], [300.0, 200.0], atol=3.0)
-    assert (pixels >= [199.5, 99.5]).all()
-    seen = crossings_in_frames(np.stack([image, np.zeros(SHAPE, np.uint8)]), PIXEL_MM)
-    assert seen.dropped == {1: "no lines that cross"}
-
-
-@pytest.mark.slow
-def test_crossings_of_all_looks():
-    shares = []
-    for seed in range(600, 608):
-        world = crossing_world(seed, 16)
-        shares.append(offered(world, crossings_in_frames(world.images, world.pixel_mm)))
-    # 92 % with 24 frames of each of 24 looks; two of these eight are 135 mm deep and more.
-    assert np.mean(shares) >= 0.8

@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wire_scenes import PIXEL_MM, SHAPE, picture, plus_results, scene
+from wire_scenes import PIXEL_MM, picture, plus_results, scene
 
-from calibration.detection.dots import dots_in_frames, dots_in_image
-from speckle3d.core.errors import InvalidInputError
+from calibration.detection.dots import dots_in_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage
 from speckle3d.io.plus_config import read_wire_phantom
@@ -47,55 +46,10 @@ def test_wires_are_found_in_speckle_through_side_lobes_and_ringing():
     assert np.median(ranks) == 8
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.3, -0.6])
-def test_a_wire_is_seen_over_a_floor_that_is_brighter(slope):
-    column, row = np.arange(SHAPE[0])[:, None] * PIXEL_MM[0], np.arange(SHAPE[1])[None] * PIXEL_MM[1]
-    rng = np.random.default_rng(5)
-    floor = np.exp(-((row - 34.0 - slope * (column - 35.0)) ** 2) / 0.3**2 / 2)
-    image = np.maximum(
-        picture([(250.0, 60.0)], seed=3, strength=[0.1]), 255 * floor * rng.uniform(0.7, 1, (SHAPE[0], 1))
-    )
-    pixels, _ = dots_in_image(image, PIXEL_MM)
-    wire = np.linalg.norm(pixels - [250.0, 60.0], axis=1) < 2.0
-    assert wire.sum() == 1
-    # The floor has a maximum every 2 mm or so of its 70 mm: left are its ends, and where it is most uneven.
-    assert len(pixels) < 10
-
-
 def test_speckle_alone_shows_hardly_a_dot():
     found = [len(dots_in_image(picture(NOTHING, seed=k, haze=0.1), PIXEL_MM)[0]) for k in range(6)]
     # Some 3000 independent places; five deviations of Gaussian noise would be met in one of 600 images.
     assert sum(found) <= 3
-
-
-def test_only_the_region_counts():
-    true = scene(2, frames=1).pixels[0]
-    image = picture(true)
-    left, right = true[:, 0].min() - 10, true[:, 0].mean()
-    region = [(left, 0), (right, 0), (right, SHAPE[1] - 1), (left, SHAPE[1] - 1)]
-    pixels, _ = dots_in_image(image, PIXEL_MM, region_px=region)
-    assert len(pixels) >= (true[:, 0] < right).sum()
-    assert (pixels[:, 0] < right + 0.5 / PIXEL_MM[0]).all()
-
-
-@pytest.mark.parametrize(
-    ("image", "pixel_mm", "message"),
-    [
-        (np.zeros((5, 5, 5)), PIXEL_MM, r"image.*\(5, 5, 5\)"),
-        (np.zeros((50, 50)), (0.1,), "pixel_mm"),
-        (np.full((50, 50), np.nan), PIXEL_MM, r"image\[\(0, 0\)\]"),
-    ],
-)
-def test_images_that_are_none_are_refused(image, pixel_mm, message):
-    with pytest.raises(InvalidInputError, match=message):
-        dots_in_image(image, pixel_mm)
-
-
-def test_a_bad_frame_is_named():
-    frames = np.zeros((3, 50, 50))
-    frames[2, 1, 1] = np.inf
-    with pytest.raises(InvalidInputError, match=r"^frame 2: image\[\(1, 1\)\]"):
-        dots_in_frames(frames, PIXEL_MM)
 
 
 @pytest.mark.slow

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -9,7 +7,6 @@ from calibration.detection.dots import Dots
 from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.plane import Chain
 from calibration.wire_fits import free_fits, rigid_fits
-from speckle3d.core.errors import InvalidInputError
 
 SYMMETRIC_MM = np.array(
     [
@@ -50,15 +47,6 @@ def test_wires_are_told_apart_among_wrong_dots_however_the_image_lies(seed, degr
     assert (away_mm(labelled, shown).reshape(-1, 9).max(axis=1) > RIGHT_MM).sum() <= 1
 
 
-def test_upside_down_and_from_behind_wires_keep_their_names():
-    shown = scene(3, frames=1, degrees=8.0)
-    for signs in ([-1, 1], [1, -1], [-1, -1]):
-        turned = replace(shown, pixels=(shown.pixels - [220, 160]) * signs + [220, 160])
-        labelled = label_dots(Dots(*candidates(turned, 0, NOISE_MM)), shown.phantom, PIXEL_MM)
-        assert len(labelled) == 9
-        assert away_mm(labelled, turned).max() < RIGHT_MM
-
-
 def test_a_phantom_that_looks_the_same_from_two_sides_is_taken_the_usual_way():
     shown = scene(4, frames=5, degrees=8.0, ends=SYMMETRIC_MM)
     labelled = label_dots(Dots(*candidates(shown, 0, NOISE_MM, wrong=0)), shown.phantom, PIXEL_MM)
@@ -67,14 +55,6 @@ def test_a_phantom_that_looks_the_same_from_two_sides_is_taken_the_usual_way():
     upper, lower = (labelled.pixels[labelled.wire == k] for k in (0, 3))
     assert (upper[:, 1] < lower[:, 1]).all()
     assert (upper[:, 0] > labelled.pixels[labelled.wire == 2][:, 0]).all()
-
-
-def test_a_frame_without_one_of_the_wires_is_dropped_for_it():
-    shown = scene(5, frames=6)
-    dots = Dots(*candidates(shown, 0, NOISE_MM, wrong=0, missing={(2, 4), (4, 0)}))
-    labelled = label_dots(dots, shown.phantom, PIXEL_MM)
-    assert set(labelled.frame) == {0, 1, 3, 5}
-    assert set(labelled.dropped) == {2, 4}
 
 
 def test_a_frame_says_which_rule_failed_and_by_how_much():
@@ -106,27 +86,6 @@ def test_a_calibration_finds_the_wires_that_show_and_no_others():
     assert right.sum() == 6 * 9 - 4
     # Ringing under a wire stays within the gate of no other; a wrong dot may fall where a wire is missing.
     assert {pair for pair, r in zip(sorted(pairs), right, strict=True) if not r} <= missing
-
-
-def test_no_dots_are_no_wires():
-    nothing = Dots(np.zeros(0, dtype=int), np.zeros((0, 2)), np.zeros(0), {0: "no dot"})
-    shown = scene(8, frames=1)
-    for labelled in (
-        label_dots(nothing, shown.phantom, PIXEL_MM),
-        label_by_calibration(nothing, shown.phantom, truth(shown), shown.world_from_sensor),
-    ):
-        assert len(labelled) == 0
-        assert labelled.dropped == {0: "no dot"}
-
-
-@pytest.mark.parametrize(
-    ("ends", "patterns", "message"),
-    [(ENDS_MM[:3], ((0, 1, 2),), "two N.*1"), (ENDS_MM[:, :, [1, 0, 2]], (), "two N.*0")],
-)
-def test_phantoms_whose_wires_cannot_be_told_apart_are_refused(ends, patterns, message):
-    dots = Dots(np.zeros(1, dtype=int), np.ones((1, 2)), np.ones(1))
-    with pytest.raises(InvalidInputError, match=message):
-        label_dots(dots, n_phantom(ends=ends, patterns=patterns), PIXEL_MM)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -4,12 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from calibration.detection.lines import NoLineError, detect_line, detect_lines
 from calibration.settings import LineSettings
-from speckle3d.core.errors import InvalidInputError
 
 PIXEL_MM = (0.25, 0.08)
 FRONT = LineSettings(place="front")
@@ -117,13 +114,6 @@ def test_a_floor_is_found_where_it_is(conditions, degrees):
     assert 0.7 * line.possible <= line.consensus <= line.possible <= 61
 
 
-@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int16, np.uint16, "grey of 40 dB"])
-def test_a_floor_is_found_in_levels_of_any_kind(kind):
-    amplitude = floor_echo(2, 10.0, 4.0)
-    image = grey(amplitude, 40.0) if isinstance(kind, str) else (1000 * amplitude).astype(kind)
-    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 10.0, 4.0)
-
-
 @pytest.mark.slow
 def test_standard_errors_are_those_of_speckle_and_the_two_points_err_independently():
     lines = [detect_line(floor_image(seed, 8.0, 5.0, (128, 220), lobes=0.0), PIXEL_MM) for seed in range(120)]
@@ -150,14 +140,6 @@ def test_where_on_the_echo_the_line_is_put():
     assert abs(depths[2]) < 0.2  # a rough floor's own depth and half
 
 
-def test_a_threshold_decides_what_counts_as_an_echo():
-    image = floor_image(5, 12.0, 0.0, lobes=0.04, haze=0.0, rough_mm=0.1)
-    low, high = (detect_line(image, PIXEL_MM, LineSettings(threshold=t, place="front")) for t in (20.0, 90.0))
-    assert abs(too_deep_mm(low, 0.8 * 12.0, 0.0).mean() + LEAD_MM) < 0.5
-    assert_on_floor(high, 12.0, 0.0)
-    assert_on_floor(detect_line(image, PIXEL_MM, FRONT), 12.0, 0.0)
-
-
 def test_noise_has_no_line():
     for seed in range(20):
         image = np.random.default_rng(seed).integers(0, 256, SHAPE, dtype=np.uint8)
@@ -178,47 +160,6 @@ def test_noise_has_no_line():
 def test_a_frame_without_content_says_so(image, reason):
     with pytest.raises(NoLineError, match=f"^no line: .*{reason}"):
         detect_line(image, PIXEL_MM, FRONT)
-
-
-def test_only_what_is_inside_a_region_that_is_not_convex_counts():
-    image = floor_image(6, 12.0, 2.0)
-    image[20:140, 40:70] = 255  # a bar across the water
-    image[60:90, 40:160] = 0  # and no floor in the middle
-    around = [(0, 80), (0, 290), (159, 290), (159, 80), (95, 80), (90, 250), (60, 250), (55, 80)]
-    line = detect_line(image, PIXEL_MM, FRONT, region_px=around)
-    assert_on_floor(line, 12.0, 2.0)
-    assert line.possible < 50
-    assert not ((line.inlier_px[:, 0] > 61) & (line.inlier_px[:, 0] < 89)).any()
-    with pytest.raises(NoLineError):
-        detect_line(image, PIXEL_MM, FRONT, region_px=[(0, 0), (159, 0), (159, 60), (0, 60)])
-
-
-@settings(deadline=None, max_examples=12)
-@given(
-    seed=st.integers(0, 1000),
-    degrees=st.floats(-12, 12),
-    gain=st.floats(0.01, 1e3),
-    level=st.floats(-100, 100),
-    down=st.integers(0, 20),
-    right=st.integers(0, 30),
-)
-def test_mirrored_shifted_and_amplified_images_have_mirrored_shifted_and_equal_lines(
-    seed, degrees, gain, level, down, right
-):
-    image = floor_image(seed, 9.0, degrees, (100, 240), haze=0.0).astype(float)
-    line = detect_line(image, PIXEL_MM, FRONT)
-    other = detect_line(image[::-1], PIXEL_MM, FRONT)
-    np.testing.assert_allclose(other.points_px[::-1], line.points_px * [-1, 1] + [99, 0], atol=1e-3)
-    assert other.point_sd_mm == pytest.approx(line.point_sd_mm, rel=1e-3)
-    other = detect_line(gain * image + level, PIXEL_MM, FRONT)
-    np.testing.assert_allclose(other.points_px, line.points_px, atol=0.02)  # float32 levels
-    dark = np.pad(image, ((right, 5), (down, 0)), constant_values=0.0)
-    corners = np.array([(0, 10), (99, 10), (99, 239), (0, 239)])
-    inside, moved = (
-        detect_line(im, PIXEL_MM, FRONT, region_px=corners + by)
-        for im, by in ((image, (0, 0)), (dark, (right, down)))
-    )
-    np.testing.assert_allclose(moved.points_px, inside.points_px + np.array([right, down]), atol=1e-3)
 
 
 class Reading:
@@ -279,27 +220,3 @@ def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
     found.pixels[:] -= [70, 40]
     assert found.dropped == {}
     assert_on_floors(found, depths, degrees)
-
-
-def test_a_probe_held_still_does_not_hide_the_floor():
-    images = [floor_image(7, 10.0, 3.0, noise=0.0)] * 4 + [floor_image(7, 10.0, 3.0, noise=0.01)]
-    for sequence in (images[:4], images):
-        found = detect_lines(Reading(sequence), PIXEL_MM, FRONT)
-        assert found.dropped == {}
-        assert_on_floors(found, [10.0] * 5, [3.0] * 5)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (((0.25,),), r"pixel_mm.*\[0\.25\]"),
-        ((PIXEL_MM, None, [(0, 0), (1, 1)]), r"region_px.*\(2, 2\)"),
-        ((PIXEL_MM, None, [(0, 0), (9, np.nan), (9, 9)]), r"region_px\[\(1, 1\)\]"),
-        ((PIXEL_MM, None, [(900, 0), (950, 0), (950, 90)]), "region_px.*160 x 300"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(arguments, message):
-    image = floor_image(0)
-    for detect, given_image in ((detect_line, image), (detect_lines, image[None])):
-        with pytest.raises(InvalidInputError, match=message):
-            detect(given_image, *arguments)

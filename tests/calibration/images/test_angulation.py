@@ -61,20 +61,6 @@ def test_disagreements_are_the_derivative_of_equation_5():
             np.testing.assert_allclose(blocks[len(points) + n][:, k], moved / h, atol=1e-4)
 
 
-def test_sensitivities_are_those_of_small_errors():
-    first, second = fan(60, 40.0, 8.0, 0.0), fan(50, 30.0, 6.0, 90.0)
-    found = angulation(first, second, RigidTransform.identity(), CORNERS)
-    assert found.crossing_deg == pytest.approx(90.0, abs=1e-6)
-    assert found.fan_deg == pytest.approx((40.0, 30.0), abs=1e-6)
-    assert found.verdict == "sufficient"
-    # x alone, whatever the fans: equation 9, but for the sweeps' turns within a fan (cos 20 degrees, 3 %).
-    assert found.alone[PARAMETERS.index("x")] == pytest.approx(np.sqrt(2.0), rel=0.03)
-    # y alone: equation 10 with the mean of cos cos over all tilts; those that meet are not quite all.
-    mean = np.sin(np.deg2rad(20)) / np.deg2rad(20) * np.sin(np.deg2rad(15)) / np.deg2rad(15)
-    assert found.alone[PARAMETERS.index("y")] == pytest.approx(np.sqrt(2 * (1 - mean)), rel=0.25)
-    assert (found.recoverable <= found.alone + 1e-12).all()
-
-
 @pytest.mark.parametrize(
     ("first", "second"),
     [(fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 0.0)), (fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 90.0))],
@@ -91,11 +77,3 @@ def test_not_tilted_sweeps_leave_the_shift_along_the_beam_open():
     found = angulation(fan(60, 0.0, 20.0, 0.0), fan(60, 0.0, 20.0, 90.0), RigidTransform.identity(), CORNERS)
     assert found.alone[PARAMETERS.index("y")] == pytest.approx(0.0, abs=1e-9)
     assert found.weakest == "y"
-
-
-def test_sweeps_that_a_bad_start_moves_apart_are_still_judged():
-    first, second = fan(60, 40.0, 8.0, 0.0), fan(60, 40.0, 8.0, 90.0)
-    start = RigidTransform.from_translation([300.0, 0.0, 0.0])
-    found = angulation(first, second, start, CORNERS)
-    assert max(found.overlap) == 0.0
-    assert np.isfinite(found.recoverable).all()

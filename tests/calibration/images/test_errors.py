@@ -2,26 +2,22 @@
 
 import dataclasses
 
-import crossing_scenes
 import numpy as np
 import pytest
-from crossing_scenes import crossing_sweeps, displaced, tissue
+from crossing_scenes import crossing_sweeps, displaced
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.images.angulation import Angulation, point_motion
+from calibration.images.angulation import Angulation
 from calibration.images.errors import (
     DEEP_MM,
     MOST_MM,
-    RESTARTED,
     _left_out,
-    _scatter,
     require_known,
     require_one_answer,
 )
-from calibration.images.fit import refine
 from calibration.images.search import DECIDED
 from calibration.images.similarity import Estimate, prepare
-from calibration.images.solver import FINE, calibrate_from_sweeps
+from calibration.images.solver import calibrate_from_sweeps
 from calibration.settings import ImageFit
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
@@ -43,10 +39,6 @@ def test_leaving_out_blocks_gives_the_standard_error_of_a_mean():
     blocks = values.reshape(-1, 4).mean(axis=1)
     # The textbook's standard error of a mean of 100 blocks; leaving one out shares what is left, 1 / 99.
     assert found[0, 0] == pytest.approx(blocks.var(ddof=1) / 100.0, rel=0.03)
-
-
-def test_an_answer_that_is_known_passes():
-    require_known(known(), FANNED, CENTRE)
 
 
 @pytest.mark.parametrize(
@@ -86,29 +78,6 @@ def test_another_answer_as_good_is_refused(scene, crossing):
     require_one_answer(comparison, here, [beside], crossing.centre_mm)
     with pytest.raises(InsufficientDataError, match="fits as well"):
         require_one_answer(comparison, beside, [here], crossing.centre_mm)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("layered", [False, True], ids=["tissue", "layers"])
-def test_fits_started_beside_return_in_tissue_and_scatter_over_layers(scene, layered, monkeypatch):
-    def layers(rng, size_mm, voxel_mm):
-        level, _ = tissue(rng, size_mm, voxel_mm)
-        return np.broadcast_to(2.0 * level.mean(axis=(0, 2))[:, None], level.shape), []
-
-    if layered:
-        monkeypatch.setattr(crossing_scenes, "tissue", layers)
-        scene = crossing_sweeps(3, frames=24)
-    crossing, truth = prepare(*scene[:2]), scene[2]
-    answer = refine(crossing.level(FINE[-1], truth), Estimate(truth, np.ones(2)))
-    beside = crossing.level(RESTARTED, answer.estimate.sensor_from_image)
-    scatter = _scatter(answer, beside, crossing.unit, None)
-    moved = point_motion(crossing.centre_mm[None])[0]
-    spread = np.sqrt(np.diag(moved @ scatter @ moved.T))
-    # The starts are 1.5 mm off; what is claimed without the scatter is 0.1 to 0.2 mm.
-    if layered:
-        assert spread[[0, 2]].max() > 0.4
-    else:
-        assert spread.max() < 0.1
 
 
 @pytest.mark.slow

@@ -3,15 +3,13 @@ import dataclasses
 import numpy as np
 import pytest
 from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
-from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS
 from calibration.images.report import similarities
 from calibration.images.similarity import Estimate, prepare
 from calibration.images.solver import calibrate_from_sweeps, calibrate_images
 from calibration.settings import ImageFit
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.streams import TimedPoses
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import ImageGrid
 
 REFINE = ImageFit(capture_mm=0.0, capture_deg=0.0)
@@ -23,20 +21,14 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def told():
-    """What was told of the progress of `crossing` and `found`."""
-    return []
+def crossing(scene):
+    return prepare(*scene[:2])
 
 
 @pytest.fixture(scope="module")
-def crossing(scene, told):
-    return prepare(*scene[:2], lambda *step: told.append(step))
-
-
-@pytest.fixture(scope="module")
-def found(scene, crossing, told):
+def found(scene, crossing):
     start = displaced(scene[2], np.random.default_rng(0))
-    return calibrate_from_sweeps(crossing, start, progress=lambda *step: told.append(step))
+    return calibrate_from_sweeps(crossing, start)
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +47,8 @@ def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     assert np.linalg.norm(error[[0, 2]]) < 0.1
     turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
     assert np.rad2deg(turned) < 0.5
-
-
-def test_result_says_what_was_gained(found):
-    # No overlap at all at such a start, or less alike.
-    assert not found.similarity.before >= found.similarity.after
-    assert found.similarity.after > 0.9
-    assert found.held_out.after > 0.9
-    assert found.converged
-    assert found.evaluations > 1000
-    for used, held in zip(found.sweeps.frames_used, found.sweeps.frames_held_out, strict=True):
-        assert sorted([*used, *held]) == list(range(36))
-        assert len(held) == 3
+    assert result.converged
+    assert min(result.similarity.after, result.held_out.after) > 0.9
 
 
 def test_errors_are_within_what_the_covariance_says(scene, found):
@@ -113,32 +95,6 @@ def test_pixel_sizes_are_found():
     assert (held.scale_errors == 0.0).all()
 
 
-@pytest.mark.slow
-def test_what_never_changes_is_not_compared(scene):
-    first, second, truth = scene
-    start = displaced(truth, np.random.default_rng(6), 3.0, 3.0)
-    plain = calibrate_images(first, second, start, REFINE)
-    views = []
-    for view in (first, second):
-        images = view.images.copy()
-        images[:, :10], images[:, -10:], images[:, :, 215:] = 0, 0, 20  # a sector's sides, and writing
-        views.append(dataclasses.replace(view, images=images))
-    masked = calibrate_images(*views, start, REFINE)
-    error = centre_error_mm(masked.sensor_from_image, truth, first.grid)
-    assert np.linalg.norm(error) < 0.5
-    # Less of the image is left, so less is known.
-    assert np.trace(masked.covariance) > np.trace(plain.covariance)
-
-
-def test_delay_of_the_sensor_counts(scene):
-    view, frames = scene[0], np.arange(3, 30)
-    late = TimedPoses(view.readings.time_s + 0.06, view.readings.world_from_sensor)
-    shifted = dataclasses.replace(view, readings=late, time_offset_s=-0.06)
-    np.testing.assert_allclose(
-        shifted.world_from_sensor(frames).as_matrix(), view.world_from_sensor(frames).as_matrix(), atol=1e-9
-    )
-
-
 def test_parallel_sweeps_are_refused_however_they_fan():
     first, _, truth = crossing_sweeps(2, frames=20, fan_deg=50.0, jitter=(0.0, 0.0))
     second, *_ = crossing_sweeps(2, frames=20, fan_deg=50.0, crossing_deg=4.0, jitter=(0.0, 0.0))
@@ -164,45 +120,10 @@ def test_similarity_falls_from_the_answer_whichever_parameters_move(crossing, fo
     assert (curves[:, 6] - np.nanmin(curves, axis=1) > 0.05).all()
 
 
-def test_progress_is_told(found, told):
-    stages = [stage for stage, *_ in told]
-    order = ["reading sweep 1", "reading sweep 2", "looking around", "following up", "comparing"]
-    order += ["looking beside", "deciding", "refining"]
-    assert list(dict.fromkeys(stages)) == order
-    assert all(1 <= done <= total for _, done, total in told)
-
-
 @pytest.mark.slow
 def test_sweeps_of_different_things_are_refused(scene, others):
     with pytest.raises(InsufficientDataError):
         calibrate_images(scene[0], others[1], scene[2])
-
-
-def test_sweeps_apart_are_refused(scene):
-    first, second, truth = scene
-    away = RigidTransform.from_translation([500.0, 0.0, 0.0]) * second.readings.world_from_sensor
-    apart = dataclasses.replace(second, readings=TimedPoses(second.readings.time_s, away))
-    with pytest.raises(InsufficientDataError, match="no overlap"):
-        calibrate_images(first, apart, truth)
-    with pytest.raises(InsufficientDataError, match="no overlap"):
-        calibrate_images(first, apart, truth, REFINE)
-
-
-def test_bad_input_is_named(scene):
-    first, second, truth = scene
-    still = dataclasses.replace(second, images=np.zeros_like(second.images))
-    with pytest.raises(InsufficientDataError, match="sweep 2"):
-        calibrate_images(first, still, truth)
-    short = TimedPoses(second.readings.time_s[:4], second.readings.world_from_sensor[:4])
-    with pytest.raises(InsufficientDataError, match=r"sweep 2: .*10 .* 4"):
-        calibrate_images(first, dataclasses.replace(second, readings=short), truth)
-    coarse = dataclasses.replace(second, grid=dataclasses.replace(second.grid, vector_pitch_mm=0.5))
-    with pytest.raises(MismatchError, match=r"sweep 2: .*sweep 1"):
-        calibrate_images(first, coarse, truth)
-    with pytest.raises(MismatchError, match=r"sweep 2: .*30 .* 36"):
-        calibrate_images(first, dataclasses.replace(second, images=second.images[:30]), truth)
-    with pytest.raises(InvalidInputError, match="start"):
-        calibrate_images(first, second, RigidTransform.concatenate([truth, truth]))
 
 
 @pytest.mark.slow

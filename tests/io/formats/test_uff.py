@@ -158,7 +158,7 @@ def test_channel_data_and_sectors_say_what_is_needed(tmp_path):
         load_sweep(path, RATE)
     with h5py.File(tmp_path / "b.uff", "w") as file:
         file.create_group("channel_data").attrs["class"] = "uff.channel_data"
-    with pytest.raises(InvalidInputError, match=r"got uff.channel_data, which needs beamforming"):
+    with pytest.raises(InvalidInputError, match=r"got uff.channel_data: beamform"):
         load_sweep(tmp_path / "b.uff")
     assert ("object", "channel_data: uff.channel_data", "") in describe(tmp_path / "b.uff")
 
@@ -195,7 +195,7 @@ TAMPERED = {
     "no pixels": (moved("b_data/data", lambda d: d[..., :0]), "expected 240 pixels"),
     "no frames": (moved("b_data/data", lambda d: d[:0]), "expected frames"),
     "NaN": (moved("b_data/data", lambda d: np.where(d == d.max(), np.nan, d)), "expected a finite value"),
-    "texts": (moved("b_data/data", lambda d: d.astype("S8")), "expected numbers"),
+    "texts": (moved("b_data/data", lambda d: d.astype("S8")), "of numbers"),
     "NaN in axis": (moved("b_data/scan/x_axis", lambda x: x * np.nan), "expected finite"),
     "elsewhere": (
         lambda file: [
@@ -203,13 +203,6 @@ TAMPERED = {
             file["b_data"].__setitem__("data", h5py.ExternalLink("other.h5", "/data")),
         ],
         "another file",
-    ),
-    "never written": (
-        lambda file: [
-            file["b_data"].pop("data"),
-            file["b_data"].create_dataset("data", (10**7, 1, 1, 240), "f4", chunks=(1, 1, 1, 240)),
-        ],
-        "expected .* chunks",
     ),
 }
 

@@ -64,12 +64,12 @@ def header(content, **changes):
 
 
 TAMPERED = {
-    "truncated": (lambda c: c[:-7], "expected 1996 bytes, or 2012 with frame numbers, got 1989"),
+    "truncated": (lambda c: c[:-7], "ends early: 3 of 4 frames"),
     "longer": (lambda c: c + b"\0" * 7, "expected 1996 bytes"),
     "no frames": (lambda c: header(c[:76], frames=0), "expected frames, got none"),
     "colour Doppler": (lambda c: header(c, kind=1024), r"got colour Doppler \(.col\)"),
     "of 8 bits": (lambda c: header(c, bits=8), "expected samples of 16 bits"),
-    "absurd": (lambda c: header(c, frames=10**6, width=2**16, height=2**16), "expected .* bytes"),
+    "absurd": (lambda c: header(c, frames=10**6, width=2**16, height=2**16), "ends early"),
     "no width": (lambda c: header(c, width=0), "expected a recording"),
     "cut header": (lambda c: c[:60], "expected a recording"),
 }

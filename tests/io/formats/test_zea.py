@@ -14,12 +14,13 @@ from format_examples import (
     rf,
     write_zea,
 )  # fmt: skip
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 
 BAND = (4.5e6, 7e6)
 GIVEN = ImportSettings(bandwidth_hz=BAND, frame_rate_hz=20.0)
@@ -188,7 +189,7 @@ TAMPERED = {
     "NaN": (changed(VALUES, lambda v: np.where(v == v.max(), np.nan, v)), "expected a finite value"),
     "NaN in places": (
         changed(PLACES, lambda v: np.where(v == v.max(), np.nan, v)),
-        "expected a finite value",
+        "expected pixels",
     ),
     "a moving grid": (
         changed(PLACES, lambda v: v + 1e-3 * np.arange(4)[:, None, None, None]),
@@ -224,3 +225,39 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, name):
         )
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["quaternion_wxyz", "quaternion_xyzw", "euler_xyz"])
+def test_probe_poses_are_the_tracker(tmp_path, kind):
+    """As zea 0.1.8 writes them: of the transducer's tip, in metres, y elevational and z axial."""
+    places = np.array([[0.0, 1e-4 * i, 0.0] for i in range(10)])
+    turns = Rotation.from_rotvec(0.01 * np.arange(10)[:, None] * [0.0, 0.0, 1.0])
+    rotation = {
+        "quaternion_wxyz": turns.as_quat(scalar_first=True),
+        "quaternion_xyzw": turns.as_quat(),
+        "euler_xyz": turns.as_euler("xyz"),
+    }[kind]
+    path = write_zea(
+        tmp_path / "a.h5", grey(), "image", scan={"time_to_next_transmit": np.full((4, 2), 0.05)}
+    )
+    places[3] = np.nan  # a lost pose
+    with h5py.File(path, "a") as file:
+        group = file.create_group("metadata/probe_pose")
+        group["translation"], group["rotation"] = places.astype("f4"), rotation.astype("f4")
+        group["rotation_representation"] = kind
+        group["start_time_offset"], group["sampling_frequency"] = np.float32(-0.1), np.float32(20.0)
+    recording = open_recording(path, ImportSettings(dynamic_range_db=60.0))
+    sweep = recording.sweep
+    np.testing.assert_allclose(
+        sweep.tracker.readings.time_s, -0.1 + 0.05 * np.delete(np.arange(10), 3), atol=1e-6
+    )
+    image = sweep.tracker.world_from_image(sweep.frame_time_s)
+    # A step along zea's y is one against the image's normal.
+    np.testing.assert_allclose(np.diff(image.translation[:, 1]), 0.2, atol=0.02)
+    np.testing.assert_allclose(
+        image[0].rotation.as_matrix()[:, 2], [np.sin(0.02), -np.cos(0.02), 0], atol=1e-5
+    )
+    left_mm = np.linalg.norm(sweep.tracker.sensor_from_image.translation)
+    assert left_mm == pytest.approx(PITCH_MM * (VECTORS - 1) / 2, abs=1e-6)
+    assert any("1 of 10 left out" in note for note in recording.notes)
+    assert any(note.startswith("poses of metadata/probe_pose") for note in recording.notes)

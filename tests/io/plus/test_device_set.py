@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from igsio_twin import Clip
 from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.region import Region
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, recording_files
@@ -134,6 +137,21 @@ def test_the_pitch_of_rf_lines_but_not_the_image_of_them(tmp_path):
     config = written(tmp_path / "set.xml", scan=scan.format("CURVILINEAR"))
     with pytest.raises(InvalidInputError, match=r"rf\.mha: .*curvilinear.*parallel"):
         load_sweep(rf, given(config, sampling_rate_hz=40e6, **more))
+
+
+def test_the_clip_of_volumes_is_that_of_plus(tmp_path):
+    """Of the rule in IGSIO, written apart; the sides of the fan are a pixel towards its middle."""
+    clip = '<VolumeReconstruction ClipRectangleOrigin="192 16" ClipRectangleSize="420 580" {}/>'
+    fan = ('FanAnglesDeg="-45 45" FanOriginPixel="380 20" FanRadiusStartPixel="120" '
+           'FanRadiusStopPixel="360"')  # fmt: skip
+    grid = ImageGrid(820, 616, 0.085, 0.079, 3.0, 0.05)
+    for text, angles in (("", None), (fan, (380, 20, 120, 360, -45, 45))):
+        device = read_device_set(written(tmp_path / "set.xml", scan=clip.format(text)))
+        expected = Clip((192, 612), (16, 596), angles).mask(820, 616).T
+        mask = Region.from_text(device.clip.region_text(grid)).mask(grid)
+        assert (mask != expected).mean() < (0.0003 if angles else 1e-9)
+    whole = '<VolumeReconstruction ClipRectangleOrigin="0 0" ClipRectangleSize="820 616"/>'
+    assert read_device_set(written(tmp_path / "set.xml", scan=whole)).clip.region_text(grid) is None
 
 
 def test_a_settings_file_names_a_set_of_its_folder(tmp_path, sequence):

@@ -65,6 +65,6 @@ def test_on_a_full_disk_the_old_files_stay(tmp_path, suffix):
     path = tmp_path / f"t{suffix}"
     write_transforms(path, poses(3))
     before = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
-    with limited(len(before[f"t-0000{suffix}"]) - 1), pytest.raises(NoSpaceError, match=FULL):
+    with limited(len(before[f"t-0000{suffix}"]) // 2), pytest.raises(NoSpaceError, match=FULL):
         write_transforms(path, poses(3, seed=1))
     assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before

@@ -18,7 +18,6 @@ from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.headers import read_header
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
-from speckle3d.study.scenes.sequences import PosedSequence
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
@@ -71,35 +70,6 @@ def test_every_reference_leads_to_a_node_before_it_and_every_file_is_there(folde
         if node.get("fileName") is not None:
             files.add(unquote(node.get("fileName")))
     assert files == {path.name for path in folder.iterdir()}
-
-
-def test_every_node_that_has_data_is_of_the_class_that_its_reference_is_for(folder):
-    nodes = {node.get("id"): node for node in nodes_of(folder)}
-    classes = {
-        "Volume": "VolumeArchetypeStorage",
-        "Segmentation": "SegmentationStorage",
-        "Model": "ModelStorage",
-        "LinearTransform": "TransformStorage",
-    }
-    of = {tag: [] for tag in classes}
-    for node in nodes.values():
-        if node.tag in classes and "storage" in references_of(node):
-            of[node.tag].append(nodes[references_of(node)["storage"]].tag)
-    assert {tag: set(found) for tag, found in of.items()} == {tag: {of} for tag, of in classes.items()}
-    assert {len(found) for found in of.values()} == {2}
-    (geometry,) = {
-        references_of(each)["referenceImageGeometryRef"]
-        for each in nodes.values()
-        if each.tag == "Segmentation" and each.get("name").startswith('Größe <&> "1"; a:b\\n, image')
-    }
-    assert nodes[geometry].tag == "Volume"
-    assert {each.get("coordinateSystem") for each in nodes.values() if each.tag == "ModelStorage"} == {"LPS"}
-
-
-def test_the_name_of_the_sweep_is_text_and_nothing_else(folder):
-    names = [node.get("name") for node in nodes_of(folder) if node.get("name")]
-    assert all(name.startswith('Größe <&> "1"; a:b\\n, ') for name in names)
-    assert len({*names}) == len(names)
 
 
 def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
@@ -162,31 +132,6 @@ def test_images_move_through_the_volume(folder):
     assert poses.frames[5]["ImageToWorldTransform"] == header["Seq_Frame0005_ImageToWorldTransform"]
 
 
-@pytest.mark.slow
-def test_the_extension_of_slicer_finds_the_images_by_vtk(tmp_path):
-    """SlicerIGSIO reads pixels of .seq.mha by VTK's reader, and transforms from the text before them."""
-    readers = pytest.importorskip("vtkmodules.vtkIOImage")
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    posed = posed_sweep()
-    PosedSequence.of(posed).write(tmp_path / "s.seq.mha")
-    reader = readers.vtkMetaImageReader()
-    reader.SetFileName(str(tmp_path / "s.seq.mha"))
-    reader.Update()
-    pixels = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars()).reshape(8, 20, 12)
-    np.testing.assert_array_equal(pixels.transpose(0, 2, 1), posed.sweep.frames)
-    assert reader.GetOutput().GetSpacing() == (1.0, 1.0, 1.0)
-    assert read_header(tmp_path / "s.seq.mha").transforms == ["ImageToWorld"]
-
-
-def test_slicer_finds_every_transform_before_a_line_that_its_reader_would_break(folder):
-    """It reads pieces of 1,000 characters, and stops at the first one without a colon."""
-    header = (folder / "images-image.seq.nrrd").read_bytes().split(b"\n\n")[0].split(b"\n")
-    last = max(i for i, line in enumerate(header) if line.startswith(b"Seq_Frame"))
-    assert all(len(line) < 1000 for line in header[: last + 1])
-    assert max(i for i, line in enumerate(header) if b"index values" in line) > last
-
-
 def test_the_browser_plays_both_sequences_into_a_volume_under_a_transform(folder):
     nodes = {node.get("id"): node for node in nodes_of(folder)}
     browsers = [node for node in nodes.values() if node.tag == "SequenceBrowser"]
@@ -223,12 +168,6 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     require_scene_place(tmp_path)
     with pytest.raises(InvalidInputError, match="holds an input"):
         require_scene_place(tmp_path, tmp_path / "notes.txt")
-
-
-def test_the_same_mode_twice_is_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match="each once, got image, image"):
-        write_scene(tmp_path / "s", [posed_sweep(), posed_sweep()], REQUEST)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("room", [100, 1000, 2500, 4000])

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from speckle3d.core.errors import InvalidInputError
@@ -33,21 +32,6 @@ def test_spacing_origin_and_shape_are_in_the_file_to_the_last_bit(posed, tmp_pat
     assert image.GetDirection() == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     again = written(posed, tmp_path / "like.nrrd", grid=GridRequest(like=tmp_path / name))
     assert (again.GetSpacing(), again.GetOrigin(), again.GetSize()) == (SPACING, ORIGIN, SHAPE)
-
-
-def test_a_size_in_mm_is_rounded_up_to_voxels(posed, tmp_path):
-    asked = GridRequest("principal", SPACING, size_mm=(7.0, 9.1, 4.4))
-    assert written(posed, tmp_path / "v.nrrd", grid=asked).GetSize() == (10, 11, 4)
-
-
-def test_the_finest_round_spacing_within_a_size(posed, tmp_path):
-    settings = CompoundingSettings(voxel_type="int16", fill_radius=0)
-    image = written(posed, tmp_path / "v.nrrd", grid=GridRequest("world", within_gb=2e-5), settings=settings)
-    (spacing,) = set(image.GetSpacing())
-    assert spacing in (0.8, 1.0, 1.2, 1.5)
-    assert np.prod(image.GetSize()) * 2 <= 2e4
-    finer = GridRequest("world", spacing_mm=(0.8 * spacing,) * 3)
-    assert np.prod(written(posed, tmp_path / "finer.nrrd", grid=finer).GetSize()) * 2 > 2e4
 
 
 @pytest.mark.parametrize("settings", [COARSE, CompoundingSettings(voxel_mm=1.0, backward_mm=1.0)])

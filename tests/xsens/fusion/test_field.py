@@ -34,7 +34,7 @@ def test_an_even_field_is_trusted_and_none_is_not_judged():
 
 @pytest.mark.parametrize(
     ("kind", "amount", "trust", "words"),
-    [("attached", 30.0, Trust.CARE, "iron on the probe"), ("walk", 0.3, Trust.NO, "--no-magnetometer")],
+    [("attached", 30.0, Trust.CARE, "iron on the probe"), ("walk", 0.3, Trust.CARE, "turns with the sensor")],
 )
 def test_iron_on_the_probe_and_in_the_room_are_told_apart(kind, amount, trust, words):
     found = judged(made(kind, amount))

@@ -86,35 +86,6 @@ def test_without_a_magnetometer_the_heading_starts_at_zero():
     assert up[0] @ up[1] > 0.9999
 
 
-def beside_iron(seconds=60.0, seed=4):
-    """A sensor at rest beside a magnet for 5 s, then carried away and turned to and fro about all axes."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(0.0, seconds, 1 / RATE_HZ)
-    moved = np.clip(time_s - 5.0, 0.0, None)
-    swing = (
-        0.8 * np.column_stack([np.sin(f * moved) for f in (1.1, 1.7, 1.3)]) * (1 - np.exp(-moved))[:, None]
-    )
-    truth = Rotation.from_euler("ZYX", swing)
-    turns = (truth[:-1].inv() * truth[1:]).as_rotvec() * RATE_HZ
-    gyroscope = np.vstack([turns[:1], turns]) + np.deg2rad(0.2) * rng.standard_normal((time_s.size, 3))
-    force = truth.inv().apply([0.0, 0.0, 9.80665]) + 0.05 * rng.standard_normal((time_s.size, 3))
-    # From 8 cm to 35 cm off it: the field of a dipole falls with the third power.
-    distance = 0.08 + 0.27 * (1.0 - np.exp(-moved))
-    magnet = np.outer((0.08 / distance) ** 3, [-0.8, 0.6, 0.4])
-    field = truth.inv().apply(FIELD + magnet) + 0.004 * rng.standard_normal((time_s.size, 3))
-    return truth, ImuLog(time_s, force, gyroscope, field)
-
-
-def test_a_start_beside_iron_is_taken_back():
-    truth, log = beside_iron()
-    filtered, smoothed = (heading_deg(truth, orient(log, method=method)) for method in ("filter", "smoother"))
-    # The magnet turns the first heading by 117 degrees. After 9 s of turning the filter knows another field
-    # to be the room's; what is left of the magnet at 35 cm turns that by 0.8 degrees. Measured 1.4 and 1.2.
-    assert np.abs(filtered[log.time_s < 5.0]).min() > 100.0
-    assert np.abs(filtered[log.time_s > 15.0]).max() < 2.5
-    assert np.abs(smoothed).max() < 2.5
-
-
 def with_field(log, field):
     return ImuLog(log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s, field)
 
@@ -123,12 +94,12 @@ def with_field(log, field):
 def test_a_magnetometer_that_reads_zero_is_none(method):
     truth, log = static(20.0)
     found = orient(with_field(log, np.zeros((len(log), 3))), method=method)
-    assert any("zero" in note and "2000 of 2000" in note for note in found.notes)
+    assert any("2000 readings of zero" in note for note in found.notes)
     assert not found.magnetic
     some = log.magnetometer_au.copy()
     some[::3] = 0.0
     found = orient(with_field(log, some), method=method)
-    assert any("zero" in note and "667 of 2000" in note for note in found.notes)
+    assert any("667 readings of zero" in note for note in found.notes)
     assert found.magnetic
     assert abs(heading_deg(truth, found)[-1]) < 3.0
 
@@ -154,20 +125,6 @@ def test_readings_in_other_units_are_refused():
         orient(ImuLog(log.time_s, log.accelerometer_m_s2 / 9.81, log.gyroscope_rad_s))
 
 
-def test_a_gyroscope_in_degrees_is_refused_or_told():
-    time_s = np.arange(0.0, 20.0, 1 / RATE_HZ)
-    truth = Rotation.from_rotvec(np.outer(0.5 * np.sin(time_s), [1.0, 0.0, 0.0]))
-    rate = np.outer(0.5 * np.cos(time_s), [1.0, 0.0, 0.0])
-    force = truth.inv().apply([0.0, 0.0, 9.80665])
-    assert not any("contradict" in note for note in orient(ImuLog(time_s, force, rate)).notes)
-    # Taken for rad/s, 28 degrees per second are within a sensor's range, but gravity turns by a 57th of it.
-    told = [note for note in orient(ImuLog(time_s, force, np.rad2deg(rate))).notes if "contradict" in note]
-    assert len(told) == 1
-    assert "shows 2 %" in told[0]
-    with pytest.raises(InvalidInputError, match="rad/s"):
-        orient(ImuLog(time_s, force, 5.0 * np.rad2deg(rate)))
-
-
 def test_what_is_missing_is_named():
     _, log = static(5.0)
     with pytest.raises(InsufficientDataError, match=r"no gyroscope$"):
@@ -179,8 +136,8 @@ def test_what_is_missing_is_named():
 
 
 def test_columns_that_were_not_understood_are_named_where_they_are_missed():
-    text = "time_s,gyr_x,gyr_y,gyr_z,accelerometer_x_g\n0,0,0,0,1\n0.01,0,0,0,1\n"
-    with pytest.raises(InsufficientDataError, match=r"accelerometer_x_g.*accelerometer_x_m_s2"):
+    text = "time_s,gyr_x,gyr_y,gyr_z,accelerometer_x_feet\n0,0,0,0,1\n0.01,0,0,0,1\n"
+    with pytest.raises(InsufficientDataError, match=r"accelerometer_x_feet.*accelerometer_x_m_s2"):
         orient(parse_text(text))
 
 

@@ -4,8 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from imu_logs import WORLDS, samples
 
 from speckle3d.core.errors import InvalidInputError
@@ -200,13 +198,12 @@ def test_a_plain_file_by_hand():
         ("nothing here\n", "table"),
         ("1\t2\t3\t4\t5\n", "columns.*5"),
         ("time_s,counter\n0,1\n", "columns"),
-        ("acc_x,acc_y,acc_z\n", "3 numbers"),
+        ("acc_x,acc_y,acc_z\n", "3 cells"),
         ("acc_x,acc_y,acc_z\n1,2,3\n", "clock.*--rate-hz"),
         ("counter,acc_x,acc_y,acc_z\n1,1,2,3\n", "no rate: give --rate-hz"),
         ("// Update Rate: 1e23Hz\nPacketCounter,acc_x,acc_y,acc_z\n1,1,2,3\n", "100000 Hz, got 1e\\+23"),
         ("time_s,acc_x,acc_y,acc_z\nnan,1,2,3\n", "clock"),
         ("counter,time_s,acc_x,acc_y,acc_z\n-1,0,1,2,3\n", "time"),
-        ("time_s,counter" + 300 * "," + "\n", "256.*302"),
     ],
 )
 def test_text_that_is_no_log_says_why(text, message):
@@ -217,37 +214,17 @@ def test_text_that_is_no_log_says_why(text, message):
 # Tables
 
 
-cells = st.one_of(st.just(""), st.floats(-1e6, 1e6).map(lambda v: f"{v:.6g}"), st.integers(-99, 99).map(str))
-
-
-@settings(deadline=None, max_examples=80)
-@given(
-    st.lists(st.lists(cells, min_size=3, max_size=3), min_size=1, max_size=12).filter(
-        lambda rows: any(map(any, rows))
-    ),
-    st.sampled_from(["\t", ";", ","]),
-    st.sampled_from(["\n", "\r\n"]),
-)
-def test_tables_are_read_quickly_as_they_are_read_cell_by_cell(rows, separator, end):
-    text = end.join(separator.join(row) for row in [["ab", "cd", "ef"], *rows])
-    there = [row for row in rows if any(row)]
-    expected = [[float(cell) if cell else np.nan for cell in row] for row in there]
-    table = read_table(text.split("\n"), frozenset({"ab", "cd", "ef"}))
-    np.testing.assert_array_equal(table.values, expected)
-    assert (table.names, table.left_out) == (("ab", "cd", "ef"), len(rows) - len(there))
-
-
 @pytest.mark.parametrize("cell", ["-", ".", "1-", "--1", "1.2.3", "1 2", "é", "# 2", "-nan(ind)", " "])
 def test_words_are_missing_and_leave_the_other_cells_as_they_are(cell):
-    rows = ["ab;cd;ef", "1.5;2.5;", f"{cell};3.5;-1e-3", "+0.5;nan;inf"]
-    table = read_table(rows, frozenset({"ab", "cd", "ef"}))
+    rows = ["acc_x;acc_y;acc_z", "1.5;2.5;", f"{cell};3.5;-1e-3", "+0.5;nan;inf"]
+    table = read_table(rows)
     expected = [[1.5, 2.5, np.nan], [np.nan, 3.5, -0.001], [0.5, np.nan, np.inf]]
     np.testing.assert_array_equal(table.values, expected)
     assert table.words == (cell != " ")
 
 
 def test_columns_may_be_aligned_with_blanks():
-    table = read_table(["ab  cd   ef", " 1   2.5   3", "10  -2   30", "1 2"], frozenset({"ab", "cd", "ef"}))
+    table = read_table(["acc_x  acc_y   acc_z", " 1   2.5   3", "10  -2   30", "1 2"])
     assert (table.values.tolist(), table.left_out) == ([[1.0, 2.5, 3.0], [10.0, -2.0, 30.0]], 1)
 
 
@@ -255,30 +232,27 @@ def test_columns_may_be_aligned_with_blanks():
 
 
 def test_columns_that_are_not_understood_are_named_with_what_was_expected():
-    text = (
-        "time_s,gyroscope_x_rad_s,gyroscope_y_rad_s,gyroscope_z_rad_s,accelerometer_x_g,remark\n0,0,0,0,1,7\n"
-    )
-    notes = parse_text(text).notes
-    assert len(notes) == 1
-    assert re.search("accelerometer_x_g.*accelerometer_x_m_s2.*remark", notes[0])
-    with pytest.raises(InvalidInputError, match=r"gyr_y_deg_s.*gyroscope_y_rad_s"):
-        parse_text("time_s,counter,gyr_x_deg_s,gyr_y_deg_s\n0,1,2,3\n")
+    text = "time_s,gyroscope_x_rad_s,gyroscope_y_rad_s,gyroscope_z_rad_s,accelerometer_x_furlong,remark\n"
+    (note,) = parse_text(text + "0,0,0,0,1,7\n").notes
+    assert re.search("accelerometer_x_furlong.*accelerometer_x_m_s2.*remark", note)
+    with pytest.raises(InvalidInputError, match=r"gyr_y_turns.*gyroscope_y_rad_s"):
+        parse_text("time_s,counter,gyr_x_turns,gyr_y_turns\n0,1,2,3\n")
     # Four or ten columns are no unnamed export of the MT9 software if they have names.
-    with pytest.raises(InvalidInputError, match="acc_x_g"):
-        parse_text("time_s,acc_x_g,acc_y_g,acc_z_g\n0,0,0,1\n1,0,0,1\n")
+    with pytest.raises(InvalidInputError, match="acc_x_furlong"):
+        parse_text("t,acc_x_furlong,acc_y_furlong,acc_z_furlong\n0,0,0,1\n1,0,0,1\n")
 
 
 def test_an_axis_that_is_missing_is_told():
     text = "time_s,acc_x,acc_y,gyr_x,gyr_y,gyr_z\n0,0,0,0,0,0\n1,0,0,0,0,0\n"
     (note,) = parse_text(text).notes
-    assert re.search("acc_x, acc_y.*acc_z", note)
+    assert re.search("acc_x, acc_y.*expected z", note)
 
 
 def test_readings_out_of_range_are_counted():
     rows = "".join(f"{i},{1e9 if i in (3, 5) else 0},0,9.8\n" for i in range(9))
     log = parse_text("time_s,acc_x,acc_y,acc_z\n" + rows)
     assert np.flatnonzero(np.isnan(log.accelerometer_m_s2).any(axis=1)).tolist() == [3, 5]
-    assert [note.startswith("2 accelerometer") for note in log.notes] == [True]
+    assert "2 out of range" in log.notes[0]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,129 @@
+"""Frames that stay in another system's file and are read, and turned, one at a time."""
+
+from __future__ import annotations
+
+import operator
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.geometry import require_finite
+from speckle3d.io.hdf5 import reading
+
+ReadFrame: TypeAlias = Callable[[int], npt.NDArray[Any]]
+"""Reads frame i of an open file, shape (vector, sample)."""
+
+
+class FileFrames:
+    """Frames of a file that is opened when the first one is asked for; several threads may read.
+
+    Parameters
+    ----------
+    open_file : callable
+        Opens the file and returns what reads a frame of it. It must survive pickling (a dataclass with
+        `__call__`), so that frames can be sent to another process, which opens the file anew.
+    shape : tuple of int
+        (frame, vector, sample).
+    stored_dtype : dtype, optional
+        Narrower type that a sweep file may keep them in: int16 of I/Q.
+    chosen : sequence of int, optional
+        Numbers of the frames in the file; by default all of them in order.
+    """
+
+    any_thread = True
+
+    def __init__(
+        self,
+        path: PathLike,
+        open_file: Callable[[], ReadFrame],
+        shape: tuple[int, int, int],
+        dtype: npt.DTypeLike,
+        stored_dtype: npt.DTypeLike | None = None,
+        chosen: Sequence[int] | None = None,
+    ) -> None:
+        self.path, self.open_file = Path(path).absolute(), open_file
+        self.chosen = range(shape[0]) if chosen is None else [int(i) for i in chosen]
+        self.shape, self.dtype = (len(self.chosen), *shape[1:]), np.dtype(dtype)
+        self.stored_dtype = self.dtype if stored_dtype is None else np.dtype(stored_dtype)
+        self._read: ReadFrame | None = None
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        i = self.chosen[operator.index(index)]
+        where = f"{self.path}: frame {i}"
+        with self._lock, reading(where), naming(where):
+            if self._read is None:
+                self._read = self.open_file()
+            frame = self._read(i)
+        if frame.shape != self.shape[1:]:
+            raise InvalidInputError(f"{where}: expected shape {self.shape[1:]}, got {frame.shape}")
+        with np.errstate(over="ignore"):  # what float32 does not hold is refused as not finite
+            frame = np.ascontiguousarray(frame, dtype=self.dtype)
+        if frame.dtype.kind in "fc":
+            require_finite(frame, where)
+        return frame
+
+    def close(self) -> None:
+        """Close the file; the next frame opens it again."""
+        with self._lock:
+            self._read = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        shape = (len(self.chosen), *self.shape[1:])
+        return type(self), (self.path, self.open_file, shape, self.dtype, self.stored_dtype, self.chosen)
+
+
+@dataclass(frozen=True)
+class RawFile:
+    """Opens frames that lie one after the other in a plain file.
+
+    Attributes
+    ----------
+    start, step : int
+        Byte of the first frame's first number, and bytes from frame to frame.
+    dtype : dtype
+        Of the numbers in the file.
+    shape : tuple of int
+        Of a frame's numbers in the file.
+    turn : callable
+        Makes (vector, sample) of them.
+    """
+
+    path: Path
+    start: int
+    step: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    turn: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
+
+    def __call__(self) -> ReadFrame:
+        """Open nothing: the file is open only while a frame is read."""
+        return self.read
+
+    def read(self, i: int) -> npt.NDArray[Any]:
+        """Read frame i.
+
+        Raises
+        ------
+        FileError
+            If the file ends before.
+        """
+        expected = int(np.prod(self.shape)) * self.dtype.itemsize
+        with open_regular(self.path) as stream:
+            stream.seek(self.start + i * self.step)
+            content = stream.read(expected)
+        if len(content) != expected:
+            raise FileError(
+                f"{self.path}: frame {i}: expected {expected} bytes, got {len(content)}: truncated"
+            )
+        return self.turn(np.frombuffer(content, self.dtype).reshape(self.shape))

@@ -1,0 +1,339 @@
+"""A recording of any format: its frames, what it says of them and where each number is from.
+
+A number comes from the file, from options or, where all scanners have the same, is assumed; each is told with
+its source, as in "0.05 (given by import.toml, the file says 0.2)". What is in none of these is asked for, all
+at once. Readers fill a `Recording`; it makes the sweep, describes itself and tells contradictions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.files import PathLike
+from speckle3d.core.printable import printable
+from speckle3d.core.sweep import (
+    BModeSettings,
+    Frames,
+    ImageGrid,
+    OrientationSensor,
+    RFSettings,
+    Sweep,
+    Tracker,
+)
+from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings, settings_file, settings_for
+from speckle3d.io.plausible import require_plausible
+from speckle3d.io.pose_paths import checked_path
+
+Row = tuple[str, str, str]
+"""Description, value, unit."""
+
+SPREAD = 1e-3
+"""How far steps of an axis may be from their mean, as a share: rounding of single precision in metres."""
+
+CONTRADICTION = 0.01
+"""Difference, as a share, above which a number that is given contradicts what a file says."""
+
+_UNITS = {"hz": "Hz", "mm": "mm", "db": "dB", "s": "m/s"}
+_ASSUMED = "assumed"
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number of a recording, and where it is from; None if the recording does not give it.
+
+    Attributes
+    ----------
+    source : str
+        As shown; begins with "assumed" if nobody says it.
+    said_by : str
+        Who says it, if it is not the recording.
+    """
+
+    value: Any = None
+    source: str = ""
+    said_by: str = "the file"
+
+    @property
+    def is_assumed(self) -> bool:
+        """Whether nobody says it."""
+        return self.source.startswith(_ASSUMED)
+
+
+ASSUMED = {
+    "speed_of_sound_m_s": Value(SPEED_OF_SOUND_M_S, _ASSUMED),
+    "first_sample_depth_mm": Value(0.0, _ASSUMED),
+}
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a reader found in a recording.
+
+    Attributes
+    ----------
+    settings : ImportSettings
+        What is given over the recording's own numbers.
+    frames : Frames, optional
+        uint8 for B-mode, real for RF, complex for I/Q.
+    values : mapping of str to Value
+        By the name of a setting.
+    sample_spacing_mm : float, optional
+        Of RF and I/Q whose samples' depths the file gives, in place of a sampling rate.
+    time_s : ndarray, shape (n,), optional
+        By default of the frame rate, from 0.
+    chain : str
+        Transforms that the tracker's poses were made of.
+    asked : mapping of str to str
+        Settings to ask for in place of others, as the probe's model for a distance.
+    assumptions : tuple of str
+        What no file says and is taken for granted.
+    rows : tuple of Row
+        Facts of the file that are no numbers of a sweep.
+    remarks : tuple of str
+        What is to be told when the recording is used: rows left out, contradictions of its own.
+    fault : InvalidInputError or FileError, optional
+        Why there is no sweep in it.
+    ready : Sweep, optional
+        The sweep itself, of formats that say all.
+    """
+
+    path: Path
+    settings: ImportSettings = field(default_factory=ImportSettings)
+    frames: Frames | None = None
+    values: Mapping[str, Value] = field(default_factory=dict)
+    sample_spacing_mm: float | None = None
+    time_s: FloatArray | None = None
+    tracker: Tracker | None = None
+    orientation: OrientationSensor | None = None
+    chain: str = "the tracker"
+    probe: str = ""
+    name: str = ""
+    full_scale: float = 255.0
+    asked: Mapping[str, str] = field(default_factory=dict)
+    assumptions: tuple[str, ...] = ()
+    rows: tuple[Row, ...] = ()
+    remarks: tuple[str, ...] = ()
+    fault: InvalidInputError | FileError | None = None
+    ready: Sweep | None = None
+
+    @property
+    def sweep(self) -> Sweep:
+        """The sweep; jumps of its tracker are left out.
+
+        Raises
+        ------
+        MissingSettingsError
+            Naming all that neither the recording nor the settings give.
+        FileError, InvalidInputError
+            If there is none, or its numbers cannot be those of echoes.
+        """
+        return self._checked[0]
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know of how the sweep was made."""
+        assumed = [
+            f"{_words(name)[0]} {_shown(one.value, _words(name)[1])} {_words(name)[1]}"
+            for name, one in self.needed.items()
+            if one.is_assumed and getattr(self.settings, name) is None
+        ]
+        assumed += self.assumptions
+        told = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
+        return [*self.contradictions(), *self.remarks, *self._checked[1], *told]
+
+    def describe(self) -> list[Row]:
+        """Rows of what the file says, where each number is from, and what is odd."""
+        numbers = [] if self.fault else [self._row(name, one) for name, one in self.needed.items()]
+        remarks = list(self.remarks)
+        with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
+            remarks += self._checked[1]
+        return [*self.rows, *numbers, *(("note", text, "") for text in remarks)]
+
+    def contradictions(self) -> list[str]:
+        """Tell each number that is given and is another than the recording says, by more than 1 %."""
+        notes = []
+        for name, one in self.needed.items():
+            given = getattr(self.settings, name)
+            if given is None or one.value is None or one.is_assumed or not differs(given, one.value):
+                continue
+            words, unit = _words(name)
+            source = f" ({one.source})" if one.source else ""
+            notes.append(
+                f"{words} {_shown(given, unit)} {unit}, {self._given(name)}: {one.said_by} says "
+                f"{_shown(one.value, unit)}{source}"
+            )
+        return notes
+
+    @cached_property
+    def needed(self) -> dict[str, Value]:
+        """The numbers that a sweep of these frames needs, by the names of their settings."""
+        if self.frames is None:
+            return {}
+        names = ["first_sample_depth_mm"]
+        if self.frames.dtype == np.uint8:
+            names += ["column_pitch_mm", "row_spacing_mm", "dynamic_range_db"]
+        else:
+            names += ["vector_pitch_mm", "speed_of_sound_m_s", "sampling_rate_hz", "centre_frequency_hz"]
+            names += ["bandwidth_hz"]
+        if self.frames.dtype.kind == "c":
+            names.append("demodulation_frequency_hz")
+        given_rate = self.settings.frame_rate_hz is not None
+        if given_rate or (self.time_s is None and self.frames.shape[0] > 1):
+            names.append("frame_rate_hz")
+        needed = {name: self.values.get(name, ASSUMED.get(name, Value())) for name in names}
+        if given_rate and self.time_s is not None and "frame_rate_hz" not in self.values:
+            needed["frame_rate_hz"] = Value(rate_of(self.time_s), "of its times")
+        if "sampling_rate_hz" in needed and self.sample_spacing_mm is not None:
+            speed = self.settings.speed_of_sound_m_s or needed["speed_of_sound_m_s"].value
+            source = f"of samples {self.sample_spacing_mm:.6g} mm apart at {speed:g} m/s"
+            needed["sampling_rate_hz"] = Value(1e3 * speed / (2.0 * self.sample_spacing_mm), source)
+        return needed
+
+    @cached_property
+    def _checked(self) -> tuple[Sweep, list[str]]:
+        with naming(str(self.path)):
+            sweep = self._made() if self.ready is None else self.ready
+            require_plausible(sweep)
+            checked, notes = checked_path(sweep, self.chain)
+        # Of a format that says all, its poses are told where something is odd of them.
+        return checked, notes if self.ready is None or len(notes) > 1 else []
+
+    def _made(self) -> Sweep:
+        if self.fault is not None:
+            raise self.fault
+        if self.frames is None or 0 in self.frames.shape:
+            shape = None if self.frames is None else self.frames.shape
+            raise InvalidInputError(f"{self.path}: expected frames, got shape {shape}")
+        wanted = {name: one.value for name, one in self.needed.items()}
+        lacking = {
+            self.asked.get(name, name): value if getattr(self.settings, name) is None else 0
+            for name, value in wanted.items()
+        }
+        self.settings.over(self.path, **lacking)  # asks for what is missing by the easiest name
+        values = self.settings.over(self.path, **wanted)
+        self._require_depths(values)
+        signal = self._signal(values)
+        is_rf = isinstance(signal, RFSettings)
+        pitch = values["vector_pitch_mm" if is_rf else "column_pitch_mm"]
+        spacing = signal.sample_spacing_mm if isinstance(signal, RFSettings) else values["row_spacing_mm"]
+        return Sweep(
+            frames=self.frames,
+            grid=ImageGrid(*self.frames.shape[1:], pitch, spacing, values["first_sample_depth_mm"]),
+            signal=signal,
+            frame_time_s=self._times(values.get("frame_rate_hz")),
+            tracker=self.tracker,
+            orientation=self.orientation,
+            name=printable(self.name or self.path.name.split(".")[0]),
+            probe=self.probe or self.settings.probe or "",
+        )
+
+    def _require_depths(self, values: Mapping[str, Any]) -> None:
+        """Refuse a sampling rate that contradicts where the recording says its samples lie."""
+        rate, spacing = values.get("sampling_rate_hz"), self.sample_spacing_mm
+        if rate is None or spacing is None:
+            return
+        speed = values["speed_of_sound_m_s"]
+        implied = 1e3 * speed / (2.0 * spacing)
+        if abs(rate - implied) > SPREAD * implied:
+            raise InvalidInputError(
+                f"sampling_rate_hz: expected {implied:.7g} of samples that lie {spacing:.6g} mm apart at "
+                f"{speed:g} m/s, got {rate:.7g}"
+            )
+
+    def _signal(self, values: Mapping[str, Any]) -> RFSettings | BModeSettings:
+        if "dynamic_range_db" in values:
+            return BModeSettings(values["dynamic_range_db"], self.full_scale)
+        return RFSettings(
+            values["sampling_rate_hz"],
+            values["speed_of_sound_m_s"],
+            values["centre_frequency_hz"],
+            tuple(values["bandwidth_hz"]),
+            values.get("demodulation_frequency_hz"),
+        )
+
+    def _times(self, rate_hz: float | None) -> FloatArray:
+        assert self.frames is not None
+        if rate_hz is None:
+            return np.zeros(1) if self.time_s is None else self.time_s
+        return np.arange(self.frames.shape[0]) / float(rate_hz)
+
+    def _given(self, name: str) -> str:
+        """Who gives a setting: the file of settings beside the recording, or an option."""
+        file = settings_file(self.path)
+        own = None if file is None else getattr(settings_for(self.path), name)
+        return "given" if file is None or own != getattr(self.settings, name) else f"given by {file.name}"
+
+    def _row(self, name: str, one: Value) -> Row:
+        words, unit = _words(name)
+        given = getattr(self.settings, name)
+        own = None if one.value is None else _shown(one.value, unit)
+        if given is None and own is None:
+            return words, f"missing: --{self.asked.get(name, name).replace('_', '-')}", ""
+        if given is None:
+            return words, f"{own} ({one.source})" if one.source else str(own), unit
+        shown = _shown(given, unit)
+        is_said = own is not None and not one.is_assumed
+        against = f", {one.said_by} says {own}" if is_said and own != shown else ""
+        return words, f"{shown} ({self._given(name)}{against})", unit
+
+
+def differs(given: Any, own: Any) -> bool:
+    """Whether two values are further apart than `CONTRADICTION`."""
+    return not np.allclose(given, own, rtol=CONTRADICTION, atol=0)
+
+
+def rate_of(time_s: FloatArray) -> float | None:
+    """Mean frame rate of times, Hz; None of fewer than two, or where they do not rise."""
+    span = float(time_s[-1] - time_s[0]) if time_s.size > 1 else 0.0
+    return (time_s.size - 1) / span if span > 0 else None
+
+
+def step_of(axis: FloatArray, where: str) -> float:
+    """Distance between neighbours of an axis.
+
+    Raises
+    ------
+    InvalidInputError
+        If it does not rise in even steps, or has fewer than two values.
+    """
+    if axis.size < 2 or not np.isfinite(axis).all():
+        raise InvalidInputError(f"{where}: expected at least two finite positions, got {axis.size}")
+    step = float(axis[-1] - axis[0]) / (axis.size - 1)
+    if not step > 0:
+        raise InvalidInputError(f"{where}: expected rising positions, got {axis[0]:g} to {axis[-1]:g}")
+    # Single precision far from zero rounds to a share of the position, not of the step.
+    allowed = SPREAD * step + 4e-7 * float(np.abs(axis).max())
+    off = np.abs(np.diff(axis) - step)
+    if off.max() > allowed:
+        worst = int(np.argmax(off))
+        raise InvalidInputError(
+            f"{where}[{worst}]: expected even steps of {step:g}, got {np.diff(axis)[worst]:g}"
+        )
+    return step
+
+
+def _words(name: str) -> tuple[str, str]:
+    """Words and unit of a setting, as they are shown."""
+    *words, unit = name.split("_")
+    if unit == "s":
+        words = words[:-1]
+    is_mega = unit == "hz" and words[0] != "frame"
+    return " ".join(words), "MHz" if is_mega else _UNITS[unit]
+
+
+def _shown(value: Any, unit: str) -> str:
+    return " to ".join(f"{number / (1e6 if unit == 'MHz' else 1.0):.7g}" for number in np.ravel(value))
+
+
+def where_of(path: PathLike, name: str) -> str:
+    """A place in a file, for messages."""
+    return f"{path}: /{name.lstrip('/')}"

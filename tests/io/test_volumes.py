@@ -1,0 +1,328 @@
+"""Volumes and labels written in slabs and read, as SimpleITK, nibabel and Slicer's own reader find them."""
+
+import gzip
+import itertools
+
+import nibabel
+import numpy as np
+import pytest
+import SimpleITK
+import slicerio
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
+from speckle3d.core.volume import VOXEL_TYPES, Volume
+from speckle3d.io.describe import describe
+from speckle3d.io.voxels import volume_writer
+from speckle3d.io.voxels.volume_writer import SUFFIXES, VolumeWriter
+from speckle3d.io.voxels.volumes import read_volume, write_volume
+
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+# NIfTI keeps its matrix in single precision: 6e-8 of places up to 300 mm, and of 5 voxels of a few mm.
+SINGLE_MM = 1e-4
+FIELDS = {
+    "levels": 'log-compressed, 0 to 255 over 60 dB; <b>"quoted"</b> & Größe µm := x',
+    "note": "two\nlines, a \\n that is none",
+    "type": "not the format's own",
+    "DimSize": "9 9 9",
+}
+
+
+def volume_of(seed=0, dtype="uint8", shape=(4, 5, 6), rotation=None, fields=None):
+    rng = np.random.default_rng(seed)
+    turned = Rotation.random(rng=rng) if rotation is None else rotation
+    pose = RigidTransform.from_components(rng.normal(0, 100, 3), turned)
+    voxels = rng.integers(0, 200, shape).astype(dtype)
+    return Volume(voxels, tuple(rng.uniform(0.05, 3.0, 3)), pose, fields or {})
+
+
+def by_itk(path):
+    """World (LPS) from index, and voxels, as ITK finds them."""
+    image = SimpleITK.ReadImage(str(path))
+    affine = np.eye(4)
+    affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
+    affine[:3, 3] = image.GetOrigin()
+    return affine, SimpleITK.GetArrayFromImage(image).T
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    suffix=st.sampled_from(SUFFIXES),
+    dtype=st.sampled_from(VOXEL_TYPES),
+    shape=st.tuples(*[st.integers(1, 5)] * 3),
+    compress=st.booleans(),
+    seed=st.integers(0, 999),
+)
+@example(suffix=".mha", dtype="uint16", shape=(1, 1, 1), compress=True, seed=0)
+@example(suffix=".nrrd", dtype="int16", shape=(1, 5, 1), compress=False, seed=0)
+def test_a_voxel_is_at_the_same_place_in_itk_and_here(tmp_path_factory, suffix, dtype, shape, compress, seed):
+    path = tmp_path_factory.mktemp("volume") / f"v{suffix}"
+    volume = volume_of(seed, dtype, shape)
+    write_volume(path, volume, compress)
+    back, (affine, voxels) = read_volume(path), by_itk(path)
+    tolerance = SINGLE_MM if ".nii" in suffix else 1e-9
+    for matrix, values in ((affine, voxels), (back.world_from_index, back.voxels)):
+        np.testing.assert_allclose(matrix, volume.world_from_index, atol=tolerance)
+        np.testing.assert_array_equal(values, volume.voxels)
+        assert values.dtype == volume.voxels.dtype
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("turn_deg", [90.0, 180.0, 179.99])
+def test_near_a_half_turn_nifti_is_as_exact_and_says_its_unit(tmp_path, turn_deg):
+    turned = Rotation.from_rotvec(np.deg2rad(turn_deg) * np.array([1, 2, 3]) / 14**0.5)
+    volume = volume_of(1, "uint8", (50, 40, 30), turned)
+    write_volume(tmp_path / "v.nii", volume)
+    image = nibabel.load(tmp_path / "v.nii")
+    assert image.header.get_xyzt_units()[0] == "mm"
+    np.testing.assert_allclose(RAS_FROM_LPS @ image.affine, volume.world_from_index, atol=SINGLE_MM)
+    by_quaternion = RAS_FROM_LPS @ image.get_qform()
+    np.testing.assert_allclose(by_quaternion[:3, :3], volume.world_from_index[:3, :3], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "letters"),
+    [
+        (np.eye(3), "RAI"),
+        (np.diag([-1, -1, 1]), "LPI"),
+        (np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), "PSR"),
+    ],
+)
+def test_the_anatomical_orientation_of_a_metaimage_is_itks(tmp_path, rotation, letters):
+    volume = volume_of(2, rotation=Rotation.from_matrix(rotation) * Rotation.from_rotvec([0.1, -0.2, 0.15]))
+    write_volume(tmp_path / "v.mha", volume, compress=False)
+    SimpleITK.WriteImage(SimpleITK.ReadImage(str(tmp_path / "v.mha")), str(tmp_path / "itk.mha"))
+    for name in ("v.mha", "itk.mha"):
+        assert f"AnatomicalOrientation = {letters}\n".encode() in (tmp_path / name).read_bytes()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_slabs_and_byte_order_do_not_show_in_the_file(tmp_path, suffix, monkeypatch):
+    volume = volume_of(3, "int16", (40, 30, 20))
+    write_volume(tmp_path / f"whole{suffix}", volume)
+    monkeypatch.setattr(volume_writer, "_BATCH_BYTES", 2**14)
+    place = volume.shape, volume.spacing_mm, volume.world_from_grid
+    with VolumeWriter(tmp_path / f"slabs{suffix}", *place, "int16") as writer:
+        for first, stop in itertools.pairwise((0, 1, 7, 20)):
+            planes = np.asfortranarray(volume.voxels.T[first:stop]).astype(">i2")
+            writer.append(planes)
+            planes[:] = -1  # the writer holds no view of it
+    for name in ("whole", "slabs"):
+        np.testing.assert_array_equal(by_itk(tmp_path / f"{name}{suffix}")[1], volume.voxels)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_fields_come_back_and_take_nobodys_place(tmp_path, suffix):
+    path = tmp_path / f"v{suffix}"
+    volume = volume_of(5, fields=FIELDS)
+    write_volume(path, volume)
+    assert dict(read_volume(path).fields) == FIELDS
+    np.testing.assert_array_equal(by_itk(path)[1], volume.voxels)
+
+
+def test_control_characters_cannot_forge_a_field_and_names_must_fit_a_header(tmp_path):
+    for suffix in (".nrrd", ".mha"):
+        write_volume(tmp_path / f"v{suffix}", volume_of(fields={"a": "x\r\nSpeckle3D_b = y\x1b\0z"}))
+        assert dict(read_volume(tmp_path / f"v{suffix}").fields) == {"a": "x\nSpeckle3D_b = y\\x1b\\x00z"}
+    for name in ("", "a b", "a:=b", "a\nb", "1a"):
+        with pytest.raises(InvalidInputError, match=r"v\.nrrd: fields"):
+            write_volume(tmp_path / "v.nrrd", volume_of(fields={name: "x"}))
+
+
+def written(path, planes=(), **others):
+    place = {"shape": (4, 3, 2), "spacing_mm": (1.0, 1.0, 1.0), "world_from_grid": RigidTransform.identity()}
+    with VolumeWriter(path, **(place | {"dtype": "uint8"} | others)) as writer:
+        for piece in planes:
+            writer.append(piece)
+
+
+@pytest.mark.parametrize(
+    ("others", "planes", "words"),
+    [
+        ({"dtype": "float64"}, [], "float64"),
+        ({"shape": (4, 0, 2)}, [], "shape"),
+        ({"shape": (40_000, 1, 1)}, [], "32767"),
+        ({"spacing_mm": (1.0, np.nan, 1.0)}, [], "spacing_mm"),
+        ({"dtype": "int16", "segments": ()}, [], "labels"),
+        ({}, [np.zeros((1, 3, 4), np.uint8)], "2 planes, got 1"),
+        ({}, [np.zeros((3, 3, 4), np.uint8)], "at most 2 planes"),
+        ({}, [np.zeros((2, 3, 4), np.int16)], "uint8, got int16"),
+    ],
+)
+def test_what_is_no_volume_leaves_no_file(tmp_path, others, planes, words):
+    with pytest.raises((InvalidInputError, MismatchError), match=rf"v\.nii\.gz: .*{words}"):
+        written(tmp_path / "v.nii.gz", planes, **others)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_suffix_and_a_segmentation_of_no_labels_are_refused(tmp_path):
+    for name in ("v.png", "v.seg.nrrd"):
+        with pytest.raises(InvalidInputError, match=name):
+            write_volume(tmp_path / name, volume_of())
+
+
+ODD = (Segment(1, 'vein <&> "left"', (1.0, 0.0, 0.25)), Segment(7, "Nerv, größer\nzwei", (0.0, 0.5, 1.0)))
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".seg.nrrd"])
+def test_labels_come_back_with_what_they_mean(tmp_path, suffix):
+    path, grey = tmp_path / f"v{suffix}", volume_of(8, "uint16")
+    write_volume(path, LabelMap(grey.voxels, grey.spacing_mm, grey.world_from_grid, {"a": "b"}, ODD))
+    back = read_volume(path)
+    assert isinstance(back, LabelMap)
+    assert (back.segments, dict(back.fields)) == (ODD, {"a": "b"})
+    np.testing.assert_array_equal(back.voxels, grey.voxels)
+    np.testing.assert_array_equal(by_itk(path)[1], grey.voxels)
+
+
+def test_a_segmentation_is_slicers(tmp_path):
+    voxels = np.random.default_rng(9).integers(0, 3, (6, 5, 4)).astype(np.uint8)
+    labels = LabelMap(voxels, (0.5, 0.25, 1.0), RigidTransform.identity(), {}, STATE_SEGMENTS)
+    write_volume(tmp_path / "state.seg.nrrd", labels)
+    theirs = slicerio.read_segmentation(str(tmp_path / "state.seg.nrrd"))
+    np.testing.assert_array_equal(theirs["voxels"], voxels)
+    np.testing.assert_allclose(theirs["ijkToLPS"], labels.world_from_index)
+    assert [(s["labelValue"], s["name"], tuple(s["color"]), s["extent"]) for s in theirs["segments"]] == [
+        (s.value, s.name, s.colour, [0, 5, 0, 4, 0, 3]) for s in STATE_SEGMENTS
+    ]
+    slicerio.write_segmentation(str(tmp_path / "theirs.seg.nrrd"), theirs)
+    assert read_volume(tmp_path / "theirs.seg.nrrd").segments == STATE_SEGMENTS
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ("Segment0_LabelValue:=half", "Segment0_LabelValue"),
+        ("Segment0_Color:=1 1", "Segment0_Color"),
+        ("Segment0_Layer:=1", "Segment0_Layer"),
+        ("Segment1_LabelValue:=1", "one for each label"),
+    ],
+)
+def test_segments_that_make_no_sense_are_named(tmp_path, field, message):
+    path, voxels = tmp_path / "s.seg.nrrd", np.zeros((2, 2, 2), np.uint8)
+    write_volume(path, LabelMap(voxels, (1, 1, 1), RigidTransform.identity(), {}, STATE_SEGMENTS))
+    header, pixels = path.read_bytes().split(b"\n\n", 1)
+    name = field.split(":=")[0].encode()
+    lines = [field.encode() if line.startswith(name + b":=") else line for line in header.split(b"\n")]
+    path.write_bytes(b"\n".join(lines) + b"\n\n" + pixels)
+    with pytest.raises(InvalidInputError, match=message):
+        read_volume(path)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.6, 0.9])
+def test_a_truncated_volume_is_refused(tmp_path, suffix, kept, capfd):
+    path = tmp_path / f"v{suffix}"
+    write_volume(path, volume_of())
+    path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+    with pytest.raises((FileError, InvalidInputError), match=r"v\.") as caught:
+        read_volume(path)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.realdata
+def test_a_reference_volume_of_plus_is_read(realdata):
+    volume = read_volume(realdata / "plus" / "vtkVolumeReconstructorTestNNMEANvolumeRef.mha")
+    assert volume.shape == (147, 106, 105)
+    assert volume.spacing_mm == (0.5, 0.5, 0.5)
+    np.testing.assert_allclose(volume.world_from_grid.translation, [-74.5217, 165.573, 29.072])
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii.gz", ".mhd", ".nhdr", ".hdr"])
+@pytest.mark.parametrize("dtype", ["u1", "i2", "f8"])
+@pytest.mark.parametrize("compress", [False, True])
+def test_volumes_of_others_are_what_the_image_library_finds(tmp_path, suffix, dtype, compress):
+    rng = np.random.default_rng(3)
+    image = SimpleITK.GetImageFromArray(rng.integers(0, 200, (3, 4, 5)).astype(dtype))
+    image.SetSpacing((0.5, 0.25, 1.1))
+    image.SetOrigin((1.0, -2.0, 3.0))
+    image.SetDirection(Rotation.random(rng=rng).as_matrix().ravel().tolist())
+    SimpleITK.WriteImage(image, str(tmp_path / f"v{suffix}"), useCompression=compress)
+    got, (affine, voxels) = read_volume(tmp_path / f"v{suffix}"), by_itk(tmp_path / f"v{suffix}")
+    np.testing.assert_array_equal(got.voxels, voxels)
+    np.testing.assert_allclose(got.world_from_index, affine, atol=1e-5)
+
+
+def test_a_left_handed_file_is_turned_about_and_nothing_moves(tmp_path):
+    voxels = np.random.default_rng(7).integers(0, 99, (3, 4, 5)).astype(np.int16)
+    affine = np.diag([-0.5, 0.25, 2.0, 1.0])
+    affine[:3, 3] = 10, 20, 30
+    nibabel.save(nibabel.Nifti1Image(voxels, RAS_FROM_LPS @ affine), tmp_path / "left.nii.gz")
+    got = read_volume(tmp_path / "left.nii.gz")
+    for index in itertools.product(range(3), range(4), range(5)):
+        place = np.array([*index, 1]) @ affine.T
+        at = np.rint(np.linalg.solve(got.world_from_index, place)[:3]).astype(int)
+        np.testing.assert_allclose(np.array([*at, 1]) @ got.world_from_index.T, place, atol=SINGLE_MM)
+        assert got.voxels[tuple(at)] == voxels[index]
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("meter", 1e3), ("micron", 1e-3), (None, 1.0)])
+@pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
+def test_nifti_is_in_its_own_unit(tmp_path, kind, unit, factor):
+    image = kind(np.ones((3, 4, 5), np.uint8), np.diag([-0.2, -0.3, 0.4, 1.0]))
+    if unit:
+        image.header.set_xyzt_units(unit)
+    nibabel.save(image, tmp_path / "v.nii")
+    np.testing.assert_allclose(
+        read_volume(tmp_path / "v.nii").spacing_mm, np.multiply((0.2, 0.3, 0.4), factor), rtol=1e-6
+    )
+
+
+def test_labels_of_eight_bytes_are_labels(tmp_path):
+    image = nibabel.Nifti1Image(np.arange(60).reshape(3, 4, 5), np.eye(4), dtype="int64")
+    image.header.set_intent("label")
+    nibabel.save(image, tmp_path / "l.nii.gz")
+    got = read_volume(tmp_path / "l.nii.gz")
+    assert isinstance(got, LabelMap)
+    np.testing.assert_array_equal(np.sort(got.voxels.ravel()), np.arange(60))
+
+
+@pytest.mark.parametrize(
+    ("line", "spacing"),
+    [('spacings: 0.02 0.03 0.04\nunits: "cm" "cm" "cm"', (0.2, 0.3, 0.4)), (
+        'space: left-posterior-superior\nspace directions: (0.0002,0,0) (0,0.0003,0) (0,0,0.0004)\n'
+        'space units: "m" "m" "m"', (0.2, 0.3, 0.4)),
+        ("spacings: 0.2 0.3 0.4", (0.2, 0.3, 0.4))],
+)  # fmt: skip
+def test_nrrd_is_in_its_own_unit(tmp_path, line, spacing):
+    path = tmp_path / "v.nrrd"
+    header = (
+        "NRRD0005\ntype: uint8\ndimension: 3\nsizes: 2 3 4\nkinds: domain domain domain\n"
+        f"{line}\nencoding: raw\n\n"
+    )
+    path.write_bytes(header.encode() + bytes(range(24)))
+    np.testing.assert_allclose(read_volume(path).spacing_mm, spacing)
+    path.write_bytes(header.replace('"cm"', '"furlong"').replace('"m"', '"furlong"').encode() + bytes(24))
+    if "units" in line:
+        with pytest.raises(InvalidInputError, match="furlong"):
+            read_volume(path)
+
+
+def test_members_of_gzip_that_follow_one_another_are_one_volume(tmp_path):
+    """As bgzip and pigz write them."""
+    volume = volume_of(4, "int16")
+    write_volume(tmp_path / "v.nii", volume)
+    whole = (tmp_path / "v.nii").read_bytes()
+    parts = [gzip.compress(whole[i : i + 100]) for i in range(0, len(whole), 100)]
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts))
+    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
+    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts[:-1]))
+    with pytest.raises(FileError, match=r"v\.nii\.gz: cannot be read as NIfTI"):
+        read_volume(tmp_path / "v.nii.gz")
+
+
+@pytest.mark.parametrize("suffix", [*SUFFIXES, ".seg.nrrd"])
+def test_info_tells_what_a_volume_holds(tmp_path, suffix):
+    path, place = tmp_path / f"v{suffix}", ((0.5, 0.25, 1.0), RigidTransform.identity(), {"levels": "linear"})
+    voxels = np.full((4, 3, 2), 2, np.uint8)
+    volume = LabelMap(voxels, *place, STATE_SEGMENTS) if "seg" in suffix else Volume(voxels, *place)
+    write_volume(path, volume)
+    rows = {what: (value, unit) for what, value, unit in describe(path)}
+    assert rows["voxels"] == ("4 x 3 x 2", "")
+    assert rows["spacing"] == ("0.5 x 0.25 x 1", "mm")
+    assert rows["levels"] == ("linear", "")
+    assert rows.get("label 2", rows.get("levels found")) in (("filled: 24", "voxels"), ("2 to 2", ""))

@@ -1,0 +1,248 @@
+"""Readings that are no measurements are missing and cost certainty; what leaves the answer open: refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InvalidInputError
+from xsens.fusion.orient import orient
+from xsens.logs.contradictions import contradictions
+from xsens.logs.faults import measured
+from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.textlogs import parse_text
+
+RATE_HZ = 100.0
+SWING_RAD, SWING_HZ = np.deg2rad(34.4), 0.5
+
+
+def swinging(seconds=12.0, noise=1.0):
+    """A sensor that rolls to and fro, and its truth."""
+    time_s = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    rng, w = np.random.default_rng(4), 2.0 * np.pi * SWING_HZ
+    truth = Rotation.from_euler("x", SWING_RAD * np.sin(w * time_s)[:, None])
+    rate = np.outer(SWING_RAD * w * np.cos(w * time_s), [1.0, 0.0, 0.0])
+    force, field = truth.inv().apply([0.0, 0.0, 9.81]), truth.inv().apply([0.45, 0.0, -0.89])
+    vectors = [
+        np.round(v + noise * sd * rng.standard_normal(v.shape), 6)
+        for v, sd in ((force, 0.02), (rate, 0.01), (field, 0.004))
+    ]
+    return ImuLog(time_s, *vectors), truth
+
+
+def with_rows(log, names, change):
+    return replace(log, **{name: change(getattr(log, name).copy()) for name in names})
+
+
+def gone(log):
+    """Half of each second."""
+    return log.time_s % 1.0 >= 0.5
+
+
+def repeated(rows, where):
+    return rows[np.maximum.accumulate(np.where(where, 0, np.arange(len(rows))))]
+
+
+def errors(log, truth, method):
+    """Largest tilt in degrees, RMS of it and of its claim, and of the heading and its claim."""
+    found = orient(log, method=method)
+    at = np.searchsorted(log.time_s, found.rotations.time_s)
+    off = np.rad2deg((found.rotations.world_from_sensor * truth[at].inv()).as_rotvec())
+    sd = np.rad2deg(found.standard_deviation_rad)
+    tilt, claim = np.hypot(off[:, 0], off[:, 1]), np.hypot(sd[:, 0], sd[:, 1])
+    return tilt.max(), *(np.sqrt(np.mean(v**2)) for v in (tilt, claim, off[:, 2], sd[:, 2]))
+
+
+SENSORS = [VECTORS, *((name,) for name in VECTORS)]
+
+
+@pytest.mark.parametrize("method", ["smoother", "filter"])
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+@pytest.mark.parametrize("kind", ["zeros", "repeats"])
+@pytest.mark.parametrize("names", SENSORS, ids=["all", "accelerometer", "gyroscope", "magnetometer"])
+def test_half_of_each_second_gone_is_missing_and_costs_certainty(names, kind, noise, method):
+    log, truth = swinging(noise=noise)
+    where = gone(log)
+    change = {
+        "zeros": lambda rows: np.where(where[:, None], 0.0, rows),
+        "repeats": lambda rows: repeated(rows, where),
+    }[kind]
+    spoiled = with_rows(log, names, change)
+    for name in names:
+        rows = getattr(measured(spoiled), name)
+        assert np.isnan(rows).any(axis=1)[where].mean() > 0.9
+        assert not np.isnan(rows).any(axis=1)[~where].any()
+    worst, tilt, claim, heading, heading_claim = errors(spoiled, truth, method)
+    assert worst < 2.0
+    assert tilt < claim
+    assert heading < heading_claim
+    if VECTORS[2] not in names or len(names) > 1:
+        assert claim > errors(log, truth, method)[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "words"),
+    [
+        (VECTORS[1], lambda rows: np.clip(rows, -1.2, 1.2), "end of the range"),
+        (VECTORS[1], lambda rows: with_every(97, rows, [25.0, -25.0, 25.0]), "spikes"),
+        (VECTORS[1], lambda rows: with_every(97, rows, [1e5, 0.0, 0.0]), "out of range"),
+        (VECTORS[0], lambda rows: with_every(97, rows, [300.0, -300.0, 20.0]), "spikes"),
+        (VECTORS[2], lambda rows: with_every(97, rows, [1e4, 0.0, 0.0]), "out of range"),
+    ],
+)
+@pytest.mark.parametrize("method", ["smoother", "filter"])
+def test_saturation_and_values_no_hand_makes_are_missing(name, spoil, words, method):
+    log, truth = swinging()
+    spoiled = with_rows(log, [name], spoil)
+    found = measured(spoiled)
+    wrong = (getattr(spoiled, name) != getattr(log, name)).any(axis=1)
+    missing = np.isnan(getattr(found, name)).any(axis=1)
+    assert missing[wrong].mean() > 0.9
+    assert missing[~wrong].mean() < 0.02
+    assert words in found.notes[-1]
+    worst, tilt, claim, heading, heading_claim = errors(spoiled, truth, method)
+    assert tilt < claim
+    assert heading < heading_claim
+    assert worst < 8.0
+
+
+def with_every(step, rows, value):
+    rows[::step] = value
+    return rows
+
+
+def test_what_a_sensor_may_repeat_is_a_measurement():
+    log, _ = swinging()
+    coarse = with_rows(log, [VECTORS[1]], lambda rows: np.trunc(rows / 0.0044) * 0.0044)
+    slow = with_rows(log, [VECTORS[2]], lambda rows: repeated(rows, np.arange(len(rows)) % 5 > 0))
+    rest = ImuLog(
+        log.time_s, *(np.tile(v, (len(log), 1)) for v in ([0.0, 0.0, 9.8], [0.0] * 3, [0.4, 0.0, -0.9]))
+    )
+    for one in (log, coarse, slow, rest):
+        assert measured(one).notes == ()
+
+
+def test_an_orientation_of_its_own_that_stays_behind_is_missing():
+    log, truth = swinging()
+    xyzw = repeated(truth.as_quat(), gone(log))
+    found = measured(
+        replace(log, world_from_sensor=Rotation.from_quat(xyzw), oriented=np.ones(len(log), bool))
+    )
+    assert (found.oriented == ~gone(log)).mean() > 0.98
+
+
+@pytest.mark.parametrize(
+    ("factor", "speed"), [(np.rad2deg(1.0), 0.1), (np.rad2deg(1.0), 1.0), (np.deg2rad(1.0), 1.0)]
+)
+def test_a_gyroscope_in_another_unit_is_refused(factor, speed):
+    log, _ = swinging(20.0)
+    slow = replace(log, time_s=log.time_s / speed, gyroscope_rad_s=factor * speed * log.gyroscope_rad_s)
+    if speed < 1.0:  # a hundred samples a second all the same
+        some = np.arange(0.0, slow.time_s[-1], 0.01)
+        vectors = [
+            np.column_stack([np.interp(some, slow.time_s, v) for v in getattr(slow, n).T]) for n in VECTORS
+        ]
+        slow = ImuLog(some, *vectors)
+    with pytest.raises(InvalidInputError, match="gyroscope"):
+        orient(slow)
+
+
+def test_a_gyroscope_that_its_own_orientation_contradicts_is_refused_where_gravity_tells_nothing():
+    log, _ = swinging()
+    about_up = Rotation.from_euler("z", np.sin(log.time_s)[:, None])
+    rate = np.outer(np.rad2deg(np.cos(log.time_s)), [0.0, 0.0, 1.0])
+    force = np.tile([0.0, 0.0, 9.81], (len(log), 1)) + 0.02 * np.random.default_rng(1).standard_normal(
+        rate.shape
+    )
+    turned = ImuLog(log.time_s, force, np.minimum(rate, 50.0), world_from_sensor=about_up)
+    assert "deg/s" in contradictions(turned)["own orientation"]
+    with pytest.raises(InvalidInputError, match="own orientation"):
+        orient(turned)
+
+
+def rows_of(log, sensor="", shift_s=0.0):
+    columns = np.column_stack([log.time_s + shift_s, *(getattr(log, name) for name in VECTORS)])
+    return [sensor + ",".join(f"{value:.6f}" for value in row) for row in columns]
+
+
+NAMES = "time_s," + ",".join(f"{kind}_{axis}" for kind in ("acc", "gyr", "mag") for axis in "xyz")
+
+
+@pytest.mark.parametrize("whose", ["sensor", "device id", "mac", ""])
+def test_two_sensors_in_one_table_are_refused(whose):
+    log, _ = swinging(4.0)
+    other = replace(log, **{name: np.roll(getattr(log, name), 1, axis=1) for name in VECTORS})
+    one, two = ("D4:22,", "D4:23,") if whose else ("", "")
+    pairs = zip(rows_of(log, one), rows_of(other, two, 4e-4), strict=True)
+    text = "\n".join([f"{whose},{NAMES}" if whose else NAMES, *(row for pair in pairs for row in pair)])
+    with pytest.raises(InvalidInputError, match=whose or "2 in turn"):
+        parse_text(text)
+
+
+def test_rows_out_of_order_are_sorted():
+    log, _ = swinging(4.0)
+    rows = rows_of(log)
+    rows[10:13] = rows[12:9:-1]
+    rows.insert(50, rows[50])
+    found = parse_text("\n".join([NAMES, *rows]))
+    np.testing.assert_allclose(found.gyroscope_rad_s, log.gyroscope_rad_s, atol=1e-6)
+    assert any("out of order" in note for note in found.notes)
+    assert any("1 samples at the time of another" in note for note in found.notes)
+
+
+def test_a_rate_that_the_times_contradict_is_refused():
+    names = "PacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z"
+    rows = [f"{i}\t{100 * i}\t0\t{0.01 * i}\t9.8" for i in range(50)]
+    parse_text("\n".join(["// Update Rate: 100.0Hz", names, *rows]))
+    with pytest.raises(InvalidInputError, match="stated rate, 10 Hz, got 100 Hz"):
+        parse_text("\n".join(["// Update Rate: 10.0Hz", names, *rows]))
+
+
+@pytest.mark.parametrize(("name", "factor"), [("time_ms", 1e3), ("time (us)", 1e6), ("timestamp [ns]", 1e9)])
+def test_units_in_names_are_read(name, factor):
+    log, _ = swinging(2.0)
+    names = [
+        name,
+        *(f"acc_{a} (g)" for a in "xyz"),
+        *(f"gyro_{a}_deg_s" for a in "xyz"),
+        *(f"mag_{a}" for a in "xyz"),
+    ]
+    columns = [
+        factor * log.time_s[:, None],
+        log.accelerometer_m_s2 / 9.80665,
+        np.rad2deg(log.gyroscope_rad_s),
+    ]
+    rows = np.column_stack([*columns, log.magnetometer_au])
+    text = "\n".join([",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())])
+    found = parse_text(text)
+    np.testing.assert_allclose(found.time_s, log.time_s, atol=1e-9)
+    np.testing.assert_allclose(found.accelerometer_m_s2, log.accelerometer_m_s2, atol=1e-9)
+    np.testing.assert_allclose(found.gyroscope_rad_s, log.gyroscope_rad_s, atol=1e-9)
+
+
+def test_a_header_says_which_world():
+    tail = "\n".join(f"{i}\t1\t0\t0\t0" for i in range(20))
+    header = "// Update Rate: 100.0Hz\n// Coordinate system: NED\n"
+    names = "PacketCounter\tQuat_q0\tQuat_q1\tQuat_q2\tQuat_q3\n"
+    down = parse_text(header + names + tail).world_from_sensor.apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(down, np.tile([0.0, 0.0, -1.0], (20, 1)), atol=1e-12)
+
+
+def test_a_clock_without_a_header_is_that_of_the_sensor_whose_rate_is_possible():
+    rows = [f"{i},{4294000000 + 10000 * i},0,0,9.81,90,0,0" for i in range(50)]
+    log = parse_text("PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n" + "\n".join(rows))
+    assert log.rate_hz == pytest.approx(100.0)
+    np.testing.assert_allclose(log.gyroscope_rad_s[:, 0], np.pi / 2)
+
+
+def test_names_that_are_not_understood_are_told_as_such():
+    with pytest.raises(InvalidInputError, match=r"gx \(expected gyroscope_x_rad_s\)"):
+        parse_text("ts,gx,gy,gz,ax,ay,az\n" + "\n".join(f"{i},1,0,0,0,0,1" for i in range(9)))
+
+
+def test_a_blank_for_a_tab_between_names_is_read():
+    names = "PacketCounter\tUTC_Day UTC_Hour\tAcc_X\tAcc_Y\tAcc_Z"
+    rows = [f"{i}\t1\t12\t0\t0\t9.8" for i in range(9)]
+    log = parse_text("\n".join(["// Update Rate: 100.0Hz", names, *rows]))
+    np.testing.assert_allclose(log.accelerometer_m_s2[:, 2], 9.8)
