@@ -27,6 +27,7 @@ _DROPPED = POSITION_BITS - SHARE_BITS
 _SHARE = 1.0 / (1 << SHARE_BITS)
 _SHARES = (1 << SHARE_BITS) - 1
 _LEAST_SHARE = 0.125
+"""Of a sample, for the maximum and the latest: its share if it lies in the middle of eight voxels."""
 
 Numbers = npt.NDArray[Any]
 Words = npt.NDArray[np.uint64]
@@ -174,33 +175,6 @@ def add_nearest(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def raise_nearest(
-    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, table: Float32Array
-) -> None:
-    """Raise voxels to the largest level of the samples that lie in them.
-
-    Parameters
-    ----------
-    images, maps, spans, box
-        As for `add_nearest`.
-    table : ndarray, shape (n_k, n_j, n_i), changed in place
-        NaN where no sample was.
-    """
-    n_j, n_i = table.shape[1:]
-    levels = table.reshape(-1)
-    for n in range(images.shape[0]):
-        m = maps[n]
-        for span in range(spans.shape[0]):
-            line, start, stop, x, y, z = cut_to_box(spans[span], m, box, 0)
-            for sample in range(start, stop):
-                at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
-                level = np.float32(images[n, line, sample])
-                if level == level and not levels[at] >= level:
-                    levels[at] = level
-                x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _fraction(x: int) -> float:
     """How far a position is from the voxel below to the one above."""
     return (x >> _DROPPED & _SHARES) * _SHARE
@@ -312,56 +286,52 @@ def add_linear(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def raise_linear(
-    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, table: Float32Array
+def keep_largest(
+    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, linear: bool, table: Float32Array
 ) -> None:
-    """Raise voxels to the largest level of the samples of which they get a share of at least 1/8.
+    """Keep the largest level in each voxel.
 
     Parameters
     ----------
-    images, maps, spans, box
-        As for `add_linear`.
+    images, spans, box
+        As for `add_nearest`.
+    maps : ndarray, shape (n, 3, 3)
+        As for `add_nearest`, or for `add_linear`.
+    linear : bool
+        Whether a sample counts in all voxels around it of which its share is at least 1/8.
     table : ndarray, shape (n_k, n_j, n_i), changed in place
         NaN where no sample was.
     """
     for n in range(images.shape[0]):
         m = maps[n]
         for span in range(spans.shape[0]):
-            line, start, stop, x, y, z = cut_to_box(spans[span], m, box, 1)
+            line, start, stop, x, y, z = cut_to_box(spans[span], m, box, int(linear))
             for sample in range(start, stop):
                 level = np.float32(images[n, line, sample])
                 i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
-                fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
-                for corner in range(8):
-                    u, v, w = corner & 1, corner >> 1 & 1, corner >> 2
-                    share = (fx if u else 1.0 - fx) * (fy if v else 1.0 - fy) * (fz if w else 1.0 - fz)
-                    if (
-                        share >= _LEAST_SHARE
-                        and box[0, 0] <= i + u < box[0, 1]
-                        and box[1, 0] <= j + v < box[1, 1]
-                        and box[2, 0] <= k + w < box[2, 1]
-                        and level == level
-                        and not table[k + w, j + v, i + u] >= level
-                    ):
-                        table[k + w, j + v, i + u] = level
+                if not linear:
+                    if level == level and not table[k, j, i] >= level:
+                        table[k, j, i] = level
+                else:
+                    fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
+                    for corner in range(8):
+                        u, v, w = corner & 1, corner >> 1 & 1, corner >> 2
+                        share = (fx if u else 1.0 - fx) * (fy if v else 1.0 - fy) * (fz if w else 1.0 - fz)
+                        if (
+                            share >= _LEAST_SHARE
+                            and box[0, 0] <= i + u < box[0, 1]
+                            and box[1, 0] <= j + v < box[1, 1]
+                            and box[2, 0] <= k + w < box[2, 1]
+                            and level == level
+                            and not table[k + w, j + v, i + u] >= level
+                        ):
+                            table[k + w, j + v, i + u] = level
                 x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def round_voxels(
-    voxels: Float32Array, state: npt.NDArray[np.uint8], low: float, high: float, out: Numbers
-) -> None:
-    """Fill `out` with levels rounded to whole numbers from `low` to `high`; 0 where the state is."""
-    for k in range(voxels.shape[0]):
-        for j in range(voxels.shape[1]):
-            for i in range(voxels.shape[2]):
-                level = min(max(np.rint(voxels[k, j, i]), np.float32(low)), np.float32(high))
-                out[k, j, i] = np.int32(level) if state[k, j, i] > 0 else 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def means_of_counts(table: Words, offset: int, voxels: Float32Array, state: npt.NDArray[np.uint8]) -> None:
-    """Turn what `count_nearest` made into means and states.
+def means_of_counts(table: Words, offset: int, voxels: Float32Array) -> None:
+    """Turn what `count_nearest` made into means.
 
     Parameters
     ----------
@@ -370,21 +340,9 @@ def means_of_counts(table: Words, offset: int, voxels: Float32Array, state: npt.
         What was added to each level.
     voxels : ndarray, shape (n_k, n_j, n_i), filled in
         NaN where no sample was.
-    state : ndarray, shape (n_k, n_j, n_i), filled in
-        1 where a sample was, else 0.
     """
-    words, means, marks = table.reshape(-1), voxels.reshape(-1), state.reshape(-1)
+    words, means = table.reshape(-1), voxels.reshape(-1)
     for at in range(words.size):
         count = np.int64(words[at] >> np.uint64(COUNT_BITS))
         total = np.int64(words[at] & np.uint64((1 << COUNT_BITS) - 1))
         means[at] = np.float32((total - count * offset) / count)
-        marks[at] = count > 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def means_of_sums(table: FloatArray, voxels: Float32Array, state: npt.NDArray[np.uint8]) -> None:
-    """Turn what `add_nearest` or `add_linear` made into means and states, as for `means_of_counts`."""
-    sums, means, marks = table.reshape(-1, 2), voxels.reshape(-1), state.reshape(-1)
-    for at in range(means.size):
-        means[at] = np.float32(sums[at, 0] / sums[at, 1])
-        marks[at] = sums[at, 1] > 0.0

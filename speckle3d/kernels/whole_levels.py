@@ -33,47 +33,6 @@ Weights = npt.NDArray[np.uint16]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def add_nearest_whole(
-    images: Pixels, maps: IntArray, spans: IntArray, box: IntArray, levels: ByteArray, weights: Weights
-) -> None:
-    """Move the means of voxels by the pixels that lie in them, and cut them to whole levels each time.
-
-    As a mean is cut after every pixel, it can only fall below the exact one. Voxels with 255 pixels get no
-    more weight: from then on each pixel moves the mean 1/256 of the way.
-
-    Parameters
-    ----------
-    images : ndarray of uint8, shape (n, row, column)
-    maps : ndarray, shape (n, 3, 3)
-        From (row, column, 1) to positions (i, j, k) in units of 2^-40 voxel, all of them whole multiples of
-        2^-14 voxel; voxel n reaches from n to n + 1 whole ones.
-    spans : ndarray, shape (m, 3)
-        Row, first column and end of what is used of every image, in the order in which it counts.
-    box : ndarray, shape (3, 2)
-        First voxel and end along i, j and k; others are left alone.
-    levels : ndarray, shape (n_k, n_j, n_i), changed in place
-    weights : ndarray, shape (n_k, n_j, n_i), changed in place
-        Units of 1/256 pixel.
-    """
-    n_j, n_i = levels.shape[1:]
-    means, so_far = levels.reshape(-1), weights.reshape(-1)
-    for n in range(images.shape[0]):
-        m = maps[n]
-        for span in range(spans.shape[0]):
-            row, start, stop, x, y, z = cut_to_box(spans[span], m, box, 0)
-            for column in range(start, stop):
-                at = ((z >> POSITION_BITS) * n_j + (y >> POSITION_BITS)) * n_i + (x >> POSITION_BITS)
-                level = np.int64(images[n, row, column])
-                mean, weight = np.int64(means[at]), np.int64(so_far[at])
-                if weight + _PIXEL <= _MOST:
-                    means[at] = (level * _PIXEL + mean * weight) // (weight + _PIXEL)
-                    so_far[at] = weight + _PIXEL
-                else:
-                    means[at] = (level + 255 * mean) >> 8
-                x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _share(x: int, above: int) -> int:
     """Share, of 2^14, of a position that goes to the voxel above or below it."""
     fraction = (x & _FRACTION) >> _DROPPED
@@ -87,58 +46,79 @@ def _within(x: int, first: int, end: int) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def add_linear_whole(
+def add_whole(
     images: Pixels,
     maps: IntArray,
     spans: IntArray,
     box: IntArray,
+    linear: bool,
     room: IntArray,
     levels: ByteArray,
     weights: Weights,
 ) -> None:
-    """Move the means of the eight voxels around each pixel by its shares, and round them each time.
+    """Move the means of voxels by the pixels that lie in them or around them, to whole levels each time.
 
-    As a mean is rounded after every pixel, one that moves it by less than half a level does not count. A
-    pixel counts nowhere unless all the voxels that it has a share in are in the grid. Weights that are full
-    stay so; a share below 1/512 adds none, so that a voxel which only got such ones is empty.
+    With nearest, a mean is cut after every pixel, so that it can only fall below the exact one, and voxels
+    with 255 pixels get no more weight: from then on each pixel moves the mean 1/256 of the way.
+
+    With linear, a mean is rounded after every pixel, so that one that moves it by less than half a level does
+    not count. A pixel counts nowhere unless all the voxels that it has a share in are in the grid. Weights
+    that are full stay so; a share below 1/512 adds none.
 
     Parameters
     ----------
-    images, spans, box, levels, weights
-        As for `add_nearest_whole`.
+    images : ndarray of uint8, shape (n, row, column)
     maps : ndarray, shape (n, 3, 3)
-        As for `add_nearest_whole`, but the centre of voxel n is n.
+        From (row, column, 1) to positions (i, j, k) in units of 2^-40 voxel, all of them whole multiples of
+        2^-14 voxel. With nearest, voxel n reaches from n to n + 1 whole ones; with linear its centre is n.
+    spans : ndarray, shape (m, 3)
+        Row, first column and end of what is used of every image, in the order in which it counts.
+    box : ndarray, shape (3, 2)
+        First voxel and end along i, j and k; others are left alone.
+    linear : bool
+        Whether pixels are shared out to the eight voxels around them.
     room : ndarray, shape (3, 2)
-        First voxel and end of the whole grid along i, j and k, of which `levels` may be a part.
+        First voxel and end of the whole grid along i, j and k.
+    levels : ndarray, shape (n_k, n_j, n_i), changed in place
+    weights : ndarray, shape (n_k, n_j, n_i), changed in place
+        Units of 1/256 pixel.
     """
     for n in range(images.shape[0]):
         m = maps[n]
         for span in range(spans.shape[0]):
-            row, start, stop, x, y, z = cut_to_box(spans[span], m, box, 1)
+            row, start, stop, x, y, z = cut_to_box(spans[span], m, box, int(linear))
             for column in range(start, stop):
-                if (
+                level = np.int64(images[n, row, column])
+                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
+                if not linear:
+                    mean, weight = np.int64(levels[k, j, i]), np.int64(weights[k, j, i])
+                    if weight + _PIXEL <= _MOST:
+                        levels[k, j, i] = (level * _PIXEL + mean * weight) // (weight + _PIXEL)
+                        weights[k, j, i] = weight + _PIXEL
+                    else:
+                        levels[k, j, i] = (level + 255 * mean) >> 8
+                elif (
                     _within(x, room[0, 0], room[0, 1])
                     and _within(y, room[1, 0], room[1, 1])
                     and _within(z, room[2, 0], room[2, 1])
                 ):
-                    level = np.int64(images[n, row, column])
                     for corner in range(8):
                         u, v, w = corner & 1, corner >> 1 & 1, corner >> 2
                         share = (_share(y, v) * _share(z, w) + _HALF) >> PLACE_BITS
                         share = (_share(x, u) * share + _HALF) >> PLACE_BITS
-                        i, j, k = (x >> POSITION_BITS) + u, (y >> POSITION_BITS) + v, (z >> POSITION_BITS) + w
                         if (
                             share == 0
-                            or not box[0, 0] <= i < box[0, 1]
-                            or not box[1, 0] <= j < box[1, 1]
-                            or not box[2, 0] <= k < box[2, 1]
+                            or not box[0, 0] <= i + u < box[0, 1]
+                            or not box[1, 0] <= j + v < box[1, 1]
+                            or not box[2, 0] <= k + w < box[2, 1]
                         ):
                             continue
-                        before = np.int64(weights[k, j, i]) << _TO_WEIGHT
-                        total = share * level + before * np.int64(levels[k, j, i])
+                        at = (k + w, j + v, i + u)
+                        before = np.int64(weights[at]) << _TO_WEIGHT
+                        total = share * level + before * np.int64(levels[at])
                         # To the nearest 2^-14 of a level, halves to even, and only then to a whole one.
                         fine = np.int64(np.rint(total / (share + before) * _ONE))
-                        levels[k, j, i] = (fine + _HALF) >> PLACE_BITS
+                        levels[at] = (fine + _HALF) >> PLACE_BITS
                         after = (share + before + (1 << _TO_WEIGHT >> 1)) >> _TO_WEIGHT
-                        weights[k, j, i] = after if after < _MOST else _MOST
+                        weights[at] = after if after < _MOST else _MOST
                 x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.labels import MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.holes import fill_holes
 
@@ -61,7 +61,7 @@ def test_backward_against_map_coordinates_on_a_stack_of_images(benchmark):
     source = PosedImages(images, grid, poses)
 
     def ours():
-        return [slab.voxels.shape for slab in backward_slabs(source, voxels, 1.5 * step_mm)]
+        return look_up_voxels(source, voxels, 1.5 * step_mm)
 
     def theirs():
         k, j, i = np.indices(SHAPE, dtype=np.float32)

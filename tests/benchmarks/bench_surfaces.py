@@ -43,7 +43,7 @@ from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.measures.measure import measured
 from speckle3d.imaging.measures.surface import measures_of, surface_of
-from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import grid_around
 from speckle3d.imaging.voxels.volume import compound
 from speckle3d.io.curves import read_curves
@@ -106,9 +106,8 @@ def at_known_poses() -> None:
 def _volume(way: str, images, grid: ImageGrid, poses, voxel_grid) -> Volume:
     if way != "backward":
         return compound(images, grid, poses, voxel_grid=voxel_grid, splat=way.split(",")[0])
-    slabs = list(backward_slabs(PosedImages(images, grid, poses), voxel_grid, 0.5))
-    voxels = np.concatenate([slab.voxels for slab in slabs]).T
-    return Volume(voxels, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
+    voxels, _ = look_up_voxels(PosedImages(images, grid, poses), voxel_grid, 0.5)
+    return Volume(voxels.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
 
 
 def _voxel_volume(volume: Volume, ball: Ball) -> float:

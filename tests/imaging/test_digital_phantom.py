@@ -8,7 +8,7 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.measures.surface import largest_part, measures_of, surface_of
-from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import grid_around
 from speckle3d.imaging.voxels.volume import compound
 
@@ -28,9 +28,8 @@ def made(way, images, grid, poses):
     if way != "backward":
         return compound(images, grid, poses, STEP_MM, splat=way)
     voxel_grid = grid_around(grid, poses, STEP_MM)
-    slabs = list(backward_slabs(PosedImages(images, grid, poses), voxel_grid, 0.5))
-    voxels = np.concatenate([slab.voxels for slab in slabs]).T
-    return Volume(voxels, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
+    voxels, _ = look_up_voxels(PosedImages(images, grid, poses), voxel_grid, 0.5)
+    return Volume(voxels.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.uint8])

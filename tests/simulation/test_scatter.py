@@ -42,12 +42,3 @@ def test_echoes_match_every_scatterer_for_every_vector(seed):
     np.testing.assert_allclose(
         out.view(np.complex64), twin, atol=2e-5
     )  # single precision, values of order one
-
-
-def test_scatterers_out_of_reach_add_nothing():
-    rng = np.random.default_rng(1)
-    table = field_table(*random_beam(rng), 3)
-    far = np.array([[0.3, 2.0, 0.71], [0.3, 0.9, 0.0], [0.3, 3.6, 0.0], [-0.6, 2.0, 0.0], [1.2, 2.0, 0.0]])
-    out = np.zeros((3, 400, 6), np.float32)
-    scatter_echoes(far, np.ones(5, np.float32), np.eye(4), 0.3, table, EchoGrid(0.0, 0.0115, 9.7), out)
-    assert not out.any()

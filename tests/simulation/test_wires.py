@@ -33,25 +33,6 @@ def test_a_calibration_scan_has_the_mounting_of_every_sweep(scan, preset):
     assert turned.magnitude() < 1e-12
 
 
-@pytest.mark.parametrize("preset", MOUNTED)
-def test_any_sweep_can_be_left_uncalibrated(preset):
-    told, bare = made(preset=preset, seed=5), made(preset=preset, seed=5, uncalibrated=True)
-    assert bare.sweep.tracker.sensor_from_image is None
-    assert bare.sweep.orientation.sensor_from_image is None
-    np.testing.assert_array_equal(
-        bare.tracker_from_image.as_matrix(), told.sweep.tracker.sensor_from_image.as_matrix()
-    )
-    # All else is the same: readings, times, images.
-    read = (each.sweep.tracker.readings.world_from_sensor.as_matrix() for each in (bare, told))
-    np.testing.assert_array_equal(*read)
-    np.testing.assert_array_equal(bare.sweep.frames[2], told.sweep.frames[2])
-
-
-def test_the_published_mounting_is_that_of_the_report():
-    mounted = made(preset="plane", mounting="published").tracker_from_image
-    np.testing.assert_allclose(mounted.translation, [-270.86, 4.86, -65.08])  # TR 303, table 3
-
-
 def test_the_crossing_echoes_where_the_truth_says():
     sweep = made(preset="wires", vectors=64, samples=3818, frames=6, seed=11, snr_db=60.0).sweep
     at = sweep.truth.inv().apply(CROSSING_MM)

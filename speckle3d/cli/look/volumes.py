@@ -97,7 +97,7 @@ def volume(
         typer.Option(help="For sparse sweeps: voxels between the nearest images, at most so far away."),
     ] = None,
     max_memory_gb: Annotated[
-        float | None, typer.Option(help="Memory to work in (2.5); larger volumes are made in slabs.")
+        float | None, typer.Option(help="Memory that making it may take (8).")
     ] = None,
     sweep_file: SweepFile = None,
     calibration: CalibrationFiles = None,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import ByteArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
@@ -44,11 +43,6 @@ class VoxelGrid:
     spacing_mm: Triple
     world_from_grid: RigidTransform
 
-    def part(self, first: int, stop: int) -> VoxelGrid:
-        """The planes `first` to before `stop` along k as a grid of their own."""
-        start = self.world_from_grid * RigidTransform.from_translation([0, 0, first * self.spacing_mm[2]])
-        return VoxelGrid((*self.shape[:2], stop - first), self.spacing_mm, start)
-
     def size_gb(self, voxel_type: str) -> float:
         """Size of the voxels alone, GB."""
         return math.prod(float(n) for n in self.shape) * np.dtype(voxel_type).itemsize / 1e9
@@ -58,60 +52,12 @@ class VoxelGrid:
         return f"{voxels} voxels of {' x '.join(f'{step:g}' for step in self.spacing_mm)} mm"
 
 
-@dataclass(frozen=True)
-class Slab:
-    """Some planes of a volume.
-
-    Attributes
-    ----------
-    first : int
-        The first plane's number along k.
-    voxels : ndarray, shape (planes, n_j, n_i)
-        Of the type asked for; empty ones are NaN in float32 and 0 in whole numbers.
-    state : ndarray of uint8, shape (planes, n_j, n_i)
-        `EMPTY`, `MEASURED` or `FILLED`; see `speckle3d.core.labels`.
-    """
-
-    first: int
-    voxels: npt.NDArray[Any]
-    state: ByteArray
-
-
 def grid_around(
     grid: ImageGrid,
     world_from_image: RigidTransform,
-    voxel_mm: float | Triple,
-    world_from_axes: Rotation | None = None,
-) -> VoxelGrid:
-    """Smallest grid that holds the corners of every image.
-
-    Parameters
-    ----------
-    grid : ImageGrid
-    world_from_image : RigidTransform, length n
-    voxel_mm : float, or tuple of float
-        Side of a cubic voxel, or sides along i, j and k.
-    world_from_axes : Rotation, optional
-        Directions of the voxel axes; without it, the world's.
-
-    Raises
-    ------
-    InvalidInputError
-        If `voxel_mm` is not positive, or there are no poses.
-    """
-    spacing = _checked_spacing(voxel_mm, "voxel_mm")
-    axes = _single(world_from_axes)
-    low, high = _bounds(grid, world_from_image, axes)
-    shape = _checked_shape(_counts(low, high, spacing), spacing)
-    return VoxelGrid(shape, spacing, RigidTransform.from_components(axes.apply(low), axes))
-
-
-def grid_as_asked(
-    grid: ImageGrid,
-    world_from_image: RigidTransform,
     spacing_mm: float | Triple,
-    *,
     world_from_axes: Rotation | None = None,
+    *,
     origin_mm: npt.ArrayLike | None = None,
     shape: tuple[int, int, int] | None = None,
     size_mm: Triple | None = None,
@@ -123,7 +69,7 @@ def grid_as_asked(
     grid : ImageGrid
     world_from_image : RigidTransform, length n
     spacing_mm : float, or tuple of float
-        The same along i, j and k, or each.
+        The same along i, j and k, or one for each.
     world_from_axes : Rotation, optional
         Directions of the voxel axes; without it, the world's.
     origin_mm : array_like, shape (3,), optional
@@ -137,32 +83,31 @@ def grid_as_asked(
     Raises
     ------
     InvalidInputError
-        If a value is not what it must be, both `shape` and `size_mm` are given, or the grid would end before
-        its origin.
+        If a value is not what it must be, there are no poses, both `shape` and `size_mm` are given, or the
+        grid would end before its origin.
     """
-    spacing = _checked_spacing(spacing_mm, "spacing_mm")
-    axes = _single(world_from_axes)
+    i, j, k = _three(np.broadcast_to(spacing_mm, 3) if np.ndim(spacing_mm) == 0 else spacing_mm, "spacing_mm")
+    spacing, axes = (i, j, k), _single(world_from_axes)
     low, high = _bounds(grid, world_from_image, axes)
-    if origin_mm is None:
-        origin = axes.apply(low)
-    else:
-        origin = _three(origin_mm, "origin_mm")
-        low = axes.inv().apply(origin)
+    if origin_mm is not None:
+        low = axes.inv().apply(_three(origin_mm, "origin_mm", -np.inf))
     if shape is not None and size_mm is not None:
         raise InvalidInputError("voxels: expected a shape or a size in mm, got both")
     if size_mm is not None:
         # A hair less, so that rounding does not add a voxel to a whole number of them.
-        counts = np.ceil(np.divide(_positive(size_mm, "size_mm"), spacing) - 1e-6)
-    elif shape is not None:
-        counts = _positive(shape, "shape")
+        counts = np.ceil(np.divide(_three(size_mm, "size_mm"), spacing) - 1e-6)
     else:
-        counts = _counts(low, high, spacing)
-    return VoxelGrid(_checked_shape(counts, spacing), spacing, RigidTransform.from_components(origin, axes))
-
-
-def even_planes(n_k: int, most: int) -> int:
-    """Planes of a slab, at most `most` of `n_k`: slabs of nearly one size, none at the end worth little."""
-    return -(-n_k // -(-n_k // most))
+        counts = _counts(low, high, spacing) if shape is None else np.array(_three(shape, "shape"))
+    if (counts < 1).any():
+        raise InvalidInputError("origin_mm: expected an origin before the images' end, got one beyond it")
+    if (counts > MAX_VOXELS_ALONG).any() or (counts != np.floor(counts)).any():
+        raise InvalidInputError(
+            f"voxels: expected whole numbers up to {MAX_VOXELS_ALONG} along each axis, got "
+            f"{' x '.join(f'{count:g}' for count in counts)} of {spacing} mm"
+        )
+    n_i, n_j, n_k = (int(count) for count in counts)
+    origin = axes.apply(low) if origin_mm is None else np.asarray(origin_mm, dtype=float)
+    return VoxelGrid((n_i, n_j, n_k), spacing, RigidTransform.from_components(origin, axes))
 
 
 def grid_like(volume: Volume) -> VoxelGrid:
@@ -187,8 +132,7 @@ def spacing_within(
     grid : ImageGrid
     world_from_image : RigidTransform, length n
     max_gb : float
-        Of the voxels: what a file, unpacked, and a viewer hold. To work on them takes `max_memory_gb` of the
-        settings, whatever the volume.
+        Of the voxels: what a file, unpacked, and a viewer hold.
     world_from_axes : Rotation, optional
         Directions of the voxel axes; without it, the world's.
     voxel_type : {"uint8", "int16", "uint16", "float32"}
@@ -239,37 +183,9 @@ def _single(world_from_axes: Rotation | None) -> Rotation:
     return axes
 
 
-def _three(values: npt.ArrayLike, name: str) -> FloatArray:
-    found = np.asarray(values, dtype=float)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        raise InvalidInputError(f"{name}: expected three finite values, got {found.tolist()}")
-    return found
-
-
-def _positive(values: npt.ArrayLike, name: str) -> FloatArray:
-    found = _three(values, name)
-    if (found <= 0).any():
-        raise InvalidInputError(f"{name}: expected values above zero, got {found.tolist()}")
-    return found
-
-
-def _checked_spacing(spacing_mm: float | Triple, name: str) -> Triple:
-    if np.ndim(spacing_mm) == 0 and not (np.isfinite(spacing_mm) and np.greater(spacing_mm, 0)):
-        raise InvalidInputError(f"{name}: expected a value above zero, got {spacing_mm}")
-    i, j, k = _positive(
-        np.broadcast_to(spacing_mm, 3) if np.ndim(spacing_mm) == 0 else spacing_mm, name
-    ).tolist()
-    return i, j, k
-
-
-def _checked_shape(counts: FloatArray, spacing_mm: Triple) -> tuple[int, int, int]:
-    if (counts < 1).any():
-        raise InvalidInputError("origin_mm: expected an origin before the images' end, got one beyond it")
-    if (counts > MAX_VOXELS_ALONG).any() or (counts != np.floor(counts)).any():
-        shown = " x ".join(f"{count:g}" for count in counts)
-        raise InvalidInputError(
-            f"voxels: expected whole numbers up to {MAX_VOXELS_ALONG} along each axis, got {shown} of "
-            f"{spacing_mm} mm"
-        )
-    n_i, n_j, n_k = (int(count) for count in counts)
-    return n_i, n_j, n_k
+def _three(values: npt.ArrayLike, name: str, above: float = 0.0) -> list[float]:
+    numbers = np.asarray(values, dtype=float)
+    if numbers.shape != (3,) or not np.isfinite(numbers).all() or (numbers <= above).any():
+        limit = " above zero" if above == 0.0 else ""
+        raise InvalidInputError(f"{name}: expected three finite values{limit}, got {numbers.tolist()}")
+    return [float(number) for number in numbers]

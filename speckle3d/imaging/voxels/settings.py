@@ -53,11 +53,7 @@ class CompoundingSettings(BaseModel):
         "log for RF and I/Q.",
     )
     dynamic_range_db: float = Field(60.0, gt=0, description="Range of the log-compressed grey levels.")
-    max_memory_gb: float = Field(
-        2.5,
-        gt=0,
-        description="Memory to work in; a larger volume is made in slabs, written as they are done.",
-    )
+    max_memory_gb: float = Field(8.0, gt=0, description="Memory that making a volume may take.")
     max_file_gb: float = Field(
         64.0, gt=0, description="Largest volume to make: larger ones are more often due to a wrong unit."
     )

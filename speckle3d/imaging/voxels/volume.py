@@ -7,27 +7,34 @@ otherwise: in the mode `image` lateral, axial and elevational of the first frame
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, ByteArray
+from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import Images, PosedImages
+from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+from speckle3d.imaging.voxels.holes import boxes_within, fill_holes
 from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
-from speckle3d.imaging.voxels.slabs import compound_slabs, working_gb
-from speckle3d.imaging.voxels.splatting import Weights, batch_gb
+from speckle3d.imaging.voxels.splatting import Weights, splat_images
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
 
-MAX_MEMORY_GB = 4.0
+MAX_MEMORY_GB = 8.0
 """Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
+
+BYTES_PER_VOXEL = 25
+"""Of work beside the voxels' own type: sum and weight, or two images beside it; tag, level and state."""
 
 
 @shown
@@ -67,7 +74,7 @@ def compound(
     around it, by trilinear shares. A voxel becomes the mean of its samples by their shares, their maximum,
     the mean of those of the latest image that has any there, or their mean by weight; with "linear", shares
     below 1/8 do not count for the maximum and the latest. With "plus" the mean is kept in whole grey levels,
-    as PLUS and 3D Slicer keep it; see `speckle3d.imaging.voxels.whole_levels`.
+    as PLUS and 3D Slicer keep it; see `speckle3d.imaging.voxels.splatting`.
 
     An empty voxel then becomes the mean of the measured ones in the smallest cube around it that holds any;
     measured voxels stay as they are.
@@ -133,9 +140,9 @@ def compound(
     >>> volume.shape, volume.voxels[0, 0].tolist()
     ((4, 5, 4), [0.0, 1.0, 2.0, 3.0])
     """
-    source = PosedImages(images, grid, world_from_image)
     if (voxel_mm is None) == (voxel_grid is None):
         raise InvalidInputError("compound: expected either voxel_mm or voxel_grid")
+    source = PosedImages(images, grid, world_from_image)
     if voxel_grid is None:
         voxel_grid = grid_around(grid, world_from_image, float(voxel_mm or 0.0), world_from_axes)
     try:
@@ -148,53 +155,64 @@ def compound(
             max_memory_gb=max_memory_gb,
         )
     except ValidationError as error:
-        found = error.errors()[0]
-        raise InvalidInputError(f"{found['loc'][0]}: {found['msg']}, got {found['input']!r}") from None
-    return _joined(
-        source, voxel_grid, _within_memory(voxel_grid, settings, batch_gb(source)), weights, region
-    )
+        first = error.errors()[0]
+        raise InvalidInputError(f"{first['loc'][0]}: {first['msg']}, got {first['input']!r}") from None
+    return compound_onto(voxel_grid, source, settings, weights, region)
 
 
-def _within_memory(
-    voxel_grid: VoxelGrid, settings: CompoundingSettings, frames_gb: float
-) -> CompoundingSettings:
-    """Settings whose memory is what slabs may take beside the whole volume.
-
-    Raises
-    ------
-    InvalidInputError
-        If nothing is left.
-    """
-    if working_gb(voxel_grid, settings, frames_gb) <= settings.max_memory_gb:
-        return settings
-    # The type that the levels have, and a byte of state.
-    most, held = settings.max_memory_gb, voxel_grid.size_gb(settings.voxel_type) + voxel_grid.size_gb("uint8")
-    if held >= most:
-        raise InvalidInputError(
-            f"volume: expected at most {most:g} GB of memory, got {held:.3g} GB for {voxel_grid}: take "
-            "larger voxels, or check the poses"
-        )
-    return settings.model_copy(update={"max_memory_gb": most - held})
-
-
-def _joined(
-    source: PosedImages,
+def compound_onto(
     voxel_grid: VoxelGrid,
+    source: PosedImages,
     settings: CompoundingSettings,
-    weights: Weights | None,
-    region: BoolArray | None,
+    weights: Weights | None = None,
+    region: BoolArray | None = None,
 ) -> CompoundedVolume:
-    voxels, state = None, None
-    for slab in compound_slabs(source, voxel_grid, settings, weights, region):
-        if slab.voxels.shape[0] == voxel_grid.shape[2]:
-            voxels, state = slab.voxels, slab.state
-            break
-        if voxels is None or state is None:
-            voxels = np.empty(voxel_grid.shape[::-1], settings.voxel_type)
-            state = np.empty(voxel_grid.shape[::-1], np.uint8)
-        own = slice(slab.first, slab.first + len(slab.voxels))
-        voxels[own], state[own] = slab.voxels, slab.state
-    if voxels is None or state is None or not state.any():
+    """Compound images into the voxels of a grid, by settings; else as `compound`.
+
+    Of the settings, `voxel_mm`, `levels` and `dynamic_range_db` are not read: the grid and the images have
+    them. With `backward_mm` neither are `splat`, `rule` and the filling's.
+    """
+    kind = settings.voxel_type
+    _require_room(voxel_grid, settings)
+    if settings.backward_mm > 0:
+        voxels, state = look_up_voxels(source, voxel_grid, settings.backward_mm, region)
+    else:
+        if settings.rule == "plus" and kind != "uint8":
+            raise InvalidInputError(
+                f"rule plus: expected voxels of type uint8, whose whole grey levels it keeps, got {kind}"
+            )
+        voxels, state = splat_images(source, voxel_grid, settings.splat, settings.rule, weights, region)
+        in_mm = settings.fill_mm > 0
+        boxes = boxes_within(settings.fill_mm, voxel_grid.spacing_mm) if in_mm else settings.fill_radius
+        fill_holes(voxels, state, boxes)
+    if not state.any():
         raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
-    placed = voxel_grid.spacing_mm, voxel_grid.world_from_grid
-    return CompoundedVolume(voxels.T, *placed, state=state.T)
+    typed = voxels if kind == "float32" else _rounded(voxels, state, kind)
+    return CompoundedVolume(typed.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid, state=state.T)
+
+
+def _require_room(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> None:
+    """Raise `InvalidInputError` if a volume is too large for its file or for the memory to make it in."""
+    size_gb = voxel_grid.size_gb(settings.voxel_type)
+    for what, most, needed in (
+        ("GB", settings.max_file_gb, size_gb),
+        ("GB of memory", settings.max_memory_gb, size_gb + BYTES_PER_VOXEL * voxel_grid.size_gb("uint8")),
+    ):
+        if needed > most:
+            raise InvalidInputError(
+                f"volume: expected at most {most:g} {what}, got {needed:.3g} GB for {voxel_grid}: take "
+                "larger voxels, or check the poses"
+            )
+
+
+def _rounded(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> npt.NDArray[Any]:
+    """Voxels rounded and clipped to a type of whole numbers, empty ones 0."""
+    limits, out = np.iinfo(voxel_type), np.empty(voxels.shape, voxel_type)
+
+    def work(first: int, stop: int) -> None:
+        for k in range(first, stop):
+            levels = np.where(state[k] > 0, voxels[k], np.float32(0.0))
+            out[k] = np.clip(np.rint(levels), limits.min, limits.max)
+
+    in_parallel(work, len(voxels))
+    return out

@@ -1,4 +1,4 @@
-"""Voxels of a sweep into files, a slab at a time: ``speckle3d volume`` and ``reconstruct --volume``."""
+"""Voxels of a sweep into files: ``speckle3d volume`` and ``reconstruct --volume``."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.measures.uncertainty import DeviationField
 from speckle3d.imaging.region import Region
-from speckle3d.imaging.voxels.grid import VoxelGrid, grid_as_asked, grid_like, spacing_within
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, grid_like, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
-from speckle3d.imaging.voxels.slabs import compound_slabs
+from speckle3d.imaging.voxels.volume import compound_onto
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volume_writer import VolumeWriter
 from speckle3d.io.voxels.volumes import read_volume
@@ -93,7 +93,7 @@ class GridRequest:
         spacing: float | tuple[float, float, float] = self.spacing_mm or settings.voxel_mm
         if self.within_gb is not None:
             spacing = spacing_within(images, world_from_image, self.within_gb, axes, settings.voxel_type)
-        return grid_as_asked(
+        return grid_around(
             images,
             world_from_image,
             spacing,
@@ -209,7 +209,6 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     source, meaning = posed.source(levels, settings.dynamic_range_db)
     images = source.grid, source.world_from_image
     grid = request.grid.grid(*(request.region.part(*images) if request.region else images), settings)
-    counts = np.zeros(3, dtype=np.int64)
     mask = None if request.region is None else request.region.mask(source.grid)
     weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
     fields = fields_of(posed, request, meaning)
@@ -231,18 +230,16 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
         deviations = None
         if request.deviation_path is not None:
             deviations = opened(request.deviation_path, "float32", _DEVIATION)
-        for slab in compound_slabs(source, grid, settings, weights, mask):
-            stop = slab.first + len(slab.state)
-            voxels.append(slab.voxels)
-            if states is not None:
-                states.append(slab.state)
-            if deviations is not None and deviation is not None:
-                deviations.append(deviation.planes(slab.first, stop, slab.state))
-            counts += [np.count_nonzero(slab.state == state) for state in range(3)]
-            if progress is not None:
-                progress(stop, grid.shape[2])
-        if counts[MEASURED] == 0:
-            raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
+        volume = compound_onto(grid, source, settings, weights, mask)
+        state = volume.state.T
+        voxels.append(volume.voxels.T)
+        if states is not None:
+            states.append(state)
+        if deviations is not None and deviation is not None:
+            deviations.append(deviation.planes(0, len(state), state))
+        counts = np.bincount(state.ravel(), minlength=3)
+        if progress is not None:
+            progress(grid.shape[2], grid.shape[2])
     seconds = time.perf_counter() - began
     return VolumeReport(request.path, posed.mode, grid, counts, request.path.stat().st_size, seconds)
 

@@ -11,16 +11,6 @@ from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
 GRID = ImageGrid(11, 21, 0.4, 0.5, 1.0)
 
 
-def test_outlines_are_closed_and_keep_the_frames_sides():
-    rng = np.random.default_rng(3)
-    poses = RigidTransform.from_components(rng.normal(0, 20, (6, 3)), Rotation.random(6, rng=rng))
-    outlines = frame_outlines(GRID, poses)
-    np.testing.assert_array_equal(outlines[:, 0], outlines[:, 4])
-    sides = np.linalg.norm(np.diff(outlines, axis=1), axis=2)
-    np.testing.assert_allclose(sides, np.tile([4.0, 10.0, 4.0, 10.0], (6, 1)))
-    np.testing.assert_allclose(outlines[2, 1], poses[2].apply([4.0, 1.0, 0.0]))
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_crossings_are_on_the_plane_and_on_the_outline(seed):
     """Against a dense walk along the line that a frame's and the cut's endless planes share."""

@@ -1,13 +1,11 @@
 """Reslices of voxels: against brute force and SciPy, voxels that hold nothing, any order in memory."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import MismatchError
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.imaging.cuts.reslice import reslice_volume
@@ -89,29 +87,3 @@ def test_matches_scipy_on_a_large_volume_and_the_same_on_any_number_of_threads(m
     np.testing.assert_allclose(got[1][inside], expected[inside], atol=1e-5)
     np.testing.assert_array_equal(got[1], got[2])
     np.testing.assert_array_equal(got[1], got[3])
-
-
-def test_a_level_of_zero_is_one_unless_its_state_is_empty():
-    voxels = np.zeros((3, 3, 3), np.uint8)
-    voxels[1] = 100
-    volume = Volume(voxels, (1.0, 1.0, 1.0), RigidTransform.identity())
-    cut = ReslicePlane(RigidTransform.identity(), 2.0, 2.0, 0.25)
-    rise = np.array([0, 25, 50, 75, 100, 75, 50, 25, 0.0])
-    np.testing.assert_allclose(reslice_volume(volume, cut)[4], rise)
-    state = np.ones((3, 3, 3), np.uint8)
-    state[0] = 0
-    # Past halfway to a voxel that holds nothing there is nothing, before it the level of the other alone.
-    expected = [np.nan, np.nan, 100, 100, 100, 75, 50, 25, 0]
-    np.testing.assert_allclose(reslice_volume(volume, cut, state)[4], expected)
-    with pytest.raises(MismatchError, match=r"state.*\(3, 3, 3\).*\(2, 3, 3\)"):
-        reslice_volume(volume, cut, state[:2])
-
-
-def test_the_last_plane_and_a_volume_of_one_plane_are_shown():
-    rng = np.random.default_rng(2)
-    voxels = rng.integers(0, 255, (9, 7, 4)).astype(np.uint8)
-    for some in (voxels, voxels[:, :, 3:]):
-        volume = Volume(some, (0.5, 0.5, 1.0), RigidTransform.identity())
-        last = (some.shape[2] - 1) * 1.0
-        cut = ReslicePlane(RigidTransform.from_translation([0, 0, last]), 4.0, 3.0, 0.5)
-        np.testing.assert_array_equal(reslice_volume(volume, cut), voxels[:, :, 3].T)

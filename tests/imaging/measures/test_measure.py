@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.measures.belonging import belonging_of, require_inside
@@ -62,29 +62,6 @@ def test_standard_errors_are_those_of_repeated_draws():
     np.testing.assert_allclose(np.std(values, axis=0), claimed, rtol=0.05)
 
 
-def test_what_is_measured_is_what_the_formulas_give():
-    poses = swept()
-    points = inside(poses, [(5, 10, 2), (15, 30, 9), (8, 20, 18), (8, 30, 18)])
-    rows = measured(points, belonging_of(points, GRID, poses), some_errors(poses), 0.1)
-    assert [row.kind for row in rows] == ["distance"] * 3 + ["length"] + ["angle"] * 2
-    steps = np.diff(points, axis=0)
-    sizes = np.linalg.norm(steps, axis=1)
-    np.testing.assert_allclose([row.value for row in rows[:3]], sizes)
-    assert rows[3].value == pytest.approx(sizes.sum())
-    cosine = -(steps[0] @ steps[1]) / sizes[0] / sizes[1]
-    assert rows[4].value == pytest.approx(np.arccos(cosine))
-    # Picked both ends of each distance to 0.1 mm per axis.
-    np.testing.assert_allclose([row.pick_sigma for row in rows[:3]], 0.1 * np.sqrt(2))
-
-
-def test_two_points_of_one_frame_are_as_sure_as_they_are_picked():
-    poses = swept()
-    points = inside(poses, [(5, 10, 12), (15, 30, 12)])
-    (row,) = measured(points, belonging_of(points, GRID, poses), some_errors(poses), 0.1)
-    assert row.pose_sigma == pytest.approx(0.0, abs=1e-9)
-    assert row.sigma == pytest.approx(0.1 * np.sqrt(2))
-
-
 def test_an_error_of_scale_makes_lengths_along_the_sweep_as_uncertain():
     poses = WORLD * RigidTransform.from_translation(np.column_stack([np.zeros((11, 2)), np.arange(11.0)]))
     factors = np.zeros((1, 11, 6))
@@ -105,13 +82,6 @@ def test_derivatives_are_those_of_small_steps(of):
         step = np.zeros((3, 3))
         step[k] = 1e-6
         assert gradient[k] == pytest.approx((of(points + step)[0] - of(points - step)[0]) / 2e-6, abs=1e-7)
-
-
-def test_a_straight_line_has_an_angle_with_an_error():
-    value, gradient = angle(np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]]))
-    assert value == pytest.approx(np.pi)
-    # Any sideways shift of an end bends the line by it over the side's length.
-    np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), [1.0, 1.5, 0.5])
 
 
 def test_points_outside_the_sweep_are_refused_by_number():
@@ -141,15 +111,3 @@ def test_belonging_is_found_as_by_looking_at_every_frame():
         assert near.weights[k, 1] == pytest.approx(max(shares, default=0.0))
         assert near.weights[k].sum() == pytest.approx(1.0)
         assert near.gap_mm[k] == pytest.approx(np.linalg.norm(beside[best]) if sides else away[best])
-
-
-def test_wrong_numbers_of_points_and_frames_are_refused():
-    poses = swept()
-    points = inside(poses, [(5, 10, 2)] * 2)
-    near = belonging_of(points, GRID, poses)
-    with pytest.raises(InvalidInputError, match="points 1 and 2: expected two places"):
-        measured(points, near, some_errors(poses), 0.1)
-    with pytest.raises(InvalidInputError, match="at least 2 points"):
-        measured(points[:1], near[:1], some_errors(poses), 0.1)
-    with pytest.raises(MismatchError, match="expected 20 poses"):
-        PosedErrors(PoseErrors(np.zeros((1, 20, 6))), poses, GRID.centre_mm)

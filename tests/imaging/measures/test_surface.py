@@ -44,14 +44,6 @@ def test_a_balls_surface_lies_on_it_and_faces_outwards(order, spacing):
     assert surface.area_mm2 == pytest.approx(4 * np.pi * 16, rel=0.01)
 
 
-def test_what_is_darker_inside_faces_outwards_too():
-    volume, _ = ball()
-    dark = Volume(-volume.voxels, volume.spacing_mm, volume.world_from_grid)
-    assert surface_of(dark, 0.0, "below").volume_mm3 == pytest.approx(
-        surface_of(volume, 0.0).volume_mm3, rel=1e-4
-    )
-
-
 def test_where_the_sweep_ends_the_surface_stays_open():
     volume, _ = ball()
     voxels = volume.voxels.copy()
@@ -62,20 +54,6 @@ def test_where_the_sweep_ends_the_surface_stays_open():
     # The rim of half a ball.
     assert found.open_mm == pytest.approx(2 * np.pi * 4.0, rel=0.05)
     assert found.area_mm2 == pytest.approx(2 * np.pi * 16.0, rel=0.05)
-
-
-def test_derivatives_of_area_and_volume_are_those_of_moved_vertices():
-    volume, _ = ball(2.0, (21, 21, 21))
-    surface = surface_of(volume, 0.0)
-    rng = np.random.default_rng(0)
-    move = rng.normal(size=surface.vertices_mm.shape)
-    ahead, behind = (
-        type(surface)(surface.vertices_mm + sign * 1e-5 * move, surface.triangles) for sign in (1, -1)
-    )
-    area = (ahead.area_mm2 - behind.area_mm2) / 2e-5
-    content = (ahead.volume_mm3 - behind.volume_mm3) / 2e-5
-    assert (surface.area_gradient() * move).sum() == pytest.approx(area, rel=1e-5)
-    assert (surface.volume_gradient() * move).sum() == pytest.approx(content, rel=1e-5)
 
 
 def labelled():
@@ -112,31 +90,12 @@ def test_zeros_at_the_border_are_empty_and_those_inside_are_black():
     assert len(whole) > len(surface)
 
 
-def test_parts_are_told_apart_and_the_largest_is_kept():
-    both = ball(1.5, (21, 21, 21))[0].voxels
-    other = ball(0.8, (21, 21, 21))[0].voxels
-    surface = surface_of(Volume(np.concatenate([both, other]), (0.25,) * 3, PLACED), 0.0)
-    assert surface.parts().max() == 1
-    assert largest_part(surface).volume_mm3 == pytest.approx(4 / 3 * np.pi * 1.5**3, rel=0.03)
-    sizes = [4 / 3 * np.pi * radius**3 for radius in (1.5, 0.8)]
-    assert surface.volume_mm3 == pytest.approx(sum(sizes), rel=0.04)
-
-
 def test_a_cavity_is_no_volume():
     volume, _ = ball(4.0)
     hollow = np.minimum(volume.voxels, 2.0 - volume.voxels)
     surface = surface_of(Volume(hollow, volume.spacing_mm, PLACED), 0.0)
     assert surface.volume_mm3 == pytest.approx(4 / 3 * np.pi * (4**3 - 2**3), rel=0.01)
     assert measures_of(surface).volume_mm3 == pytest.approx(surface.volume_mm3)
-
-
-def test_a_cavity_in_what_is_open_has_no_volume():
-    """The ball's outside is cut by the grid; the hollow in it is closed, but nothing is known to hold it."""
-    volume, _ = ball(4.0, (25, 25, 25))
-    hollow = np.minimum(volume.voxels, 2.0 - volume.voxels)
-    found = measures_of(surface_of(Volume(hollow, volume.spacing_mm, PLACED), 0.0))
-    assert found.open_mm > 0.0
-    assert found.volume_mm3 is None
 
 
 def test_smoothing_evens_noise_out_and_keeps_the_volume():

@@ -1,14 +1,13 @@
 """Deviation of position per voxel: along the sweep, smooth, empty where there is nothing."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.measures.uncertainty import DeviationField, deviations
-from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+from speckle3d.imaging.voxels.grid import grid_around
 
 GRID = ImageGrid(31, 41, 0.5, 0.5)
 
@@ -32,14 +31,6 @@ def test_an_error_of_scale_grows_along_the_sweep():
     assert found.dtype == np.float32
     z = grid.world_from_grid.translation[2] + 0.5 * np.arange(grid.shape[2])
     np.testing.assert_allclose(found, np.broadcast_to(0.05 * z[:, None, None], found.shape), atol=1e-5)
-
-
-def test_yaw_makes_the_images_sides_uncertain():
-    errors = scaled()
-    last = errors.world_from_image[-1]
-    centre, side = (deviations(errors, GRID, last.apply([[x, 10.0, 0.0]])) for x in (7.5, 15.0))
-    assert centre[0] == pytest.approx(1.0)
-    assert side[0] == pytest.approx(np.hypot(1.0, 0.01 * 7.5))
 
 
 def test_interpolated_deviations_are_those_of_the_voxels_themselves():
@@ -66,21 +57,3 @@ def test_slabs_are_the_whole_and_empty_voxels_have_no_value():
     np.testing.assert_array_equal(np.concatenate(parts), whole)
     state = np.random.default_rng(0).integers(0, 3, whole.shape).astype(np.uint8)
     np.testing.assert_array_equal(np.isnan(field.planes(0, grid.shape[2], state)), state == 0)
-
-
-def test_a_grid_of_one_voxel_has_its_own_value():
-    errors = scaled()
-    at = errors.world_from_image[20].apply(GRID.centre_mm)
-    one = VoxelGrid((1, 1, 1), (0.5, 0.5, 0.5), RigidTransform.from_translation(at))
-    assert DeviationField(errors, GRID, one).planes(0, 1)[0, 0, 0] == pytest.approx(0.5, rel=1e-3)
-
-
-def test_variances_by_neighbours_are_those_of_all_displacements():
-    rng = np.random.default_rng(2)
-    poses = scaled(turn_deg=8.0).world_from_image
-    errors = PosedErrors(PoseErrors(np.cumsum(rng.normal(size=(9, 41, 6)), axis=1)), poses, GRID.centre_mm)
-    points = rng.uniform([0, 0, -1], [15, 20, 21], (300, 3))
-    directions = Rotation.random(300, rng=rng).apply([0.0, 0.0, 1.0])
-    near = belonging_of(points, GRID, poses)
-    moved = np.einsum("mka,ka->mk", errors.displacements(points, near), directions)
-    np.testing.assert_allclose(errors.variance(points, directions, near), (moved**2).sum(axis=0))

@@ -1,4 +1,4 @@
-"""Volumes voxel by voxel: against brute force, in slabs, on any number of threads."""
+"""Volumes voxel by voxel: against brute force, on any number of threads."""
 
 import numpy as np
 import pytest
@@ -12,9 +12,8 @@ from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.region import Region
-from speckle3d.imaging.voxels.backward import backward_slabs
+from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
-from speckle3d.imaging.voxels.volume import compound
 from speckle3d.kernels.cuts import EDGE_TOLERANCE
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
@@ -67,13 +66,6 @@ def by_definition(images, poses, voxel_grid, reach_mm):
     return voxels, state
 
 
-def joined(slabs):
-    slabs = list(slabs)
-    firsts = np.cumsum([0, *(len(slab.voxels) for slab in slabs)])
-    assert [slab.first for slab in slabs] == firsts[:-1].tolist()
-    return np.concatenate([slab.voxels for slab in slabs]), np.concatenate([slab.state for slab in slabs])
-
-
 @settings(max_examples=6, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -85,7 +77,7 @@ def test_matches_brute_force(seed, spacing, reach_mm):
     poses, images = shaken(rng, 5, 0.9), rng.normal(size=(5, 9, 14)).astype(np.float32)
     images[2, 3:5] = np.nan
     grid = grid_around(GRID, poses, spacing, Rotation.from_rotvec(rng.normal(0.0, 0.5, 3)))
-    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, reach_mm))
+    voxels, state = look_up_voxels(PosedImages(images, GRID, poses), grid, reach_mm)
     expected, expected_state = by_definition(images.tolist(), poses, grid, reach_mm)
     np.testing.assert_array_equal(state, expected_state.T)
     # Single precision of levels of order one, of distances up to 5 mm and of their ratios.
@@ -98,7 +90,7 @@ def test_a_linear_field_is_met_between_sparse_images():
     y = 0.7 + np.arange(14) * 0.3
     images = [(3.0 * x - 2.0 * y + 5.0 * z) for z in poses.translation[:, 2]]
     grid = VoxelGrid((7, 6, 17), (0.5, 0.5, 0.5), RigidTransform.from_translation([0.25, 1.0, -1.0]))
-    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.1))
+    voxels, state = look_up_voxels(PosedImages(images, GRID, poses), grid, 2.1)
     z, y, x = np.meshgrid(
         np.arange(17) * 0.5 - 1.0, 1.0 + np.arange(6) * 0.5, 0.25 + np.arange(7) * 0.5, indexing="ij"
     )
@@ -113,59 +105,14 @@ def test_a_linear_field_is_met_between_sparse_images():
     assert np.isnan(voxels[state == EMPTY]).all()
 
 
-@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5, 6, 7], [3, 0, 7, 1, 6, 2, 5, 4]])
-def test_slabs_equal_the_whole_to_the_last_bit(order):
-    rng = np.random.default_rng(2)
-    poses, images = shaken(rng, 8, 0.8)[order], rng.normal(size=(8, 9, 14)).astype(np.float32)
-    source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.3)
-    whole = joined(backward_slabs(source, grid, 1.5))
-    images_gb = 16 * 9 * 14 * 4 / 1e9
-    plane_gb = grid.shape[0] * grid.shape[1] * 30 / 1e9
-    slabs = list(backward_slabs(source, grid, 1.5, max_memory_gb=images_gb + 4.5 * plane_gb))
-    assert len(slabs) > 3
-    assert max(len(slab.voxels) for slab in slabs) <= 4
-    for found, expected in zip(joined(slabs), whole, strict=True):
-        np.testing.assert_array_equal(found, expected)
-
-
-def test_images_are_read_once_for_each_slab_they_reach():
-    poses, read = RigidTransform.from_translation(np.outer(np.arange(40.0), [0, 0, 1])), []
-
-    def image(number):
-        read.append(number)
-        return np.full((9, 14), number)
-
-    grid = grid_around(GRID, poses, 0.5)
-    memory_gb = 16 * 9 * 14 * 4 / 1e9 + grid.shape[0] * grid.shape[1] * 30 * 20.5 / 1e9
-    slabs = list(backward_slabs(PosedImages(image, GRID, poses), grid, 1.2, max_memory_gb=memory_gb))
-    assert len(slabs) == 4
-    # 79 planes of 0.5 mm in four slabs; images within 1.2 mm of either end are read for the next one, too.
-    assert len(read) == 40 + 3 * 2
-
-
-def test_images_that_share_their_memory_are_looked_up_as_any_others():
-    rng = np.random.default_rng(4)
-    poses, images = shaken(rng, 20, 0.5), rng.normal(size=(20, 9, 14)).astype(np.float32)
-    buffer, grid = np.empty((9, 14), np.float32), grid_around(GRID, poses, 0.4)
-
-    def read(number):
-        buffer[:] = images[number]
-        return buffer
-
-    shared = joined(backward_slabs(PosedImages(read, GRID, poses), grid, 2.0))
-    alone = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.0))
-    for found, expected in zip(shared, alone, strict=True):
-        np.testing.assert_array_equal(found, expected)
-
-
 def test_any_number_of_threads_gives_the_same(many_threads):
     rng = np.random.default_rng(3)
     poses, images = shaken(rng, 20, 0.5), rng.normal(size=(20, 9, 14)).astype(np.float32)
     source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.25)
-    shared = joined(backward_slabs(source, grid, 2.0))
+    shared = look_up_voxels(source, grid, 2.0)
     with pytest.MonkeyPatch.context() as one:
         one.setattr(threads, "cores", lambda: 1)
-        alone = joined(backward_slabs(source, grid, 2.0))
+        alone = look_up_voxels(source, grid, 2.0)
     for found, expected in zip(shared, alone, strict=True):
         np.testing.assert_array_equal(found, expected)
 
@@ -179,22 +126,10 @@ def test_as_many_images_of_either_facing_are_told_apart(seed):
     there, back = shaken(rng, 3, 1.0), shaken(rng, 3, 1.0) * turned
     poses, images = RigidTransform.concatenate([there, back]), rng.normal(size=(6, 9, 14)).astype(np.float32)
     grid = grid_around(GRID, poses, 0.6)
-    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 2.0))
+    voxels, state = look_up_voxels(PosedImages(images, GRID, poses), grid, 2.0)
     expected, expected_state = by_definition(images.tolist(), poses, grid, 2.0)
     np.testing.assert_array_equal(state, expected_state.T)
     np.testing.assert_allclose(voxels, expected.T, atol=2e-5)
-
-
-def test_a_probe_turned_round_between_passes_interpolates_between_them():
-    there = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
-    turned = RigidTransform.from_components([4.0, 0.0, 2.0], Rotation.from_rotvec([0.0, np.pi, 0.0]))
-    poses = RigidTransform.concatenate([there, turned])
-    images = [np.full((9, 14), level) for level in (10.0, 50.0, 30.0)]
-    grid = VoxelGrid((5, 5, 5), (0.5, 0.5, 1.0), RigidTransform.from_translation([1.0, 1.0, 0.0]))
-    voxels, _ = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 4.5))
-    np.testing.assert_allclose(
-        voxels, np.broadcast_to([[[10.0]], [[20.0]], [[30.0]], [[40.0]], [[50.0]]], (5, 5, 5))
-    )
 
 
 def test_only_the_region_counts():
@@ -202,7 +137,7 @@ def test_only_the_region_counts():
     source = PosedImages(np.ones((2, 9, 14)), GRID, poses)
     region = Region.from_text("rectangle 1,1 3,3").mask(GRID)
     grid = grid_around(GRID, poses, 0.25)
-    voxels, state = joined(backward_slabs(source, grid, 2.0, region))
+    voxels, state = look_up_voxels(source, grid, 2.0, region)
     x, y = np.arange(grid.shape[0]) * 0.25, 0.7 + np.arange(grid.shape[1]) * 0.25
     # Right on the far side a voxel is beside samples that do not count.
     inside = (y[:, None] >= 1.0) & (y[:, None] < 2.8) & (x >= 1.0) & (x < 3.0)
@@ -210,25 +145,14 @@ def test_only_the_region_counts():
     assert (voxels[state != EMPTY] == 1.0).all()
 
 
-def test_compounding_backward_is_this_in_any_type():
-    rng = np.random.default_rng(5)
-    poses, images = shaken(rng, 6, 1.1), rng.uniform(0.0, 255.0, (6, 9, 14)).astype(np.float32)
-    grid = grid_around(GRID, poses, 0.4)
-    voxels, state = joined(backward_slabs(PosedImages(images, GRID, poses), grid, 1.7))
-    for voxel_type, expected in (("float32", voxels), ("uint8", np.nan_to_num(np.rint(voxels)))):
-        volume = compound(images, GRID, poses, 0.4, backward_mm=1.7, voxel_type=voxel_type)
-        np.testing.assert_array_equal(volume.voxels, expected.T)
-        np.testing.assert_array_equal(volume.state, state.T)
-
-
 def test_one_image_and_none_near():
     source = PosedImages(np.full((1, 9, 14), 7.0), GRID, RigidTransform.identity(1))
     grid = VoxelGrid((3, 3, 3), (0.5, 0.5, 0.5), RigidTransform.from_translation([1.0, 1.0, -0.5]))
-    voxels, state = joined(backward_slabs(source, grid, 3.0))
+    voxels, state = look_up_voxels(source, grid, 3.0)
     np.testing.assert_array_equal(state[:, 0, 0], [EMPTY, MEASURED, EMPTY])
     assert (voxels[1] == 7.0).all()
     far = VoxelGrid((3, 3, 3), (0.5, 0.5, 0.5), RigidTransform.from_translation([1.0, 1.0, 50.0]))
-    voxels, state = joined(backward_slabs(source, far, 3.0))
+    voxels, state = look_up_voxels(source, far, 3.0)
     assert np.isnan(voxels).all()
     assert (state == EMPTY).all()
 
@@ -238,8 +162,6 @@ def test_wrong_input_is_refused():
     grid = VoxelGrid((300, 300, 3), (0.5, 0.5, 0.5), RigidTransform.identity())
     for bad in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(InvalidInputError, match="max_distance_mm"):
-            next(iter(backward_slabs(source, grid, bad)))
+            look_up_voxels(source, grid, bad)
     with pytest.raises(InvalidInputError, match="region"):
-        next(iter(backward_slabs(source, grid, 1.0, np.ones((3, 3), bool))))
-    with pytest.raises(InvalidInputError, match=r"within 0\.001 GB .* plane of 300 x 300"):
-        next(iter(backward_slabs(source, grid, 1.0, max_memory_gb=0.001)))
+        look_up_voxels(source, grid, 1.0, np.ones((3, 3), bool))

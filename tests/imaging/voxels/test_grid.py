@@ -5,12 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from posed_sweeps import GRID, KINDS, corners_in, sweep
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.voxels.grid import grid_around, grid_as_asked, grid_like, spacing_within
+from speckle3d.imaging.voxels.grid import grid_around, spacing_within
 
 
 @settings(max_examples=8, deadline=None)
@@ -44,7 +43,7 @@ def test_what_is_asked_for_is_had_to_the_last_bit(seed, spacing, origin, shape):
     rng = np.random.default_rng(seed)
     poses, _ = sweep(rng, 3)
     axes = Rotation.random(rng=rng)
-    voxels = grid_as_asked(GRID, poses, spacing, world_from_axes=axes, origin_mm=origin, shape=shape)
+    voxels = grid_around(GRID, poses, spacing, world_from_axes=axes, origin_mm=origin, shape=shape)
     assert voxels.shape == shape
     assert voxels.spacing_mm == spacing
     np.testing.assert_array_equal(voxels.world_from_grid.translation, origin)
@@ -52,35 +51,23 @@ def test_what_is_asked_for_is_had_to_the_last_bit(seed, spacing, origin, shape):
     np.testing.assert_allclose(
         voxels.world_from_grid.as_matrix()[:3, :3], axes.as_matrix(), atol=1e-15, rtol=0
     )
-    upright = grid_as_asked(GRID, poses, spacing, origin_mm=origin, shape=shape).world_from_grid.as_matrix()
+    upright = grid_around(GRID, poses, spacing, origin_mm=origin, shape=shape).world_from_grid.as_matrix()
     np.testing.assert_array_equal(upright[:3], np.column_stack([np.eye(3), origin]))
     # A size of so many voxels is so many voxels.
     size = tuple(np.multiply(shape, spacing))
-    assert grid_as_asked(GRID, poses, spacing, origin_mm=origin, size_mm=size).shape == shape
+    assert grid_around(GRID, poses, spacing, origin_mm=origin, size_mm=size).shape == shape
 
 
 def test_what_is_not_asked_for_holds_the_images():
     poses, axes = sweep(np.random.default_rng(3), 20)
     around = grid_around(GRID, poses, 0.5, axes)
-    same = grid_as_asked(GRID, poses, 0.5, world_from_axes=axes)
-    assert (same.shape, same.spacing_mm) == (around.shape, around.spacing_mm)
-    np.testing.assert_array_equal(same.world_from_grid.as_matrix(), around.world_from_grid.as_matrix())
-    sized = grid_as_asked(GRID, poses, 0.5, world_from_axes=axes, size_mm=(10.1, 20.0, 0.2))
+    sized = grid_around(GRID, poses, 0.5, world_from_axes=axes, size_mm=(10.1, 20.0, 0.2))
     assert sized.shape == (21, 40, 1)
     np.testing.assert_array_equal(sized.world_from_grid.translation, around.world_from_grid.translation)
     # From an origin 7 voxels in, the far side stays where it was.
     inside = around.world_from_grid.apply([3.5, 3.5, 3.5])
-    placed = grid_as_asked(GRID, poses, 0.5, world_from_axes=axes, origin_mm=inside)
+    placed = grid_around(GRID, poses, 0.5, world_from_axes=axes, origin_mm=inside)
     assert placed.shape == tuple(n - 7 for n in around.shape)
-
-
-def test_a_grid_like_a_volume_is_its_grid():
-    pose = RigidTransform.from_components([0.1, 0.2, 0.3], Rotation.from_rotvec([0.1, 0.7, 0.2]))
-    volume = Volume(np.zeros((3, 4, 5), np.uint8), (0.1, 0.2, 0.3), pose)
-    voxels = grid_like(volume)
-    assert voxels.shape == (3, 4, 5)
-    assert voxels.spacing_mm == (0.1, 0.2, 0.3)
-    np.testing.assert_array_equal(voxels.world_from_grid.as_matrix(), pose.as_matrix())
 
 
 @settings(max_examples=8, deadline=None)
@@ -104,19 +91,19 @@ def test_wrong_input_is_refused():
     poses, _ = sweep(np.random.default_rng(4), 3)
     for bad in (0.0, -1.0, np.nan, (1.0, 1.0), (1.0, 0.0, 1.0)):
         with pytest.raises(InvalidInputError, match="spacing_mm"):
-            grid_as_asked(GRID, poses, bad)
+            grid_around(GRID, poses, bad)
     with pytest.raises(InvalidInputError, match="got both"):
-        grid_as_asked(GRID, poses, 1.0, shape=(1, 1, 1), size_mm=(1.0, 1.0, 1.0))
+        grid_around(GRID, poses, 1.0, shape=(1, 1, 1), size_mm=(1.0, 1.0, 1.0))
     with pytest.raises(InvalidInputError, match="shape"):
-        grid_as_asked(GRID, poses, 1.0, shape=(0, 1, 1))
+        grid_around(GRID, poses, 1.0, shape=(0, 1, 1))
     with pytest.raises(InvalidInputError, match="whole numbers"):
-        grid_as_asked(GRID, poses, 1.0, shape=(1.5, 1, 1))
+        grid_around(GRID, poses, 1.0, shape=(1.5, 1, 1))
     with pytest.raises(InvalidInputError, match="size_mm"):
-        grid_as_asked(GRID, poses, 1.0, size_mm=(-1.0, 1.0, 1.0))
+        grid_around(GRID, poses, 1.0, size_mm=(-1.0, 1.0, 1.0))
     with pytest.raises(InvalidInputError, match="origin_mm"):
-        grid_as_asked(GRID, poses, 1.0, origin_mm=(0.0, np.inf, 1.0))
+        grid_around(GRID, poses, 1.0, origin_mm=(0.0, np.inf, 1.0))
     with pytest.raises(InvalidInputError, match="origin_mm"):
-        grid_as_asked(GRID, poses, 1.0, origin_mm=(1e5, 0.0, 0.0))
+        grid_around(GRID, poses, 1.0, origin_mm=(1e5, 0.0, 0.0))
     with pytest.raises(InvalidInputError, match="single rotation"):
         grid_around(GRID, poses, 1.0, Rotation.identity(2))
     with pytest.raises(InvalidInputError, match="up to 1000000 along"):

@@ -1,7 +1,5 @@
-"""Images given to voxels: against brute force, in slabs, on any number of threads, at borders."""
+"""Images given to voxels: against brute force, on any number of threads, at borders."""
 
-import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core import threads
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import ChosenImages, PosedImages
+from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.grid import VoxelGrid
-from speckle3d.imaging.voxels.settings import CompoundingSettings
-from speckle3d.imaging.voxels.slabs import compound_slabs
 from speckle3d.imaging.voxels.volume import compound
 
 GRID = ImageGrid(
@@ -63,7 +59,7 @@ def sweep_of(frames, step_mm, kind=np.uint8):
     return PosedImages(images, GRID, poses), voxel_grid
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     splat=st.sampled_from(SPLATS),
@@ -95,79 +91,20 @@ def test_matches_brute_force(seed, splat, rule, kind, turned):
 
 @pytest.mark.parametrize("rule", [*RULES, "plus"])
 @pytest.mark.parametrize("splat", SPLATS)
-def test_slabs_and_threads_change_nothing(monkeypatch, splat, rule):
+def test_any_number_of_threads_gives_the_same(many_threads, splat, rule):
     source, voxel_grid = sweep_of(60, 0.3)
     weights = np.random.default_rng(6).uniform(0.5, 2.0, 60)
-    voxel_type = "uint8" if rule == "plus" else "float32"
-    chosen = CompoundingSettings(splat=splat, rule=rule, voxel_type=voxel_type, fill_radius=2)
-    (whole,) = compound_slabs(source, voxel_grid, chosen, weights)
-    monkeypatch.setattr(threads, "_pool", None)
-    monkeypatch.setattr(threads, "cores", lambda: 5)
-    memory = 1.8e-4 if rule in ("maximum", "plus") else 3.3e-4
-    slabs = list(compound_slabs(source, voxel_grid, replace_memory(chosen, memory), weights))
-    threads._pool.shutdown()
-    assert len(slabs) > 2
-    assert [slab.first for slab in slabs] == np.cumsum([0, *(len(s.voxels) for s in slabs[:-1])]).tolist()
-    np.testing.assert_array_equal(np.concatenate([slab.voxels for slab in slabs]), whole.voxels)
-    np.testing.assert_array_equal(np.concatenate([slab.state for slab in slabs]), whole.state)
 
+    def volume():
+        chosen = {"splat": splat, "rule": rule, "weights": weights, "voxel_type": "uint8"}
+        return compound(source.images, GRID, source.world_from_image, voxel_grid=voxel_grid, **chosen)
 
-def replace_memory(chosen, gigabytes):
-    return chosen.model_copy(update={"max_memory_gb": gigabytes})
-
-
-def test_frames_are_read_only_for_slabs_they_touch():
-    source, voxel_grid = sweep_of(60, 0.3)
-    images, read = source.images, []
-
-    def reader(index):
-        read.append(index)
-        return images[index]
-
-    chosen = CompoundingSettings(fill_radius=0, max_memory_gb=2.6e-4)
-    slabs = len(list(compound_slabs(replace(source, images=reader), voxel_grid, chosen)))
-    assert slabs > 3
-    assert len(read) < 2 * 60  # each slab's first frame tells the type of the others
-    assert set(read) == set(range(60))
-
-
-class OnAnyThread:
-    """Frames made as they are asked for, by several threads at once."""
-
-    any_thread = True
-
-    def __init__(self, images):
-        self.images, self.threads = images, set()
-
-    def __getitem__(self, index):
-        self.threads.add(threading.get_ident())
-        time.sleep(1e-3)
-        return self.images[index].copy()
-
-
-def test_frames_are_made_by_several_threads_where_they_may_be(monkeypatch):
-    source, voxel_grid = sweep_of(40, 0.3)
-    monkeypatch.setattr(threads, "_pool", None)
-    monkeypatch.setattr(threads, "cores", lambda: 3)
-    made = OnAnyThread(source.images)
-    some = ChosenImages(made, np.arange(0, 40, 2))
-    volume = compound(some, GRID, source.world_from_image[::2], voxel_grid=voxel_grid)
-    threads._pool.shutdown()
-    assert len(made.threads) > 1
-    expected = compound(source.images[::2], GRID, source.world_from_image[::2], voxel_grid=voxel_grid)
-    np.testing.assert_array_equal(volume.voxels, expected.voxels)
-
-
-def test_a_part_of_the_grid_is_that_part_of_the_whole():
-    source, voxel_grid = sweep_of(40, 0.3, np.float32)
-    for splat in SPLATS:
-        chosen = {"splat": splat, "fill_radius": 0}
-        whole, part = (
-            compound(source.images, GRID, source.world_from_image, voxel_grid=grid, **chosen).voxels
-            for grid in (voxel_grid, voxel_grid.part(9, 20))
-        )
-        # Positions on the part's own grid round otherwise: by 1e-12 voxel.
-        np.testing.assert_allclose(part, whole[:, :, 9:20], rtol=1e-5)
+    shared = volume()
+    with pytest.MonkeyPatch.context() as one:
+        one.setattr(threads, "cores", lambda: 1)
+        alone = volume()
+    np.testing.assert_array_equal(shared.voxels, alone.voxels)
+    np.testing.assert_array_equal(shared.state, alone.state)
 
 
 def test_samples_on_a_border_belong_to_the_voxel_above():
@@ -269,12 +206,8 @@ def test_what_cannot_be_compounded_is_refused():
         attempt(voxel_mm=0.3)
     with pytest.raises(InvalidInputError, match=r"rule: .*'median'"):
         attempt(rule="median")
+    with pytest.raises(InvalidInputError, match=r"1e-05 GB of memory, got .* GB for 24 x 16 x 60 voxels of"):
+        attempt(max_memory_gb=1e-5)
     tiny = VoxelGrid((9, 9, 9), (1e-7, 1e-7, 1e-7), RigidTransform.from_translation([3.0, 3.0, 0.0]))
     with pytest.raises(InvalidInputError, match=r"images\[0\]: expected to reach less than 4194304 voxels"):
-        list(compound_slabs(source, tiny, CompoundingSettings()))
-    with pytest.raises(InvalidInputError, match="slab of 24 x 16 voxels takes"):
-        list(compound_slabs(source, voxel_grid, CompoundingSettings(max_memory_gb=1e-5)))
-    with pytest.raises(
-        InvalidInputError, match=r"1e-06 GB, got 2.3e-05 GB for 24 x 16 x 60 voxels of 0.27 x"
-    ):
-        list(compound_slabs(source, voxel_grid, CompoundingSettings(max_file_gb=1e-6)))
+        compound(images, GRID, poses, voxel_grid=tiny)
