@@ -83,7 +83,7 @@ def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
     turned = RigidTransform.from_matrix([[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 9], [0, 0, 0, 1.0]])
     figure = Figure()
     plane = ReslicePlane(turned, 8.0, 10.0, 0.2)
-    save_cuts(figure, picture, {"fused": plane}, {"fused": [figure.add_subplot()]})
+    save_cuts(figure, picture, {"fused": plane}, {"fused": figure.add_subplot()})
     code, out, err = run("measure", rec, "--on", picture, "--point", "0,5", "--point", "6,5", "--json")
     assert code == 0, err
     told = json.loads(out)
@@ -98,7 +98,7 @@ def test_a_picture_of_other_poses_is_refused(run, refused, rec, tmp_path):
     plane = ReslicePlane(POSES[0], 8.0, 10.0, 0.2)
     for poses, name in ((POSES, "own.png"), (longer, "longer.png"), (POSES[:9], "shorter.png")):
         figure = Figure()
-        panels = {"image": [figure.add_subplot()]}
+        panels = {"image": figure.add_subplot()}
         save_cuts(figure, tmp_path / name, {"image": plane}, panels, anchors={"image": anchors_of(poses)})
     code, _, err = run("measure", rec, "--on", tmp_path / "own.png", *picks)
     assert code == 0, err

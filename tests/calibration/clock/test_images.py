@@ -90,5 +90,5 @@ def test_images_of_one_plane_are_refused_at_once(recording):
     # Tremor of a millimetre across is less than a beam's width.
     path = np.column_stack([along, 0.5 * along, 0.5 * np.sin(20.0 * times)])
     readings = TimedPoses(times, RigidTransform.from_translation(path))
-    with pytest.raises(InsufficientDataError, match=r"0.9 mm"):
+    with pytest.raises(InsufficientDataError, match=r"1.0 mm"):
         delay_from_images(replace(whole, readings=readings, images=None), RigidTransform.identity(), 0.05)
