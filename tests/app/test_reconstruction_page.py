@@ -21,6 +21,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.study.pose_errors import measure
+from speckle3d.study.posed import USUAL_RANGE_DB
 from speckle3d.study.reslices.cuts import cut_posed
 
 GRID = ImageGrid(vectors=32, samples=40, vector_pitch_mm=0.5, sample_spacing_mm=0.5)
@@ -101,7 +102,7 @@ def test_cuts_of_voxels_are_those_of_the_frames_but_coarser(material, name, othe
     opened = material.opened(*shown.modes)
     voxels = {mode: material.voxels(mode) for mode in shown.modes}
     quick = cut_of_voxels(opened, place, material, voxels)
-    fine = cut_posed(opened, place, made=material.images())
+    fine = cut_posed(opened, place, USUAL_RANGE_DB, made=material.images())
     assert list(quick.cuts) == list(fine.cuts)
     for mode, drawn in fine.cuts.items():
         both = np.isfinite(drawn.image) & np.isfinite(quick.cuts[mode].image)
