@@ -77,29 +77,33 @@ class FusionProblem:
     def normal_equations(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrix and gradient, summed over pieces of the equations."""
         matrix, gradient = np.zeros((unknowns.size, unknowns.size)), np.zeros(unknowns.size)
-        for columns, residual, slope in self._equations(unknowns):
-            root = np.sqrt(huber_weights(np.sqrt((residual**2).mean(axis=1)), HUBER))[:, None]
+        for columns, residual, slope, robust in self._equations(unknowns):
+            size = np.sqrt((residual**2).mean(axis=1))
+            root = np.sqrt(huber_weights(size, HUBER) if robust else np.ones_like(size))[:, None]
             weighed, pull = (slope * root[:, :, None]).reshape(-1, slope.shape[-1]), (residual * root).ravel()
             matrix[np.ix_(columns, columns)] += weighed.T @ weighed
             gradient[columns] += weighed.T @ pull
         return matrix, gradient
 
-    def _equations(self, unknowns: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Columns, residuals (k, r) of which a row has one weight, and derivatives (k, r, columns)."""
+    def _equations(self, unknowns: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray, bool]]:
+        """Columns, residuals (k, r), a row of one weight, derivatives (k, r, columns), and if the loss is robust.
+
+        It is not for what is known of a sensor: its millimetres would be free.
+        """
         every: IntArray = np.arange(unknowns.size)
         on_path = self.columns[0]
         coefficients = unknowns[on_path]
         residual, slope = self.path.prior(coefficients)
-        yield every[on_path], residual[:, None], slope[:, None]
+        yield every[on_path], residual[:, None], slope[:, None], True
         for evidence in self.evidence:
             residual, slope = self.path.misfit(coefficients, evidence)
-            yield every[on_path], residual[None], slope[None]
+            yield every[on_path], residual[None], slope[None], True
         for sensor, own in zip(self.sensors, self.columns[1:], strict=True):
             residual, slope = sensor.prior(unknowns[own])
-            yield every[own], residual[:, None], slope[:, None]
+            yield every[own], residual[:, None], slope[:, None], False
             joint = np.concatenate([every[on_path], every[own]])
             for residual, slope in sensor.equations(self.path, coefficients, unknowns[own]):
-                yield joint, residual, slope
+                yield joint, residual, slope, True
 
 
 def fuse(

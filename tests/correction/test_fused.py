@@ -76,7 +76,7 @@ def test_derivatives_match_differences(monkeypatch):
     at = 1e-3 * rng.standard_normal(problem.columns[-1].stop)
     step = 1e-6 * rng.standard_normal(at.size)
     ahead, behind = (problem._equations(at + sign * step) for sign in (1.0, -1.0))
-    for (columns, _, slope), (_, after, _), (_, before, _) in zip(
+    for (columns, _, slope, _), (_, after, *_), (_, before, *_) in zip(
         problem._equations(at), ahead, behind, strict=True
     ):
         wanted = (after - before) / 2.0

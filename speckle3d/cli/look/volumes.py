@@ -96,9 +96,7 @@ def volume(
         float | None,
         typer.Option(help="For sparse sweeps: voxels between the nearest images, at most so far away."),
     ] = None,
-    max_memory_gb: Annotated[
-        float | None, typer.Option(help="Memory that making it may take (8).")
-    ] = None,
+    max_memory_gb: Annotated[float | None, typer.Option(help="Memory that making it may take (8).")] = None,
     sweep_file: SweepFile = None,
     calibration: CalibrationFiles = None,
     plus_config: PlusConfig = None,
