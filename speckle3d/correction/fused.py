@@ -86,7 +86,7 @@ class FusionProblem:
         return matrix, gradient
 
     def _equations(self, unknowns: FloatArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray, bool]]:
-        """Columns, residuals (k, r), a row of one weight, derivatives (k, r, columns), and if the loss is robust.
+        """Columns, residuals (k, r), a weight a row, derivatives (k, r, columns), and if the loss is robust.
 
         It is not for what is known of a sensor: its millimetres would be free.
         """
