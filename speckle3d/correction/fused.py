@@ -53,7 +53,10 @@ class FusionProblem:
         return [slice(int(first), int(last)) for first, last in zip([0, *ends[:-1]], ends, strict=True)]
 
     def solve(self) -> tuple[FloatArray, FloatArray, FusionProblem]:
-        """Best unknowns, their covariance, and the problem with the sensors' jitter as it was found."""
+        """Best unknowns, their covariance, and the problem with the sensors' jitter as it was found.
+
+        Where images and tracker strain the tracker's millimetres, the covariance grows by as much.
+        """
         # A path that cannot follow a sensor that wanders shows how large its error is.
         stiff = replace(self, path=self.path.stiff)
         unknowns, _ = stiff.iterated(np.zeros(self.columns[-1].stop))
@@ -61,7 +64,9 @@ class FusionProblem:
         sensors = zip(self.sensors, self.columns[1:], strict=True)
         problem = replace(self, sensors=tuple(each.sized(poses, unknowns[own]) for each, own in sensors))
         unknowns, matrix = problem.iterated(unknowns)
-        return unknowns, np.asarray(np.linalg.inv(matrix), dtype=float), problem
+        sensors = zip(self.sensors, self.columns[1:], strict=True)
+        strain = max([1.0, *(each.strain(unknowns[own]) for each, own in sensors)])
+        return unknowns, strain**2 * np.asarray(np.linalg.inv(matrix), dtype=float), problem
 
     def iterated(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton with Huber's weights: unknowns, and the matrix of the normal equations there."""

@@ -256,6 +256,10 @@ class SensorReadings:
             matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / size))
         return matrix @ unknowns, matrix
 
+    def strain(self, unknowns: FloatArray) -> float:
+        """How many of their deviations a tracker's millimetres are off, to please the images, too."""
+        return float(abs(unknowns[MILLIMETRES])) / self.settings.tracker_scale_sigma
+
     def sized(self, path: FloatArray, unknowns: FloatArray) -> SensorReadings:
         """The readings with the jitter that is left of them along a path.
 
