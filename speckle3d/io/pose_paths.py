@@ -20,6 +20,8 @@ time stamps."""
 _LEVER_MM = 50.0
 """From the sensor to points whose displacement stands for a rotation: half a probe's length."""
 
+_MOST_JUMPING = 0.2
+"""Share of poses after jumps, above which these are no readings that went wrong but how the probe was placed."""
 _MOST_PIECES = 2000
 """Of a path cut at its jumps; with more it is no path."""
 
@@ -109,7 +111,7 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
 def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     """Keep the largest part of a path in which a hand reaches each pose from the one before.
 
-    Where that is no more than half of it, poses are single placements and not a path: all stay.
+    Where that leaves out more than a fifth, poses are single placements and not a path: all stay.
     """
     points, time_s = _points(readings.world_from_sensor), readings.time_s
     moved, steps = _apart(points[1:], points[:-1]), np.diff(time_s)
@@ -120,7 +122,7 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     told = f"{moved[worst]:.3g} mm in {1e3 * steps[worst]:.3g} ms at {time_s[worst + 1]:.3f} s"
     starts, ends = np.r_[0, jumps + 1], np.r_[jumps, len(readings) - 1]
     keep = _largest_chain(points, time_s, starts, ends)
-    if keep is None or 2 * np.count_nonzero(keep) <= len(readings):
+    if keep is None or np.count_nonzero(~keep) > _MOST_JUMPING * len(readings):
         return readings, [f"poses: {jumps.size} jumps that no hand makes, as {told}: all are kept"]
     notes = left_out("poses", len(readings), {f"after jumps, as {told}": int(np.sum(~keep))}, time_s[keep])
     kept = replace(readings, time_s=time_s[keep], world_from_sensor=readings.world_from_sensor[keep])
