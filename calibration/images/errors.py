@@ -35,6 +35,8 @@ the similarity's bends of a higher order drown the difference."""
 _FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0, 0.2, 0.2])
 """Largest steps, rad, mm and relative sizes: of an error that hardly shows no step would be wide enough."""
 
+APART_MM = 0.3
+"""Displacement of the image's edge for differences of slopes where steps are taken: less than speckle's blur."""
 LEAST_CURVATURE = 0.01
 """Least curvature in any direction, as a share of Gauss-Newton's. Layers have 0.01 to 0.06, other tissue 0.07
 and more: below, the standard errors are so large that the answer is refused."""
@@ -99,6 +101,23 @@ def curvature_of(
         columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
     bends = np.stack(columns, axis=2)
     return bends, positive(bends.sum(axis=0), refined.system[0])
+
+
+def curvature_at(refined: Refined, share: bool = False) -> FloatArray:
+    """Curvature of the similarity where it is, for steps: differences of its exact slope, shape (f, f)."""
+    chosen, base = list(refined.free), about_pivot(refined.pivot_mm)
+    columns = []
+    for parameter in chosen:
+        slopes = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(len(LEVERS_MM))
+            step[parameter] = sign * APART_MM / LEVERS_MM[parameter]
+            there = refined.estimate.stepped(step, refined.pivot_mm)
+            seen = refined.comparison.at(there, True, share)
+            weight = np.where(seen.valid, refined.weight, 0.0)
+            slopes.append((base.T @ (weight @ seen.gradient))[chosen])
+        columns.append((slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM))
+    return positive(np.stack(columns, axis=1), refined.system[0])
 
 
 def claimed(

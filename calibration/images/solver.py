@@ -21,6 +21,7 @@ from calibration.images.errors import (
     LEAST_SIMILARITY,
     RESTARTED,
     claimed,
+    curvature_at,
     curvature_of,
     require_known,
     require_one_answer,
@@ -162,7 +163,7 @@ def calibrate_from_sweeps(
     angles = _angulation(crossing, found.sensor_from_image)
     angles.require()
     bends, curvature = curvature_of(refined, angles, crossing.unit, share=True)
-    refined = settle(refined, curvature, share=True)
+    refined = settle(refined, curvature_at(refined, share=True), share=True)
     found, near = refined.estimate, refined.estimate.sensor_from_image
     tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
     restarted = crossing.level(RESTARTED, near)
