@@ -36,7 +36,7 @@ _FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0, 0.2, 0.2])
 """Largest steps, rad, mm and relative sizes: of an error that hardly shows no step would be wide enough."""
 
 APART_MM = 0.3
-"""Displacement of the image's edge for differences of slopes where steps are taken: less than speckle's blur."""
+"""Displacement of the image's edge for differences of slopes where steps are taken, mm: less than speckle."""
 LEAST_CURVATURE = 0.01
 """Least curvature in any direction, as a share of Gauss-Newton's. Layers have 0.01 to 0.06, other tissue 0.07
 and more: below, the standard errors are so large that the answer is refused."""

@@ -21,7 +21,7 @@ _LEVER_MM = 50.0
 """From the sensor to points whose displacement stands for a rotation: half a probe's length."""
 
 _MOST_JUMPING = 0.2
-"""Share of poses after jumps, above which these are no readings that went wrong but how the probe was placed."""
+"""Share of poses after jumps, above which these are no faults of readings but how the probe was placed."""
 _MOST_PIECES = 2000
 """Of a path cut at its jumps; with more it is no path."""
 
