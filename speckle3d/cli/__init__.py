@@ -148,6 +148,10 @@ def _stoppable() -> Iterator[list[int]]:
         sys.unraisablehook = show_dropped
         for each, was in before.items():
             signal.signal(each, was)
+        if heard:
+            from speckle3d.core.threads import end_threads
+
+            end_threads()
 
 
 def _fail(message: str, code: int = 2) -> None:

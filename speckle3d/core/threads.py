@@ -87,6 +87,16 @@ def _others() -> ThreadPoolExecutor:
     return _pool
 
 
+def end_threads() -> None:
+    """Let the shared threads end when they are done.
+
+    One whose start was interrupted is not known to the interpreter, whose end would wait for it for good.
+    """
+    if _pool is not None:
+        _pool.shutdown(wait=False, cancel_futures=True)
+        _forget()
+
+
 def _submitted(work: Callable[[], Result]) -> Future[Result] | None:
     """Give work to another thread; None while the interpreter ends, when there are none."""
     try:

@@ -1,5 +1,7 @@
 """Work shared out to threads: every item once, errors told, nesting without a deadlock."""
 
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -153,3 +155,26 @@ def test_work_is_done_here_while_the_interpreter_ends(monkeypatch):
     in_parallel(lambda first, stop: done.append((first, stop)), 8)
     assert sum(stop - first for first, stop in done) == 8
     assert list(ahead(str, range(3))) == ["0", "1", "2"]
+
+
+INTERRUPTED = """
+import threading
+from speckle3d.core import threads
+
+start = threading.Thread.start
+
+def interrupted(thread):
+    start(thread)
+    raise KeyboardInterrupt
+
+threading.Thread.start = interrupted
+threads.cores = lambda: 2
+try:
+    threads.in_parallel(lambda first, end: None, 100)
+except KeyboardInterrupt:
+    threads.end_threads()
+"""
+
+
+def test_a_process_ends_whose_thread_was_interrupted_as_it_began():
+    assert subprocess.run([sys.executable, "-c", INTERRUPTED], timeout=60).returncode == 0
