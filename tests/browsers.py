@@ -27,21 +27,40 @@ needs_browser = [
 ]
 
 
+LIMIT_S = 900
+"""For so long a server of a test may run, whatever becomes of the test."""
+
+
 @contextmanager
 def chromium():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS, *SOFTWARE_WEBGL])
-        yield browser
-        browser.close()
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@contextmanager
+def running(command, **streams):
+    """A process that does not outlive the block nor the limit; `Popen` by itself waits without one."""
+    with subprocess.Popen(list(map(str, command)), text=True, **streams) as process:
+        limit = threading.Timer(LIMIT_S, process.kill)
+        limit.start()
+        try:
+            yield process
+        finally:
+            limit.cancel()
+            process.kill()
 
 
 @contextmanager
 def viewing(*arguments):
     """The address that `speckle3d view ...` serves; the server has its port and everything to itself."""
-    command = [sys.executable, "-m", "speckle3d.cli", "view", "--no-browser", *map(str, arguments)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+    command = [sys.executable, "-m", "speckle3d.cli", "view", "--no-browser", *arguments]
+    with running(command, stderr=subprocess.PIPE) as server:
         said = []
         for line in server.stderr:
             said.append(line)
@@ -51,12 +70,10 @@ def viewing(*arguments):
             raise AssertionError("".join(said))
         drain = threading.Thread(target=lambda: said.extend(server.stderr), daemon=True)
         drain.start()
-        try:
-            yield said[-1].strip()
-        finally:
-            server.terminate()
-            server.wait(20)
-            drain.join(5)
+        yield said[-1].strip()
+        server.terminate()
+        server.wait(20)
+        drain.join(5)
         assert not [line for line in said if "Traceback" in line], "".join(said)
 
 
@@ -64,7 +81,7 @@ def opened(browser, address, width=1366, height=768):
     """A page with what it complained of and asked for in `complaints` and `requests`."""
     page = browser.new_page(viewport={"width": width, "height": height})
     # Where no kernel has been compiled yet, that comes first.
-    page.set_default_timeout(240_000)
+    page.set_default_timeout(120_000)
     page.complaints, page.requests = [], []
     page.on("console", lambda m: page.complaints.append(m.text) if m.type == "error" else None)
     page.on("pageerror", lambda error: page.complaints.append(str(error)))

@@ -12,7 +12,7 @@ import urllib.parse
 import urllib.request
 
 import pytest
-from browsers import needs_browser, opened, viewing
+from browsers import needs_browser, opened, running, viewing
 from commands import command
 
 pytestmark = needs_browser
@@ -84,10 +84,8 @@ def test_what_it_answers_tells_other_hosts_nothing(address):
 
 def test_a_page_of_another_server_cannot_show_or_ask_it(browser, address, tmp_path):
     (tmp_path / "other.html").write_text(f'<iframe src="{address}"></iframe>', encoding="utf-8")
-    with subprocess.Popen(
-        [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1", "--directory", tmp_path],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    ) as server:  # fmt: skip
+    command = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1", "--directory", tmp_path]
+    with running(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as server:
         port = re.search(r"port (\d+)", server.stdout.readline())[1]
         page = opened(browser, f"http://127.0.0.1:{port}/other.html")
         socket = f"{address.split('?')[0]}ws".replace("http", "ws")
@@ -102,7 +100,6 @@ def test_a_page_of_another_server_cannot_show_or_ask_it(browser, address, tmp_pa
         assert any("frame" in each or "403" in each for each in page.complaints)
         assert all(frame.url in ("", "chrome-error://chromewebdata/") for frame in page.frames[1:])
         page.close()
-        server.terminate()
 
 
 def test_it_ends_when_nobody_looks(browser, shipped):
@@ -112,9 +109,8 @@ def test_it_ends_when_nobody_looks(browser, shipped):
         "server = AppServer(pages_of(path), path.name, unseen_s=3.0); "
         "print(server.address_for_once(), flush=True); server.run()"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", code, shipped / "phantom.h5"], stdout=subprocess.PIPE, text=True
-    ) as server:
+    command = [sys.executable, "-c", code, shipped / "phantom.h5"]
+    with running(command, stdout=subprocess.PIPE) as server:
         page = opened(browser, server.stdout.readline().strip())
         page.wait_for_selector("canvas")
         page.wait_for_timeout(5000)
@@ -125,9 +121,8 @@ def test_it_ends_when_nobody_looks(browser, shipped):
 
 def test_ctrl_c_ends_it_and_leaves_nothing(shipped, tmp_path):
     (tmp_path / "sweep.h5").symlink_to(shipped / "phantom.h5")
-    with subprocess.Popen(
-        command("view", "--no-browser", tmp_path / "sweep.h5"), stderr=subprocess.PIPE, text=True
-    ) as server:
+    view = command("view", "--no-browser", tmp_path / "sweep.h5")
+    with running(view, stderr=subprocess.PIPE) as server:
         assert server.stderr.readline().startswith("http://127.0.0.1:")
         time.sleep(0.5)
         os.kill(server.pid, signal.SIGINT)

@@ -20,8 +20,8 @@ from speckle3d.app.reconstruction.space import RADIUS_95, band, ellipsoid
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.pose_errors import measure
-from speckle3d.study.posed import USUAL_RANGE_DB
 from speckle3d.study.reslices.cuts import cut_posed
 
 GRID = ImageGrid(vectors=32, samples=40, vector_pitch_mm=0.5, sample_spacing_mm=0.5)
@@ -102,7 +102,7 @@ def test_cuts_of_voxels_are_those_of_the_frames_but_coarser(material, name, othe
     opened = material.opened(*shown.modes)
     voxels = {mode: material.voxels(mode) for mode in shown.modes}
     quick = cut_of_voxels(opened, place, material, voxels)
-    fine = cut_posed(opened, place, USUAL_RANGE_DB, made=material.images())
+    fine = cut_posed(opened, place, RANGE_DB, made=material.images())
     assert list(quick.cuts) == list(fine.cuts)
     for mode, drawn in fine.cuts.items():
         both = np.isfinite(drawn.image) & np.isfinite(quick.cuts[mode].image)

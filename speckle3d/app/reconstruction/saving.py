@@ -15,7 +15,7 @@ from speckle3d.app.reconstruction.cuts.cuts_view import TITLES
 from speckle3d.app.reconstruction.cuts.material import Material
 from speckle3d.app.reconstruction.cuts.shown import Name, Shown
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.study.posed import USUAL_RANGE_DB
+from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.reslices.cuts import cut_posed
 from speckle3d.study.reslices.reslice_figures import save_outlines, save_reslices
 
@@ -85,7 +85,7 @@ class Saving:
         if name is None:
             return lambda path: save_outlines(opened, path)
         place = shown.place(name, material.axes(shown.mode), material)
-        picture = cut_posed(opened, place, USUAL_RANGE_DB, made=material.images())
+        picture = cut_posed(opened, place, RANGE_DB, made=material.images())
         return lambda path: save_reslices(picture, path)
 
 

@@ -8,7 +8,7 @@ from speckle3d.app.reconstruction.cuts.material import Material, NotWanted
 from speckle3d.app.reconstruction.cuts.newest import Newest
 from speckle3d.app.reconstruction.cuts.shown import NAMES, Name, Shown, cut_of_voxels
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.study.posed import USUAL_RANGE_DB
+from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.reslices.cuts import CutPicture, cut_posed
 
 REST_S = 0.3
@@ -85,6 +85,6 @@ class Cutter:
         material = self._material
         try:
             place = shown.place(name, material.axes(shown.mode), material)
-            return cut_posed(material.opened(*shown.modes), place, USUAL_RANGE_DB, made=material.images(look))
+            return cut_posed(material.opened(*shown.modes), place, RANGE_DB, made=material.images(look))
         except Speckle3DError as error:
             return str(error)

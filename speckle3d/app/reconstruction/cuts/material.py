@@ -21,8 +21,9 @@ from speckle3d.imaging.voxels.grid import spacing_within
 from speckle3d.imaging.voxels.volume import CompoundedVolume, compound
 from speckle3d.scoring.references import find_reference
 from speckle3d.scoring.trajectories import poses_of
+from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.pose_errors import errors_of
-from speckle3d.study.posed import USUAL_RANGE_DB, PosedSweep
+from speckle3d.study.posed import PosedSweep
 from speckle3d.study.reslices.cuts import OpenedModes, at_modes
 
 KEPT_BYTES = 600_000_000
@@ -152,7 +153,7 @@ class Material:
         """Images to cut, log-compressed, and their grid; `look` is called before each is read."""
         with self._making:
             if self._made is None:
-                images, grid = self._posed.images(USUAL_RANGE_DB)
+                images, grid = self._posed.images(RANGE_DB)
                 self._made = KeptImages(images, len(self._sweep)), grid
         return Watched(self._made[0], look), self._made[1]
 

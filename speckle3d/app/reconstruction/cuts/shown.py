@@ -12,7 +12,7 @@ from speckle3d.app.reconstruction.cuts.free_plane import FreePlane, SweepAxes
 from speckle3d.app.reconstruction.cuts.material import Material
 from speckle3d.imaging.cuts.reslice import reslice_volume
 from speckle3d.imaging.voxels.volume import CompoundedVolume
-from speckle3d.study.posed import USUAL_RANGE_DB
+from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, OpenedModes
 from speckle3d.study.reslices.places import Place
 
@@ -20,7 +20,7 @@ Name = Literal["along", "frame", "depth", "free"]
 NAMES: tuple[Name, ...] = ("along", "frame", "depth", "free")
 """Cuts: along the sweep, in a frame's plane, parallel to the skin, and the one that is dragged."""
 
-LEVELS_DB = (-USUAL_RANGE_DB, 0.0)
+LEVELS_DB = (-RANGE_DB, 0.0)
 """Black and white."""
 
 
@@ -86,7 +86,7 @@ def cut_of_voxels(
     """
     grid = material.grid
     placed = place.cuts(opened.poses, grid, opened.reference)
-    step_db = np.float32(USUAL_RANGE_DB / 255)
+    step_db = np.float32(RANGE_DB / 255)
     cuts = {
         mode: DrawnCut((reslice_volume(voxels[mode], cut, voxels[mode].state) - 255) * step_db, cut)
         for mode, cut in placed.items()
