@@ -35,7 +35,10 @@ REMOVED_SETTINGS = {
     "coherence.block_frames": "patches are fitted over at least 10 mm of travel",
     "coherence.evidence": "no patch is judged to hold structure or not",
     "coherence.redundancy": "errors come from the scatter of rows of patches",
+    "inplane.interpolate": "correlations are always read between samples",
+    "inplane.passes": "lags are centred twice",
     "trajectory.block_frames": "a sweep is matched in one go",
+    "trajectory.join": "poses are always solved from all pairs",
     "inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first",
     "fused.contradiction_sigma": "where images and sensors differ both numbers are told",
 }

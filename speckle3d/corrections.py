@@ -103,7 +103,7 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
             0.0 if tracked.coherence is None else float(tracked.coherence.share.mean()),
             tracked.scale_sigma,
             tracked.curves_sigma,
-            tracked.slopes.deviation_per_mm,
+            tracked.shared.turn_sigma_per_mm,
             sweep.grid.centre_mm,
             sweep.frame_time_s,
             sweep.orientation,

@@ -102,7 +102,7 @@ def crossing_side(sweep: Sweep, tracked: Tracked, stack: ImageStack, config: Con
         tracked.image,
         sweep.grid.centre_mm,
         tracked.scale_sigma,
-        float(tracked.slopes.deviation_per_mm.max()),
+        float(tracked.shared.turn_sigma_per_mm.max()),
         sensed_orientation(believed(sweep, tracked.doubts), config.sensors),
         tracked.flags,
         sweep.frame_time_s,

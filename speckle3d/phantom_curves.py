@@ -13,10 +13,10 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
-from speckle3d.matching.chosen import match_in_order
+from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.spectra import PHANTOM_FRAMES, mean_spectra, row_spectra
-from speckle3d.matching.texture import speckle_size
+from speckle3d.matching.schedule import KnownSchedule
+from speckle3d.matching.texture import PHANTOM_FRAMES, mean_spectra
 from speckle3d.motion.decorrelation import fit_curves
 from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
 
@@ -57,10 +57,17 @@ def calibrate_curves(
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
         wanted = phantom_pairs(sweep, settings.curves)
-        matches = match_in_order(sweep, matcher, wanted, after(progress, before, total))
-        samples.append(phantom_samples(sweep, matcher.patches, matches))
-        sizes.append((matcher.patches.row_depth_mm, speckle_size(sweep, matcher)))
-        spectra.append(row_spectra(sweep, matcher, most=PHANTOM_FRAMES))
+        matches = match_sweep(
+            sweep,
+            matcher,
+            KnownSchedule(wanted),
+            settings.quality,
+            after(progress, before, total),
+            textures=PHANTOM_FRAMES,
+        )
+        samples.append(phantom_samples(sweep, matcher.patches, matches.table, wanted))
+        sizes.append((matcher.patches.row_depth_mm, matches.texture.speckle_size()))
+        spectra.append(matches.texture.spectra())
         before += len(sweep)
     curves = fit_curves(keys[0], samples, settings.curves)
     return replace(

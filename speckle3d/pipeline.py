@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, naming
 from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
@@ -27,35 +28,30 @@ from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid, Sweep
-from speckle3d.examine.curves import examine_curves
 from speckle3d.examine.disagreements import disagreements
-from speckle3d.examine.images import examine_path, examine_standing, interleaved
+from speckle3d.examine.images import examine_images
 from speckle3d.examine.recording import examine_recording
 from speckle3d.examine.sensors import examined_sensors
-from speckle3d.matching.chosen import match_again
-from speckle3d.matching.frames import ImageSink, MatchedSweep, StageTimes, match_sweep
+from speckle3d.matching.frames import ImageSink, MatchedSweep, match_chosen, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.quality import FrameFlag, describe, flag_frames, sound_pairs
-from speckle3d.matching.spectra import row_spectra
-from speckle3d.matching.table import CorrelationTable
-from speckle3d.matching.texture import SpeckleSizes
-from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
-from speckle3d.motion.coherence import Coherence, RowScales, scale_sigma
+from speckle3d.matching.quality import FrameFlag, describe, flag_frames
+from speckle3d.matching.schedule import PairSchedule
+from speckle3d.motion.attenuation import Attenuation
+from speckle3d.motion.coherence import Coherence, RowScales
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import Motion, MotionProblem, edges_of, estimate_motion, frame_pairs
-from speckle3d.motion.revisits import find_returns, tie_returns
-from speckle3d.motion.signs import SignedPairs
-from speckle3d.motion.subset import consistent_planes
-from speckle3d.motion.trajectory import solve_trajectory, unjoined
-from speckle3d.motion.uncertainty import SlopeEvidence, claimed_covariance
+from speckle3d.motion.estimate import MotionProblem
+from speckle3d.motion.image_motion import (
+    ImageMotion,
+    consistent_poses,
+    estimate_image_motion,
+    frame_pairs,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PairSink = Callable[[FramePairs], None]
 """Called with some pairs at a time, in the order of their second frames, once the signs are settled."""
-MOTION = "distances, planes and scale"
-"""Name of the stage in `StageTimes`."""
 MOST_LOST = 0.3
 """Share of frames that may not be placed; with more, lengths are mostly guesses."""
 
@@ -97,10 +93,8 @@ class Tracked:
         With which the images were read.
     rows : RowScales or None
         Scales that rows of patches ask for, over that of all; None if not adapted to.
-    slopes : SlopeEvidence
-        What the images' own yaw and tilt are worth.
-    times : StageTimes
-        Seconds spent in each stage.
+    shared : SharedErrors
+        What `covariance` has all frames have wrong together.
     doubts : tuple of Doubt
         What of the recording contradicts the images or itself; what rests on refuted parts was not used.
     grid : ImageGrid or None
@@ -123,17 +117,10 @@ class Tracked:
     coherence: Coherence | None
     curves: DecorrelationCurves
     rows: RowScales | None
-    slopes: SlopeEvidence
-    times: StageTimes
+    shared: SharedErrors
     doubts: tuple[Doubt, ...] = ()
     grid: ImageGrid | None = None
     frame_time_s: FloatArray | None = None
-
-    @property
-    def shared(self) -> SharedErrors:
-        """What `covariance` has all frames have wrong together."""
-        scale = scale_sigma(self.coherence)
-        return SharedErrors(scale, self.curves_sigma, self.slopes.deviation_per_mm)
 
     def plot(self) -> Figure:
         """Draw length, tilt, yaw and roll against the frame, with their 95 % intervals."""
@@ -230,80 +217,39 @@ def track(
     require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
     if len(sweep) < 2:
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
-    settings, times = config or Config(), StageTimes()
+    settings = config or Config()
     matcher = matcher_for(sweep, curves, settings)
     doubts = examine_recording(sweep, matcher, curves)
 
-    sizes = SpeckleSizes(sweep, matcher, images)
-    matches = match_sweep(sweep, matcher, settings.trajectory, settings.quality, times, progress, sizes.keep)
-    table, flags = matches.table, frame_flags(sweep, matches, settings)
+    schedule = PairSchedule(settings.trajectory)
+    matches = match_sweep(sweep, matcher, schedule, settings.quality, progress, images)
+    flags = frame_flags(matches, settings)
+    require_placed(flags, sweep.name)
 
-    with times.of(MOTION):
-        attenuation = estimate_attenuation(curves, row_spectra(sweep, matcher, np.flatnonzero(flags == 0)))
-        problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)
-        motion = estimate_motion(problem, table, sound_pairs(table, flags))
-    doubts += attenuation.doubts
-    flags = with_unplaced(sweep, flags, motion.pairs)
-    with times.of("checks of the images"):
-        doubts += examine_standing(sweep, matcher, curves, motion.path[:, 0], flags == 0)
-        doubts += examine_curves(sweep, matcher, sizes, motion, flags == 0)
+    problem = motion_problem(curves, matcher, len(sweep), settings)
+    spectra, match = matches.texture.spectra(flags == 0), partial(match_chosen, sweep, matcher)
+    same_probe = settings.curves.same_probe
+    bad = (flags & ~FrameFlag.UNMATCHED) != 0
+    motion = estimate_image_motion(problem, matches.table, spectra, bad, same_probe, match)
+    flags[motion.unplaced & (flags == 0)] = int(FrameFlag.UNMATCHED)
+    require_placed(flags, sweep.name)
+    doubts += motion.attenuation.doubts
+    doubts += examine_images(sweep, matcher, matches, motion, curves, flags == 0)
 
-    with times.of("revisits"):
-        table, motion = tied_to_returns(sweep, matcher, table, motion, flags)
-    with times.of("trajectory"):
-        slopes = motion.slopes
-        mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
-        edges = edges_of(table, motion.pairs, slopes.applied(motion.pairs.planes))
-        trajectory = solve_trajectory(edges, len(sweep), matcher.centre_mm, settings.trajectory, True)
-        shared = SharedErrors(scale_sigma(motion.coherence), mismatch, slopes.deviation_per_mm)
-        covariance = claimed_covariance(
-            trajectory.poses, trajectory.covariance, matcher.centre_mm, shared, motion.structure
-        )
-    doubts += examine_path(
-        sweep,
-        trajectory.poses,
-        covariance,
-        matches.table,
-        motion.pairs,
-        problem.patches.centre_mm,
-        float(curves.distance_mm[-1]),
-        flags == 0,
+    sensors = examined_sensors(sweep, motion.poses, settings.sensors.examine)
+    direction, source = settle_direction(
+        sensors.trusted, motion.poses, settings.sensors, sensors.turn_confirmed
     )
-
-    with times.of("sensors"):
-        sensors = examined_sensors(sweep, trajectory.poses, settings.sensors.examine)
-        direction, source = settle_direction(
-            sensors.trusted, trajectory.poses, settings.sensors, sensors.turn_confirmed
-        )
-        subset, used = consistent_poses(sensors.trusted, table, motion, direction, settings)
-
-    sigma = float(np.hypot(scale_sigma(motion.coherence), mismatch))
+    sensed = sensed_orientation(sensors.trusted, settings.sensors)
+    subset, used = consistent_poses(motion, sensed, direction)
     if sink:
-        for some in frame_pairs(motion, table, edges, used, direction, sigma):
-            sink(some)
-    image = _seen_from(direction, trajectory.poses)
-    covariance = covariance if direction > 0 else MIRROR @ covariance @ MIRROR
-    return Tracked(
-        image=image,
-        covariance=covariance,
-        subset=None if subset is None else _seen_from(direction, subset),
-        rejected_share=float("nan") if subset is None else _rejected_share(motion.pairs, used),
-        flags=flags,
-        edges=edges if direction > 0 else edges.mirrored(),
-        scale_sigma=sigma,
-        curves_sigma=mismatch,
-        direction=direction,
-        direction_from=source,
-        attenuation=attenuation,
-        coherence=motion.coherence,
-        curves=motion.problem.curves,
-        rows=motion.rows,
-        slopes=slopes,
-        times=times,
-        doubts=(*doubts, *sensors.doubts, *disagreements(sensors.trusted, image, covariance, sigma)),
-        grid=sweep.grid,
-        frame_time_s=sweep.frame_time_s,
+        for pairs in frame_pairs(motion, used, direction):
+            sink(pairs)
+    tracked = _tracked(motion, subset, used, flags, direction, source)
+    doubts += sensors.doubts + disagreements(
+        sensors.trusted, tracked.image, tracked.covariance, tracked.scale_sigma
     )
+    return replace(tracked, doubts=doubts, grid=sweep.grid, frame_time_s=sweep.frame_time_s)
 
 
 def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:
@@ -329,61 +275,52 @@ def motion_problem(
     return MotionProblem(curves, matcher.patches, matcher.centre_mm, frames, planes, trajectory, adapt)
 
 
-def frame_flags(sweep: Sweep, matches: MatchedSweep, config: Config) -> IntArray:
-    """Flags of all frames, if few enough have one."""
-    least = config.trajectory.least_correlation
+def frame_flags(matches: MatchedSweep, config: Config) -> IntArray:
+    """Flags of all frames by what is in them and what they share with others."""
     flags = flag_frames(matches.features, config.quality)
-    flags[matches.table.unmatched(len(sweep), least)] |= FrameFlag.UNMATCHED
-    _require_placed(sweep, flags)
-    unrefuted([interleaved(matches.table, len(sweep), least)], sweep.name, InsufficientDataError)
+    unmatched = matches.table.unmatched(len(matches.features), config.trajectory.least_correlation)
+    flags[unmatched] |= FrameFlag.UNMATCHED
     return flags
 
 
-def with_unplaced(sweep: Sweep, flags: IntArray, pairs: SignedPairs) -> IntArray:
-    """Flags in which sound frames that no pair joins to earlier ones are unmatched, too."""
-    flags = np.where(unjoined(pairs.second, len(sweep)) & (flags == 0), int(FrameFlag.UNMATCHED), flags)
-    _require_placed(sweep, flags)
-    return flags
-
-
-def _require_placed(sweep: Sweep, flags: IntArray) -> None:
-    """Raise if too many frames have a flag."""
+def require_placed(flags: IntArray, name: str) -> None:
+    """Raise `InsufficientDataError` if too many frames have a flag."""
     lost = int((flags != 0).sum())
-    if lost > MOST_LOST * len(sweep):
+    if lost > MOST_LOST * len(flags):
         raise InsufficientDataError(
-            f"{sweep.name}: expected frames with speckle in common, got {lost} of {len(sweep)} that cannot "
+            f"{name}: expected frames with speckle in common, got {lost} of {len(flags)} that cannot "
             f"be placed: {'; '.join(describe(flags))}"
         )
 
 
-def tied_to_returns(
-    sweep: Sweep, matcher: FrameMatcher, table: CorrelationTable, motion: Motion, flags: IntArray
-) -> tuple[CorrelationTable, Motion]:
-    """Match frames of different visits of the same tissue, which the path shows, and add their pairs."""
-    returns = find_returns(motion.path[:, 0], motion.problem.trajectory.revisit_mm)
-    wanted = [pair for each in returns for pair in each.pairs()]
-    table = table.followed_by(match_again(sweep, matcher, wanted))
-    ties = tie_returns(returns, motion, table)
-    ties = ties[(flags[ties.first] == 0) & (flags[ties.second] == 0)]
-    return table, replace(motion, pairs=motion.pairs.and_also(ties))
-
-
-def consistent_poses(
-    sweep: Sweep, table: CorrelationTable, motion: Motion, direction: int, config: Config
-) -> tuple[RigidTransform | None, BoolArray]:
-    """Poses from the orientation-consistent patches (None without a sensor), and each pair's patches used."""
-    sensed = sensed_orientation(sweep, config.sensors)
-    if sensed is None:
-        return None, motion.pairs.planes.used
-    planes = consistent_planes(motion, table, sensed, direction)
-    edges = edges_of(table, motion.pairs, planes)
-    poses = solve_trajectory(edges, len(sweep), motion.problem.centre_mm, config.trajectory).poses
-    return poses, planes.used
-
-
-def _rejected_share(pairs: SignedPairs, used: BoolArray) -> float:
-    return float((pairs.planes.used & ~used).sum() / pairs.planes.used.sum())
-
-
-def _seen_from(direction: int, poses: RigidTransform) -> RigidTransform:
-    return poses if direction > 0 else mirrored(poses)
+def _tracked(
+    found: ImageMotion,
+    subset: RigidTransform | None,
+    used: BoolArray,
+    flags: IntArray,
+    direction: int,
+    source: str,
+) -> Tracked:
+    """Seen from the side on which the elevational motion has its sign."""
+    motion, taken = found.motion, found.motion.pairs.planes.used
+    image, covariance, edges = found.poses, found.covariance, found.edges
+    if direction < 0:
+        image, covariance, edges = mirrored(image), MIRROR @ covariance @ MIRROR, edges.mirrored()
+        subset = None if subset is None else mirrored(subset)
+    return Tracked(
+        image=image,
+        covariance=covariance,
+        subset=subset,
+        rejected_share=float("nan") if subset is None else float((taken & ~used).sum() / taken.sum()),
+        flags=flags,
+        edges=edges,
+        scale_sigma=found.length_sigma,
+        curves_sigma=found.shared.curves_sigma,
+        direction=direction,
+        direction_from=source,
+        attenuation=found.attenuation,
+        coherence=motion.coherence,
+        curves=motion.problem.curves,
+        rows=motion.rows,
+        shared=found.shared,
+    )

@@ -10,7 +10,7 @@ from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.texture import echo_spectra, speckle_size
+from speckle3d.matching.texture import echo_spectra, measured_texture
 from speckle3d.motion.data_sheet import ProbeSheet, sheet_curves
 
 
@@ -46,7 +46,7 @@ def data_sheet_curves(
     rows, seen = matcher.patches.row_depth_mm, None
     if isinstance(like.signal, RFSettings):
         seen = EchoSpectra(rows, *echo_spectra(like, rows, settings.patches.height_mm))
-    size = speckle_size(like, matcher)
+    size = measured_texture(like, matcher).speckle_size()
     area = 2.0 * np.pi * _filled(rows, size.lateral_mm) * _filled(rows, size.axial_mm)
     known = bool(np.isfinite(area).all())
     return sheet_curves(sheet, matcher.key, rows, seen, area if known else None, settings.curves.largest_mm)

@@ -10,14 +10,14 @@ LEAST = 0.05
 
 
 def match(fixed, moving, patches, start, centre_mm, settings=None, echoes=None, wavenumber_per_mm=0.0):
-    """Correlation of the patches, their own shifts, and (x, y, roll) with its covariance."""
+    """Correlation of the patches and (x, y, roll) with its covariance."""
     s = settings or InPlaneSettings()
     at, spacing = patches.centre_mm - centre_mm[:2], patches.spacing_mm
     place = patches.first, patches.size
     motion, covariance, strain = np.array([start.x_mm, start.y_mm, start.roll_rad]), None, np.zeros(2)
     turn = np.array([[np.cos(motion[2]), -np.sin(motion[2])], [np.sin(motion[2]), np.cos(motion[2])]])
     predicted = (at - motion[:2]) @ turn - at
-    for _ in range(s.passes):
+    for _ in range(2):
         lag = np.rint(predicted / spacing).astype(np.int64)
         rho = oracles.patch_correlations(fixed, moving, *place, lag, s.least_overlap, (1, 1))
         shift, weight = peaks(rho, lag, spacing)
@@ -33,7 +33,7 @@ def match(fixed, moving, patches, start, centre_mm, settings=None, echoes=None, 
         centre = np.maximum(rho[:, 1:2, 1:2], LEAST)
         rho[:, ::2, ::2] = rho[:, ::2, 1:2] * rho[:, 1:2, ::2] / centre
     offset = np.clip(predicted / spacing - lag, -1.0, 1.0)
-    return read_at(rho, offset) if s.interpolate else rho[:, 1, 1], shift, motion, covariance
+    return read_at(rho, offset), motion, covariance
 
 
 def sound(rho):

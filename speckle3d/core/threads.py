@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -23,7 +22,6 @@ _SLICES_PER_CORE = 4
 """So that a core that has done its own share takes from another's."""
 _LIMITS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
-_SPENT: ContextVar[list[float] | None] = ContextVar("spent", default=None)
 _pool: ThreadPoolExecutor | None = None
 
 
@@ -50,33 +48,6 @@ def cores() -> int:
     # OpenMP's may be a list, by depth of nesting.
     told = (os.environ.get(name, "").partition(",")[0].strip() for name in _LIMITS)
     return max(1, min([allowed, *(int(value) for value in told if value.isascii() and value.isdecimal())]))
-
-
-@contextmanager
-def counting_seconds() -> Iterator[list[float]]:
-    """Gather the processor time that is spent inside by this thread and those that help it, s."""
-    spent: list[float] = []
-    token, began = _SPENT.set(spent), time.thread_time()
-    try:
-        yield spent
-    finally:
-        spent.append(time.thread_time() - began)
-        _SPENT.reset(token)
-
-
-def _helping(work: Callable[[], Result]) -> Callable[[], Result]:
-    """Make work fit for another thread: in the context of this one, which is told the time it takes."""
-    spent, context = _SPENT.get(), copy_context()
-
-    def run() -> Result:
-        began = time.thread_time()
-        try:
-            return context.run(work)
-        finally:
-            if spent is not None:
-                spent.append(time.thread_time() - began)
-
-    return run
 
 
 def _others() -> ThreadPoolExecutor:
@@ -136,7 +107,7 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
                 return
             function(first, min(first + size, count))
 
-    others = [other for _ in range(threads - 1) if (other := _submitted(_helping(work)))]
+    others = [other for _ in range(threads - 1) if (other := _submitted(partial(copy_context().run, work)))]
     try:
         work()
     except BaseException:

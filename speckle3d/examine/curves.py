@@ -17,9 +17,8 @@ from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import Sweep
-from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
-from speckle3d.matching.texture import SpeckleSizes, speckle_size
+from speckle3d.matching.texture import Texture
 from speckle3d.motion.coherence import NOISY_GAIN, RowScales
 from speckle3d.motion.estimate import Motion
 
@@ -49,9 +48,7 @@ _ROW_ERROR = 0.03
 """Of a row's factor, from the curves and tissue."""
 
 
-def examine_curves(
-    sweep: Sweep, matcher: FrameMatcher, sizes: SpeckleSizes, motion: Motion, usable: BoolArray
-) -> tuple[Doubt, ...]:
+def examine_curves(sweep: Sweep, texture: Texture, motion: Motion, usable: BoolArray) -> tuple[Doubt, ...]:
     """Hold the curves against a sweep's own speckle and steps.
 
     Raises
@@ -60,7 +57,7 @@ def examine_curves(
         If they are refuted.
     """
     problem, pairs = motion.problem, motion.pairs
-    size = speckle_size(sweep, matcher, np.flatnonzero(usable), sizes)
+    size = texture.speckle_size(usable)
     least = FLAT * float(problem.fitter.estimator.typical_distance(np.sqrt(0.5)))
     ratios = sum_ratios(pairs.first, pairs.second, pairs.sign * pairs.planes.offset_mm, least)
     doubts = doubt_curves(size, rows_without_tilt(motion), ratios, problem.curves, problem.patches)

@@ -16,11 +16,13 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Sweep
+from speckle3d.examine.curves import examine_curves
+from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.distances import LEAST_CORRELATION
-from speckle3d.motion.signs import SignedPairs
+from speckle3d.motion.image_motion import ImageMotion
 from speckle3d.motion.trajectory import HELD_MM
 
 IMAGES = "images"
@@ -71,52 +73,56 @@ to three standard errors have up to 0.18, two at three of them 0.23 and 0.24, an
 a half too short 0.41 and more; whole images have up to 0.05, with noise of a tenth of the power 0.14."""
 
 
-def examine_standing(
+def examine_images(
     sweep: Sweep,
     matcher: FrameMatcher,
+    matches: MatchedSweep,
+    motion: ImageMotion,
     curves: DecorrelationCurves,
-    position_mm: FloatArray,
     usable: BoolArray,
 ) -> tuple[Doubt, ...]:
-    """Look for echoes that are the same in frames beyond the reach of speckle.
+    """Hold a sweep's images against the motion and the curves that they were read with.
+
+    Parameters
+    ----------
+    curves : DecorrelationCurves
+        As measured.
+    usable : ndarray of bool, shape (n,)
 
     Raises
     ------
+    MismatchError
+        If the curves are refuted.
     InsufficientDataError
-        If so much stands still that distances mean nothing.
+        If so much stands still that distances mean nothing, the images do not determine the length, or they
+        cannot be those of one probe that moves.
     """
-    frames = far_apart(position_mm, usable, curves)
-    if len(frames) < 2:
-        return ()
-    share = standing_share(sweep, matcher, frames.tolist())
-    found = standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
-    return unrefuted([found], sweep.name, InsufficientDataError)
-
-
-def examine_path(
-    sweep: Sweep,
-    poses: RigidTransform,
-    covariance: FloatArray,
-    table: CorrelationTable,
-    pairs: SignedPairs,
-    patch_centre_mm: FloatArray,
-    reach_mm: float,
-    usable: BoolArray,
-) -> tuple[Doubt, ...]:
-    """Ask whether a length is open, a sweep in pieces, or a path contradicted by pairs.
-
-    Raises
-    ------
-    InsufficientDataError
-        If the images do not determine the length, or cannot be those of one probe that moves.
-    """
-    z_mm, sigma_mm = poses.apply(sweep.grid.centre_mm)[:, 2], np.sqrt(covariance[:, 2, 2])
-    found = (
-        undetermined(z_mm, sigma_mm, reach_mm),
-        severed(pairs.first, pairs.second, usable),
-        folded(table, poses, patch_centre_mm, usable),
+    pairs, path_mm = motion.motion.pairs, motion.motion.path[:, 0]
+    doubts = unrefuted(
+        [
+            interleaved(matches.table, len(sweep), motion.motion.problem.trajectory.least_correlation),
+            _standing_echoes(sweep, matcher, far_apart(path_mm, usable, curves), curves),
+        ],
+        sweep.name,
+        InsufficientDataError,
     )
-    return unrefuted(found, sweep.name, InsufficientDataError)
+    doubts += examine_curves(sweep, matches.texture, motion.motion, usable)
+    z_mm = motion.poses.apply(sweep.grid.centre_mm)[:, 2]
+    path = (
+        undetermined(z_mm, np.sqrt(motion.covariance[:, 2, 2]), float(curves.distance_mm[-1])),
+        severed(pairs.first, pairs.second, usable),
+        folded(matches.table, motion.poses, matcher.patches.centre_mm, usable),
+    )
+    return doubts + unrefuted(path, sweep.name, InsufficientDataError)
+
+
+def _standing_echoes(
+    sweep: Sweep, matcher: FrameMatcher, frames: IntArray, curves: DecorrelationCurves
+) -> Doubt | None:
+    if len(frames) < 2:
+        return None
+    share = standing_share(sweep, matcher, frames.tolist())
+    return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
 
 
 def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:

@@ -132,7 +132,7 @@ def doubt_white(sweep: Sweep) -> tuple[Doubt, ...]:
     signal = sweep.signal
     if not isinstance(signal, BModeSettings):
         return ()
-    some = [sweep.frames[k] for k in spread_frames(np.arange(len(sweep)), SPECTRA)]
+    some = [sweep.frames[k] for k in spread_frames(len(sweep), SPECTRA)]
     seen = sum(int(np.count_nonzero(frame)) for frame in some)
     share = sum(int((frame >= signal.full_scale).sum()) for frame in some) / max(seen, 1)
     if share <= MOST_WHITE:
@@ -187,7 +187,7 @@ def _turns_by_depth(sweep: Sweep) -> ComplexArray:
        technique", IEEE Trans. Sonics Ultrason. 32, 1985.
     """
     turns = []
-    for k in spread_frames(np.arange(len(sweep)), SPECTRA):
+    for k in spread_frames(len(sweep), SPECTRA):
         parts = np.array_split(sweep.frames[k].astype(np.complex128), _DEPTHS, axis=1)
         # Over the energy of each vector: bright structure counts no more than speckle.
         turns.append([_coherence(part).mean() for part in parts])
@@ -206,7 +206,7 @@ def _spectrum(sweep: Sweep, signal: RFSettings) -> tuple[FloatArray, FloatArray]
     frequency_hz, bins = spectrum_bins(signal, samples)
     window = np.hanning(samples).astype(np.float32)
     total = np.zeros(bins.size)
-    for k in spread_frames(np.arange(len(sweep)), SPECTRA):
+    for k in spread_frames(len(sweep), SPECTRA):
         frame = sweep.frames[k][:, :samples] * window
         spectrum = (fft.fft(frame, axis=1) if signal.are_complex else fft.rfft(frame, axis=1))[:, bins]
         total = total + (spectrum.real**2 + spectrum.imag**2).mean(axis=0)

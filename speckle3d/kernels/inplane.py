@@ -15,6 +15,8 @@ LEAST_CORRELATION = 0.05
 """Below this at any lag, the logarithm is mostly noise; the parabola is then put through the coefficient."""
 REFERENCES = 8
 """Frames that `match_pairs` is given; the last may be repeated."""
+PASSES = 2
+"""Fits of the motion: about the start, and about the first fit."""
 _HUBER, _ROUNDS = 1.5, 5
 _NOWHERE = np.iinfo(np.int64).max
 _LEAST_PATCHES = 6
@@ -35,8 +37,7 @@ class Geometry(NamedTuple):
         Of the patches' centres, from the image's.
     spacing_mm : float64, shape (2,)
     least_overlap : float
-    passes : int
-    interpolate, of_echo : bool
+    of_echo : bool
     wavenumber_per_mm : float
     """
 
@@ -45,8 +46,6 @@ class Geometry(NamedTuple):
     at_mm: FloatArray
     spacing_mm: FloatArray
     least_overlap: float
-    passes: int
-    interpolate: bool
     of_echo: bool
     wavenumber_per_mm: float
 
@@ -57,21 +56,18 @@ class Matches(NamedTuple):
     Attributes
     ----------
     correlation : float64, shape (m, p)
-    shift_mm : float64, shape (m, p, 2)
     motion : float64, shape (m, 4, 3)
         Displacement of the centre, mm, and roll, rad; in the rows after their covariance, if fitted.
     median : float64, shape (m,)
         Of the correlations that are finite; zero if none is.
-    fitted, settled : bool, shape (m,)
-        Whether the motion was fitted, not kept from the start, and whether the last fit left every lag.
+    fitted : bool, shape (m,)
+        Whether the motion was fitted, not kept from the start.
     """
 
     correlation: FloatArray
-    shift_mm: FloatArray
     motion: FloatArray
     median: FloatArray
     fitted: BoolArray
-    settled: BoolArray
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -363,19 +359,20 @@ def match_pairs(
     """
     first, size, at_mm, spacing = geometry.first, geometry.size, geometry.at_mm, geometry.spacing_mm
     patches, of_echo, least_overlap = first.shape[0], geometry.of_echo, geometry.least_overlap
-    predicted, weight, room = np.empty((patches, 2)), np.empty(patches), np.empty((8, max(patches, 9)))
+    predicted, shift = np.empty((patches, 2)), np.empty((patches, 2))
+    weight, room = np.empty(patches), np.empty((8, max(patches, 9)))
     lag, changed = np.empty((patches, 2), np.int64), np.empty(patches, np.bool_)
     rho, field, patch_room = np.empty((patches, 3, 3)), np.empty((2, 3)), buffers(size, 1, 1)
     ramp_rad = np.empty(2)
     for m in range(begin, stop):
-        fixed, shift, motion = images[m - begin], matches.shift_mm[m], matches.motion[m]
+        fixed, motion = images[m - begin], matches.motion[m]
         x_mm, y_mm, roll_rad = motion[0, 0], motion[0, 1], motion[0, 2]
         _displaced(x_mm, y_mm, roll_rad, at_mm, predicted)
         for p in range(patches):
             lag[p, 0], lag[p, 1] = _NOWHERE, _NOWHERE
         _round(predicted, spacing, lag, changed)
-        moved, fitted = True, False
-        for turn in range(geometry.passes):
+        fitted = False
+        for turn in range(PASSES):
             for p in range(patches):
                 if changed[p]:
                     correlate_patch(
@@ -390,15 +387,14 @@ def match_pairs(
                     for k in range(2):
                         predicted[p, k] = field[k, 0] + field[k, 1] * at_mm[p, 0] + field[k, 2] * at_mm[p, 1]
             # Where intensity is correlated it is read about the lags of the last pass.
-            if not of_echo and turn == geometry.passes - 1:
+            if not of_echo and turn == PASSES - 1:
                 break
-            moved = _round(predicted, spacing, lag, changed)
-            if not moved:
+            if not _round(predicted, spacing, lag, changed):
                 break
         if not fitted:
             motion[0, 0], motion[0, 1], motion[0, 2] = x_mm, y_mm, roll_rad
             field[1, 1], field[1, 2] = 0.0, 0.0
-        matches.fitted[m], matches.settled[m] = fitted, not moved
+        matches.fitted[m] = fitted
         if of_echo:
             for k in range(2):
                 ramp_rad[k] = geometry.wavenumber_per_mm * field[1, 1 + k] * spacing[k]
@@ -418,12 +414,7 @@ def match_pairs(
                 )
                 _fill_corners(rho[p])
         for p in range(patches):
-            value = rho[p, 1, 1]
-            if geometry.interpolate:
-                lateral, axial = (
-                    predicted[p, 0] / spacing[0] - lag[p, 0],
-                    predicted[p, 1] / spacing[1] - lag[p, 1],
-                )
-                value = _read(rho[p], lateral, axial)
-            matches.correlation[m, p] = value
+            lateral = predicted[p, 0] / spacing[0] - lag[p, 0]
+            axial = predicted[p, 1] / spacing[1] - lag[p, 1]
+            matches.correlation[m, p] = _read(rho[p], lateral, axial)
         matches.median[m] = finite_median(matches.correlation[m], room[0])

@@ -28,7 +28,8 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.matching.frames import FrameByFrame, FrameMaker, ImageSink
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, sound_pairs
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
+from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.estimate import (
@@ -132,8 +133,8 @@ class LiveTracker:
         matcher = matcher_for(example, curves, self._config)
         self._patches = len(matcher.patches)
         self.image_grid = matcher.grid
-        self._maker = FrameMaker(example.signal, matcher, self._config.quality)
-        self._matched = FrameByFrame(matcher, self._config.trajectory)
+        self._maker = FrameMaker(example, matcher, self._config.quality)
+        self._matched = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
         self._problem = motion_problem(curves, matcher, 1, self._config)
         self._features: list[FrameFeatures] = []
         self._tables: list[CorrelationTable] = []
@@ -193,9 +194,9 @@ class LiveTracker:
         if self._failure is not None:
             raise self._failure
         number = len(self._tables)
-        made = self._maker.make(number, frame)
+        made = self._maker.make(frame)
         if self.images:
-            self.images(number, made.intensity)
+            self.images(number, made.echo.intensity)
         pairs = self._matched.advance(number, made.ready)
         table = CorrelationTable.of(((i, number, pairs[i]) for i in sorted(pairs)), self._patches)
         with self._lock:
@@ -274,7 +275,8 @@ class LiveTracker:
             return
         every = CorrelationTable.joined(tables[begin + 1 :])
         table = every.where(every.first >= begin, -begin)
-        sound = sound_pairs(table, flags[begin:])
+        bad = (flags[begin:] & ~FrameFlag.UNMATCHED) != 0
+        sound = ~bad[table.first] & ~bad[table.second]
         if not sound.any():
             return
         problem = replace(self._problem, frames=count - begin)

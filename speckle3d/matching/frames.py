@@ -2,142 +2,122 @@
 
 from __future__ import annotations
 
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy.typing as npt
 
 from speckle3d.core.arrays import Float32Array
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
-from speckle3d.core.threads import ahead, counting_seconds
-from speckle3d.matching.inplane import InPlaneMotion
-from speckle3d.matching.matcher import FrameMatcher, ReadyFrame, compose, inverse
+from speckle3d.core.sweep import Sweep, read_frame
+from speckle3d.core.threads import ahead
+from speckle3d.matching.inplane import InPlaneMotion, MatchedPair, compose, inverse
+from speckle3d.matching.matcher import Echo, FrameMatcher, ReadyFrame
 from speckle3d.matching.quality import FrameFeatures, FrameInspector, QualitySettings
-from speckle3d.matching.schedule import PairSchedule, TrajectorySettings
-from speckle3d.matching.table import CorrelationTable, MatchedPair
+from speckle3d.matching.schedule import Schedule
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.matching.texture import FRAMES, Texture, spread_frames
 
 SEARCHED = 3
 """References against which the in-plane motion of a frame is searched, if it resembles none before."""
-AHEAD = 3
-"""Frames made ready before they are asked for."""
-MATCHING = "in-plane motion and correlation"
-"""Name of the stage in `StageTimes`."""
+KEPT_FRAMES = 24
+"""Frames kept ready while chosen pairs are matched: one, and all that it is matched with."""
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order."""
 
 
-@dataclass
-class StageTimes:
-    """Time spent in each stage; reading and intensity overlap with the rest on other cores.
+@dataclass(frozen=True)
+class MatchedSweep:
+    """All that later stages need of a sweep's images.
 
     Attributes
     ----------
-    seconds : dict
-        By stage: what its threads spent from beginning to end, waits included.
-    processor_seconds : dict
-        By stage: what processors spent on it.
+    table : CorrelationTable
+        All pairs, sorted by second frame, then by first.
+    features : sequence of FrameFeatures
+        Of every frame.
+    texture : Texture
+        Of some frames.
     """
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    processor_seconds: dict[str, float] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
-
-    @contextmanager
-    def of(self, stage: str) -> Iterator[None]:
-        """Add the time spent inside to a stage's."""
-        then = time.perf_counter()
-        with counting_seconds() as spent:
-            try:
-                yield
-            finally:
-                took = time.perf_counter() - then
-        with self._lock:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + took
-            self.processor_seconds[stage] = self.processor_seconds.get(stage, 0.0) + sum(spent)
-
-
-@dataclass(frozen=True)
-class MatchedSweep:
-    """All pairs of a sweep, sorted by second frame, then by first, and the features of every frame."""
 
     table: CorrelationTable
     features: Sequence[FrameFeatures]
+    texture: Texture
 
 
 def match_sweep(
     sweep: Sweep,
     matcher: FrameMatcher,
-    trajectory: TrajectorySettings,
+    schedule: Schedule,
     quality: QualitySettings,
-    times: StageTimes,
     progress: Callable[[int, int], None] | None = None,
     images: ImageSink | None = None,
+    textures: int = FRAMES,
 ) -> MatchedSweep:
     """Match every frame of a sweep with the earlier ones that the schedule wants.
 
     Parameters
     ----------
-    times : StageTimes
-        To which the time spent is added.
     progress : callable, optional
         Called with frames done and frames in all.
     images : callable, optional
         Called with every intensity image.
+    textures : int
+        Frames whose texture is measured.
     """
+    maker, matched = FrameMaker(sweep, matcher, quality), FrameByFrame(matcher, schedule)
+    texture, chosen = Texture(sweep.signal, matcher), spread_frames(len(sweep), textures)
     features: list[FrameFeatures] = []
-    maker, matched = (
-        FrameMaker(sweep.signal, matcher, quality, times),
-        FrameByFrame(matcher, trajectory, times),
-    )
 
-    def make(index: int) -> MadeReady:
-        with times.of("reading"):
-            frame = read_frame(sweep.frames, index)
-        return maker.make(index, frame)
+    def make(number: int) -> tuple[int, MadeReady]:
+        made = maker.make(read_frame(sweep.frames, number))
+        if number in chosen:
+            texture.keep(number, made.echo)
+        return number, made
 
     def pairs() -> Iterator[tuple[int, int, MatchedPair]]:
-        for made in ahead(make, range(len(sweep)), AHEAD):
+        for number, made in ahead(make, range(len(sweep))):
             if images:
-                images(made.number, made.intensity)
+                images(number, made.echo.intensity)
             features.append(made.features)
-            found = matched.advance(made.number, made.ready)
-            yield from ((first, made.number, found[first]) for first in sorted(found))
+            matches = matched.advance(number, made.ready)
+            yield from ((first, number, matches[first]) for first in sorted(matches))
             if progress:
-                progress(made.number + 1, len(sweep))
+                progress(number + 1, len(sweep))
 
-    return MatchedSweep(CorrelationTable.of(pairs(), len(matcher.patches)), features)
+    return MatchedSweep(CorrelationTable.of(pairs(), len(matcher.patches)), features, texture)
 
 
 @dataclass(frozen=True)
 class MadeReady:
     """What is made of a frame on the way to matching it."""
 
-    number: int
-    intensity: Float32Array
+    echo: Echo
     ready: ReadyFrame
     features: FrameFeatures
 
 
+class FrameMaker:
+    """Makes frames of one sweep ready to be matched, each by itself and on any thread."""
+
+    def __init__(self, sweep: Sweep, matcher: FrameMatcher, quality: QualitySettings) -> None:
+        self._matcher = matcher
+        self._inspector = FrameInspector(sweep.signal, matcher.patches, quality)
+
+    def make(self, frame: npt.NDArray[Any]) -> MadeReady:
+        """Make one frame ready; `frame` as read, shape (vector, sample)."""
+        echo = self._matcher.echo(frame)
+        features = self._inspector.inspect(frame, echo.intensity)
+        return MadeReady(echo, self._matcher.prepare(echo), features)
+
+
 class FrameByFrame:
-    """Matches frames in order; keeps those that later ones are still to be matched with.
+    """Matches frames in order; keeps those that later ones are still to be matched with."""
 
-    Parameters
-    ----------
-    matcher : FrameMatcher
-    trajectory : TrajectorySettings
-    times : StageTimes, optional
-        To which the time spent is added.
-    """
-
-    def __init__(
-        self, matcher: FrameMatcher, trajectory: TrajectorySettings, times: StageTimes | None = None
-    ) -> None:
-        self._matcher, self._settings, self._times = matcher, trajectory, times or StageTimes()
-        self._schedule = PairSchedule(trajectory)
+    def __init__(self, matcher: FrameMatcher, schedule: Schedule) -> None:
+        self._matcher, self._schedule = matcher, schedule
         self._ready: dict[int, ReadyFrame] = {}
         self._motion: dict[int, InPlaneMotion] = {0: InPlaneMotion()}
 
@@ -149,13 +129,12 @@ class FrameByFrame:
         frame : int
             The number after that of the frame before.
         """
-        with self._times.of(MATCHING):
-            self._ready[frame] = ready
-            pairs = self._pairs(frame)
-            self._schedule.settle(frame, {first: pair.median for first, pair in pairs.items()})
-            keep = self._schedule.needed(frame)
-            self._ready = {k: v for k, v in self._ready.items() if k in keep}
-            self._motion = {k: v for k, v in self._motion.items() if k in keep}
+        self._ready[frame] = ready
+        pairs = self._pairs(frame)
+        self._schedule.settle(frame, {first: pair.median for first, pair in pairs.items()})
+        keep = self._schedule.needed(frame)
+        self._ready = {k: v for k, v in self._ready.items() if k in keep}
+        self._motion = {k: v for k, v in self._motion.items() if k in keep}
         return pairs
 
     def _pairs(self, frame: int) -> dict[int, MatchedPair]:
@@ -163,10 +142,10 @@ class FrameByFrame:
         references = self._schedule.references(frame)
         pairs: dict[int, MatchedPair] = {}
         for anchor in references[:SEARCHED]:
-            found = self._matcher.search(self._ready[anchor], self._ready[frame])
-            self._motion[frame] = compose(self._motion[anchor], found)
+            start = self._matcher.search(self._ready[anchor], self._ready[frame])
+            self._motion[frame] = compose(self._motion[anchor], start)
             pairs = self._match(references, frame)
-            if max(pair.median for pair in pairs.values()) >= self._settings.least_correlation:
+            if max(pair.median for pair in pairs.values()) >= self._schedule.least_correlation:
                 break
         else:
             if references:
@@ -181,29 +160,35 @@ class FrameByFrame:
         for some in filter(None, (references[:split], references[split:])):
             starts = [compose(inverse(self._motion[first]), self._motion[frame]) for first in some]
             fixed = [self._ready[first] for first in some]
-            found = self._matcher.match_with_each(fixed, self._ready[frame], starts)
-            pairs.update({first: MatchedPair.of(match) for first, match in zip(some, found, strict=True)})
-            if some[-1] == before and pairs[before].median >= self._settings.least_correlation:
+            pairs |= zip(some, self._matcher.match_with_each(fixed, self._ready[frame], starts), strict=True)
+            if some[-1] == before and pairs[before].median >= self._schedule.least_correlation:
                 self._motion[frame] = compose(self._motion[before], pairs[before].motion)
         return pairs
 
 
-class FrameMaker:
-    """Makes frames of one sweep ready to be matched, each by itself and on any thread."""
+def match_chosen(sweep: Sweep, matcher: FrameMatcher, pairs: Sequence[tuple[int, int]]) -> CorrelationTable:
+    """Match chosen pairs of a sweep, reading frames anew; in-plane motion is searched for in each pair.
 
-    def __init__(
-        self,
-        signal: RFSettings | BModeSettings,
-        matcher: FrameMatcher,
-        quality: QualitySettings,
-        times: StageTimes | None = None,
-    ) -> None:
-        self._matcher, self._times = matcher, times or StageTimes()
-        self._inspector = FrameInspector(signal, matcher.patches, quality)
+    Fastest where pairs of one second frame follow each other.
+    """
+    kept: dict[int, ReadyFrame] = {}
 
-    def make(self, number: int, frame: npt.NDArray[Any]) -> MadeReady:
-        """Make one frame ready; `frame` as read, shape (vector, sample)."""
-        with self._times.of("intensity"):
-            echo = self._matcher.echo(frame)
-            features = self._inspector.inspect(frame, echo.intensity)
-            return MadeReady(number, echo.intensity, self._matcher.prepare(echo), features)
+    def ready(frame: int) -> ReadyFrame:
+        return matcher.prepare(matcher.echo(read_frame(sweep.frames, frame)))
+
+    def matches() -> Iterator[tuple[int, int, MatchedPair]]:
+        for second, some in groupby(pairs, key=itemgetter(1)):
+            firsts = [first for first, _ in some]
+            wanted = [*firsts, second]
+            missing = sorted(set(wanted) - kept.keys())
+            kept.update(zip(missing, ahead(ready, missing), strict=True))
+            for frame in wanted:  # The last asked for go last.
+                kept[frame] = kept.pop(frame)
+            for frame in list(kept)[: max(0, len(kept) - max(KEPT_FRAMES, len(wanted)))]:
+                del kept[frame]
+            fixed, moving = [kept[first] for first in firsts], kept[second]
+            starts = [matcher.search(other, moving) for other in fixed]
+            found = matcher.match_with_each(fixed, moving, starts)
+            yield from ((first, second, match) for first, match in zip(firsts, found, strict=True))
+
+    return CorrelationTable.of(matches(), len(matcher.patches))

@@ -33,10 +33,6 @@ class InPlaneSettings(BaseModel):
     least_overlap: float = Field(
         0.6, gt=0, le=1, description="Share of a patch that must still lie in the other image."
     )
-    interpolate: bool = Field(
-        True, description="Read correlations between samples; false: at the nearest, for comparison."
-    )
-    passes: int = Field(2, ge=1, le=5, description="How often lags are centred anew on the fitted motion.")
 
 
 @dataclass(frozen=True)
@@ -58,8 +54,26 @@ class InPlaneMotion:
     covariance: FloatArray | None = None
 
 
+def compose(first: InPlaneMotion, then: InPlaneMotion) -> InPlaneMotion:
+    """In-plane motion over two steps, as a start for matching across both."""
+    c, s = np.cos(first.roll_rad), np.sin(first.roll_rad)
+    return InPlaneMotion(
+        first.x_mm + c * then.x_mm - s * then.y_mm,
+        first.y_mm + s * then.x_mm + c * then.y_mm,
+        first.roll_rad + then.roll_rad,
+    )
+
+
+def inverse(motion: InPlaneMotion) -> InPlaneMotion:
+    """In-plane motion the other way round."""
+    c, s = np.cos(motion.roll_rad), np.sin(motion.roll_rad)
+    return InPlaneMotion(
+        -c * motion.x_mm - s * motion.y_mm, s * motion.x_mm - c * motion.y_mm, -motion.roll_rad
+    )
+
+
 @dataclass(frozen=True)
-class PatchMatch:
+class MatchedPair:
     """What two frames' patches have in common once in-plane motion is taken out.
 
     Attributes
@@ -67,20 +81,14 @@ class PatchMatch:
     correlation : ndarray, shape (p,)
         Of intensity, or the squared magnitude of the complex echo's, at the frame's in-plane shift; NaN where
         a patch left the image or is flat.
-    shift_mm : ndarray, shape (p, 2)
-        Each patch's own shift, lateral and axial; NaN where it has no peak.
-    motion : InPlaneMotion
     median : float
         Of the correlations; zero if there is none.
-    settled : bool
-        Whether looking again about the motion found would change nothing.
+    motion : InPlaneMotion
     """
 
     correlation: FloatArray
-    shift_mm: FloatArray
-    motion: InPlaneMotion
     median: float
-    settled: bool
+    motion: InPlaneMotion
 
 
 class CoarseMatcher:
@@ -122,22 +130,6 @@ class CoarseMatcher:
         return np.array([peak[0] - rows, (peak[1] - columns) * self._pool], dtype=np.int64)
 
 
-def match_patches(
-    fixed: Float32Array,
-    moving: Float32Array,
-    patches: PatchGrid,
-    start: InPlaneMotion,
-    centre_mm: FloatArray,
-    settings: InPlaneSettings | None = None,
-    echoes: tuple[Float32Array, Float32Array] | None = None,
-    wavenumber_per_mm: float = 0.0,
-) -> PatchMatch:
-    """Find the in-plane motion between two frames and the correlation left at it; see `match_with_each`."""
-    each = echoes and ([echoes[0]], echoes[1])
-    found = match_with_each([fixed], moving, patches, [start], centre_mm, settings, each, wavenumber_per_mm)
-    return found[0]
-
-
 def match_with_each(
     fixed: Sequence[Float32Array],
     moving: Float32Array,
@@ -147,7 +139,7 @@ def match_with_each(
     settings: InPlaneSettings | None = None,
     echoes: tuple[Sequence[Float32Array], Float32Array] | None = None,
     wavenumber_per_mm: float = 0.0,
-) -> list[PatchMatch]:
+) -> list[MatchedPair]:
     """Find the in-plane motion of a frame against each of some others, and the correlations left at it.
 
     Parameters
@@ -183,17 +175,13 @@ def match_with_each(
         patches.centre_mm - centre_mm[:2],
         patches.spacing_mm,
         s.least_overlap,
-        s.passes,
-        s.interpolate,
         echoes is not None,
         float(wavenumber_per_mm),
     )
     matches = Matches(
         np.empty((count, size)),
-        np.empty((count, size, 2)),
         np.empty((count, 4, 3)),
         np.empty(count),
-        np.empty(count, dtype=np.bool_),
         np.empty(count, dtype=np.bool_),
     )
     matches.motion[:, 0] = [(start.x_mm, start.y_mm, start.roll_rad) for start in starts]
@@ -214,13 +202,8 @@ def _filled(frames: Sequence[Float32Array]) -> tuple[Float32Array, ...]:
     return (*frames, *[frames[-1]] * (REFERENCES - len(frames)))
 
 
-def _match(matches: Matches, row: int) -> PatchMatch:
+def _match(matches: Matches, row: int) -> MatchedPair:
     x, y, roll = matches.motion[row, 0].tolist()
     covariance = matches.motion[row, 1:] if matches.fitted[row] else None
-    return PatchMatch(
-        matches.correlation[row],
-        matches.shift_mm[row],
-        InPlaneMotion(x, y, roll, covariance),
-        float(matches.median[row]),
-        bool(matches.settled[row]),
-    )
+    motion = InPlaneMotion(x, y, roll, covariance)
+    return MatchedPair(matches.correlation[row], float(matches.median[row]), motion)

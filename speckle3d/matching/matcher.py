@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -17,7 +16,7 @@ from speckle3d.matching.inplane import (
     CoarseMatcher,
     InPlaneMotion,
     InPlaneSettings,
-    PatchMatch,
+    MatchedPair,
     match_with_each,
 )
 from speckle3d.matching.intensity import (
@@ -131,13 +130,13 @@ class FrameMatcher:
         shift = self._coarse.shift(fixed.spectrum, moving.spectrum) * self.patches.spacing_mm
         return InPlaneMotion(float(-shift[0]), float(-shift[1]))
 
-    def match(self, fixed: ReadyFrame, moving: ReadyFrame, start: InPlaneMotion) -> PatchMatch:
+    def match(self, fixed: ReadyFrame, moving: ReadyFrame, start: InPlaneMotion) -> MatchedPair:
         """In-plane motion and correlation of one pair, from a start that is right to about a sample."""
         return self.match_with_each([fixed], moving, [start])[0]
 
     def match_with_each(
         self, fixed: Sequence[ReadyFrame], moving: ReadyFrame, starts: Sequence[InPlaneMotion]
-    ) -> list[PatchMatch]:
+    ) -> list[MatchedPair]:
         """In-plane motion and correlation of a frame's pairs with some others, from a start for each."""
         theirs = [frame.echo for frame in fixed if frame.echo is not None]
         return match_with_each(
@@ -150,21 +149,3 @@ class FrameMatcher:
             None if moving.echo is None else (theirs, moving.echo),
             self._wavenumber,
         )
-
-
-def compose(first: InPlaneMotion, then: InPlaneMotion) -> InPlaneMotion:
-    """In-plane motion over two steps, as a start for matching across both."""
-    c, s = np.cos(first.roll_rad), np.sin(first.roll_rad)
-    return InPlaneMotion(
-        first.x_mm + c * then.x_mm - s * then.y_mm,
-        first.y_mm + s * then.x_mm + c * then.y_mm,
-        first.roll_rad + then.roll_rad,
-    )
-
-
-def inverse(motion: InPlaneMotion) -> InPlaneMotion:
-    """In-plane motion the other way round."""
-    c, s = np.cos(motion.roll_rad), np.sin(motion.roll_rad)
-    return InPlaneMotion(
-        -c * motion.x_mm - s * motion.y_mm, s * motion.x_mm - c * motion.y_mm, -motion.roll_rad
-    )

@@ -29,7 +29,6 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.kernels.quality import patch_statistics
 from speckle3d.matching.patches import PatchGrid
-from speckle3d.matching.table import CorrelationTable
 
 try:  # Ten times as fast.
     from isal.isal_zlib import crc32
@@ -339,9 +338,3 @@ def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool
 def _decibel(power: npt.ArrayLike) -> FloatArray:
     """Finite whatever comes in: nothing, and what is not a number, is far below everything."""
     return np.asarray(10 * np.log10(np.fmin(np.fmax(power, 1e-38), 1e38)), dtype=float)
-
-
-def sound_pairs(table: CorrelationTable, flags: IntArray) -> BoolArray:
-    """Pairs of frames that are to be trusted, shape (e,)."""
-    bad = (flags & ~FrameFlag.UNMATCHED) != 0
-    return np.asarray(~bad[table.first] & ~bad[table.second])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Protocol
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from speckle3d.core.arrays import IntArray
 
 
 class TrajectorySettings(BaseModel):
@@ -44,11 +46,49 @@ class TrajectorySettings(BaseModel):
         description="Travel between the frames of a sweep that comes back at which they are matched with "
         "those of its way there; 0: never.",
     )
-    join: Literal["graph", "chain"] = Field(
-        "graph",
-        description="graph: least squares over all pairs. chain: each frame by the one earlier frame that "
-        "tells its distance best, for comparison.",
-    )
+
+
+class Schedule(Protocol):
+    """Chooses the earlier frames that each frame is measured against."""
+
+    least_correlation: float
+    """Median correlation from which the in-plane motion to a frame is believed."""
+
+    def references(self, frame: int) -> list[int]:
+        """Earlier frames to measure `frame` against, the one tried first in front."""
+
+    def settle(self, frame: int, correlations: dict[int, float]) -> None:
+        """Take note of the median correlations of `frame` with its references."""
+
+    def needed(self, frame: int) -> set[int]:
+        """Frames up to `frame` that later ones may be measured against."""
+
+
+class KnownSchedule:
+    """Chosen pairs of a sweep, and each frame with the one before it, from which in-plane motion is followed.
+
+    Parameters
+    ----------
+    pairs : ndarray, shape (m, 2)
+        First and second frame of each.
+    """
+
+    least_correlation = 0.0
+
+    def __init__(self, pairs: IntArray) -> None:
+        self._pairs = pairs
+
+    def references(self, frame: int) -> list[int]:
+        """Return the frame before and the first frames of the pairs."""
+        firsts = set(self._pairs[self._pairs[:, 1] == frame, 0].tolist()) - {frame - 1}
+        return [frame - 1, *sorted(firsts)] if frame else []
+
+    def settle(self, frame: int, correlations: dict[int, float]) -> None:
+        """Do nothing: the pairs are known."""
+
+    def needed(self, frame: int) -> set[int]:
+        """Return this frame and the first frames of later pairs."""
+        return {frame, *self._pairs[self._pairs[:, 1] > frame, 0].tolist()}
 
 
 class PairSchedule:
@@ -60,6 +100,7 @@ class PairSchedule:
 
     def __init__(self, settings: TrajectorySettings | None = None) -> None:
         self.settings = settings or TrajectorySettings()
+        self.least_correlation = self.settings.least_correlation
         self._keys: list[int] = []
         self._sound: list[int] = []
 

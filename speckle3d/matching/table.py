@@ -9,29 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
-
-
-@dataclass(frozen=True)
-class MatchedPair:
-    """What a frame has in common with an earlier one.
-
-    Attributes
-    ----------
-    correlation : ndarray, shape (p,)
-        Of each patch; see `PatchMatch`.
-    median : float
-        Over the patches that have a correlation; zero if none has.
-    """
-
-    correlation: FloatArray
-    median: float
-    motion: InPlaneMotion
-
-    @classmethod
-    def of(cls, match: PatchMatch) -> MatchedPair:
-        """Keep what later stages need."""
-        return cls(match.correlation, match.median, match.motion)
+from speckle3d.matching.inplane import InPlaneMotion, MatchedPair
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Speckle's size by depth and the echo's spectrum, from some frames: marks of a probe and its settings.
+"""Speckle's size and the echo's spectrum by depth, from some frames: marks of a probe and its settings.
 
 The size of speckle along the vectors is the pulse's, across them the aperture's over depth; neither depends
 on what is scanned as long as it scatters as a phantom does; patches whose contrast denies that do not count.
@@ -6,18 +6,23 @@ on what is scanned as long as it scatters as a phantom does; patches whose contr
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
-from speckle3d.core.curves import SpeckleSize
+import numpy as np
+from scipy import fft
+
+from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.curves import EchoSpectra, SpeckleSize
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.matching.frames import ImageSink
-from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
+from speckle3d.matching.matcher import Echo, FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 
-FRAMES = 12
-"""Frames looked at, evenly spread over the sweep."""
+FRAMES = 16
+"""Frames looked at, evenly spread over the sweep: one in each 0.5 mm of 8 mm; nearer ones see the same
+speckle."""
+PHANTOM_FRAMES = 48
+"""The same of a phantom's sweep, whose texture serves many others."""
 CONTRAST = (0.75, 1.15)
 """Standard deviation over mean of intensity in patches that count: 1 for speckle, scattered by its 50 to 90
 cells. Coherent structure is above; its patches look coarser than speckle."""
@@ -26,56 +31,78 @@ LEAST_PATCHES = 8
 NOISE_QUANTILE = 0.2
 
 
-class SpeckleSizes:
-    """Speckle's sizes in the frames that are looked at if none is left out, kept as the sweep is matched.
+class Texture:
+    """Speckle's size and the echo's spectrum in the patches of some frames.
 
     Parameters
     ----------
-    then : callable, optional
-        To which every image is passed on.
+    signal : RFSettings or BModeSettings
+    matcher : FrameMatcher
     """
 
-    def __init__(self, sweep: Sweep, matcher: FrameMatcher, then: ImageSink | None = None) -> None:
-        self._wanted, self._patches, self._then = (
-            spread_frames(np.arange(len(sweep)), FRAMES),
-            matcher.patches,
-            then,
-        )
-        self.by_frame: dict[int, FloatArray] = {}
+    def __init__(self, signal: RFSettings | BModeSettings, matcher: FrameMatcher) -> None:
+        self._signal, self._patches = signal, matcher.patches
+        self._edge_fraction = matcher.key.edge_fraction
+        self._sizes: dict[int, FloatArray] = {}
+        self._powers: dict[int, FloatArray] = {}
 
-    def keep(self, frame: int, intensity: Float32Array) -> None:
-        """Take the intensity image of one frame."""
-        if frame in self._wanted:
-            self.by_frame[frame] = _sizes(intensity, self._patches)
-        if self._then:
-            self._then(frame, intensity)
+    def keep(self, frame: int, echo: Echo) -> None:
+        """Measure the echo of one frame, on any thread."""
+        self._sizes[frame] = _sizes(echo.intensity, self._patches)
+        if echo.analytic is not None:
+            self._powers[frame] = _patch_powers(echo.analytic, self._patches)
+
+    def speckle_size(self, usable: BoolArray | None = None) -> SpeckleSize:
+        """Lateral and axial size of speckle in each row of patches.
+
+        Parameters
+        ----------
+        usable : ndarray of bool, shape (n,), optional
+            Frames that count, if any of those that were looked at do.
+
+        Returns
+        -------
+        SpeckleSize
+            Of shape (r,); NaN where too few patches hold fully developed speckle.
+        """
+        sizes = self._patches.rows_of(np.stack(_some(self._sizes, usable)))
+        lateral, axial = sizes.transpose(1, 2, 0, 3).reshape(*sizes.shape[1:3], -1)
+        return SpeckleSize(_medians(lateral), _medians(axial))
+
+    def spectra(self, usable: BoolArray | None = None) -> EchoSpectra | None:
+        """Power spectrum within the band that is matched, at each row of patches; None without phase.
+
+        RF and I/Q of one sweep have the same: both are band-passed and resampled alike before they are
+        matched. Every patch counts the same, however bright.
+        """
+        if not self._powers or not isinstance(self._signal, RFSettings):
+            return None
+        power = self._patches.rows_of(np.mean(_some(self._powers, usable), axis=0).T).mean(axis=-1).T
+        rate_hz = 1e3 * self._signal.speed_of_sound_m_s / (2.0 * self._patches.spacing_mm[1])
+        low, high = self._signal.bandwidth_hz
+        # The band's centre was shifted to zero.
+        frequency = fft.fftfreq(power.shape[1], 1.0 / rate_hz) + (low + high) / 2.0
+        edge = self._edge_fraction * (high - low)
+        rising = np.argsort(frequency)
+        kept = rising[(frequency[rising] > low - edge) & (frequency[rising] < high + edge)]
+        return EchoSpectra(self._patches.row_depth_mm, frequency[kept], power[:, kept])
 
 
-def speckle_size(
-    sweep: Sweep, matcher: FrameMatcher, among: IntArray | None = None, known: SpeckleSizes | None = None
-) -> SpeckleSize:
-    """Measure lateral and axial speckle size in each row of the patches that are matched.
+def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
+    """Read some frames of a sweep, and measure their texture."""
+    texture = Texture(sweep.signal, matcher)
+    for frame in spread_frames(len(sweep), FRAMES):
+        texture.keep(frame, matcher.echo(read_frame(sweep.frames, frame)))
+    return texture
 
-    Parameters
-    ----------
-    among : ndarray of int, optional
-        Frames to choose from; by default all.
-    known : SpeckleSizes, optional
-        Of frames that need not be read anew.
 
-    Returns
-    -------
-    SpeckleSize
-        Of shape (r,); NaN where too few patches hold fully developed speckle.
-    """
-    frames = spread_frames(np.arange(len(sweep)) if among is None else among, FRAMES)
-    found = dict(known.by_frame) if known else {}
-    for k in frames:
-        if k not in found:
-            found[k] = _sizes(matcher.echo(sweep.frames[k]).intensity, matcher.patches)
-    sizes = matcher.patches.rows_of(np.stack([found[k] for k in frames]))
-    lateral, axial = sizes.transpose(1, 2, 0, 3).reshape(*sizes.shape[1:3], -1)
-    return SpeckleSize(_medians(lateral), _medians(axial))
+def mean_spectra(spectra: Sequence[EchoSpectra]) -> EchoSpectra | None:
+    """Mean of some sweeps' spectra at the depths of the first; None of none."""
+    if not spectra:
+        return None
+    first = spectra[0]
+    power = np.mean([each.at(first.depth_mm, first.frequency_hz) for each in spectra], axis=0)
+    return EchoSpectra(first.depth_mm, first.frequency_hz, power)
 
 
 def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[FloatArray, FloatArray]:
@@ -111,7 +138,7 @@ def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[
     frequency_hz, bins = spectrum_bins(signal, count)
     window = np.hanning(count).astype(np.float32)
     power = np.zeros((depth_mm.size, bins.size))
-    for k in spread_frames(np.arange(len(sweep)), FRAMES):
+    for k in spread_frames(len(sweep), FRAMES):
         frame = sweep.frames[k]
         for row, start in enumerate(first):
             spectrum = np.fft.fft(frame[:, start : start + count] * window, axis=1)[:, bins]
@@ -124,10 +151,25 @@ def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[
     return frequency_hz, np.maximum(power - noise, 1e-12 * power.max())
 
 
-def spread_frames(frames: IntArray, count: int) -> list[int]:
-    """Choose at most so many of some frames, evenly spread."""
-    at = np.unique(np.linspace(0, frames.size - 1, count).round().astype(int))
-    return [int(k) for k in frames[at]]
+def spread_frames(frames: int, count: int) -> list[int]:
+    """Choose at most so many of a sweep's frames, evenly spread."""
+    return [int(k) for k in np.unique(np.linspace(0, frames - 1, count).round())]
+
+
+def _some(by_frame: dict[int, FloatArray], usable: BoolArray | None) -> list[FloatArray]:
+    """Return the usable frames' values in order, or all if none is usable."""
+    frames = sorted(by_frame)
+    sound = [k for k in frames if usable is None or usable[k]]
+    return [by_frame[k] for k in sound or frames]
+
+
+def _patch_powers(echo: Complex64Array, patches: PatchGrid) -> FloatArray:
+    """Power spectrum of each patch, of unit sum, shape (p, f)."""
+    wide, high = patches.size
+    tiles = np.stack([echo[v : v + wide, s : s + high] for v, s in patches.first])
+    spectrum = fft.fft(tiles * np.hanning(high).astype(np.float32), axis=-1)
+    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1, dtype=float)
+    return np.asarray(power / np.maximum(power.sum(axis=1, keepdims=True), 1e-30))
 
 
 def _medians(rows: FloatArray) -> FloatArray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,8 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.relative import MIRROR, RelativePoses
+from speckle3d.core.relative import RelativePoses
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
@@ -45,8 +43,6 @@ LENS_ROUNDS = 4
 """Fits of a data sheet's lens: a path read with a wrong lens bends the rows otherwise than the right one."""
 ENOUGH_PAIRS = 3
 """Pairs to earlier frames from which a frame needs none that tells less."""
-PAIRS_AT_ONCE = 1024
-"""Pairs whose distances are held at once."""
 
 
 @dataclass(frozen=True)
@@ -295,34 +291,6 @@ def path_of(
 def elevation_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     """Elevational position of the image's centre, mm, and slopes along x and y, shape (n, 3)."""
     return np.column_stack([poses.apply(centre_mm)[:, 2], poses.rotation.as_matrix()[:, 2, :2]])
-
-
-def frame_pairs(
-    motion: Motion,
-    table: CorrelationTable,
-    edges: RelativePoses,
-    used: BoolArray,
-    direction: int,
-    scale_sigma: float,
-) -> Iterator[FramePairs]:
-    """Yield the pairs for the reconstruction file, some at a time; deviations include that of the scale."""
-    problem, pairs = motion.problem, motion.pairs
-    centre = RigidTransform.from_translation(problem.centre_mm)
-    flip, turn = np.diag([1.0, 1.0, direction, 1.0]), MIRROR if direction < 0 else np.eye(6)
-    for start in range(0, max(len(pairs), 1), PAIRS_AT_ONCE):
-        some = slice(start, start + PAIRS_AT_ONCE)
-        d = problem.fitter.distances(table.correlation[pairs.row[some]], motion.coherence, pairs.first[some])
-        d = d.scaled(motion.scale)
-        yield FramePairs(
-            first=edges.first[some],
-            second=edges.second[some],
-            first_from_second=flip @ (centre * edges.poses[some] * centre.inv()).as_matrix() @ flip,
-            covariance=turn @ edges.covariance[some] @ turn,
-            distance_mm=d.distance_mm.astype(np.float32),
-            sigma_mm=np.hypot(d.sigma_mm, scale_sigma * d.distance_mm).astype(np.float32),
-            used=used[some],
-            patch_centre_mm=problem.patches.centre_mm,
-        )
 
 
 def alike_pairs(problem: MotionProblem, table: CorrelationTable) -> IntArray:

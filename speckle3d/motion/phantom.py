@@ -12,8 +12,9 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.curves import SpeckleSize
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Sweep
-from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
+from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.patches import PatchGrid
+from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.decorrelation import CurveSettings, PhantomSamples
 
 
@@ -65,22 +66,26 @@ def phantom_pairs(sweep: Sweep, settings: CurveSettings | None = None) -> IntArr
 
 
 def phantom_samples(
-    sweep: Sweep, patches: PatchGrid, matches: Iterable[tuple[int, int, PatchMatch]]
+    sweep: Sweep, patches: PatchGrid, table: CorrelationTable, pairs: IntArray
 ) -> PhantomSamples:
     """Set the correlations of matched phantom frames beside their known distances.
 
     Parameters
     ----------
-    matches : iterable of (first frame, second frame, match)
+    table : CorrelationTable
+    pairs : ndarray, shape (m, 2)
+        Those of the table that count.
     """
     poses, _ = known_positions(sweep)
     depth = patches.centre_mm[:, 1]
-    rows = []
-    for first, second, match in matches:
-        offset, tilt = _patch_offsets(poses[first].inv() * poses[second], patches, match.motion)
-        rows.append(np.column_stack([depth, offset, np.full(depth.size, tilt), match.correlation]))
-    table = np.concatenate(rows)
-    return PhantomSamples(table[:, 0], table[:, 1], table[:, 2], table[:, 3], len(rows))
+    rows, wanted = [], set(map(tuple, pairs.tolist()))
+    for row, (first, second) in enumerate(zip(table.first.tolist(), table.second.tolist(), strict=True)):
+        if (first, second) in wanted:
+            offset, tilt = _patch_offsets(poses[first].inv() * poses[second], patches, table.motion[row])
+            tilts = np.full(depth.size, tilt)
+            rows.append(np.column_stack([depth, offset, tilts, table.correlation[row].astype(float)]))
+    depths, offset, tilt, correlation = np.concatenate(rows).T
+    return PhantomSamples(depths, offset, tilt, correlation, len(rows))
 
 
 def _separations(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:

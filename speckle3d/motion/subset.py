@@ -12,8 +12,8 @@ from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.planes import agreeing_patches
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.distances import PatchDistances
-from speckle3d.motion.estimate import PAIRS_AT_ONCE, Motion
-from speckle3d.motion.planes import GRAIN, PairPlanes
+from speckle3d.motion.estimate import Motion
+from speckle3d.motion.planes import GRAIN, PAIRS_AT_ONCE, PairPlanes
 
 
 def consistent_planes(

@@ -127,9 +127,8 @@ def solve_trajectory(
     lone = np.flatnonzero(unjoined(pairs.second, frames))
     after = lone[lone + 1 < frames]
     pairs = joined(pairs, held(np.concatenate([lone - 1, after]), np.concatenate([lone, after + 1])))
-    graph, poses = _graph(pairs, frames), _chain(pairs, frames, s.join == "chain")
-    if s.join == "graph":
-        relax(graph, poses, s.huber, ROUNDS, SETTLED)
+    graph, poses = _graph(pairs, frames), _chain(pairs, frames)
+    relax(graph, poses, s.huber, ROUNDS, SETTLED)
     covariance = _marginals(graph, poses, s.huber) if with_covariance else np.zeros((frames, 6, 6))
     centre = RigidTransform.from_translation(centre_mm)
     return Trajectory(centre * RigidTransform.from_matrix(poses) * centre.inv(), covariance)
@@ -143,13 +142,10 @@ def unjoined(second: IntArray, frames: int) -> BoolArray:
     return lone
 
 
-def _chain(pairs: RelativePoses, frames: int, relative: bool) -> FloatArray:
-    """Each frame from the pair whose distance is most certain, absolutely or relative to its size."""
-    doubt = pairs.covariance[:, 2, 2]
-    if relative:
-        doubt = doubt / np.maximum(pairs.poses.translation[:, 2] ** 2, 1e-6)
+def _chain(pairs: RelativePoses, frames: int) -> FloatArray:
+    """Each frame from the pair whose distance is most certain."""
     best = np.zeros(frames, dtype=np.int64)
-    backwards = np.lexsort((doubt, pairs.second))[::-1]
+    backwards = np.lexsort((pairs.covariance[:, 2, 2], pairs.second))[::-1]
     best[pairs.second[backwards]] = backwards  # the last that is written stays
     first, step = pairs.first[best].tolist(), pairs.poses.as_matrix()[best]
     matrices = np.tile(np.eye(4), (frames, 1, 1))

@@ -71,7 +71,6 @@ def details_of(
         "direction": tracked.direction,
         "direction_from": tracked.direction_from,
         "coherence": _coherence_details(tracked),
-        "seconds_by_stage": tracked.times.seconds,
         "corrections": {mode: _correction_details(c) for mode, c in corrections.items()},
     }
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core import threads
-from speckle3d.core.threads import ahead, cores, counting_seconds, in_parallel, on_one_thread
+from speckle3d.core.threads import ahead, cores, in_parallel, on_one_thread
 
 
 @pytest.fixture(autouse=True)
@@ -92,18 +92,6 @@ def test_work_ahead_stops_where_no_more_is_asked_for():
     next(results)
     results.close()
     assert len(made) <= 4
-
-
-def test_seconds_of_helping_threads_count():
-    def busy(first, stop):
-        for _ in range(first, stop):
-            np.sort(np.random.default_rng(0).random(100_000))
-
-    with counting_seconds() as alone:
-        busy(0, 8)
-    with counting_seconds() as shared:
-        in_parallel(busy, 8)
-    assert sum(shared) > 0.5 * sum(alone)
 
 
 def test_ctrl_c_is_not_kept_for_later():

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
-from speckle3d.matching.inplane import InPlaneMotion, InPlaneSettings
+from speckle3d.matching.inplane import InPlaneMotion, InPlaneSettings, compose, inverse
 from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher, MatchingSettings, compose, inverse
+from speckle3d.matching.matcher import FrameMatcher, MatchingSettings
 from speckle3d.matching.patches import PatchSettings
 
 motions = st.builds(InPlaneMotion, st.floats(-20, 20), st.floats(-20, 20), st.floats(-np.pi / 2, np.pi / 2))

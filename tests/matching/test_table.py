@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from speckle3d.matching.inplane import InPlaneMotion, PatchMatch
-from speckle3d.matching.table import CorrelationTable, MatchedPair
+from speckle3d.matching.inplane import InPlaneMotion, MatchedPair
+from speckle3d.matching.table import CorrelationTable
 
 
 def pair(*correlation, x_mm=0.0, y_mm=0.0):
     rho, known = np.array(correlation), [value for value in correlation if np.isfinite(value)]
     median = float(np.median(known)) if known else 0.0
-    return MatchedPair.of(PatchMatch(rho, np.zeros((rho.size, 2)), InPlaneMotion(x_mm, y_mm), median, True))
+    return MatchedPair(rho, median, InPlaneMotion(x_mm, y_mm))
 
 
 def table(*rows):

@@ -12,7 +12,7 @@ from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchSettings
-from speckle3d.matching.texture import speckle_size
+from speckle3d.matching.texture import measured_texture
 
 GREY = BModeSettings(dynamic_range_db=100.0, full_scale=65535.0)
 """Fine enough to hold intensities as they are."""
@@ -37,7 +37,7 @@ def seen():
 
 def test_speckle_has_the_size_it_was_made_with(seen):
     sweep = grey_sweep(seen)
-    size = speckle_size(sweep, matcher_of(sweep))
+    size = measured_texture(sweep, matcher_of(sweep)).speckle_size()
     # Some 16 patches a row; taking each one's own mean away makes speckle 6 % finer, in a phantom as here.
     np.testing.assert_allclose(size.lateral_mm, speckle.LATERAL_MM, rtol=0.13)
     np.testing.assert_allclose(size.axial_mm, speckle.AXIAL_MM, rtol=0.13)
@@ -49,7 +49,7 @@ def test_rows_without_speckle_have_no_size(seen):
     frames[:, 5::12, 250:] *= 100.0
     sweep = grey_sweep(frames)
     matcher = matcher_of(sweep)
-    size, depth = speckle_size(sweep, matcher), matcher.patches.row_depth_mm
+    size, depth = measured_texture(sweep, matcher).speckle_size(), matcher.patches.row_depth_mm
     assert np.isnan(size.lateral_mm[depth < 5.0]).all()
     assert np.isnan(size.axial_mm[depth > 18.0]).all()
     assert np.isfinite(size.lateral_mm[(depth > 8.0) & (depth < 14.0)]).all()

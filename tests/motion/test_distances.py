@@ -7,7 +7,7 @@ import speckle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from speckle3d.matching.inplane import InPlaneMotion, match_patches
+from speckle3d.matching.inplane import InPlaneMotion, match_with_each
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.distances import (
     INTERPOLATION,
@@ -171,10 +171,16 @@ def read(u, kind):
         echoes = (
             tuple(np.stack([z.real, z.imag]).astype(np.float32) for z in both) if kind == "echo" else None
         )
-        images = (speckle.intensity(z) for z in both)
-        match = match_patches(
-            *images, PATCHES, InPlaneMotion(), speckle.GRID.centre_mm, echoes=echoes, wavenumber_per_mm=57.0
-        )
+        images = [speckle.intensity(z) for z in both]
+        match = match_with_each(
+            images[:1],
+            images[1],
+            PATCHES,
+            [InPlaneMotion()],
+            speckle.GRID.centre_mm,
+            echoes=echoes and ([echoes[0]], echoes[1]),
+            wavenumber_per_mm=57.0,
+        )[0]
         found.append(estimator.distances(match.correlation).distance_mm)
     return np.array(found)
 

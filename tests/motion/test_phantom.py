@@ -10,11 +10,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
-from speckle3d.matching.chosen import match_in_order
+from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchSettings
+from speckle3d.matching.quality import QualitySettings
+from speckle3d.matching.schedule import KnownSchedule
 from speckle3d.motion.decorrelation import CurveSettings, fit_curves
 from speckle3d.motion.phantom import known_positions, phantom_pairs, phantom_samples
 
@@ -47,8 +49,9 @@ def matcher_of(sweep):
 
 def samples_of(sweep, settings, progress=None):
     matcher = matcher_of(sweep)
-    matches = match_in_order(sweep, matcher, phantom_pairs(sweep, settings), progress)
-    return phantom_samples(sweep, matcher.patches, matches)
+    pairs = phantom_pairs(sweep, settings)
+    matches = match_sweep(sweep, matcher, KnownSchedule(pairs), QualitySettings(), progress)
+    return phantom_samples(sweep, matcher.patches, matches.table, pairs)
 
 
 def test_the_curve_comes_back(phantom):

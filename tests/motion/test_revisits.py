@@ -7,7 +7,7 @@ import pytest
 
 from speckle3d import pipeline
 from speckle3d.config import Config
-from speckle3d.matching.chosen import match_again
+from speckle3d.matching.frames import match_chosen
 from speckle3d.motion.estimate import Motion
 from speckle3d.motion.revisits import (
     AWAY_MM,
@@ -69,7 +69,7 @@ def ties_of(sweep, curves, position):
     problem = pipeline.motion_problem(curves, matcher, len(sweep), s)
     path = np.column_stack([position, np.zeros((len(position), 2))])
     returns = find_returns(position, s.trajectory.revisit_mm)
-    table = match_again(sweep, matcher, [pair for each in returns for pair in each.pairs()])
+    table = match_chosen(sweep, matcher, [pair for each in returns for pair in each.pairs()])
     return tie_returns(returns, Motion(problem, None, None, None, path), table), table
 
 
@@ -105,9 +105,9 @@ def test_revisits_draw_together_ways_that_drifted_apart(sweep, curves):
 
 def test_one_way_no_frame_is_matched_again(sweep, curves, monkeypatch):
     chosen = []
-    plain = pipeline.match_again
+    plain = pipeline.match_chosen
     monkeypatch.setattr(
-        pipeline, "match_again", lambda s, m, pairs: chosen.extend(pairs) or plain(s, m, chosen)
+        pipeline, "match_chosen", lambda s, m, pairs: chosen.extend(pairs) or plain(s, m, chosen)
     )
     frames = np.arange(48)
     # Six millimetres, twice what a return takes at least.

@@ -162,26 +162,6 @@ def test_without_noise_poses_are_exact():
     assert np.abs(elevation(found) - elevation(truth)).max() < 0.02
 
 
-@pytest.mark.parametrize("heavy", [False, True], ids=["normal", "heavy tails"])
-def test_the_graph_jitters_less_than_the_chain(heavy):
-    """Steps between frames, from pairs whose errors are not those their covariance has it."""
-    z = uneven(120, 12.0)
-    truth, rms = about_centre(hand(z)), {}
-    rng = np.random.default_rng(11)
-    pairs = follow(hand(z), relative_noise=0.0, noise_mm=1e-9)
-    size = 0.02 + 0.06 * np.abs(pairs.poses.translation[:, 2])
-    draws = rng.standard_t(3, len(pairs)) / np.sqrt(3) if heavy else rng.normal(size=len(pairs))
-    error = np.column_stack([np.zeros((len(pairs), 2)), size * draws])
-    noisy = replace(pairs, poses=RigidTransform.from_translation(error) * pairs.poses)
-    for join in ("graph", "chain"):
-        found = elevation(solved(noisy, len(z), settings=TrajectorySettings(join=join)))
-        rms[join] = np.std(np.diff(found) - np.diff(elevation(truth)))
-    # A chained step is the difference of two pairs' errors; six to ten pairs share one in the graph.
-    assert rms["graph"] < 0.6 * rms["chain"]
-    # And the chain is as noisy as what it was given: long pairs, whose key frames are chained themselves.
-    assert 0.5 * size.mean() < rms["chain"] < 5 * size.mean()
-
-
 # ---- one pair ----------------------------------------------------------------------------------------------
 
 
@@ -307,11 +287,8 @@ def test_pairs_that_agree_are_met_exactly_wherever_the_centre_is():
     pairs = RelativePoses(first, second, local[first].inv() * local[second], exact)
     for centre in (np.zeros(3), CENTRE_MM):
         shift = RigidTransform.from_translation(centre)
-        for join in ("graph", "chain"):
-            found = solved(pairs, 6, centre, TrajectorySettings(join=join))
-            np.testing.assert_allclose(
-                found.as_matrix(), (shift * local * shift.inv()).as_matrix(), atol=1e-8
-            )
+        found = solved(pairs, 6, centre, TrajectorySettings())
+        np.testing.assert_allclose(found.as_matrix(), (shift * local * shift.inv()).as_matrix(), atol=1e-8)
 
 
 @pytest.mark.parametrize("axis", range(6), ids=["x", "y", "z", "tilt", "yaw", "roll"])
@@ -342,16 +319,6 @@ def test_one_false_pair_among_many_is_overruled():
         for p, h in ((pairs, 2.0), (replace(pairs, poses=false), 2.0), (replace(pairs, poses=false), 1e6))
     )
     assert abs(robust - clean) < 0.25 * abs(plain - clean)
-
-
-def test_the_chain_takes_the_pair_whose_distance_is_surest_for_its_size():
-    near, far = pose_of(0, 0, 0.1, 0, 0, 0), pose_of(0, 0, 0.5, 0, 0, 0)
-    covariance = np.tile(1e-6 * np.eye(6), (3, 1, 1))
-    # 0.01 mm of 0.1 mm, then 0.02 of 0.5: surer for its size, and the two do not agree.
-    covariance[:, 2, 2] = [1e-6, 0.01**2, 0.02**2]
-    pairs = edges_of(zip([0, 1, 0], [1, 2, 2], [near, near, far], covariance, strict=True))
-    found = solved(pairs, 3, np.zeros(3), TrajectorySettings(join="chain"))
-    np.testing.assert_allclose(found.translation[:, 2], [0, 0.1, 0.5], atol=1e-12)
 
 
 # ---- covariance --------------------------------------------------------------------------------------------

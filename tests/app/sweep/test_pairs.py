@@ -4,8 +4,9 @@ import pytest
 from speckle3d.app.sweep.pairs import SweepPairs, nearest_lag
 from speckle3d.config import Config
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.matching.frames import StageTimes, match_sweep
+from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.schedule import PairSchedule
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +18,7 @@ def part(sweep):
 def matched(part):
     c = Config()
     matcher = FrameMatcher(part, c.intensity, c.patches, c.inplane, c.matching)
-    return matcher, match_sweep(part, matcher, c.trajectory, c.quality, StageTimes()).table
+    return matcher, match_sweep(part, matcher, PairSchedule(c.trajectory), c.quality).table
 
 
 @pytest.fixture(scope="module")

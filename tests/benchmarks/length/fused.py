@@ -61,7 +61,7 @@ def _on_sweeps(
             0.0 if tracked.coherence is None else float(tracked.coherence.share.mean()),
             float(np.hypot(tracked.scale_sigma, mismatch)),
             float(np.hypot(tracked.curves_sigma, mismatch)),
-            tracked.slopes.deviation_per_mm,
+            tracked.shared.turn_sigma_per_mm,
             sweep.grid.centre_mm,
             sweep.frame_time_s,
         )

@@ -1,4 +1,4 @@
-"""Tracking a sweep: frames per second beside the transforms alone, shares of the stages, cores kept busy."""
+"""Tracking a sweep: frames per second beside the transforms alone, cores kept busy."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -10,7 +10,6 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import cores, on_one_thread
 from speckle3d.io.load import load_sweep
-from speckle3d.matching.frames import StageTimes
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.pipeline import track
 from speed.rows import Row, timed
@@ -22,14 +21,13 @@ FRAMES = 20
 
 
 def rows(paths: list[Path], curves: DecorrelationCurves, runs: int) -> list[Row]:
-    """One row for each sweep on all cores, and for the first on one; prints the stages of the last."""
-    made, stages = [], None
+    """One row for each sweep on all cores, and for the first on one."""
+    made = []
     for number, path in enumerate([paths[0], *paths]):
         alone = number == 0
         sweep, threads = load_sweep(path), 1 if alone else cores()
         with on_one_thread() if alone else nullcontext():
             ours = timed(lambda sweep=sweep: track(sweep, curves), runs)
-            times = track(sweep, curves).times
         limit = transforms_per_second(sweep, runs)
         made.append(
             Row(
@@ -43,10 +41,8 @@ def rows(paths: list[Path], curves: DecorrelationCurves, runs: int) -> list[Row]
                 cores=ours.cores,
             )
         )
-        stages = times, len(sweep), ours.seconds
         slowest, fastest = (len(sweep) / s for s in reversed(ours.spread))
         print(f"{made[-1].what}: {slowest:.0f} to {fastest:.0f} frames/s in {runs} runs")
-    print_stages(*stages)
     made += [ratio(row) for row in made[1:]]
     return made
 
@@ -74,16 +70,6 @@ def transforms_per_second(sweep: Sweep, runs: int) -> float:
             fft.ifft(band, axis=1)
 
     return FRAMES / timed(some, runs).seconds
-
-
-def print_stages(times: StageTimes, frames: int, seconds: float) -> None:
-    """Print what each stage takes of a frame, its share of all processor time, and the cores it kept busy."""
-    whole = sum(times.processor_seconds.values())
-    print(f"\n{'ms of processor a frame':>24} {'share':>7} {'cores busy':>11}  stage")
-    for stage, spent in sorted(times.processor_seconds.items(), key=lambda item: -item[1]):
-        busy = spent / times.seconds[stage]
-        print(f"{1e3 * spent / frames:24.2f} {100 * spent / whole:6.1f} % {busy:10.2f}   {stage}")
-    print(f"{1e3 * whole / frames:24.2f}  in {1e3 * seconds / frames:.2f} ms a frame\n")
 
 
 def memory_bandwidth(runs: int) -> float:
