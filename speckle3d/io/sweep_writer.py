@@ -25,6 +25,7 @@ from speckle3d.core.sweep import (
     Tracker,
     stored_dtype,
 )
+from speckle3d.core.threads import ahead
 from speckle3d.io.hdf5 import PathLike, atomic_path, find_member, has_member, open_hdf5, opened, reading
 from speckle3d.io.records import HDF5Writer, Room, put
 from speckle3d.io.sweeps import (
@@ -247,8 +248,8 @@ def write_sweep(
     3
     """
     frames = sweep.frames
-    # Frames that are computed when they are read may be fastest from the first to the last.
-    made = getattr(frames, "in_order", lambda: map(frames.__getitem__, range(len(sweep))))()
+    # Frames that are computed when they are read are made on all cores.
+    made = (ahead if getattr(frames, "computed", False) else map)(frames.__getitem__, range(len(sweep)))
     with SweepWriter(path, sweep.grid, sweep.signal, stored_dtype(frames), compression) as writer:
         for i, (frame, time_s) in enumerate(zip(made, sweep.frame_time_s, strict=True)):
             writer.append(frame, time_s)

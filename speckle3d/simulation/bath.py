@@ -1,29 +1,53 @@
-"""A water bath: its floor, or a bar in the middle of the beam, under water with a little dust.
+"""A water bath: its floor, a bar in the middle of the beam or two threads, under water with a little dust.
 
-The medium's y axis points down and the floor is its plane y = 0, so that the probe is at negative y.
+The medium's y axis points down. The floor is its plane y = 0, so that the probe is at negative y; the threads
+lie in that plane and cross at the origin.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.simulation.medium import Layer, Scatterers, TiledMedium, Waves, bounds_in_medium
-from speckle3d.simulation.tiles import Tiles, tile_seed
+from speckle3d.simulation.medium import TILE_MM, Layer, Scatterers, TiledMedium, tile_rng, tiles_near
 
 Reflector = Literal["wall", "bar"]
 
-_KEPT_TILES = 200
-"""An image meets the floor in about 40 tiles; the rest serve the frames around it."""
-
 _STEEPEST = np.cos(np.deg2rad(35.0))
 """Reverberations off virtual surfaces turned further than this miss the aperture."""
+
+_STRENGTH_PER_MM2 = 8.0
+"""Echo strength of the floor. The bar's is higher, so that both are equally bright from above."""
+
+_BAR_MM = 0.2
+"""Width of the strip."""
+
+_BEAM_MM = 0.8
+"""Thickness of the focused beam: it covers this much of a wall, but only `_BAR_MM` of a bar."""
+
+_REVERBERATION = 0.2
+"""Amplitude left after sound went once more from the reflector to the probe's face and back."""
+
+_REPEATS = 2
+"""How many such echoes there are."""
+
+_THREAD_STRENGTH = 0.3
+"""Of each scatterer of a thread."""
+
+_THREAD_RADIUS_MM = 0.1
+
+_THREAD_SPACING_MM = 0.02
+"""Between scatterers of a thread, a tenth of the shortest wavelength."""
+
+_HALF_LENGTH_MM = 40.0
+
+_BEARINGS_DEG = (40.0, 125.0)
+"""Directions of the threads in their plane, from x towards z: a little off square, as a bench has them."""
 
 
 @dataclass(frozen=True)
@@ -48,34 +72,24 @@ class RoughSheet:
     entropy: int
     spacing_mm: float = 0.0625
     roughness_mm: float = 0.01
-    tile_mm: float = 4.0
 
-    @cached_property
-    def tiles(self) -> Tiles[FloatArray]:
-        """Positions of the scatterers on tiles whose first corners are at i, j tiles, shape (n, 3) each."""
-        return Tiles(self._make, _KEPT_TILES)
-
-    def _make(self, i: int, j: int) -> FloatArray:
-        rng = np.random.default_rng([self.entropy, *tile_seed(i, j)])
-        along = (np.arange(round(self.tile_mm / self.spacing_mm)) + 0.5) * self.spacing_mm
-        x, z = np.meshgrid(i * self.tile_mm + along, j * self.tile_mm + along)
-        return np.stack([x.ravel(), rng.normal(0.0, self.roughness_mm, x.size), z.ravel()], axis=1)
+    def tile(self, i: int, j: int) -> FloatArray:
+        """Positions of the scatterers on the tile whose first corner is at i, j tiles, shape (n, 3)."""
+        along = (np.arange(round(TILE_MM / self.spacing_mm)) + 0.5) * self.spacing_mm
+        x, z = np.meshgrid(i * TILE_MM + along, j * TILE_MM + along)
+        height = tile_rng(self.entropy, i=i, j=j).normal(0.0, self.roughness_mm, x.size)
+        return np.stack([x.ravel(), height, z.ravel()], axis=1)
 
     def near(self, image_from_sheet: RigidTransform, low_mm: FloatArray, high_mm: FloatArray) -> FloatArray:
         """Positions, in the sheet, on all tiles that may reach into a box of the image, shape (n, 3)."""
-        low, high = bounds_in_medium(image_from_sheet.inv(), low_mm, high_mm)
-        first = np.floor(low[[0, 2]] / self.tile_mm).astype(int)
-        last = np.floor(high[[0, 2]] / self.tile_mm).astype(int)
-        tiles = np.indices(last - first + 1).reshape(2, -1).T + first
-        middle = np.insert((tiles + 0.5) * self.tile_mm, 1, 0.0, axis=1)
-        place, corner = image_from_sheet.apply(middle), self.tile_mm / np.sqrt(2.0)
+        tiles = tiles_near(image_from_sheet.inv(), low_mm, high_mm)
+        middle = np.insert((tiles + 0.5) * TILE_MM, 1, 0.0, axis=1)
+        place, corner = image_from_sheet.apply(middle), TILE_MM / np.sqrt(2.0)
         reached = ((place >= low_mm - corner) & (place <= high_mm + corner)).all(axis=1)
-        found = self.tiles(tiles[reached])
-        return np.concatenate(found) if found else np.empty((0, 3))
+        return np.concatenate([np.empty((0, 3)), *(self.tile(i, j) for i, j in tiles[reached].tolist())])
 
 
-@dataclass(frozen=True)
-class Level:
+class Level(NamedTuple):
     """A plane in the image: ``normal @ position = offset_mm``, the normal pointing away from the probe."""
 
     normal: FloatArray
@@ -89,10 +103,8 @@ class Level:
 
     def mirrored_in(self, mirror: Level) -> Level:
         """Return the mirror image of this plane in another, its normal turned to point away as well."""
-        along = float(self.normal @ mirror.normal)
-        return Level(
-            2.0 * along * mirror.normal - self.normal, 2.0 * along * mirror.offset_mm - self.offset_mm
-        )
+        along = 2.0 * float(self.normal @ mirror.normal)
+        return Level(along * mirror.normal - self.normal, along * mirror.offset_mm - self.offset_mm)
 
     def facing(self) -> Level:
         """Return the plane through the same line of the image that is perpendicular to the image."""
@@ -123,14 +135,6 @@ class WaterBath:
     reflector : str
         wall: the whole floor. bar: a strip in the floor's plane that is only in the middle of the beam, and
         always turned towards the probe.
-    strength_per_mm2 : float
-        Echo strength of the floor. The bar's is higher, so that both are equally bright from above.
-    bar_mm : float
-        Width of the strip.
-    reverberation : float
-        Amplitude left after sound went once more from the reflector to the probe's face and back.
-    repeats : int
-        How many such echoes there are.
 
     References
     ----------
@@ -141,78 +145,110 @@ class WaterBath:
     haze: TiledMedium
     sheet: RoughSheet
     reflector: Reflector = "wall"
-    strength_per_mm2: float = 8.0
-    bar_mm: float = 0.2
-    reverberation: float = 0.2
-    repeats: int = 2
     attenuation_db_cm_mhz: float = 0.0
 
     def seen(
         self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
     ) -> list[Scatterers]:
         """Reflector, its reverberations and the haze in a box of the image."""
-        blocks = self.haze.seen(medium_from_image, low_mm, high_mm)
         floor = Level.floor(medium_from_image)
         if self.reflector == "wall":
-            floor_from_sheet = medium_from_image.inv()
-            blocks.append(self._scatterers(self.sheet.near(floor_from_sheet, low_mm, high_mm)))
+            image_from_sheet, medium_from_sheet = medium_from_image.inv(), RigidTransform.identity()
         else:
             floor = floor.facing()
-            blocks.append(self._bar(floor, medium_from_image, low_mm, high_mm))
-        for level, amplitude in self._reverberations(floor):
-            position = self._strip(self.sheet.near(level.image_from_sheet, low_mm, high_mm))
-            position[:, 1] = 0.0
+            image_from_line = floor.image_from_sheet
+            # The bar stays where it is: the probe sees other parts of it as it slides over it.
+            place = medium_from_image * image_from_line
+            slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
+            image_from_sheet = image_from_line * RigidTransform.from_translation([-slid, 0.0, 0.0])
+            medium_from_sheet = medium_from_image * image_from_sheet
+        position = self._surface(image_from_sheet, low_mm, high_mm)
+        blocks = [*self.haze.seen(medium_from_image, low_mm, high_mm)]
+        blocks.append(self._scatterers(medium_from_sheet.apply(position)))
+        for level, amplitude in _reverberations(floor):
+            position = self._surface(level.image_from_sheet, low_mm, high_mm) * [1.0, 0.0, 1.0]
             place = medium_from_image * level.image_from_sheet
             blocks.append(self._scatterers(place.apply(position), amplitude))
         return blocks
 
-    def _bar(
-        self, line: Level, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-    ) -> Scatterers:
-        image_from_line = line.image_from_sheet
-        # The bar stays where it is: the probe sees other parts of it as it slides over it.
-        place = medium_from_image * image_from_line
-        slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
-        image_from_bar = image_from_line * RigidTransform.from_translation([-slid, 0.0, 0.0])
-        position = self._strip(self.sheet.near(image_from_bar, low_mm, high_mm))
-        return self._scatterers((medium_from_image * image_from_bar).apply(position))
-
-    def _strip(self, position: FloatArray) -> FloatArray:
-        """Those of the sheet's scatterers that the reflector has."""
-        if self.reflector == "wall":
-            return position
-        return position[np.abs(position[:, 2]) <= self.bar_mm / 2.0]
-
-    def _reverberations(self, floor: Level) -> Iterator[tuple[Level, float]]:
-        """Virtual reflectors of the second and later round trips, with their amplitudes.
-
-        Unfolding the path, the probe's face is mirrored in the floor, the floor in that, and so on: from
-        straight above these lie at twice and three times the depth; elsewhere they seem turned further too.
-        """
-        before, level = Level(np.array([0.0, 1.0, 0.0]), 0.0), floor
-        for count in range(1, self.repeats + 1):
-            before, level = level, before.mirrored_in(level)
-            if level.normal[1] < _STEEPEST:
-                return
-            yield level, self.reverberation**count
+    def _surface(
+        self, image_from_sheet: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
+    ) -> FloatArray:
+        """Those of the sheet's scatterers that the reflector has near a box of the image."""
+        position = self.sheet.near(image_from_sheet, low_mm, high_mm)
+        return position if self.reflector == "wall" else position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
 
     def _scatterers(self, position: FloatArray, amplitude: float = 1.0) -> Scatterers:
-        each = amplitude * self.strength_per_mm2 * self.sheet.spacing_mm**2
+        strength = amplitude * _STRENGTH_PER_MM2 * self.sheet.spacing_mm**2
         if self.reflector == "bar":
-            each *= _BEAM_MM / self.bar_mm
-        return position, np.full(len(position), each, np.float32)
+            strength *= _BEAM_MM / _BAR_MM
+        return position, np.full(len(position), strength, np.float32)
 
 
-_BEAM_MM = 0.8
-"""Thickness of the focused beam: it covers this much of a wall, but only `bar_mm` of a bar."""
+def _reverberations(floor: Level) -> Iterator[tuple[Level, float]]:
+    """Virtual reflectors of the second and later round trips, with their amplitudes.
+
+    Unfolding the path, the probe's face is mirrored in the floor, the floor in that, and so on: from
+    straight above these lie at twice and three times the depth; elsewhere they seem turned further too.
+    """
+    before, level = Level(np.array([0.0, 1.0, 0.0]), 0.0), floor
+    for count in range(1, _REPEATS + 1):
+        before, level = level, before.mirrored_in(level)
+        if level.normal[1] < _STEEPEST:
+            return
+        yield level, _REVERBERATION**count
 
 
-def water_haze(entropy: int, down_to_mm: float = 0.0) -> TiledMedium:
+@dataclass(frozen=True)
+class CrossedThreads:
+    """Two braided threads under water with a little dust.
+
+    A braid is rough on the scale of the wavelength, so that it echoes in all directions; a smooth wire would
+    be a mirror, dark wherever the beam does not meet it squarely.
+
+    Parameters
+    ----------
+    haze : TiledMedium
+        What drifts in the water.
+    position_mm : ndarray, shape (n, 3)
+        Scatterers of both threads, in the medium.
+    """
+
+    haze: TiledMedium
+    position_mm: FloatArray
+    attenuation_db_cm_mhz: float = 0.0
+
+    def seen(
+        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
+    ) -> list[Scatterers]:
+        """Haze and the parts of the threads in a box of the image."""
+        place = medium_from_image.inv().apply(self.position_mm)
+        near = self.position_mm[((place >= low_mm) & (place <= high_mm)).all(axis=1)]
+        threads = near, np.full(len(near), _THREAD_STRENGTH, np.float32)
+        return [*self.haze.seen(medium_from_image, low_mm, high_mm), threads]
+
+
+def _haze(entropy: int, down_to_mm: float) -> TiledMedium:
     """Make a little dust in water, 34 dB weaker than speckle of unit strength."""
-    still = Waves(np.zeros((0, 5)))
+    still = np.zeros((0, 5))
     return TiledMedium(entropy, 2.0, 0.0, [Layer(-60.0, still, 0.02)], depth_mm=(-60.0, down_to_mm))
 
 
 def water_bath(entropy: int, reflector: Reflector) -> WaterBath:
     """Make a bath with a little dust in its water."""
-    return WaterBath(water_haze(entropy), RoughSheet(entropy), reflector)
+    return WaterBath(_haze(entropy, 0.0), RoughSheet(entropy), reflector)
+
+
+def crossed_threads(entropy: int) -> CrossedThreads:
+    """Stretch two threads across each other, their scatterers at random in them."""
+    rng = np.random.default_rng([entropy, 2])
+    count = round(2.0 * _HALF_LENGTH_MM / _THREAD_SPACING_MM)
+    threads = []
+    for bearing in np.deg2rad(_BEARINGS_DEG):
+        along = np.array([np.cos(bearing), 0.0, np.sin(bearing)])
+        across = np.array([-along[2], 0.0, along[0]])
+        place = rng.uniform(-_HALF_LENGTH_MM, _HALF_LENGTH_MM, count)
+        angle, radius = rng.uniform(0.0, 2.0 * np.pi, count), _THREAD_RADIUS_MM * np.sqrt(rng.random(count))
+        aside = np.outer(radius * np.cos(angle), across) + np.outer(radius * np.sin(angle), [0.0, 1.0, 0.0])
+        threads.append(np.outer(place, along) + aside)
+    return CrossedThreads(_haze(entropy, 30.0), np.concatenate(threads))

@@ -12,7 +12,28 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.field import line_field, two_way_field
 
-NEPER_PER_DB = np.log(10.0) / 20.0
+_NEPER_PER_DB = np.log(10.0) / 20.0
+
+_DEPTH_MM = np.arange(1.0, 45.0 + 1e-9, 0.5)
+_ELEVATION_MM = np.arange(0.0, 4.0 + 1e-9, 0.08)
+_LATERAL_REACH_MM = 2.7
+"""Where the beam is tabulated."""
+
+PER_PITCH = 4
+"""Lateral steps of the table in a pitch of the elements."""
+
+_STRIPS = 64
+"""Elevational strips of the aperture, 0.08 mm high: two fifths of the shortest wavelength."""
+
+_NODES_HZ = np.linspace(3e6, 12e6, 13)
+_COMPONENTS = 4
+"""Frequencies at which the field is computed, and the main components over them that are kept.
+
+They are what makes a short sum broadband.
+"""
+
+_FLOOR_DB = -40.0
+"""Under each depth's peak: what is left out."""
 
 
 @dataclass(frozen=True)
@@ -62,37 +83,11 @@ class Probe:
             self.sampling_rate_hz, self.speed_of_sound_m_s, self.centre_frequency_hz, self.bandwidth_hz
         )
 
-    def receive_half_width_mm(self, depth_mm: FloatArray) -> FloatArray:
-        """Half the width of the receive aperture in use at each depth, at least two elements."""
-        widest = self.receive_elements * self.pitch_mm
-        return np.asarray(np.clip(depth_mm / self.receive_f_number, 4 * self.pitch_mm, widest)) / 2.0
-
     def spectrum(self, frequency_hz: FloatArray) -> FloatArray:
         """Two-way pulse spectrum: a raised cosine, halved in amplitude (-6 dB) at the band's edges."""
         low, high = self.bandwidth_hz
         phase = (np.asarray(frequency_hz) - (low + high) / 2.0) / (high - low)
         return np.where(np.abs(phase) < 1.0, np.cos(np.pi / 2.0 * phase) ** 2, 0.0)
-
-
-@dataclass(frozen=True)
-class BeamGrid:
-    """Grid on which the beam is tabulated, with `per_pitch` lateral positions per element pitch.
-
-    The field is computed at the frequencies `node_hz` and kept as its `components` main components over
-    frequency, which is what makes a short sum broadband.
-    """
-
-    first_depth_mm: float = 1.0
-    last_depth_mm: float = 45.0
-    depth_step_mm: float = 0.5
-    lateral_reach_mm: float = 2.7
-    per_pitch: int = 4
-    elevation_reach_mm: float = 4.0
-    elevation_step_mm: float = 0.08
-    strips: int = 64
-    node_hz: tuple[float, ...] = tuple(np.linspace(3e6, 12e6, 13).tolist())
-    components: int = 4
-    floor_db: float = -40.0
 
 
 @dataclass(frozen=True)
@@ -110,13 +105,12 @@ class BeamTable:
     components : ndarray, shape (component, node)
         How each component is spread over frequency.
     reach : ndarray, shape (depth, lateral)
-        Elevational steps to where the amplitude has fallen to the grid's floor for good.
+        Elevational steps to where the amplitude has fallen to the floor for good.
     curvature_per_mm : ndarray, shape (depth, 2)
         kx and kz.
     """
 
     probe: Probe
-    grid: BeamGrid
     depth_mm: FloatArray
     lateral_mm: FloatArray
     elevation_mm: FloatArray
@@ -133,12 +127,11 @@ class BeamTable:
     @property
     def elevation_extent_mm(self) -> FloatArray:
         """Largest distance from the image plane at which the field is above the floor, at each depth."""
-        return np.asarray(self.reach.max(axis=1) * self.grid.elevation_step_mm)
+        return np.asarray(self.reach.max(axis=1) * self.elevation_mm[1])
 
     def spectra(self, frequency_hz: FloatArray) -> ComplexArray:
         """Two-way pulse spectrum of each component, shape (component, frequency)."""
-        nodes = np.asarray(self.grid.node_hz)
-        hats = np.stack([np.interp(frequency_hz, nodes, row) for row in np.eye(nodes.size)])
+        hats = np.stack([np.interp(frequency_hz, _NODES_HZ, row) for row in np.eye(_NODES_HZ.size)])
         return np.asarray(self.components @ hats * self.probe.spectrum(frequency_hz))
 
     def echo_power(self, frequency_hz: FloatArray) -> FloatArray:
@@ -160,9 +153,7 @@ class BeamTable:
 
 
 @lru_cache(maxsize=4)
-def tabulate_beam(
-    probe: Probe | None = None, grid: BeamGrid | None = None, attenuation_db_cm_mhz: float = 0.0
-) -> BeamTable:
+def tabulate_beam(probe: Probe | None = None, attenuation_db_cm_mhz: float = 0.0) -> BeamTable:
     """Compute the two-way field of `probe` by Rayleigh-Sommerfeld sums over elements and lens strips.
 
     The last four tables, 5 MB each, are kept: the two sweeps of a pair share one, each kind of medium has
@@ -171,7 +162,6 @@ def tabulate_beam(
     Parameters
     ----------
     probe : Probe, optional
-    grid : BeamGrid, optional
     attenuation_db_cm_mhz : float
         One-way attenuation of the medium, proportional to frequency.
 
@@ -179,56 +169,53 @@ def tabulate_beam(
     ----------
     .. [1] J. W. Goodman, "Introduction to Fourier Optics", first Rayleigh-Sommerfeld solution.
     """
-    probe, grid = probe or Probe(), grid or BeamGrid()
-    depth = np.arange(grid.first_depth_mm, grid.last_depth_mm + 1e-9, grid.depth_step_mm, dtype=np.float64)
-    step = probe.pitch_mm / grid.per_pitch
-    lateral = np.arange(round(grid.lateral_reach_mm / step) + 1, dtype=np.float64) * step
-    elevation = np.arange(0.0, grid.elevation_reach_mm + 1e-9, grid.elevation_step_mm, dtype=np.float64)
-    field = _sum_sources(probe, grid, depth, lateral, elevation)
-    nodes = np.asarray(grid.node_hz)
-    neper = attenuation_db_cm_mhz * NEPER_PER_DB * 1e-7 * nodes
-    field *= np.exp(-2.0 * depth[:, None] * neper)[:, None, None, :]
-    field /= np.abs(field[np.argmin(np.abs(depth - probe.transmit_focus_mm)), 0, 0]).max()
-    curvature = _fit_curvature(field, lateral, elevation, _wavenumbers(probe, nodes))
-    echo = depth[:, None, None] + curvature[:, 0, None, None] * lateral[:, None] ** 2
-    echo = echo + curvature[:, 1, None, None] * elevation**2
-    reach = _reach(np.abs(field).max(axis=-1), 10.0 ** (grid.floor_db / 20.0))
-    field *= np.exp(2j * echo[..., None] * _wavenumbers(probe, nodes))
-    residual, components = _compress(field, probe.spectrum(nodes), grid.components)
-    return BeamTable(probe, grid, depth, lateral, elevation, residual, components, reach, curvature)
-
-
-def _wavenumbers(probe: Probe, frequency_hz: FloatArray) -> FloatArray:
-    """Wavenumbers in rad/mm."""
-    return np.asarray(2e-3 * np.pi * frequency_hz / probe.speed_of_sound_m_s)
+    probe = probe or Probe()
+    step = probe.pitch_mm / PER_PITCH
+    lateral = np.arange(round(_LATERAL_REACH_MM / step) + 1, dtype=np.float64) * step
+    wavenumbers = 2e-3 * np.pi * _NODES_HZ / probe.speed_of_sound_m_s
+    field = _sum_sources(probe, lateral, wavenumbers)
+    neper = attenuation_db_cm_mhz * _NEPER_PER_DB * 1e-7 * _NODES_HZ
+    field *= np.exp(-2.0 * _DEPTH_MM[:, None] * neper)[:, None, None, :]
+    field /= np.abs(field[np.argmin(np.abs(_DEPTH_MM - probe.transmit_focus_mm)), 0, 0]).max()
+    # Curvature of the two-way wavefront near the axis, lateral and elevational.
+    middle, double = field[..., _NODES_HZ.size // 2], 2.0 * wavenumbers[_NODES_HZ.size // 2]
+    kx = np.array([_parabola(row, lateral, double) for row in middle[:, :, 0]])
+    kz = np.array([_parabola(row, _ELEVATION_MM, double) for row in middle[:, 0, :]])
+    echo = _DEPTH_MM[:, None, None] + kx[:, None, None] * lateral[:, None] ** 2
+    echo = echo + kz[:, None, None] * _ELEVATION_MM**2
+    reach = _reach(np.abs(field).max(axis=-1), 10.0 ** (_FLOOR_DB / 20.0))
+    field *= np.exp(2j * echo[..., None] * wavenumbers)
+    residual, components = _compress(field, probe.spectrum(_NODES_HZ))
+    curvature = np.stack([kx, kz], axis=1)
+    return BeamTable(probe, _DEPTH_MM, lateral, _ELEVATION_MM, residual, components, reach, curvature)
 
 
 def _sides(coordinate: FloatArray) -> FloatArray:
     return np.where(coordinate > 0.0, 2.0, 1.0)
 
 
-def _sum_sources(
-    probe: Probe, grid: BeamGrid, depth: FloatArray, lateral: FloatArray, elevation: FloatArray
-) -> ComplexArray:
-    wavenumbers = _wavenumbers(probe, np.asarray(grid.node_hz))
-    step = probe.pitch_mm / grid.per_pitch
+def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> ComplexArray:
+    """Two-way field, shape (depth, lateral, elevation, node)."""
+    depth, step = _DEPTH_MM, probe.pitch_mm / PER_PITCH
     widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
     element = (np.arange(widest) - widest // 2) * probe.pitch_mm
-    sub = (np.arange(grid.per_pitch) - (grid.per_pitch - 1) / 2.0) * step
-    source = (element[:, None] + sub).ravel()
+    source = (element[:, None] + (np.arange(PER_PITCH) - (PER_PITCH - 1) / 2.0) * step).ravel()
     distance = (np.arange(round((source[-1] + lateral[-1]) / step) + 1) + 0.5) * step
     # All elements share the field of one elevational line source, shifted along the array.
-    strip = (np.arange(grid.strips) + 0.5) / grid.strips * probe.elevation_aperture_mm
+    strip = (np.arange(_STRIPS) + 0.5) / _STRIPS * probe.elevation_aperture_mm
     strip = strip - probe.elevation_aperture_mm / 2.0
     lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
-    line = np.empty((depth.size, distance.size, elevation.size, wavenumbers.size), dtype=complex)
-    line_field(depth, distance, elevation, strip, lens, wavenumbers, line)
-    across = np.repeat(element, grid.per_pitch)
+    line = np.empty((depth.size, distance.size, _ELEVATION_MM.size, wavenumbers.size), dtype=complex)
+    line_field(depth, distance, _ELEVATION_MM, strip, lens, wavenumbers, line)
+    across = np.repeat(element, PER_PITCH)
     half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
     focus = np.full(depth.size, probe.transmit_focus_mm)
     transmit = _focused(probe, across, half, focus, wavenumbers)
-    receive = _focused(probe, across, probe.receive_half_width_mm(depth), depth, wavenumbers)
-    out = np.empty((depth.size, lateral.size, elevation.size, wavenumbers.size), dtype=complex)
+    # The dynamic receive aperture has at least four elements.
+    widest_mm = probe.receive_elements * probe.pitch_mm
+    half = np.clip(depth / probe.receive_f_number, 4 * probe.pitch_mm, widest_mm) / 2.0
+    receive = _focused(probe, across, half, depth, wavenumbers)
+    out = np.empty((depth.size, lateral.size, _ELEVATION_MM.size, wavenumbers.size), dtype=complex)
     two_way_field(line, source, step, transmit, receive, out)
     return out
 
@@ -244,17 +231,6 @@ def _focused(
     return np.asarray(weight[..., None] * np.exp(-1j * path[..., None] * wavenumbers))
 
 
-def _fit_curvature(
-    field: ComplexArray, lateral: FloatArray, elevation: FloatArray, wavenumbers: FloatArray
-) -> FloatArray:
-    """Curvature of the two-way wavefront near the axis, lateral and elevational, shape (depth, 2)."""
-    k = 2.0 * wavenumbers[wavenumbers.size // 2]
-    middle = field[..., wavenumbers.size // 2]
-    lateral_fit = [_parabola(row, lateral, k) for row in middle[:, :, 0]]
-    elevation_fit = [_parabola(row, elevation, k) for row in middle[:, 0, :]]
-    return np.stack([lateral_fit, elevation_fit], axis=1)
-
-
 def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> float:
     """Least-squares `a` of path = a x^2 over the main lobe (a third of the axis), by energy."""
     fallen = np.flatnonzero(np.abs(profile) < np.abs(profile[0]) / 3.0)
@@ -264,13 +240,13 @@ def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> f
     return float((weight * path * across[lobe] ** 2).sum() / (weight * across[lobe] ** 4).sum())
 
 
-def _compress(field: ComplexArray, pulse: FloatArray, count: int) -> tuple[Complex64Array, ComplexArray]:
+def _compress(field: ComplexArray, pulse: FloatArray) -> tuple[Complex64Array, ComplexArray]:
     """Principal components of the field over frequency, with depths and the pulse's band equally weighted."""
     weight = np.maximum(pulse, 0.1 * pulse.max())
     depth_rms = np.sqrt((np.abs(field) ** 2).mean(axis=(1, 2, 3)))
     rows = (field * weight / depth_rms[:, None, None, None]).reshape(-1, pulse.size)
     _, vectors = np.linalg.eigh(rows.conj().T @ rows)
-    main = vectors[:, : -count - 1 : -1]
+    main = vectors[:, : -_COMPONENTS - 1 : -1]
     residual = (field * weight) @ main
     return residual.astype(np.complex64), main.conj().T / weight
 

@@ -7,23 +7,27 @@ media that presets name are at the end: a uniform phantom, a phantom with inclus
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from threading import Lock
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
-from speckle3d.simulation.tiles import Tiles, tile_seed
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 
 Scatterers = tuple[FloatArray, Float32Array]
 """Positions, shape (n, 3), mm, and strengths, shape (n,): unit strength at 1 per mm^3 is the reference."""
 
-_KEPT_TILES = 160
+_KEPT_TILES = 200
 """A frame of 127 vectors sees about 40 tiles; the rest serve neighbouring frames and turned ones."""
 
+TILE_MM = 4.0
+"""Side of the square columns that media are made in; no cluster reaches further than this from its parent."""
 
 _PER_MM3 = 100.0
 """Density of the diffuse background of the media that presets name."""
@@ -31,8 +35,14 @@ _PER_MM3 = 100.0
 _DEPTH_BIN_MM = 0.25
 """Tiles are sorted by depth in such steps, half of the beam table's."""
 
+_FASCIA_PER_MM2 = 60.0
+"""Density of scatterers on a reflecting sheet."""
+
 _CELL_MM = 0.5
 """Lateral and elevational side of cells with one background scatterer each: the focused beam's width."""
+
+
+Tile = TypeVar("Tile")
 
 
 class Medium(Protocol):
@@ -48,60 +58,92 @@ class Medium(Protocol):
         """Blocks of scatterers, in the medium, that include all those in a box of the image."""
 
 
-def bounds_in_medium(
-    medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Opposite corners, in the medium, of the upright box about a box of the image."""
-    x, y, z = np.stack([low_mm, high_mm], axis=-1)
-    corners = np.stack(np.meshgrid(x, y, z), axis=-1)
-    seen = medium_from_image.apply(corners.reshape(-1, 3))
-    return seen.min(axis=0), seen.max(axis=0)
+class Tiles(Generic[Tile]):
+    """The tiles asked for last, each made once: threads that need the same ones share the work.
 
-
-@dataclass(frozen=True)
-class Waves:
-    """A smooth function of position: a sum of plane sinusoids.
-
-    ``rows`` holds one sinusoid each: amplitude, wave number along x, y and z (rad/mm), phase (rad).
+    Parameters
+    ----------
+    make : callable
+        Makes a tile from its two indices, the same whenever it is called.
     """
 
-    rows: FloatArray
+    def __init__(self, make: Callable[[int, int], Tile]) -> None:
+        self._make = make
+        self._kept: OrderedDict[tuple[int, int], Future[Tile]] = OrderedDict()
+        self._lock = Lock()
 
-    def at(self, position_mm: FloatArray) -> FloatArray:
-        """Value at positions, shape (n, 3)."""
-        return np.asarray(np.sin(position_mm @ self.rows[:, 1:4].T + self.rows[:, 4]) @ self.rows[:, 0])
+    def __reduce__(self) -> tuple[type[Tiles[Tile]], tuple[Callable[[int, int], Tile]]]:
+        """Copies make their own tiles."""
+        return type(self), (self._make,)
 
-    @property
-    def largest(self) -> float:
-        """Bound on the absolute value."""
-        return float(np.abs(self.rows[:, 0]).sum())
+    def __call__(self, indices: IntArray) -> list[Tile]:
+        """Tiles of indices, shape (n, 2)."""
+        return [tile.result() for tile in [self._tile(i, j) for i, j in indices.tolist()]]
 
-    @staticmethod
-    def random(rng: np.random.Generator, rms: float, waves_rad_mm: Sequence[float], count: int = 6) -> Waves:
-        """Draw `count` waves of given largest wave numbers, together of `rms`."""
-        rows = np.empty((count, 5))
-        rows[:, 0] = rms * np.sqrt(2.0 / count)
-        rows[:, 1:4] = rng.uniform(-1.0, 1.0, (count, 3)) * waves_rad_mm
-        rows[:, 4] = rng.uniform(0.0, 2.0 * np.pi, count)
-        return Waves(rows)
+    def _tile(self, i: int, j: int) -> Future[Tile]:
+        with self._lock:
+            kept = self._kept.pop((i, j), None)
+            tile = self._kept[i, j] = kept or Future()
+            if len(self._kept) > _KEPT_TILES:
+                self._kept.popitem(last=False)
+        if kept is None:
+            try:
+                tile.set_result(self._make(i, j))
+            except BaseException as error:
+                self._kept.pop((i, j), None)
+                tile.set_exception(error)
+                raise
+        return tile
 
 
-@dataclass(frozen=True)
-class Sphere:
+def tiles_near(medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray) -> IntArray:
+    """Indices of the tiles of a medium that together hold a box of the image, shape (n, 2)."""
+    corners = np.stack(np.meshgrid(*np.stack([low_mm, high_mm], axis=-1)), axis=-1)
+    seen = medium_from_image.apply(corners.reshape(-1, 3))[:, [0, 2]]
+    first = np.floor(seen.min(axis=0) / TILE_MM).astype(int)
+    last = np.floor(seen.max(axis=0) / TILE_MM).astype(int)
+    return np.asarray(np.indices(last - first + 1).reshape(2, -1).T + first)
+
+
+def tile_rng(entropy: int, *part: int, i: int, j: int) -> np.random.Generator:
+    """Random numbers of a part of a tile."""
+    # Seeds are not negative: remainders are distinct on either side of the origin.
+    return np.random.default_rng([entropy, *part, i % 2**32, j % 2**32])
+
+
+def wave_sum(waves: FloatArray, position_mm: FloatArray) -> FloatArray:
+    """Sum of plane sinusoids at positions, shape (n, 3).
+
+    ``waves`` holds one in a row: amplitude, wave number along x, y and z (rad/mm), phase (rad).
+    """
+    return np.asarray(np.sin(position_mm @ waves[:, 1:4].T + waves[:, 4]) @ waves[:, 0])
+
+
+def random_waves(
+    rng: np.random.Generator, rms: float, waves_rad_mm: Sequence[float], count: int = 6
+) -> FloatArray:
+    """Draw `count` waves of given largest wave numbers, together of `rms`."""
+    rows = np.empty((count, 5))
+    rows[:, 0] = rms * np.sqrt(2.0 / count)
+    rows[:, 1:4] = rng.uniform(-1.0, 1.0, (count, 3)) * waves_rad_mm
+    rows[:, 4] = rng.uniform(0.0, 2.0 * np.pi, count)
+    return rows
+
+
+class Sphere(NamedTuple):
     """A ball in which echo strengths are multiplied by `factor` (0: an anechoic cyst)."""
 
-    centre_mm: tuple[float, float, float]
+    centre_mm: FloatArray
     radius_mm: float
     factor: float
 
 
-@dataclass(frozen=True)
-class Layer:
+class Layer(NamedTuple):
     """What lies below an undulating boundary, down to the next layer's.
 
-    Parameters
+    Attributes
     ----------
-    top_mm, undulation : float, Waves
+    top_mm, undulation : float, ndarray
         Mean depth of the boundary and its shape; the waves' amplitudes are in mm.
     strength, fill : float
         Of the diffuse background: relative echo strength, and the part of its scatterers that are there.
@@ -110,29 +152,24 @@ class Layer:
     """
 
     top_mm: float
-    undulation: Waves
+    undulation: FloatArray
     strength: float
     fill: float = 1.0
     fascia: float = 0.0
-
-    def top_at(self, position_mm: FloatArray) -> FloatArray:
-        """Depth of the boundary above or below positions, shape (n, 3)."""
-        return np.asarray(self.top_mm + self.undulation.at(position_mm * [1.0, 0.0, 1.0]))
 
     def covers(self, position_mm: FloatArray) -> BoolArray:
         """Whether positions, shape (n, 3), lie below the boundary."""
         below = position_mm[:, 1] - self.top_mm
         # Waves are slow to evaluate, so only near the boundary, where they can change the answer.
-        near = np.flatnonzero(np.abs(below) <= self.undulation.largest)
-        below[near] -= self.undulation.at(position_mm[near] * [1.0, 0.0, 1.0])
+        near = np.flatnonzero(np.abs(below) <= np.abs(self.undulation[:, 0]).sum())
+        below[near] -= wave_sum(self.undulation, position_mm[near] * [1.0, 0.0, 1.0])
         return np.asarray(below >= 0.0)
 
 
-@dataclass(frozen=True)
-class Clusters:
+class Clusters(NamedTuple):
     """Neyman-Scott clusters, round or drawn out into fibres: parents at random, children about them.
 
-    Parameters
+    Attributes
     ----------
     per_mm3, children, strength : float
         Density of parents, children of each, and a child's strength.
@@ -158,11 +195,12 @@ class Clusters:
     wander_rad: float = 0.05
     coherent: bool = True
 
-    def draw(self, rng: np.random.Generator, corner_mm: FloatArray, side_mm: float) -> Scatterers:
-        """Children of the parents in one square column; some lie outside it."""
-        size = np.array([side_mm, self.depth_mm[1] - self.depth_mm[0], side_mm])
+    def draw(self, entropy: int, number: int, i: int, j: int) -> Scatterers:
+        """Children of the parents in one tile; some lie outside it."""
+        rng = tile_rng(entropy, 1000 + number, i=i, j=j)
+        size = np.array([TILE_MM, self.depth_mm[1] - self.depth_mm[0], TILE_MM])
         n = rng.poisson(self.per_mm3 * size.prod())
-        parent = np.array([corner_mm[0], self.depth_mm[0], corner_mm[1]]) + rng.random((n, 3)) * size
+        parent = np.array([i * TILE_MM, self.depth_mm[0], j * TILE_MM]) + rng.random((n, 3)) * size
         axis = np.asarray(self.direction) + self.wander_rad * rng.standard_normal((n, 3))
         axis *= (self.length_mm * rng.uniform(0.25, 1.0, n) / np.linalg.norm(axis, axis=1))[:, None]
         along = rng.random((n, self.children, 1)) - 0.5
@@ -185,56 +223,46 @@ class TiledMedium:
         Density of the diffuse background.
     layers : sequence of Layer
         From the skin down.
-    texture : Waves, optional
+    texture : ndarray, optional
         Slow variation of the background's echo strength, in nepers.
     clusters, spheres
         Spheres multiply whatever lies in them.
     depth_mm : tuple of float
         The slab, from a little above the skin so that a probe may move up.
-    tile_mm : float
-        Side of the columns; no cluster may reach further than this from its parent.
     """
 
     entropy: int
     per_mm3: float
     attenuation_db_cm_mhz: float
     layers: Sequence[Layer] = ()
-    texture: Waves | None = None
+    texture: FloatArray | None = None
     clusters: Sequence[Clusters] = ()
     spheres: Sequence[Sphere] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
-    tile_mm: float = 4.0
-    fascia_per_mm2: float = 60.0
 
     def seen(
         self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
     ) -> list[Scatterers]:
         """Tiles that together hold all scatterers in a box of the image."""
-        return self.within(*bounds_in_medium(medium_from_image, low_mm, high_mm))
-
-    def within(self, low_mm: FloatArray, high_mm: FloatArray) -> list[Scatterers]:
-        """Tiles that together hold all scatterers between the corners."""
-        first = np.floor(low_mm[[0, 2]] / self.tile_mm).astype(int)
-        last = np.floor(high_mm[[0, 2]] / self.tile_mm).astype(int)
-        columns = range(first[0], last[0] + 1), range(first[1], last[1] + 1)
-        return self._tiles((i, j) for i in columns[0] for j in columns[1])
+        return self._tiles(tiles_near(medium_from_image, low_mm, high_mm))
 
     @cached_property
     def _tiles(self) -> Tiles[Scatterers]:
-        return Tiles(self._make, _KEPT_TILES)
+        return Tiles(self._make)
 
     @cached_property
     def _families(self) -> Tiles[Scatterers]:
-        return Tiles(self._draw, _KEPT_TILES)
+        return Tiles(self._draw)
 
     def _make(self, i: int, j: int) -> Scatterers:
         parts = [self._background(i, j)]
         parts += [self._fascia(layer, n, i, j) for n, layer in enumerate(self.layers) if layer.fascia]
         # Children of a neighbouring tile's parents may lie in this tile.
-        around = [(i + di, j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1)] if self.clusters else []
-        parts += [_within(i, j, self.tile_mm, family) for family in self._families(around)]
-        position = np.concatenate([p for p, _ in parts])
-        strength = np.concatenate([s for _, s in parts])
+        around = np.indices((3, 3)).reshape(2, -1).T + np.array([i - 1, j - 1])
+        for position, strength in self._families(around) if self.clusters else ():
+            inside = (np.floor(position[:, [0, 2]] / TILE_MM) == [i, j]).all(axis=1)
+            parts.append((position[inside], strength[inside]))
+        position, strength = _joined(parts)
         for sphere in self.spheres:
             inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
             strength[inside] *= sphere.factor
@@ -244,69 +272,48 @@ class TiledMedium:
         kept = kept[np.argsort(depth.astype(np.int16), kind="stable")]
         return position[kept], strength[kept]
 
-    def _rng(self, part: int, i: int, j: int) -> np.random.Generator:
-        return np.random.default_rng([self.entropy, part, *tile_seed(i, j)])
-
     def _background(self, i: int, j: int) -> Scatterers:
-        rng = self._rng(0, i, j)
-        position = np.concatenate([self._at_random(rng), self._one_per_cell(rng)])
-        position += [i * self.tile_mm, self.depth_mm[0], j * self.tile_mm]
+        """Half of the scatterers Poisson distributed, half of them one anywhere in each of equal cells.
+
+        Few scatterers per resolution cell make intensity vary more than fully developed speckle's if they
+        are Poisson distributed, and less by as much if their number does not vary. Half and half, the
+        moments up to the fourth, and so the correlation of intensity, are those of a dense medium.
+        """
+        rng, height = tile_rng(self.entropy, 0, i=i, j=j), self.depth_mm[1] - self.depth_mm[0]
+        size = np.array([TILE_MM, height, TILE_MM])
+        loose = rng.random((rng.poisson(self.per_mm3 / 2.0 * size.prod()), 3)) * size
+        across = round(TILE_MM / _CELL_MM)
+        down = round(height * self.per_mm3 / 2.0 * _CELL_MM**2)
+        cell = np.indices((across, down, across)).reshape(3, -1).T
+        celled = (cell + rng.random(cell.shape)) * [_CELL_MM, height / down, _CELL_MM]
+        position = np.concatenate([loose, celled])
+        position += [i * TILE_MM, self.depth_mm[0], j * TILE_MM]
         n = len(position)
         strength, fill = np.ones(n), np.ones(n)
         for layer in self.layers:
             below = layer.covers(position)
             strength[below], fill[below] = layer.strength, layer.fill
         if self.texture is not None:
-            strength *= np.exp(self.texture.at(position))
+            strength *= np.exp(wave_sum(self.texture, position))
         # Equal strengths of random sign give fully developed speckle with the fewest scatterers.
         strength *= rng.choice([-1.0, 1.0], n) / np.sqrt(self.per_mm3)
         kept = rng.random(n) < fill
         return position[kept], strength[kept].astype(np.float32)
 
-    def _at_random(self, rng: np.random.Generator) -> FloatArray:
-        """Half of the background, Poisson distributed over a tile at the origin."""
-        size = np.array([self.tile_mm, self.depth_mm[1] - self.depth_mm[0], self.tile_mm])
-        return np.asarray(rng.random((rng.poisson(self.per_mm3 / 2.0 * size.prod()), 3)) * size)
-
-    def _one_per_cell(self, rng: np.random.Generator) -> FloatArray:
-        """Return the other half of the background: one scatterer anywhere in each of equal cells.
-
-        Few scatterers per resolution cell make intensity vary more than fully developed speckle's if they
-        are Poisson distributed, and less by as much if their number does not vary. Half and half, the
-        moments up to the fourth, and so the correlation of intensity, are those of a dense medium.
-        """
-        across = round(self.tile_mm / _CELL_MM)
-        side = self.tile_mm / across
-        height = self.depth_mm[1] - self.depth_mm[0]
-        down = round(height * self.per_mm3 / 2.0 * side**2)
-        cell = np.indices((across, down, across)).reshape(3, -1).T
-        return np.asarray((cell + rng.random(cell.shape)) * [side, height / down, side])
-
     def _fascia(self, layer: Layer, number: int, i: int, j: int) -> Scatterers:
-        rng = self._rng(1 + number, i, j)
-        n = rng.poisson(self.fascia_per_mm2 * self.tile_mm**2)
-        position = [i * self.tile_mm, 0.0, j * self.tile_mm] + rng.random((n, 3)) * [
-            self.tile_mm,
-            0.0,
-            self.tile_mm,
-        ]
-        position[:, 1] = layer.top_at(position) + rng.normal(0.0, 0.015, n)
-        return position, np.full(n, layer.fascia / self.fascia_per_mm2, np.float32)
+        rng = tile_rng(self.entropy, 1 + number, i=i, j=j)
+        n = rng.poisson(_FASCIA_PER_MM2 * TILE_MM**2)
+        position = [i * TILE_MM, 0.0, j * TILE_MM] + rng.random((n, 3)) * [TILE_MM, 0.0, TILE_MM]
+        position[:, 1] = layer.top_mm + wave_sum(layer.undulation, position) + rng.normal(0.0, 0.015, n)
+        return position, np.full(n, layer.fascia / _FASCIA_PER_MM2, np.float32)
 
     def _draw(self, i: int, j: int) -> Scatterers:
         """Children of all parents in a tile; some lie outside it."""
-        corner = np.array([i, j]) * self.tile_mm
-        drawn = [
-            kind.draw(self._rng(1000 + number, i, j), corner, self.tile_mm)
-            for number, kind in enumerate(self.clusters)
-        ]
-        return np.concatenate([p for p, _ in drawn]), np.concatenate([s for _, s in drawn])
+        return _joined([kind.draw(self.entropy, n, i, j) for n, kind in enumerate(self.clusters)])
 
 
-def _within(i: int, j: int, tile_mm: float, scatterers: Scatterers) -> Scatterers:
-    position, strength = scatterers
-    mine = (np.floor(position[:, [0, 2]] / tile_mm) == [i, j]).all(axis=1)
-    return position[mine], strength[mine]
+def _joined(parts: Sequence[Scatterers]) -> Scatterers:
+    return np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts])
 
 
 def fully_developed(entropy: int, length_mm: float) -> TiledMedium:
@@ -335,10 +342,10 @@ def tissue(entropy: int, length_mm: float) -> TiledMedium:
     fills = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.2)
     fascias = (0.0, 1.0, 1.6, 0.8, 2.0, 1.0, 1.6, 1.2)
     layers = [
-        Layer(float(top), Waves.random(rng, 0.25, (0.25, 0.0, 0.2)), *rest)
+        Layer(float(top), random_waves(rng, 0.25, (0.25, 0.0, 0.2)), *rest)
         for top, *rest in zip(tops, strengths, fills, fascias, strict=True)
     ]
-    texture = Waves.random(rng, 0.25, (2.0, 2.0, 2.0), 12)
+    texture = random_waves(rng, 0.25, (2.0, 2.0, 2.0), 12)
     cysts = [_sphere(rng, length_mm, (1.0, 2.5), 0.0) for _ in range(6)]
     clusters = _tissue_clusters(rng, tops.tolist())
     return TiledMedium(entropy, _PER_MM3, 0.4, layers, texture, clusters, cysts)
@@ -348,8 +355,7 @@ def _sphere(
     rng: np.random.Generator, length_mm: float, radius_mm: tuple[float, float], factor: float
 ) -> Sphere:
     centre = rng.uniform([3.0, 8.0, 0.0], [35.0, 34.0, length_mm])
-    x, y, z = (float(c) for c in centre)
-    return Sphere((x, y, z), float(rng.uniform(*radius_mm)), factor)
+    return Sphere(centre, float(rng.uniform(*radius_mm)), factor)
 
 
 def _tissue_clusters(rng: np.random.Generator, tops: Sequence[float]) -> list[Clusters]:

@@ -8,6 +8,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.simulation.settings import SimulationSettings
@@ -27,14 +28,16 @@ _LEAD_S = 0.5
 """The trajectory starts and ends this much beyond the frames, for sensors on their own clocks."""
 
 _SWINGS = np.array([2.3, 3.7, 2.9, 6.5, 1.6, 4.3])
-"""Swings during the scan of each column of `FloorScan`: incommensurate, so that all combinations occur."""
+"""Swings of each column during a calibration scan: incommensurate, so that all combinations occur."""
 
 _ROAMING_MM = 15.0
+"""How far either way the probe wanders over the floor."""
+
 _LATERAL_SHARE = 0.35
 """Of the face: how far a point that is kept in the image goes to either side."""
+
 _OFF_POINT_MM = 0.15
 """How far a hand that watches the image misses a point; the focused beam is 0.4 mm to either side."""
-"""How far either way the probe wanders over the floor."""
 
 
 @dataclass(frozen=True)
@@ -86,19 +89,15 @@ class Trajectory:
     ----------
     knot_s : ndarray, shape (m,)
     knots : ndarray, shape (m, 6)
-        Lateral, axial, elevational position of the pivot (mm), then tilt, yaw, roll (rad), all against
-        the start.
-    pivot_mm : ndarray, shape (3,)
-        The point of the image about which the probe turns: the middle of its face, on the skin.
-    medium_from_start : RigidTransform
-        Where and in which direction the sweep starts.
+        Three positions (mm), then tilt, yaw, roll (rad), of what `medium_from_columns` makes poses.
+    medium_from_columns : callable
+        Poses in the medium from columns interpolated between the knots.
     world_from_medium : RigidTransform
     """
 
     knot_s: FloatArray
     knots: FloatArray
-    pivot_mm: FloatArray
-    medium_from_start: RigidTransform
+    medium_from_columns: Callable[[FloatArray], RigidTransform]
     world_from_medium: RigidTransform
 
     def medium_from_image(self, time_s: FloatArray) -> RigidTransform:
@@ -109,17 +108,11 @@ class Trajectory:
                 f"time_s: expected {self.knot_s[0]:.3f} to {self.knot_s[-1]:.3f} s, "
                 f"got {t.min():.3f} to {t.max():.3f} s"
             )
-        return self.medium_from_start * self._start_from_image(self._spline(t))
+        return self.medium_from_columns(self._spline(t))
 
     def world_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the world at any times within the knots."""
         return self.world_from_medium * self.medium_from_image(time_s)
-
-    def _start_from_image(self, columns: FloatArray) -> RigidTransform:
-        x, y, z, tilt, yaw, roll = np.moveaxis(columns, -1, 0)
-        rotation = rotation_from_fixed_angles(roll, yaw, tilt)
-        moved = np.stack([x, y, z], axis=-1)
-        return RigidTransform.from_components(moved - rotation.apply(self.pivot_mm), rotation)
 
     @cached_property
     def _spline(self) -> BSpline[np.float64]:
@@ -133,8 +126,7 @@ def frame_times(frames: int, rate_hz: float, rng: np.random.Generator, jitter_s:
     return np.arange(frames) / rate_hz + rng.uniform(-jitter, jitter, frames)
 
 
-def hand_knots(duration_s: float) -> FloatArray:
-    """Times of a trajectory's knots, from a little before the first frame to a little after the last."""
+def _knot_times(duration_s: float) -> FloatArray:
     knots = round((duration_s + 2 * _LEAD_S) * _KNOT_RATE_HZ) + 1
     return np.linspace(-_LEAD_S, duration_s + _LEAD_S, knots)
 
@@ -154,89 +146,65 @@ def hand_sweep(
     ----------
     face_mm : float
         Width of the image; the probe turns about the middle of its face.
+    medium_from_start : RigidTransform
+        Where and in which direction the sweep starts.
     """
-    time = hand_knots(duration_s)
-    inside = (time >= 0.0) & (time <= duration_s)
-    along = _progress(time, inside, motion, rng) * length_mm
+    time = _knot_times(duration_s)
     pivot = np.array([face_mm / 2.0, 0.0, 0.0])
     columns = np.zeros((time.size, 6))
     columns[:, :3] = pivot
-    columns[:, 2] += along
+    columns[:, 2] += _progress(time, duration_s, motion, rng) * length_mm
     phase = np.clip(time / duration_s, 0.0, 1.0)
     columns[:, 3:] = motion.start_rad + _smooth_step(phase)[:, None] * np.asarray(motion.turn_rad)
     for axis in range(6):
         slow = motion.drift_mm if axis < 3 else motion.wander_rad
-        fast = motion.tremor_mm if axis < 3 else motion.tremor_rad
         if axis != 2:
-            columns[:, axis] += slow * band_noise(time, (0.0, 1.0 / duration_s), rng)
-        columns[:, axis] += fast * band_noise(time, motion.tremor_band_hz, rng)
+            columns[:, axis] += slow * _band_noise(time, (0.0, 1.0 / duration_s), rng)
+        columns[:, axis] += _tremor(time, axis, motion, rng)
     if motion.wobble_mm > 0:
         columns[:, 2] += _wobble(time, duration_s, motion, rng)
-    return Trajectory(time, columns, pivot, medium_from_start, world_from_medium)
+
+    def medium_from_columns(columns: FloatArray) -> RigidTransform:
+        tilt, yaw, roll = np.moveaxis(columns[..., 3:], -1, 0)
+        rotation = rotation_from_fixed_angles(roll, yaw, tilt)
+        moved = columns[..., :3] - rotation.apply(pivot)
+        return medium_from_start * RigidTransform.from_components(moved, rotation)
+
+    return Trajectory(time, columns, medium_from_columns, world_from_medium)
 
 
-@dataclass(frozen=True)
-class FloorScan(Trajectory):
-    """A motion over a floor at y = 0 of the medium.
-
-    The columns of `knots` are x (mm) of the point of the floor that the image's middle vector meets, its
-    depth in the image, its z; then tilt, yaw, roll (rad). Yaw is about the floor's normal and comes first,
-    then tilt and roll about the image's own axes, so that the angle to the floor is theirs alone.
-    """
-
-    def _start_from_image(self, columns: FloatArray) -> RigidTransform:
-        x, depth, z, tilt, yaw, roll = np.moveaxis(columns, -1, 0)
-        rotation = Rotation.from_euler("YXZ", np.stack([yaw, tilt, roll], axis=-1))
-        below = self.pivot_mm + np.multiply.outer(depth, [0.0, 1.0, 0.0])
-        met = np.stack([x, np.zeros_like(x), z], axis=-1)
-        return RigidTransform.from_components(met - rotation.apply(below), rotation)
-
-
-@dataclass(frozen=True)
-class PointScan(Trajectory):
-    """A motion about the origin of the medium, which stays in the image or beside it.
-
-    The columns of `knots` are where that point is in the image: lateral from the image's middle, depth, out
-    of the plane (mm); then tilt, yaw, roll (rad), of which yaw comes first, as in a `FloorScan`.
-    """
-
-    def _start_from_image(self, columns: FloatArray) -> RigidTransform:
-        rotation = Rotation.from_euler("YXZ", columns[..., [4, 3, 5]])
-        return RigidTransform.from_components(-rotation.apply(self.pivot_mm + columns[..., :3]), rotation)
-
-
-def scan_floor(
+def calibration_scan(
     settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: np.random.Generator
-) -> FloorScan:
-    """Turn and lift the probe over the ranges in `settings`, all axes at once, as a hand would."""
-    time, columns = _scan(settings, (_ROAMING_MM, _ROAMING_MM), rng)
-    return FloorScan(time, columns, np.array([face_mm / 2.0, 0.0, 0.0]), RigidTransform.identity(), world)
+) -> Trajectory:
+    """Turn and lift the probe over the ranges in `settings`, all axes at once, as a hand would.
 
-
-def scan_point(
-    settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: np.random.Generator
-) -> PointScan:
-    """Keep a point in the image while the probe turns and lifts over the ranges in `settings`."""
-    time, columns = _scan(settings, (_LATERAL_SHARE * face_mm, _OFF_POINT_MM), rng)
-    return PointScan(time, columns, np.array([face_mm / 2.0, 0.0, 0.0]), RigidTransform.identity(), world)
-
-
-def _scan(
-    settings: SimulationSettings, reach_mm: tuple[float, float], rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Times, and swings of six columns; `reach_mm` is of the first and third."""
-    duration, tremor = settings.duration_s, HandMotion()
-    time = hand_knots(duration)
+    Over a floor at y = 0 of the medium (`plane`), the columns are x of the point of the floor that the
+    image's middle vector meets, its depth in the image, its z. About a point at the medium's origin
+    (`wires`), they are where the point is in the image: lateral from its middle, depth, out of the plane.
+    Yaw is about the medium's y and comes first, then tilt and roll about the image's own axes, so that the
+    angle to the floor is theirs alone.
+    """
+    over_floor = settings.preset == "plane"
+    across, off = (_ROAMING_MM, _ROAMING_MM) if over_floor else (_LATERAL_SHARE * face_mm, _OFF_POINT_MM)
     nearest, farthest = settings.depth_range_mm
     turns = np.deg2rad([settings.tilt_range_deg, settings.yaw_range_deg, settings.roll_range_deg])
-    reach = np.array([reach_mm[0], (farthest - nearest) / 2.0, reach_mm[1], *turns])
+    reach = np.array([across, (farthest - nearest) / 2.0, off, *turns])
+    time = _knot_times(settings.duration_s)
     columns = np.empty((time.size, 6))
     for axis in range(6):
-        fast = tremor.tremor_mm if axis < 3 else tremor.tremor_rad
-        columns[:, axis] = reach[axis] * _swings(time / duration, _SWINGS[axis], rng)
-        columns[:, axis] += fast * band_noise(time, tremor.tremor_band_hz, rng)
+        columns[:, axis] = reach[axis] * _swings(time / settings.duration_s, _SWINGS[axis], rng)
+        columns[:, axis] += _tremor(time, axis, HandMotion(), rng)
     columns[:, 1] += (nearest + farthest) / 2.0
-    return time, columns
+    pivot = np.array([face_mm / 2.0, 0.0, 0.0])
+    in_medium = np.array([1.0, 0.0, 1.0]) if over_floor else np.zeros(3)
+
+    def medium_from_columns(columns: FloatArray) -> RigidTransform:
+        rotation = Rotation.from_euler("YXZ", columns[..., [4, 3, 5]])
+        in_image = pivot + columns[..., :3] * (1.0 - in_medium)
+        moved = columns[..., :3] * in_medium - rotation.apply(in_image)
+        return RigidTransform.from_components(moved, rotation)
+
+    return Trajectory(time, columns, medium_from_columns, world)
 
 
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:
@@ -258,15 +226,17 @@ def world_from_medium(heading_rad: float) -> RigidTransform:
 
 
 def _progress(
-    time: FloatArray, inside: BoolArray, motion: HandMotion, rng: np.random.Generator
+    time: FloatArray, duration_s: float, motion: HandMotion, rng: np.random.Generator
 ) -> FloatArray:
     """Fraction of the length travelled: zero before the sweep, one (or zero again) after it."""
+    inside = (time >= 0.0) & (time <= duration_s)
     duration = float(time[inside][-1])
-    speed = 1.0 + motion.speed_variation * np.tanh(band_noise(time, (0.0, 0.8), rng))
+    speed = 1.0 + motion.speed_variation * np.tanh(_band_noise(time, (0.0, 0.8), rng))
     # In a very short sweep a whole pause would leave no motion at all.
     pause_s = min(motion.pause_s, 0.2 * duration)
     for centre in rng.uniform(0.15, 0.85, motion.pauses) * duration:
-        speed *= 1.0 - _window((time - centre) / pause_s)
+        # At rest for a pause, which begins and ends within a quarter of it.
+        speed *= 1.0 - np.clip(3.0 - 4.0 * np.abs((time - centre) / pause_s), 0.0, 1.0)
     speed = np.where(inside, speed, 0.0)
     if motion.reverse:
         speed *= np.tanh((duration / 2.0 - time) / 0.25)
@@ -274,34 +244,30 @@ def _progress(
         speed = np.where(speed > 0.0, speed / forward, speed / back)
     else:
         speed /= speed.sum()
-    return np.cumsum(_smoothed(speed))
+    # A hand accelerates over about a tenth of a second.
+    start = np.hanning(13)[1:-1]
+    return np.cumsum(np.convolve(speed, start / start.sum(), mode="same"))
 
 
 def _wobble(time: FloatArray, duration_s: float, motion: HandMotion, rng: np.random.Generator) -> FloatArray:
     """To and fro during the sweep, as evenly as a hand can: phase and amplitude wander."""
-    uneven = band_noise(time, (0.0, 0.3), rng)
-    strength = 1.0 + 0.15 * np.tanh(band_noise(time, (0.0, 0.5), rng))
+    uneven = _band_noise(time, (0.0, 0.3), rng)
+    strength = 1.0 + 0.15 * np.tanh(_band_noise(time, (0.0, 0.5), rng))
     during = np.clip(time / 0.5, 0.0, 1.0) * np.clip((duration_s - time) / 0.5, 0.0, 1.0)
     phase = 2.0 * np.pi * motion.wobble_hz * time + uneven
     return np.asarray(motion.wobble_mm * strength * _smooth_step(during) * np.sin(phase))
-
-
-def _smoothed(speed: FloatArray) -> FloatArray:
-    """Smooth starts and stops: a hand accelerates over about a tenth of a second."""
-    kernel = np.hanning(13)[1:-1]
-    return np.convolve(speed, kernel / kernel.sum(), mode="same")
-
-
-def _window(u: FloatArray) -> FloatArray:
-    """One within half a unit of zero, falling to zero over a further quarter."""
-    return np.clip(3.0 - 4.0 * np.abs(u), 0.0, 1.0)
 
 
 def _smooth_step(u: FloatArray) -> FloatArray:
     return u * u * (3.0 - 2.0 * u)
 
 
-def band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:
+def _tremor(time: FloatArray, axis: int, motion: HandMotion, rng: np.random.Generator) -> FloatArray:
+    size = motion.tremor_mm if axis < 3 else motion.tremor_rad
+    return size * _band_noise(time, motion.tremor_band_hz, rng)
+
+
+def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:
     """Random smooth function of unit rms made of a dozen sinusoids in the band."""
     frequency = rng.uniform(*band_hz, 12)
     phase = rng.uniform(0.0, 2.0 * np.pi, 12)
@@ -312,6 +278,6 @@ def band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Ge
 def _swings(phase: FloatArray, count: float, rng: np.random.Generator) -> FloatArray:
     """Nearly triangular wave between -1 and 1, about `count` periods per unit of phase, with rounded ends."""
     # The speed varies slowly against a swing.
-    angle = count * rng.uniform(0.95, 1.05) * phase + 0.05 * band_noise(phase, (0.0, 0.5 * count), rng)
+    angle = count * rng.uniform(0.95, 1.05) * phase + 0.05 * _band_noise(phase, (0.0, 0.5 * count), rng)
     sine = np.sin(2.0 * np.pi * (angle + rng.random()))
     return np.asarray(np.arcsin(0.95 * sine) / np.arcsin(0.95))

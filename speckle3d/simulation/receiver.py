@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -13,14 +12,13 @@ from scipy import signal as filters
 
 from speckle3d.core.arrays import Complex64Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, RFSettings, Sweep, read_frame
-from speckle3d.core.threads import ahead
+from speckle3d.core.sweep import BModeSettings, Frames, RFSettings, Sweep, read_frame
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 
-GUARD = 0.1
+_GUARD = 0.1
 """Kept on either side of the band, over its width."""
 
-WHITE_DB = 20.0
+_WHITE_DB = 20.0
 """Full white over the mean of fully developed speckle."""
 
 _ROOM, _LEAST_ROOM = 1.25, 1.05
@@ -61,7 +59,7 @@ class Demodulator:
     def reach_hz(self) -> float:
         """Highest frequency after mixing that is kept."""
         low, high = self.rf.bandwidth_hz
-        return max(high - self.frequency_hz, self.frequency_hz - low) + GUARD * (high - low)
+        return max(high - self.frequency_hz, self.frequency_hz - low) + _GUARD * (high - low)
 
     @property
     def every(self) -> int:
@@ -94,7 +92,7 @@ class Demodulator:
         half_rate = self.rf.sampling_rate_hz / 2.0
         low, high = self.rf.bandwidth_hz
         # Real echoes have a mirror image of their band, which mixing shifts down, too.
-        mirror_hz = low + self.frequency_hz - GUARD * (high - low)
+        mirror_hz = low + self.frequency_hz - _GUARD * (high - low)
         # What aliases may fall where nothing is kept, and only there.
         stop_hz = min(self.rf.sampling_rate_hz / self.every - self.reach_hz, half_rate, mirror_hz)
         if stop_hz <= self.reach_hz:
@@ -109,10 +107,28 @@ class Demodulator:
 
 
 @dataclass(frozen=True)
-class _Received:
+class ReceivedFrames:
+    """What is stored of RF frames: I/Q in whole counts of 16 bits, or the log-compressed envelope in 8 bits.
+
+    Parameters
+    ----------
+    frames : Frames
+    demodulate : Demodulator
+    dynamic_range_db : float, optional
+        From black to white, of an envelope; I/Q without it.
+    """
+
     frames: Frames
     demodulate: Demodulator
+    dynamic_range_db: float | None = None
     any_thread: ClassVar[bool] = True
+    computed: ClassVar[bool] = True
+    stored_dtype: ClassVar[np.dtype[Any]] = np.dtype(np.int16)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Complex, or grey levels."""
+        return np.dtype(np.complex64 if self.dynamic_range_db is None else np.uint8)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -124,52 +140,15 @@ class _Received:
         return self.frames.shape[0]
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        raise NotImplementedError
-
-    def in_order(self) -> Iterator[npt.NDArray[Any]]:
-        """All frames from the first, made on all cores."""
-        return ahead(self.__getitem__, range(len(self)))
-
-
-@dataclass(frozen=True)
-class IQFrames(_Received):
-    """I/Q of RF frames in whole counts, as pairs of 16-bit numbers hold them."""
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Complex."""
-        return np.dtype(np.complex64)
-
-    @property
-    def stored_dtype(self) -> np.dtype[Any]:
-        """Counts."""
-        return np.dtype(np.int16)
-
-    def __getitem__(self, index: int) -> Complex64Array:
         """One frame, shape (vector, sample)."""
         counts = self.demodulate(read_frame(self.frames, index))
-        limits = np.iinfo(np.int16)
-        parts = np.clip(np.rint(counts.view(np.float32)), limits.min, limits.max)
-        return parts.view(np.complex64)
-
-
-@dataclass(frozen=True)
-class GreyFrames(_Received):
-    """Log-compressed envelope of RF frames, 8 bits; black and white where they go beyond the range."""
-
-    dynamic_range_db: float
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Grey levels."""
-        return np.dtype(np.uint8)
-
-    def __getitem__(self, index: int) -> npt.NDArray[np.uint8]:
-        """One frame, shape (column, row)."""
-        power = np.abs(self.demodulate(read_frame(self.frames, index))) ** 2
+        if self.dynamic_range_db is None:
+            limits = np.iinfo(np.int16)
+            parts = np.clip(np.rint(counts.view(np.float32)), limits.min, limits.max)
+            return parts.view(np.complex64)
         # The envelope's square is twice the RF's.
-        over_speckle = np.maximum(power / (2.0 * SPECKLE_RMS_COUNTS**2), 1e-12)
-        level = 1.0 + (10.0 * np.log10(over_speckle) - WHITE_DB) / self.dynamic_range_db
+        over_speckle = np.maximum(np.abs(counts) ** 2 / (2.0 * SPECKLE_RMS_COUNTS**2), 1e-12)
+        level = 1.0 + (10.0 * np.log10(over_speckle) - _WHITE_DB) / self.dynamic_range_db
         return np.rint(255.0 * np.clip(level, 0.0, 1.0)).astype(np.uint8)
 
 
@@ -186,13 +165,9 @@ def received_as_iq(sweep: Sweep, frequency_hz: float | None = None, decimation: 
     Raises
     ------
     InvalidInputError
-        If the rate that is left does not hold the band.
+        If the sweep is not RF, or the rate that is left does not hold the band.
     """
-    rf = _real(sweep)
-    made = Demodulator(rf, rf.centre_frequency_hz if frequency_hz is None else frequency_hz, decimation)
-    return replace(
-        sweep, frames=IQFrames(sweep.frames, made), grid=_coarser(sweep.grid, made), signal=made.signal
-    )
+    return _received(sweep, frequency_hz, decimation, None)
 
 
 def received_as_bmode(sweep: Sweep, dynamic_range_db: float, decimation: int | None = None) -> Sweep:
@@ -201,23 +176,23 @@ def received_as_bmode(sweep: Sweep, dynamic_range_db: float, decimation: int | N
     Raises
     ------
     InvalidInputError
-        If the rows do not hold the band.
+        If the sweep is not RF, or the rows do not hold the band.
     """
-    rf = _real(sweep)
-    made = Demodulator(rf, rf.centre_frequency_hz, _GREY_DECIMATION if decimation is None else decimation)
+    decimation = _GREY_DECIMATION if decimation is None else decimation
+    return _received(sweep, None, decimation, dynamic_range_db)
+
+
+def _received(
+    sweep: Sweep, frequency_hz: float | None, decimation: int | None, dynamic_range_db: float | None
+) -> Sweep:
+    rf, grid = sweep.signal, sweep.grid
+    if not isinstance(rf, RFSettings) or rf.are_complex:
+        raise InvalidInputError(f"{sweep.name}: expected RF, got samples of another kind")
+    made = Demodulator(rf, rf.centre_frequency_hz if frequency_hz is None else frequency_hz, decimation)
+    spacing_mm = made.signal.sample_spacing_mm
     return replace(
         sweep,
-        frames=GreyFrames(sweep.frames, made, dynamic_range_db),
-        grid=_coarser(sweep.grid, made),
-        signal=BModeSettings(dynamic_range_db),
+        frames=ReceivedFrames(sweep.frames, made, dynamic_range_db),
+        grid=replace(grid, samples=made.samples(grid.samples), sample_spacing_mm=spacing_mm),
+        signal=made.signal if dynamic_range_db is None else BModeSettings(dynamic_range_db),
     )
-
-
-def _real(sweep: Sweep) -> RFSettings:
-    if not isinstance(sweep.signal, RFSettings) or sweep.signal.are_complex:
-        raise InvalidInputError(f"{sweep.name}: expected RF, got samples of another kind")
-    return sweep.signal
-
-
-def _coarser(grid: ImageGrid, made: Demodulator) -> ImageGrid:
-    return replace(grid, samples=made.samples(grid.samples), sample_spacing_mm=made.signal.sample_spacing_mm)

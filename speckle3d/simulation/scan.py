@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -12,15 +11,14 @@ import numpy.typing as npt
 from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
+from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.core.threads import ahead
 from speckle3d.kernels.scatter import EchoGrid, FieldTable, field_table, scatter_echoes
-from speckle3d.simulation.beam import BeamTable
+from speckle3d.simulation.beam import PER_PITCH, BeamTable
 from speckle3d.simulation.medium import Medium
 
-FULL_SCALE = 8191
+_FULL_SCALE = 8191
 """14 bits, signed."""
 
 SPECKLE_RMS_COUNTS = 350.0
@@ -59,6 +57,8 @@ class SimulatedFrames:
     snr_db: float = 40.0
     noise_entropy: int = 0
     any_thread: ClassVar[bool] = True
+    computed: ClassVar[bool] = True
+    dtype: ClassVar[np.dtype[Any]] = np.dtype(np.int16)
 
     def __post_init__(self) -> None:
         pitch_mm, probe_mm = self.image.vector_pitch_mm, self.beam.probe.pitch_mm
@@ -72,32 +72,29 @@ class SimulatedFrames:
         """Frames, vectors, samples."""
         return len(self.medium_from_image), self.image.vectors, self.image.samples
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Counts."""
-        return np.dtype(np.int16)
-
     def __len__(self) -> int:
         return len(self.medium_from_image)
 
     def __getitem__(self, index: int) -> npt.NDArray[np.int16]:
         """One frame, shape (vector, sample), 14-bit counts."""
-        n = len(self)
-        if not -n <= index < n:
-            raise IndexError(f"frame {index} of {n}")
-        index %= n
-        counts = self._spectra.waveforms(self.echoes(index), self._noise(index)) * self._gain
-        return np.clip(np.rint(counts), -FULL_SCALE, FULL_SCALE).astype(np.int16)
+        counts = self.waveforms(range(len(self))[index]) * self._gain
+        return np.clip(np.rint(counts), -_FULL_SCALE, _FULL_SCALE).astype(np.int16)
 
-    def in_order(self) -> Iterator[npt.NDArray[np.int16]]:
-        """All frames from the first, made on all cores."""
-        return ahead(self.__getitem__, range(len(self)))
+    def waveforms(self, index: int) -> Float32Array:
+        """RF of frame `index` before gain, shape (vector, sample): echoes through their pulses, and noise."""
+        band, pulse = self._pulses
+        # The band holds less than half of the bins: baseband bins wrap, so negative ones are in place.
+        baseband = fft(self._echoes(index), axis=1)[:, band - self._carrier_bin]
+        spectrum = self._noise(index)
+        spectrum[:, band] += np.einsum("vfk,fk->vf", baseband, pulse)
+        wave: Float32Array = irfft(spectrum, self._length, axis=1)[:, : self.image.samples]
+        return wave
 
-    def echoes(self, index: int) -> Complex64Array:
+    def _echoes(self, index: int) -> Complex64Array:
         """Baseband echoes of frame `index`, shape (vector, sample, component of the beam)."""
         probe, image = self.beam.probe, self.image
-        out = np.zeros((image.vectors, self._spectra.length, self.beam.grid.components), np.complex64)
-        carrier = 2e-3 * self._spectra.carrier_hz / probe.speed_of_sound_m_s
+        out = np.zeros((image.vectors, self._length, len(self.beam.components)), np.complex64)
+        carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
         medium_from_image = self.medium_from_image[index]
         matrix = medium_from_image.inv().as_matrix()
@@ -108,15 +105,11 @@ class SimulatedFrames:
         return out
 
     @cached_property
-    def _spectra(self) -> _Spectra:
-        return _Spectra(self.beam, self.image.samples)
-
-    @cached_property
     def _field(self) -> FieldTable:
         beam = self.beam
         depth, lateral, elevation = beam.depth_mm, beam.lateral_mm, beam.elevation_mm
         steps = np.array([depth[0], depth[1] - depth[0], lateral[1], elevation[1]])
-        return field_table(beam.residual, beam.reach, beam.curvature_per_mm, steps, beam.grid.per_pitch)
+        return field_table(beam.residual, beam.reach, beam.curvature_per_mm, steps, PER_PITCH)
 
     @cached_property
     def _box(self) -> tuple[FloatArray, FloatArray]:
@@ -125,6 +118,28 @@ class SimulatedFrames:
         depth = self.beam.depth_mm
         low = np.array([-margin, depth[0], -thick])
         return low, np.array([self.image.width_mm + margin, depth[-1], thick])
+
+    @cached_property
+    def _length(self) -> int:
+        """Samples of the FFT."""
+        return int(next_fast_len(self.image.samples + _GUARD_SAMPLES, real=True))
+
+    @cached_property
+    def _frequency_hz(self) -> FloatArray:
+        """Of the FFT's bins."""
+        return np.arange(self._length // 2 + 1) * self.beam.probe.sampling_rate_hz / self._length
+
+    @property
+    def _carrier_bin(self) -> int:
+        probe = self.beam.probe
+        return round(probe.centre_frequency_hz / probe.sampling_rate_hz * self._length)
+
+    @cached_property
+    def _pulses(self) -> tuple[IntArray, Complex64Array]:
+        """Bins of the pulse's band, and each component's pulse spectrum in them, shape (bin, component)."""
+        spectra = self.beam.spectra(self._frequency_hz)
+        band = np.flatnonzero(spectra.any(axis=0))
+        return band, np.ascontiguousarray(spectra[:, band].T).astype(np.complex64)
 
     @cached_property
     def _rms(self) -> tuple[FloatArray, float]:
@@ -146,37 +161,13 @@ class SimulatedFrames:
         """Spectrum of one frame's electronic noise, shape (vector, bin)."""
         rng = np.random.default_rng([self.noise_entropy, index])
         low, high = _NOISE_BAND_HZ
-        frequency = self._spectra.frequency_hz
+        frequency = self._frequency_hz
         band = np.flatnonzero((frequency >= low) & (frequency <= high))
         _, focus = self._rms
         rms = focus * 10.0 ** (-self.snr_db / 20.0)
         # irfft of bins of variance 2 s^2 over n samples has variance 4 s^2 bins / n^2.
-        scale = rms * self._spectra.length / np.sqrt(4.0 * band.size)
+        scale = rms * self._length / np.sqrt(4.0 * band.size)
         noise = np.zeros((self.image.vectors, frequency.size), np.complex64)
         white = rng.standard_normal((self.image.vectors, band.size, 2), dtype=np.float32)
         noise[:, band] = scale * white.view(np.complex64)[..., 0]
         return noise
-
-
-class _Spectra:
-    """Pulse spectra of the beam's components on the FFT's bins; turns baseband echoes into RF."""
-
-    def __init__(self, beam: BeamTable, samples: int) -> None:
-        rate = beam.probe.sampling_rate_hz
-        self.samples = samples
-        self.length = next_fast_len(samples + _GUARD_SAMPLES, real=True)
-        self.frequency_hz = np.arange(self.length // 2 + 1) * rate / self.length
-        self._carrier_bin = round(beam.probe.centre_frequency_hz / rate * self.length)
-        self.carrier_hz = float(self.frequency_hz[self._carrier_bin])
-        spectra = beam.spectra(self.frequency_hz)
-        self._band = np.flatnonzero(spectra.any(axis=0))
-        self._pulse = np.ascontiguousarray(spectra[:, self._band].T).astype(np.complex64)
-
-    def waveforms(self, echoes: Complex64Array, noise: Complex64Array) -> Float32Array:
-        """RF, shape (vector, sample): each component's echoes through its pulse, and the noise, summed."""
-        # The band holds less than half of the bins: baseband bins wrap, so negative ones are in place.
-        baseband = fft(echoes, axis=1)[:, self._band - self._carrier_bin]
-        spectrum = noise
-        spectrum[:, self._band] += np.einsum("vfk,fk->vf", baseband, self._pulse)
-        wave: Float32Array = irfft(spectrum, self.length, axis=1)[:, : self.samples]
-        return wave

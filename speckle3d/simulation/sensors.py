@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -79,32 +78,14 @@ class OrientationModel:
         return Rotation.from_euler("ZYX", self.mounting_rad)
 
 
-_ERRORS = (
-    "position_mm",
-    "orientation_rad",
-    "inclination_rad",
-    "heading_rad",
-    "white_rad",
-    "gyroscope_rad_s",
-    "gyroscope_bias_rad_s",
-    "accelerometer_m_s2",
-    "accelerometer_bias_m_s2",
-    "magnetometer_au",
-)
-
-Model = TypeVar("Model", TrackerModel, OrientationModel)
-
-
-def with_noise(model: Model, factor: float) -> Model:
-    """Return the same sensor with all of its errors multiplied, those of its clock excepted."""
-    errors = {name: value for name, value in vars(model).items() if name in _ERRORS}
-    return replace(model, **{name: factor * value for name, value in errors.items()})
-
-
 def simulate_tracker(
-    trajectory: Trajectory, span_s: tuple[float, float], model: TrackerModel, rng: np.random.Generator
+    trajectory: Trajectory,
+    span_s: tuple[float, float],
+    model: TrackerModel,
+    rng: np.random.Generator,
+    noise: float = 1.0,
 ) -> Tracker:
-    """Track the probe over `span_s` of image time.
+    """Track the probe over `span_s` of image time; `noise` multiplies all errors but the clock's.
 
     The reading stamped t on the sensor's clock shows the probe at ``t - latency``.
     """
@@ -112,31 +93,45 @@ def simulate_tracker(
     clock = clock[rng.random(clock.size) >= model.dropouts]
     true = trajectory.world_from_image(clock) * model.sensor_from_image.inv()
     translation, rotation = true.as_components()
-    jitter = Rotation.from_rotvec(model.orientation_rad * rng.standard_normal((clock.size, 3)))
-    moved = translation + model.position_mm * rng.standard_normal((clock.size, 3))
+    jitter = Rotation.from_rotvec(noise * model.orientation_rad * rng.standard_normal((clock.size, 3)))
+    moved = translation + noise * model.position_mm * rng.standard_normal((clock.size, 3))
     readings = TimedPoses(clock + model.latency_s, RigidTransform.from_components(moved, rotation * jitter))
     return Tracker(readings, model.sensor_from_image, -model.latency_s)
 
 
 def simulate_orientation(
-    trajectory: Trajectory, span_s: tuple[float, float], model: OrientationModel, rng: np.random.Generator
+    trajectory: Trajectory,
+    span_s: tuple[float, float],
+    model: OrientationModel,
+    rng: np.random.Generator,
+    noise: float = 1.0,
 ) -> OrientationSensor:
-    """Orientation and raw inertial readings over `span_s` of image time."""
+    """Orientation and raw inertial readings over `span_s` of image time; `noise` as of the tracker."""
     clock = _clock(span_s, model.rate_hz, model.clock_jitter_s, rng)
-    world_from_sensor = _sensor_rotation(trajectory, model, clock)
-    slow_rad = [model.inclination_rad, model.inclination_rad, model.heading_rad]
-    wander = _wander(clock, model.wander_s, rng) * slow_rad
-    white = Rotation.from_rotvec(model.white_rad * rng.standard_normal((clock.size, 3)))
-    reported = Rotation.from_rotvec(wander) * world_from_sensor * white
-    force, rate = _specific_force(trajectory, model, clock), _angular_rate(trajectory, model, clock)
-    field = world_from_sensor.inv().apply([np.cos(model.dip_rad), 0.0, -np.sin(model.dip_rad)])
+    poses = [trajectory.world_from_image(clock + shift) for shift in (-_DERIVATIVE_S, 0.0, _DERIVATIVE_S)]
+    before, now, after = (pose.rotation * model.sensor_from_image.inv() for pose in poses)
+    path = [pose.apply(np.asarray(model.lever_mm)) for pose in poses]
+    slow_rad = np.array([model.inclination_rad, model.inclination_rad, model.heading_rad])
+    wander = _wander(clock, model.wander_s, rng) * (noise * slow_rad)
+    white = Rotation.from_rotvec(noise * model.white_rad * rng.standard_normal((clock.size, 3)))
+    reported = Rotation.from_rotvec(wander) * now * white
+    # At rest the specific force, acceleration minus gravity, points up.
+    acceleration = 1e-3 * (path[0] - 2.0 * path[1] + path[2]) / _DERIVATIVE_S**2
+    force = now.inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY_M_S2]))
+    rate = (before.inv() * after).as_rotvec() / (2.0 * _DERIVATIVE_S)
+    field = now.inv().apply([np.cos(model.dip_rad), 0.0, -np.sin(model.dip_rad)])
+
+    def noisy(true: FloatArray, bias: float, white: float) -> FloatArray:
+        drawn = noise * bias * rng.standard_normal(3), noise * white * rng.standard_normal(true.shape)
+        return np.asarray(true + drawn[0] + drawn[1])
+
     return OrientationSensor(
         TimedRotations(clock - model.time_offset_s, reported),
         model.sensor_from_image,
         model.time_offset_s,
-        _noisy(force, model.accelerometer_bias_m_s2, model.accelerometer_m_s2, rng),
-        _noisy(rate, model.gyroscope_bias_rad_s, model.gyroscope_rad_s, rng),
-        _noisy(field, 0.0, model.magnetometer_au, rng),
+        noisy(force, model.accelerometer_bias_m_s2, model.accelerometer_m_s2),
+        noisy(rate, model.gyroscope_bias_rad_s, model.gyroscope_rad_s),
+        noisy(field, 0.0, model.magnetometer_au),
     )
 
 
@@ -146,33 +141,6 @@ def _clock(
     first = span_s[0] + rng.uniform(0.0, 1.0 / rate_hz)
     n = int((span_s[1] - first) * rate_hz)
     return first + np.arange(n) / rate_hz + rng.uniform(-jitter_s, jitter_s, n)
-
-
-def _sensor_rotation(trajectory: Trajectory, model: OrientationModel, time_s: FloatArray) -> Rotation:
-    return trajectory.world_from_image(time_s).rotation * model.sensor_from_image.inv()
-
-
-def _angular_rate(trajectory: Trajectory, model: OrientationModel, time_s: FloatArray) -> FloatArray:
-    """Angular rate in the sensor frame, rad/s."""
-    before = _sensor_rotation(trajectory, model, time_s - _DERIVATIVE_S)
-    after = _sensor_rotation(trajectory, model, time_s + _DERIVATIVE_S)
-    return np.asarray((before.inv() * after).as_rotvec() / (2.0 * _DERIVATIVE_S))
-
-
-def _specific_force(trajectory: Trajectory, model: OrientationModel, time_s: FloatArray) -> FloatArray:
-    """Acceleration minus gravity at the sensor, in its frame, m/s^2: at rest it points up."""
-    lever = np.asarray(model.lever_mm)
-    before, now, after = (
-        trajectory.world_from_image(time_s + shift).apply(lever)
-        for shift in (-_DERIVATIVE_S, 0.0, _DERIVATIVE_S)
-    )
-    acceleration = 1e-3 * (before - 2.0 * now + after) / _DERIVATIVE_S**2
-    world = acceleration + np.array([0.0, 0.0, GRAVITY_M_S2])
-    return np.asarray(_sensor_rotation(trajectory, model, time_s).inv().apply(world))
-
-
-def _noisy(true: FloatArray, bias: float, white: float, rng: np.random.Generator) -> FloatArray:
-    return np.asarray(true + bias * rng.standard_normal(3) + white * rng.standard_normal(true.shape))
 
 
 def _wander(time_s: FloatArray, correlation_s: float, rng: np.random.Generator) -> FloatArray:

@@ -4,24 +4,34 @@ import numpy as np
 import oracles
 import pytest
 from points import PointMedium
+from scipy.signal import hilbert
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.simulation.beam import Probe, tabulate_beam
-from speckle3d.simulation.medium import TiledMedium
+from speckle3d.simulation.medium import TiledMedium, tissue
+from speckle3d.simulation.movement import stepped_poses
 from speckle3d.simulation.scan import SimulatedFrames
 
 PROBE = Probe()
 NODES_HZ = np.arange(2.75e6, 12.3e6, 0.5e6)
 SILENT = 200.0
+STILL = RigidTransform.from_matrix(np.eye(4)[None])
+STEP_MM, STEPS = 0.1, 5
 
 
-def direct_response(points_mm, frequency_hz=NODES_HZ):
+def pulse(frequency_hz):
+    """Raised cosine of 10 MHz about 7.5 MHz."""
+    off = np.abs(frequency_hz - 7.5e6)
+    return np.where(off < 5e6, np.cos(np.pi * off / 1e7) ** 2, 0)
+
+
+def direct_response(points_mm, frequency_hz=NODES_HZ, step_mm=0.1):
     depth = points_mm[0][1]
     return oracles.linear_array_response(
         points_mm,
         frequency_hz,
-        step_mm=0.1,  # two thirds of the shortest wavelength
+        step_mm=step_mm,  # 0.1 mm is two thirds of the shortest wavelength
         pitch_mm=0.3,
         elements=49,
         focus_mm=(20.0, depth),
@@ -38,14 +48,14 @@ def beam():
     return tabulate_beam(PROBE)
 
 
+def image(vectors, samples=3818):
+    return ImageGrid(vectors, samples, 0.3, PROBE.signal.sample_spacing_mm)
+
+
 def echo(beam, point_mm):
-    """RF of one scatterer on one vector, in counts before rounding, without gain."""
-    image = ImageGrid(1, 3818, 0.3, PROBE.signal.sample_spacing_mm)
+    """RF of one scatterer on one vector, without gain."""
     medium = PointMedium(np.array([point_mm]), np.ones(1, np.float32))
-    frames = SimulatedFrames(beam, medium, RigidTransform.from_matrix(np.eye(4)[None]), image, SILENT)
-    spectra = frames._spectra
-    silence = np.zeros((1, spectra.frequency_hz.size), np.complex64)
-    return spectra.waveforms(frames.echoes(0), silence)[0].astype(float)
+    return SimulatedFrames(beam, medium, STILL, image(1), SILENT).waveforms(0)[0].astype(float)
 
 
 def direct_echo(point_mm):
@@ -55,12 +65,11 @@ def direct_echo(point_mm):
     turns = 2e-3 * point_mm[1] / 1540.0
     slow = direct_response([point_mm])[0] * np.exp(2j * np.pi * NODES_HZ * turns)
     slow = np.interp(frequency, NODES_HZ, slow.real) + 1j * np.interp(frequency, NODES_HZ, slow.imag)
-    pulse = np.where(np.abs(frequency - 7.5e6) < 5e6, np.cos(np.pi * (frequency - 7.5e6) / 1e7) ** 2, 0)
-    return np.fft.irfft(slow * np.exp(-2j * np.pi * frequency * turns) * pulse, n)[:3818]
+    return np.fft.irfft(slow * np.exp(-2j * np.pi * frequency * turns) * pulse(frequency), n)[:3818]
 
 
-@pytest.mark.parametrize("depth_mm", [5.0, 10.0, 20.25, 30.0, 40.0])
-@pytest.mark.parametrize("across_mm", [(0.0, 0.0), (0.11, 0.33), (0.5, 0.8)])
+@pytest.mark.parametrize("depth_mm", [5.0, 20.25, 40.0])
+@pytest.mark.parametrize("across_mm", [(0.0, 0.0), (0.5, 0.8)])
 def test_one_echo_has_the_right_shape_phase_and_delay(beam, depth_mm, across_mm):
     point = (across_mm[0], depth_mm, across_mm[1])
     made, direct = echo(beam, point), direct_echo(point)
@@ -69,40 +78,62 @@ def test_one_echo_has_the_right_shape_phase_and_delay(beam, depth_mm, across_mm)
     assert made @ direct / np.sqrt(made @ made * (direct @ direct)) > 0.975
 
 
-@pytest.mark.parametrize("depth_mm", [10.0, 20.0, 30.0])
+@pytest.mark.parametrize("depth_mm", [10.0, 30.0])
 def test_elevational_energy_profile(beam, depth_mm):
-    z = np.arange(0.0, 3.3, 0.2)
-    points = [(0.0, depth_mm, float(e)) for e in z]
+    points = [(0.0, depth_mm, float(z)) for z in np.arange(0.0, 3.3, 0.2)]
     made = np.array([(echo(beam, p) ** 2).sum() for p in points])
-    band = np.abs(NODES_HZ - 7.5e6) < 5e6
-    pulse = np.cos(np.pi * (NODES_HZ[band] - 7.5e6) / 1e7) ** 2
-    direct = (np.abs(direct_response(points)[:, band] * pulse) ** 2).sum(axis=1)
-    made, direct = made / made[0], direct / direct[0]
+    direct = (np.abs(direct_response(points) * pulse(NODES_HZ)) ** 2).sum(axis=1)
     # 3 % of the axis: linear interpolation over 0.08 mm (up to 2 % of the energy on a slope).
-    np.testing.assert_allclose(made, direct, atol=0.03)
-    assert half_width(z, made) == pytest.approx(half_width(z, direct), rel=0.03)
-
-
-def test_the_wavefront_is_flat_at_the_lens_focus_and_curved_off_it(beam):
-    kz = np.interp([10.0, 30.0], beam.depth_mm, beam.curvature_per_mm[:, 1])
-    assert kz[0] < -0.01 < 0.01 < kz[1]
+    np.testing.assert_allclose(made / made[0], direct / direct[0], atol=0.03)
 
 
 def test_predicted_echo_power_is_that_of_speckle(beam):
-    medium = TiledMedium(3, 100.0, 0.0)
-    image = ImageGrid(32, 3818, 0.3, PROBE.signal.sample_spacing_mm)
-    frames = SimulatedFrames(beam, medium, RigidTransform.from_matrix(np.eye(4)[None]), image, SILENT)
-    silence = np.zeros((32, frames._spectra.frequency_hz.size), np.complex64)
-    rf = frames._spectra.waveforms(frames.echoes(0), silence)
-    frequency = np.linspace(0, 100e6 / 3, 513)
+    rf = SimulatedFrames(beam, TiledMedium(3, 100.0, 0.0), STILL, image(32), SILENT).waveforms(0)
+    predicted = beam.echo_power(np.linspace(0, 100e6 / 3, 513))
     for depth in (10.0, 20.0, 30.0):
         row = round(depth / PROBE.signal.sample_spacing_mm)
         measured = rf[:, row - 150 : row + 150].astype(float).var()
-        predicted = np.interp(depth, beam.depth_mm, beam.echo_power(frequency))
         # About 20 x 20 cells of exponential intensity: 5 % standard error; three of them.
-        assert measured == pytest.approx(predicted, rel=0.15)
+        assert measured == pytest.approx(np.interp(depth, beam.depth_mm, predicted), rel=0.15)
 
 
-def half_width(z_mm, energy):
-    i = int(np.argmax(energy < 0.5))
-    return z_mm[i - 1] + (z_mm[i] - z_mm[i - 1]) * (energy[i - 1] - 0.5) / (energy[i - 1] - energy[i])
+def intensity_correlation(medium, beam, depths_mm, blocks):
+    """Mean correlation of intensity over pairs at 0, 1, .. steps, and its standard error over blocks."""
+    poses = stepped_poses(STEPS, STEP_MM, blocks, 6.0)
+    frames = SimulatedFrames(beam, medium, poses, image(48, 2700), snr_db=60.0)
+    rho = np.zeros((len(depths_mm), blocks, STEPS))
+    for block in range(blocks):
+        rf = np.stack([frames[block * STEPS + i] for i in range(STEPS)]).astype(float)
+        intensity = np.abs(hilbert(rf, axis=-1)) ** 2
+        for d, depth in enumerate(depths_mm):
+            row = round(depth / frames.image.sample_spacing_mm)
+            r = np.corrcoef(intensity[:, :, row - 85 : row + 85].reshape(STEPS, -1))
+            rho[d, block] = [np.diag(r, lag).mean() for lag in range(STEPS)]
+    return rho.mean(axis=1), rho.std(axis=1, ddof=1) / np.sqrt(blocks)
+
+
+def predicted_correlation(depth_mm):
+    """|normalised autocorrelation of the two-way field over elevation|^2, over the band and the aperture."""
+    x, z = np.arange(0.0, 1.6, 0.15), np.arange(0.0, 3.61, STEP_MM)
+    frequency = np.arange(3e6, 12.1e6, 1e6)
+    field = direct_response([(a, depth_mm, b) for a in x for b in z], frequency, 0.15)
+    field = field.reshape(x.size, z.size, -1) * pulse(frequency)
+    field = np.concatenate([field[:, :0:-1], field], axis=1)
+    sides = np.where(x > 0, 2.0, 1.0)[:, None, None]
+    n = field.shape[1]
+    rho = [(sides * field[:, : n - i] * field[:, i:].conj()).sum() for i in range(STEPS)]
+    return np.abs(np.array(rho) / rho[0]) ** 2
+
+
+@pytest.mark.slow
+def test_decorrelation_is_what_diffraction_predicts_and_slower_in_fibres(beam):
+    depths_mm = (10.0, 20.0, 30.0)
+    rho, error = intensity_correlation(TiledMedium(5, 100.0, 0.0), beam, depths_mm, 5)
+    for measured, sigma, depth_mm in zip(rho, error, depths_mm, strict=True):
+        # Three standard errors over five independent blocks (0.06 at most), and 0.02 for the beam table.
+        # The standard error is itself known to a third only, hence the same for all lags.
+        assert np.abs(measured - predicted_correlation(depth_mm)).max() < 3.0 * sigma.max() + 0.02
+    medium = tissue(5, 40.0)
+    attenuated = tabulate_beam(attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
+    fibrous, _ = intensity_correlation(medium, attenuated, (20.0,), 2)
+    assert fibrous[0][3] > rho[1][3] + 0.05

@@ -7,12 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
-from speckle3d.simulation.movement import (
-    HandMotion,
-    frame_times,
-    hand_sweep,
-    turned_about,
-)
+from speckle3d.simulation.movement import HandMotion, hand_sweep
 
 HERE = RigidTransform.identity()
 
@@ -59,15 +54,3 @@ def test_a_trajectory_is_smooth_between_its_knots():
     # Tremor of 12 um at 12 Hz: (2 pi 12)^2 0.012 mm = 70 mm/s^2, times the peak factor, plus starts.
     assert np.abs(acceleration).max() < 1000.0
     assert np.abs(np.diff(acceleration, axis=0)).max() < 100.0
-
-
-def test_the_frame_clock_increases_with_a_little_jitter():
-    times = frame_times(200, 25.0, np.random.default_rng(1))
-    assert (np.diff(times) > 0).all()
-    assert 1e-4 < np.diff(times).std() < 1e-3
-
-
-def test_a_crossing_sweep_starts_turned_about_the_beam():
-    turned = turned_about(np.array([19.0, 0.0, 10.0]), np.pi / 2)
-    np.testing.assert_allclose(turned.apply([19.0, 5.0, 10.0]), [19.0, 5.0, 10.0], atol=1e-12)
-    np.testing.assert_allclose(turned.rotation.apply([0, 0, 1]), [1, 0, 0], atol=1e-12)

@@ -1,5 +1,8 @@
 """Simulated frames: determinism, statistics, invariance."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from points import PointMedium
@@ -8,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.simulation.beam import tabulate_beam
-from speckle3d.simulation.medium import fully_developed, tissue
+from speckle3d.simulation.medium import Tiles, fully_developed, tissue
 from speckle3d.simulation.scan import SimulatedFrames
 
 STILL = RigidTransform.from_matrix(np.eye(4)[None])
@@ -45,6 +48,7 @@ def test_a_frame_is_the_same_however_often_and_in_whatever_order_it_is_read(beam
     forward, backward = [one[i] for i in range(3)], [other[i] for i in (2, 1, 0)][::-1]
     np.testing.assert_array_equal(forward, backward)
     np.testing.assert_array_equal(one[-1], forward[2])
+    assert not np.array_equal(forward[0], forward[1])
 
 
 def test_electronic_noise_is_as_far_below_speckle_as_asked_at_the_focus_and_grows_with_gain(beam):
@@ -70,7 +74,7 @@ def test_moving_medium_and_probe_together_changes_nothing(beam):
 
 def test_tissue_has_cysts_layers_and_a_poorly_filled_depth():
     medium = tissue(4, 20.0)
-    blocks = medium.within(np.array([0.0, 0.0, 0.0]), np.array([18.0, 0.0, 10.0]))
+    blocks = medium.seen(RigidTransform.identity(), np.zeros(3), np.array([18.0, 0.0, 10.0]))
     position = np.concatenate([p for p, _ in blocks])
     power = np.concatenate([s for _, s in blocks]).astype(float) ** 2
     by_depth = np.histogram(position[:, 1], [3.0, 6.0, 17.0, 22.0, 32.0, 42.0], weights=power)[0]
@@ -79,3 +83,17 @@ def test_tissue_has_cysts_layers_and_a_poorly_filled_depth():
     assert by_depth[0] < 0.6 * by_depth[2]
     for cyst in medium.spheres:
         assert (np.linalg.norm(position - cyst.centre_mm, axis=1) >= cyst.radius_mm).all()
+
+
+def test_threads_that_need_the_same_tiles_share_the_work():
+    calls, both = [], threading.Barrier(2, timeout=20)
+
+    def make(i, j):
+        calls.append((i, j))
+        both.wait()  # passed only if two threads make a tile each at the same time
+        return i + j
+
+    tiles, wanted = Tiles(make), np.array([(0, 1), (2, 3)])
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(tiles, [wanted, wanted])) == [[1, 5]] * 2
+    assert sorted(calls) == [(0, 1), (2, 3)]

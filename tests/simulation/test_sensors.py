@@ -99,13 +99,6 @@ def test_accelerometer_feels_gravity_and_the_sweep(trajectory):
     assert np.abs(rest).max() < 0.1
 
 
-def test_magnetometer_points_north_and_down(trajectory):
-    sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
-    field = sensor.readings.world_from_sensor.apply(sensor.magnetometer_au)
-    dip = np.deg2rad(66.0)
-    np.testing.assert_allclose(field, np.tile([np.cos(dip), 0, -np.sin(dip)], (len(field), 1)), atol=1e-9)
-
-
 def test_raw_noise_is_that_of_the_model(trajectory):
     noisy, exact = (
         simulate_orientation(trajectory, SPAN_S, m, np.random.default_rng(3))
