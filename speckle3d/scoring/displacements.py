@@ -34,6 +34,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -155,12 +156,17 @@ def score_row(
 
 
 def challenge_score(
-    poses: RigidTransform, true: RigidTransform, grid: ImageGrid, landmarks: Landmarks
+    errors: Mapping[str, float], true: RigidTransform, grid: ImageGrid, landmarks: Landmarks
 ) -> float:
     """The challenge's final score of one scan, as of 2025 [1]_: 1 if exact, 0 if as far off as resting poses.
 
     The mean over the four errors of ``1 - error / error of identity poses``. Below zero where an estimate is
     worse than none.
+
+    Parameters
+    ----------
+    errors : mapping of str to float
+        Of `score_row`.
 
     Raises
     ------
@@ -171,7 +177,6 @@ def challenge_score(
     ----------
     .. [1] TUS-REC challenge 2025, assessment criteria, ranking method.
     """
-    errors = _point_row(poses, true, grid, landmarks)
     resting = _point_row(RigidTransform.identity(len(true)), true, grid, landmarks)
     for key in CHALLENGE_ERRORS:
         if not resting[key] > 0:
@@ -200,16 +205,15 @@ def _differences(
 
 def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:
     """Mean length of the differences over all pixels, a frame at a time."""
-    x = (np.arange(grid.vectors) - (grid.vectors - 1) / 2) * grid.vector_pitch_mm
-    y = (np.arange(grid.samples) - (grid.samples - 1) / 2) * grid.sample_spacing_mm
-    at_centre = differences[:, :, :3] @ grid.centre_mm + differences[:, :, 3]
-    total = 0.0
-    for across, down, middle in zip(differences[:, :, 0], differences[:, :, 1], at_centre, strict=True):
+    x = np.arange(grid.vectors)[:, None] * grid.vector_pitch_mm
+    y = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
+    means = []
+    for across, down, _, middle in differences.swapaxes(1, 2):
         # |m + a x + d y|^2 in powers of y: three passes over the image in place of nine.
-        along = middle + x[:, None] * across
-        squares = ((along**2).sum(axis=1)[:, None] + 2.0 * (along @ down)[:, None] * y) + down @ down * y**2
-        total += float(np.sqrt(np.maximum(squares, 0.0)).mean())
-    return total / len(differences)
+        along = middle + x * across
+        squares = (along**2).sum(axis=1)[:, None] + 2.0 * (along @ down)[:, None] * y + down @ down * y**2
+        means.append(np.sqrt(np.maximum(squares, 0.0)).mean())
+    return float(np.mean(means))
 
 
 def _require_comparable(poses: RigidTransform, reference: RigidTransform) -> None:

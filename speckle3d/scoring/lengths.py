@@ -42,11 +42,6 @@ END_FRAMES = 25
 tracker's 0.15 mm and 0.1 degrees per axis, lines of at most 1, 9, 25 and 51 frames (and a tenth of the sweep)
 leave 0.34, 0.14, 0.09 and 0.13 mm RMS of error in the tracker's own length."""
 
-_THIRD_DIFFERENCES = np.sqrt(20.0)
-"""Of white noise of unit standard deviation: 1 + 9 + 9 + 1 under the root."""
-
-_FEWEST_READINGS = 8
-
 _LINE_EXCESS = 1.25
 """Variance of a Theil-Sen line's end over that of least squares in white noise: 1.13 to 1.25 for 3 to 25
 samples, in 20,000 trials each."""
@@ -107,14 +102,14 @@ class ModeError:
     reference_sigma_mm: float = 0.0
 
     @classmethod
-    def of_estimate(cls, part: str, mode: str, frames: int, estimate_mm: float) -> ModeError:
-        """Row without a reference: the estimate alone, errors NaN."""
-        nan = float("nan")
-        return cls(part, mode, frames, nan, abs(estimate_mm), nan, nan, nan, nan, nan)
+    def of_length(cls, part: str, mode: str, frames: int, length_mm: float) -> ModeError:
+        """Row of a length alone, where there is nothing to compare it with; errors NaN."""
+        nan = np.nan
+        return cls(part, mode, frames, nan, abs(length_mm), nan, nan, nan, nan, nan)
 
     def of_reference(self, mode: str) -> ModeError:
         """Row of the reference itself under a mode's name: its length, errors NaN."""
-        row = ModeError.of_estimate(self.part, mode, self.frames, self.reference_mm)
+        row = ModeError.of_length(self.part, mode, self.frames, self.reference_mm)
         return replace(row, reference_mm=self.reference_mm, reference_sigma_mm=self.reference_sigma_mm)
 
 
@@ -140,15 +135,13 @@ def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> A
     return Accumulated(*(np.concatenate([[0.0], np.cumsum(a)]) for a in (along_z, tilt, yaw, roll)))
 
 
-def monotone_parts(length_mm: npt.ArrayLike, jitter_frames: int = JITTER_FRAMES) -> list[Part]:
+def monotone_parts(length_mm: npt.ArrayLike) -> list[Part]:
     """Split a sweep at the frames where the probe turns back.
 
     Parameters
     ----------
     length_mm : array_like, shape (n,)
         Accumulated length of the reference.
-    jitter_frames : int
-        Width of the median and of the mean that remove a sensor's spikes and jitter first; 1 for none.
 
     Returns
     -------
@@ -157,7 +150,7 @@ def monotone_parts(length_mm: npt.ArrayLike, jitter_frames: int = JITTER_FRAMES)
     """
     length = np.asarray(length_mm, dtype=float)
     require_finite(length, "length_mm")
-    width = min(jitter_frames, length.size)
+    width = min(JITTER_FRAMES, length.size)
     smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
     edges = [0, *_turning_frames(smooth), length.size - 1]
     names = [("f", "r")[i % 2] + (str(i // 2 + 1) if i > 1 else "") for i in range(len(edges) - 1)]
@@ -219,16 +212,13 @@ def compare_modes(
     """
     if not poses:
         raise InvalidInputError("poses: expected at least one mode, got none")
-    frames = len(next(iter(poses.values())))
+    frames = len(next(iter(poses.values()))) if covered is None else np.size(covered)
     used = np.ones(frames, dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
-    if used.shape != (frames,):
-        raise MismatchError(f"covered: expected shape ({frames},), got {used.shape}")
-    for mode, each in poses.items():
-        if len(each) != frames:
-            raise MismatchError(f"mode {mode}: expected {frames} poses, got {len(each)}")
     true_poses = reference[used] if len(reference) == frames else reference
-    if len(true_poses) != used.sum():
-        raise MismatchError(f"reference: expected {used.sum()} poses, got {len(true_poses)}")
+    lengths = [(f"mode {mode}", len(each), frames) for mode, each in poses.items()]
+    for name, got, expected in [*lengths, ("reference", len(true_poses), used.sum())]:
+        if got != expected:
+            raise MismatchError(f"{name}: expected {expected} poses, got {got}")
     true = accumulated(true_poses, centre_mm)
     jitter = 0.0 if end_frames == 1 else jitter_mm(true.length_mm)
     estimates = {mode: accumulated(each[used], centre_mm) for mode, each in poses.items()}
@@ -240,6 +230,12 @@ def compare_modes(
             changes = _changes(estimate, part, END_FRAMES if mode == TRACKER else end_frames)
             rows.append(_mode_error(part, mode, changes, true_changes, sigma_mm))
     return rows
+
+
+def travelled_mm(mode: str, world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> float:
+    """Signed length of a whole sweep between its ends, read as the module says without a reference."""
+    whole = Part("all", 0, len(world_from_image) - 1)
+    return _changes(accumulated(world_from_image, centre_mm), whole, END_FRAMES if mode == TRACKER else 1)[0]
 
 
 def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
@@ -273,9 +269,9 @@ def jitter_mm(length_mm: FloatArray) -> float:
     length_mm : ndarray, shape (n,)
         Accumulated by the tracker; its steps telescope, so that one reading's jitter is in one value.
     """
-    if length_mm.size < _FEWEST_READINGS:
-        return float("nan")
-    return robust_sigma(np.diff(length_mm, 3)) / float(_THIRD_DIFFERENCES)
+    if length_mm.size < 8:
+        return np.nan
+    return robust_sigma(np.diff(length_mm, 3)) / float(np.sqrt(1 + 9 + 9 + 1))
 
 
 def _width(size: int, end_frames: int) -> int:
@@ -298,11 +294,10 @@ def _changes(motion: Accumulated, part: Part, end_frames: int) -> list[float]:
 def _mode_error(part: Part, mode: str, changes: list[float], true: list[float], sigma_mm: float) -> ModeError:
     reference_mm, sign = abs(true[0]), -1.0 if true[0] < 0 else 1.0
     error_mm = sign * (changes[0] - true[0])
-    percent = 100.0 * error_mm / reference_mm if reference_mm else float("nan")
+    percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
+    turns = np.rad2deg(np.subtract(changes[1:], true[1:])).tolist()
     lengths = reference_mm, reference_mm + error_mm, error_mm, percent
-    tilt, yaw, roll = np.rad2deg(np.subtract(changes[1:], true[1:])).tolist()
-    frames = part.last - part.first + 1
-    return ModeError(part.name, mode, frames, *lengths, tilt, yaw, roll, sigma_mm)
+    return ModeError(part.name, mode, part.last - part.first + 1, *lengths, *turns, sigma_mm)
 
 
 def _turning_frames(length: FloatArray) -> list[int]:

@@ -16,7 +16,15 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
-from speckle3d.scoring.lengths import END_FRAMES, accumulated, read_end
+from speckle3d.scoring.lengths import (
+    END_FRAMES,
+    TRACKER,
+    ModeError,
+    accumulated,
+    compare_modes,
+    read_end,
+    travelled_mm,
+)
 
 REFERENCES = ("tracker", "truth")
 
@@ -28,7 +36,8 @@ class Reference:
 
     Attributes
     ----------
-    name : {"tracker", "truth"}
+    name : str
+        "tracker", "truth", or a mode that others are compared with.
     world_from_image : RigidTransform, length k
         At the covered frames.
     covered : ndarray of bool, shape (n,)
@@ -39,10 +48,15 @@ class Reference:
     world_from_image: RigidTransform
     covered: BoolArray
 
+    @classmethod
+    def over_all(cls, name: str, world_from_image: RigidTransform) -> Reference:
+        """A reference at every frame."""
+        return cls(name, world_from_image, np.ones(len(world_from_image), dtype=bool))
+
     @property
     def end_frames(self) -> int:
-        """Most frames of the line that reads an end of a part: 1 for the truth, which is exact."""
-        return 1 if self.name == "truth" else END_FRAMES
+        """Most frames of the line that reads an end of a part: 1 for any but a tracker, which jitters."""
+        return END_FRAMES if self.name == TRACKER else 1
 
 
 @shown
@@ -94,7 +108,7 @@ def find_reference(sweep: Sweep, wanted: str | None = None) -> Reference | None:
     """
     require_reference(wanted)
     if sweep.truth is not None and wanted != "tracker":
-        return Reference("truth", sweep.truth, np.ones(len(sweep), dtype=bool))
+        return Reference.over_all("truth", sweep.truth)
     if wanted == "truth":
         raise InsufficientDataError(f"{sweep.name}: expected true poses in /truth, got none")
     if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
@@ -140,7 +154,9 @@ def sweep_curves(
     MismatchError
         If the reference is not of the same frames.
     """
-    modes = {mode: _curves(each, centre_mm) for mode, each in poses.items()}
+    modes = {
+        mode: _curves(each, centre_mm, END_FRAMES if mode == TRACKER else 1) for mode, each in poses.items()
+    }
     half_width = None
     if covariance is not None and "image" in modes:
         half_width = 1.96 * _in_degrees(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T[2:])
@@ -157,7 +173,35 @@ def sweep_curves(
     return SweepCurves(modes, curves, reference.name, half_width)
 
 
-def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int = 1) -> FloatArray:
+def error_rows(
+    poses: Mapping[str, RigidTransform], reference: Reference | None, centre_mm: npt.ArrayLike
+) -> list[ModeError]:
+    """Errors of every mode by part; lengths alone of the tracker as the reference, and without a reference.
+
+    Parameters
+    ----------
+    poses : mapping of str to RigidTransform, length n
+        By mode; the reference may be among them.
+    """
+    others = {mode: each for mode, each in poses.items() if reference is None or mode != reference.name}
+    frames = len(next(iter(poses.values())))
+    if frames < 2:
+        return []
+    if reference is None or not others:
+        return [
+            ModeError.of_length("all", mode, frames, travelled_mm(mode, each, centre_mm))
+            for mode, each in poses.items()
+        ]
+    true = reference.world_from_image
+    rows = compare_modes(others, true, centre_mm, reference.covered, reference.end_frames)
+    if reference.name == TRACKER:
+        last = {row.part: row for row in rows}
+        for row in last.values():
+            rows.insert(rows.index(row) + 1, row.of_reference(TRACKER))
+    return rows
+
+
+def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int) -> FloatArray:
     """Length (mm), tilt, yaw and roll (degrees), shape (4, n), zero where the first end is read."""
     curves = _in_degrees(np.stack(accumulated(poses, centre_mm)))
     start = np.array([[read_end(each[::-1], end_frames)] for each in curves])

@@ -109,10 +109,10 @@ def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | Non
     length_unit : {"m", "mm"}, optional
         Of text that does not say; else metres.
     """
-    if kind_of(path) != "text":
-        return load_reconstructed(path, mode)
-    text = read_tum(path, length_unit)
-    return Trajectory(path.name, text.time_s, text.world_from_sensor)
+    if kind_of(path) == "text":
+        text = read_tum(path, length_unit)
+        return Trajectory(path.name, text.time_s, text.world_from_sensor)
+    return load_reconstructed(path, mode)
 
 
 def load_reconstructed(path: Path, mode: str) -> Trajectory:
@@ -201,7 +201,8 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     whole = bool(shared.all()) and len(true) == len(reference.poses)
     marks = reference.landmarks if whole else None
     of = estimate.sweep_sha256, reference.sweep_sha256
-    score = challenge_score(estimated, true, grid, marks) if grid is not None and marks is not None else None
+    errors = score_row(estimated, true, grid, marks)
+    score = challenge_score(errors, true, grid, marks) if grid is not None and marks is not None else None
     return {
         "estimate": estimate.name,
         "reference": reference.name,
@@ -212,14 +213,12 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
         "same_sweep": of[0] == of[1] if all(of) else None,
         "APE": absolute_pose_error(estimated, true),
         "RPE": relative_pose_error(estimated, true),
-        **score_row(estimated, true, grid, marks),
+        **errors,
         "score": score,
     }
 
 
 def _snapped(time_s: FloatArray, onto_s: FloatArray) -> FloatArray:
     """Set times that equal a time of `onto_s` but for rounding to it, so that its ends are covered."""
-    right = np.clip(np.searchsorted(onto_s, time_s), 1, max(onto_s.size - 1, 1))
-    near = [onto_s[np.minimum(each, onto_s.size - 1)] for each in (right - 1, right)]
-    nearest = np.where(np.abs(near[0] - time_s) <= np.abs(near[1] - time_s), *near)
+    nearest = onto_s[np.rint(np.interp(time_s, onto_s, np.arange(onto_s.size))).astype(int)]
     return np.where(np.abs(nearest - time_s) <= _ROUNDING_S + np.spacing(nearest), nearest, time_s)

@@ -10,14 +10,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
-
-import numpy as np
 
 from speckle3d.config import Config, config_from_toml
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Speckle3DError
@@ -31,7 +30,7 @@ from speckle3d.scoring.references import require_reference
 from speckle3d.study.job import RESULTS, run_job
 from speckle3d.study.request import SUBSET, available_modes
 from speckle3d.study.results import FILES, Study, SweepOutcome, is_study, require_own, write_study
-from speckle3d.study.schedulers import InProcess, Scheduler
+from speckle3d.study.schedulers import Scheduler
 
 KNOWN_MODES = ("image", SUBSET, *DRIFT_MODES)
 
@@ -73,28 +72,26 @@ class SweepJob:
 
 @dataclass
 class StudyProgress:
-    """How far a study is, and how long the rest will take judging by what is finished."""
+    """How far a study is, and how long the rest will take by the pace so far; skipped sweeps set no pace."""
 
     sweeps: int
     frames: int
     done: int = 0
     failed: int = 0
-    done_frames: float = 0.0
+    done_frames: int = 0
     remaining_s: float | None = None
-    _rates: list[float] = field(default_factory=list)
+    _run_frames: int = 0
+    _began_s: float = field(default_factory=time.monotonic)
 
-    def add(self, outcome: SweepOutcome, workers: int) -> None:
-        """Count a finished sweep; skipped and failed ones do not count for the time left."""
+    def add(self, outcome: SweepOutcome) -> None:
+        """Count a finished sweep."""
         self.done += 1
         self.failed += outcome.status == "failed"
         self.done_frames += outcome.frames
-        if outcome.status == "done" and not outcome.skipped and outcome.frames:
-            self._rates.append(outcome.seconds / outcome.frames)
-        if self.done == self.sweeps:
-            self.remaining_s = 0.0
-        elif self._rates:
-            running = max(1, min(workers, self.sweeps - self.done))
-            self.remaining_s = float(np.median(self._rates)) * (self.frames - self.done_frames) / running
+        self._run_frames += outcome.frames * (outcome.status == "done" and not outcome.skipped)
+        if self._run_frames:
+            pace_s = (time.monotonic() - self._began_s) / self._run_frames
+            self.remaining_s = pace_s * (self.frames - self.done_frames)
 
 
 def compare_sweeps(
@@ -142,35 +139,35 @@ def compare_sweeps(
     require_own(directory, FILES, is_study(directory), "a study to go on with or to replace")
     if curves is not None:
         read_curves(curves)
-    where, settings = scheduler or InProcess(), (config or Config()).to_toml()
-    plan = {
-        name: plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
+    settings = (config or Config()).to_toml()
+    plan = [
+        plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
         for name, path in named(paths)
-    }
-    outcomes = {name: each for name, each in plan.items() if isinstance(each, SweepOutcome)}
-    # The longest first, so that no worker is left with it while the others have nothing to do.
-    jobs = sorted(
-        (each for each in plan.values() if isinstance(each, SweepJob)), key=lambda job: -job.planned.frames
-    )
+    ]
+    outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
+    jobs = [each for each in plan if isinstance(each, SweepJob)]
     if not jobs:
         first = next(iter(outcomes.values()))
         raise InsufficientDataError(
             f"expected a sweep that can be compared, got none of {len(plan)}; {first.name}: {first.reason}"
         )
+    # The longest first, so that no worker is left with it while the others have nothing to do.
+    jobs.sort(key=lambda job: -job.planned.frames)
     make_folder(directory / "sweeps")
     so_far = StudyProgress(len(jobs), sum(job.planned.frames for job in jobs))
     tell = progress or (lambda at: None)
     tell(so_far)
     try:
-        for outcome in where.run(run_sweep, jobs, SweepJob.failed):
+        for outcome in (scheduler or Scheduler()).run(run_sweep, jobs, SweepJob.failed):
             outcomes[outcome.name] = outcome
-            so_far.add(outcome, where.workers)
+            so_far.add(outcome)
             tell(so_far)
     finally:
         for folder in (directory / "sweeps", directory):
             with suppress(OSError):  # it holds finished sweeps
                 folder.rmdir()
-    return write_study(directory, [outcomes[name] for name in plan], settings)
+    order = [each.name if isinstance(each, SweepOutcome) else each.planned.name for each in plan]
+    return write_study(directory, [outcomes[name] for name in order], settings)
 
 
 def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
@@ -178,19 +175,16 @@ def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
 
     Names depend on the files alone, not on their order: a study given again in another order is the same.
     """
-    by_target: dict[Path, Path] = {}
-    for path in paths:
-        by_target.setdefault(path.resolve(), path.absolute())
-    files = list(by_target.values())
+    files = list({path.resolve(): path.absolute() for path in paths}.values())
     # What a terminal would obey is escaped, with % in place of the backslash.
-    stems = [printable(path.stem).replace("\\", "%") for path in files]
+    names = [printable(path.stem).replace("\\", "%") for path in files]
     folders = [printable(path.parent.name).replace("\\", "%") for path in files]
     marks = [hashlib.sha256(os.fsencode(path)).hexdigest()[:6] for path in files]
-    names = stems
     for more in (folders, marks):
         counts = Counter(names)
-        longer = [f"{word}-{stem}" for word, stem in zip(more, stems, strict=True)]
-        names = [name if counts[name] == 1 else other for name, other in zip(names, longer, strict=True)]
+        names = [
+            name if counts[name] == 1 else f"{word}-{name}" for word, name in zip(more, names, strict=True)
+        ]
     return list(zip(names, files, strict=True))
 
 
@@ -249,9 +243,8 @@ def run_sweep(job: SweepJob) -> SweepOutcome:
             [mode for mode in modes if mode != "image"],
             job.reference,
             settings,
-            None,
-            job.calibrations,
-            None if job.crossing is None else (load_sweep(job.crossing), job.crossing),
+            calibrations=job.calibrations,
+            crossing=None if job.crossing is None else (load_sweep(job.crossing), job.crossing),
         )
         return job.done()
     except Exception as error:  # noqa: BLE001 - one broken sweep, or one bug that it reveals, stops no other
@@ -260,6 +253,4 @@ def run_sweep(job: SweepJob) -> SweepOutcome:
 
 def _reason(error: Exception) -> str:
     words = " ".join(one_line(error).split())
-    if isinstance(error, OSError) and error.filename and not isinstance(error, Speckle3DError):
-        words = f"{error.filename}: {words}"
     return words if isinstance(error, Speckle3DError) else f"{type(error).__name__}: {words}"

@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.references import SweepCurves
@@ -116,6 +116,11 @@ def colour_of(mode: str, modes: Sequence[str] = ()) -> str:
     return _COLOURS.get(mode, spare)
 
 
+def spread_frames(count: int, most: int) -> IntArray:
+    """Frames to draw: every one of a short sweep, evenly spread ones of a long one, both ends included."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
 def curve_panels(
     curves: SweepCurves,
     count: int = len(CURVE_LABELS),
@@ -202,8 +207,8 @@ def show_grey(
                        interpolation="nearest")  # fmt: skip
 
 
-def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a PNG; it appears whole or not at all.
+def save_figure(figure: Figure, path: Path, words: Mapping[str, str] | None = None) -> Path:
+    """Write a PNG, with texts by keyword; it appears whole or not at all.
 
     Raises
     ------
@@ -214,7 +219,7 @@ def save_figure(figure: Figure, path: Path) -> Path:
     figure.set_dpi(DOTS_PER_INCH)
     with atomic_path(path) as part:
         # `savefig` would draw everything twice, the first time for the layout alone.
-        FigureCanvasAgg(figure).print_png(part)  # type: ignore[no-untyped-call]
+        FigureCanvasAgg(figure).print_png(part, metadata=words)  # type: ignore[no-untyped-call]
     return path
 
 

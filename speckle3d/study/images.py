@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
-from speckle3d.imaging.cuts.planes import ReslicePlane, lateral_line, planes_from_first_frame
-from speckle3d.imaging.cuts.reslice import reslice_frames
-from speckle3d.imaging.images import Images
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
@@ -27,13 +23,25 @@ STRIP_MM = 2.4
 PIXEL_MM = 0.1
 """Pixel of a cut along the sweep, and spacing of the depths that `Strip` keeps."""
 
-_LARGEST_MM = (400.0, 200.0)
 _GLANCES = 24
 """Frames looked at for the brightest echo; one between them may still be cut off by a few decibels."""
 
 
-class GreyFrames:
+class GreyImages:
     """Grey images of a sweep by frame number, made one at a time as they are asked for.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    dynamic_range_db : float
+        Of the log-compressed levels 0 to 255.
+    progress : callable, optional
+        Called with the number of each image and of all.
+    settings : IntensitySettings, optional
+    clipped : bool
+        Let the brightest echoes saturate, as on a screen.
+    levels : {"log", "linear", "stored"}
+        Log-compressed to 0-255, linear echo amplitude, or B-mode as it is stored.
 
     Attributes
     ----------
@@ -43,19 +51,50 @@ class GreyFrames:
         What the grey levels are, in words.
     dtype : numpy.dtype
         Of the grey levels.
+
+    Raises
+    ------
+    InvalidInputError
+        If `dynamic_range_db` is not above zero, or echoes are asked for as stored.
     """
 
     def __init__(
         self,
         sweep: Sweep,
+        dynamic_range_db: float = 60.0,
         progress: Callable[[int, int], None] | None = None,
         settings: IntensitySettings | None = None,
+        clipped: bool = True,
+        levels: Levels = "log",
     ) -> None:
-        self._sweep, self._progress = sweep, progress
+        if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
+            raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
+        bmode = sweep.signal if isinstance(sweep.signal, BModeSettings) else None
+        self._sweep, self._progress, self._levels = sweep, progress, levels
         self._extractor = IntensityExtractor.for_sweep(sweep, settings)
         self.grid: ImageGrid = self._extractor.grid
-        self.meaning = ""
         self.dtype: np.dtype[Any] = np.dtype(np.float32)
+        self.meaning = f"log-compressed, 0 to 255 over {dynamic_range_db:g} dB"
+        if levels == "stored":
+            if bmode is None:
+                raise InvalidInputError(
+                    f"{sweep.name}: expected B-mode for levels as stored, got RF or I/Q: take log or linear"
+                )
+            self.grid, self.dtype = sweep.grid, np.dtype(sweep.frames.dtype)
+            self.meaning = f"B-mode as stored, 0 to {bmode.full_scale:g}"
+        elif levels == "linear":
+            self.meaning = "echo amplitude, linear, " + (
+                "in the units of the samples"
+                if bmode is None
+                else f"of B-mode over {bmode.dynamic_range_db:g} dB; 1 is full scale"
+            )
+        else:
+            self._range_db = dynamic_range_db
+            # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo
+            # does not darken it; for measuring an echo's place, the brightest, so that none is cut off.
+            shown = [len(sweep) // 2] if clipped else np.linspace(0, len(sweep) - 1, _GLANCES).astype(int)
+            images = [_decibel(self._extractor.intensity(read_frame(sweep.frames, int(i)))) for i in shown]
+            self._brightest = max(float(np.percentile(each, 99.9 if clipped else 100)) for each in images)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -70,83 +109,13 @@ class GreyFrames:
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         if self._progress:
             self._progress(index + 1, len(self._sweep))
-        return self._levels(read_frame(self._sweep.frames, index))
-
-    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        raise NotImplementedError
-
-
-class StoredImages(GreyFrames):
-    """B-mode images as they are stored, in their own type; arguments as for `GreyImages`.
-
-    Raises
-    ------
-    InvalidInputError
-        If the sweep holds echoes, which are no images yet.
-    """
-
-    def __init__(self, sweep: Sweep, progress: Callable[[int, int], None] | None = None) -> None:
-        if not isinstance(sweep.signal, BModeSettings):
-            raise InvalidInputError(
-                f"{sweep.name}: expected B-mode for levels as stored, got RF or I/Q: take log or linear"
-            )
-        super().__init__(sweep, progress)
-        self.grid, self.dtype = sweep.grid, np.dtype(sweep.frames.dtype)
-        self.meaning = f"B-mode as stored, 0 to {sweep.signal.full_scale:g}"
-
-    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return frame
-
-
-class AmplitudeImages(GreyFrames):
-    """Echo amplitude, on a linear scale; arguments as for `GreyImages`."""
-
-    def __init__(
-        self,
-        sweep: Sweep,
-        progress: Callable[[int, int], None] | None = None,
-        settings: IntensitySettings | None = None,
-    ) -> None:
-        super().__init__(sweep, progress, settings)
-        self.meaning = "echo amplitude, linear, in the units of the samples"
-        if isinstance(sweep.signal, BModeSettings):
-            range_db = sweep.signal.dynamic_range_db
-            self.meaning = f"echo amplitude, linear, of B-mode over {range_db:g} dB; 1 is full scale"
-
-    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return np.asarray(np.sqrt(self._extractor.intensity(frame)), dtype=np.float32)
-
-
-class GreyImages(GreyFrames):
-    """Log-compressed images of a sweep, 0 to 255, by frame number.
-
-    Parameters
-    ----------
-    clipped : bool
-        Let the brightest echoes saturate, as on a screen.
-    """
-
-    def __init__(
-        self,
-        sweep: Sweep,
-        dynamic_range_db: float,
-        progress: Callable[[int, int], None] | None = None,
-        settings: IntensitySettings | None = None,
-        clipped: bool = True,
-    ) -> None:
-        if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
-            raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
-        super().__init__(sweep, progress, settings)
-        self._range_db = dynamic_range_db
-        self.meaning = f"log-compressed, 0 to 255 over {dynamic_range_db:g} dB"
-        # One level for the whole sweep. For looking, the 99.9th percentile, so that one specular echo does
-        # not darken it; for measuring an echo's place, the brightest, so that none is cut off.
-        shown = [len(sweep) // 2] if clipped else np.linspace(0, len(sweep) - 1, _GLANCES).astype(int)
-        levels = [_decibel(self._extractor.intensity(read_frame(sweep.frames, int(i)))) for i in shown]
-        self._brightest = max(float(np.percentile(each, 99.9 if clipped else 100.0)) for each in levels)
-
-    def _levels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        level = 1 + (_decibel(self._extractor.intensity(frame)) - self._brightest) / self._range_db
+        frame = read_frame(self._sweep.frames, index)
+        if self._levels == "stored":
+            return frame
+        intensity = self._extractor.intensity(frame)
+        if self._levels == "linear":
+            return np.asarray(np.sqrt(intensity), dtype=np.float32)
+        level = 1 + (_decibel(intensity) - self._brightest) / self._range_db
         return np.asarray(255 * np.clip(level, 0, 1), dtype=np.float32)
 
 
@@ -160,7 +129,7 @@ def grey_images(
     progress: Callable[[int, int], None] | None = None,
     reconstruction: Reconstruction | None = None,
     levels: Levels = "log",
-) -> GreyFrames:
+) -> GreyImages:
     """Make a sweep's grey images for compounding and reslicing, one at a time as they are asked for.
 
     Parameters
@@ -177,7 +146,7 @@ def grey_images(
 
     Returns
     -------
-    GreyImages, AmplitudeImages or StoredImages
+    GreyImages
         Indexed by frame: float32, or the type that is stored, shape (vector, sample).
 
     Raises
@@ -198,11 +167,7 @@ def grey_images(
     settings = None
     if reconstruction is not None and reconstruction.config_toml:
         settings = stored_config(reconstruction.config_toml).intensity
-    if levels == "stored":
-        return StoredImages(sweep, progress)
-    if levels == "linear":
-        return AmplitudeImages(sweep, progress, settings)
-    return GreyImages(sweep, dynamic_range_db, progress, settings)
+    return GreyImages(sweep, dynamic_range_db, progress, settings, levels=levels)
 
 
 def usual_levels(sweep: Sweep) -> Levels:
@@ -284,17 +249,3 @@ class Strip:
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
         return len(self._images), self.grid.vectors, self.grid.samples
-
-
-def middle_planes(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> dict[str, ReslicePlane]:
-    """Planes along the sweep through the middle vector at the poses of every mode, at most 400 x 200 mm."""
-    return planes_from_first_frame(poses, lateral_line(grid, grid.width_mm / 2), PIXEL_MM, _LARGEST_MM)
-
-
-def cut_frames(
-    images: Images, grid: ImageGrid, world_from_image: RigidTransform, plane: ReslicePlane
-) -> Float32Array:
-    """Reslice with a reach of two of the sweep's longest steps, so that no gaps show between frames."""
-    steps = np.abs(np.diff((world_from_image[0].inv() * world_from_image).translation[:, 2]))
-    reach_mm = max(0.3, 2.0 * float(np.percentile(steps, 99)))
-    return reslice_frames(images, grid, world_from_image, plane, reach_mm)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
@@ -35,8 +35,8 @@ from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Tracked, track
 from speckle3d.scoring.displacements import score_row
-from speckle3d.scoring.lengths import TRACKER, ModeError, compare_modes
-from speckle3d.scoring.references import Reference, SweepCurves, sweep_curves, tracker_alone
+from speckle3d.scoring.lengths import TRACKER, compare_modes
+from speckle3d.scoring.references import Reference, error_rows, sweep_curves, tracker_alone
 from speckle3d.study.crossed import Companion
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
@@ -134,20 +134,29 @@ def run_job(
     began, settings = time.perf_counter(), config or Config()
     require_own_results(directory)
     sweep, mounted = apply_calibrations(sweep, calibrations)
-    second, second_file = None, None
+    compared = require_possible(sweep, drift, reference, settings, crossing is not None)
+    strip, frames, side, second_file = Strip(sweep, settings), len(sweep), None, None
     if crossing is not None:
         second, _ = apply_calibrations(crossing[0], calibrations)
         second_file = SourceFile(written_path(crossing[1]), recording_sha256(crossing[1]))
-    compared = require_possible(sweep, drift, reference, settings, second is not None)
-    strip = Strip(sweep, settings)
-    side = None if second is None else Companion(sweep, second, curves, settings)
+        side, frames = Companion((sweep, second), curves, settings), frames + len(second)
+    sinks = [strip.keep] if side is None else [strip.keep, side.keep]
+    pair, corrected, refusal = None, None, ""
     with RESULTS.replaced(directory) as part:
         with ReconstructionWriter(part / RESULTS.primary, sweep.frame_time_s, sweep.grid) as writer:
-            sink = strip.keep if side is None else side.beside(strip.keep)
-            shown = progress if side is None else after(progress, 0, side.frames)
-            tracked = track(sweep, curves, settings, shown, writer.append_pairs, sink)
-            crossed, refusal = (None, "") if side is None else side.cross(tracked, progress)
-            poses, corrections, left_out = _corrected(tracked, sweep, drift, settings, crossed, refusal)
+
+            def keep(index: int, intensity: Float32Array) -> None:
+                for sink in sinks:
+                    sink(index, intensity)
+
+            told = after(progress, 0, frames)
+            tracked = track(sweep, curves, settings, told, writer.append_pairs, keep)
+            if side is not None:
+                try:
+                    pair, corrected = side.cross(tracked, progress)
+                except (InsufficientDataError, MismatchError) as error:
+                    refusal = f"{sweep.name}: drift mode crossed: {error}"
+            poses, corrections, left_out = _corrected(tracked, sweep, drift, settings, pair, refusal)
             provenance = Provenance(
                 written_path(source),
                 recording_sha256(source),
@@ -157,39 +166,39 @@ def run_job(
                 import_record(source),
             )
             writer.finish(poses, provenance, settings.to_toml(), trust_of(tracked, corrections))
-        if reference is None and compared is not None and compared.name == TRACKER:
-            compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
         alone = tracker_alone(believed(sweep, tracked.doubts))
+        if reference is None and compared is not None and compared.name == TRACKER:
+            compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
         every = poses if alone is None else {**poses, TRACKER: alone}
-        curves_of = poses if compared is None or compared.name == TRACKER else every
-        moved = sweep_curves(curves_of, sweep.grid.centre_mm, compared, tracked.covariance)
-        claims = claims_of(tracked, sweep.grid.centre_mm, corrections)
+        centre = sweep.grid.centre_mm
+        drawn = poses if compared is None or compared.name == TRACKER else every
+        moved = sweep_curves(drawn, centre, compared, tracked.covariance)
+        claims = claims_of(tracked, centre, corrections)
         lengths = {mode: float(np.abs(curve[0, -1])) for mode, curve in moved.modes.items()}
         claimed = {m: (lengths[m], lengths[m] * sigma) for m, sigma in claims.items() if m in lengths}
         doubts = (*tracked.doubts, *differing_lengths(claimed))
-        rows = error_rows(every, moved, compared, sweep.grid.centre_mm)
+        rows = error_rows(every, compared, centre)
+        details = details_of(tracked, corrections, provenance)
         summary = Summary(
             sweep.name,
             "none" if compared is None else compared.name,
             len(sweep),
             0.0 if compared is None else float(compared.covered.mean()),
             rows,
-            details_of(tracked, corrections, provenance),
+            details,
             doubts,
             doubted_modes(sweep, doubts, every),
             left_out,
-            claims | _own_claim(alone, sweep.grid.centre_mm),
+            claims | _own_claim(alone, centre),
             _drift(every, compared, sweep, source),
         )
         save_figure(figure_drift(moved, _title(summary)), part / PICTURES[0])
         draw_strip(strip, every, compared, sweep.name, rows, (part / PICTURES[1], part / PICTURES[2]))
-        seconds = time.perf_counter() - began
-        summary.details["seconds"] = seconds
+        details["seconds"] = time.perf_counter() - began
         write_summary(part, summary)
-    corrected = None if side is None or crossed is None else side.curves(tracked, crossed)
     files = tuple(directory / name for name in (RESULTS.primary, *RESULTS.others))
-    return JobResult(directory, summary, summary_text([summary]), files, seconds, corrected)
+    return JobResult(directory, summary, summary_text([summary]), files, details["seconds"], corrected)
 
 
 def require_own_results(directory: Path) -> None:
@@ -206,35 +215,6 @@ def require_own_results(directory: Path) -> None:
     except (FileError, InvalidInputError):
         is_own = False
     require_own(directory, RESULTS, is_own, "the results of `reconstruct` to replace")
-
-
-def error_rows(
-    poses: Mapping[str, RigidTransform],
-    moved: SweepCurves,
-    reference: Reference | None,
-    centre_mm: FloatArray,
-) -> list[ModeError]:
-    """Errors of every mode by part; of the reference under a mode's name, the length alone.
-
-    Parameters
-    ----------
-    poses : mapping of str to RigidTransform, length n
-        Of all modes, "tracker" among them.
-    moved : SweepCurves
-        Of the modes: their lengths where there is no reference.
-    """
-    if reference is None:
-        curves = moved.modes.items()
-        return [ModeError.of_estimate("all", mode, moved.frames, float(c[0, -1])) for mode, c in curves]
-    others = {mode: each for mode, each in poses.items() if mode != reference.name}
-    rows = compare_modes(
-        others, reference.world_from_image, centre_mm, reference.covered, reference.end_frames
-    )
-    if reference.name == TRACKER:
-        last = {row.part: row for row in rows}
-        for row in last.values():
-            rows.insert(rows.index(row) + 1, row.of_reference(TRACKER))
-    return rows
 
 
 def _corrected(

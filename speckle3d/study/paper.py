@@ -16,7 +16,7 @@ from __future__ import annotations
 import csv
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -29,18 +29,18 @@ from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.core.tables import text_table
 from speckle3d.io.curves import write_curves
-from speckle3d.io.hdf5 import make_folder, one_line
+from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.phantom_curves import calibrate_curves
-from speckle3d.scoring.lengths import TRACKER, ModeError, compare_modes
-from speckle3d.scoring.references import tracker_alone
+from speckle3d.scoring.lengths import TRACKER, ModeError
+from speckle3d.scoring.references import error_rows, find_reference, tracker_alone
 from speckle3d.scoring.statistics import MeanInterval, mean_interval
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import StudyProgress, compare_sweeps
 from speckle3d.study.results import Study, json_text, write_texts
-from speckle3d.study.schedulers import InProcess, Scheduler
+from speckle3d.study.schedulers import Scheduler
 
 _TISSUE = SimulationSettings(preset="tissue", vectors=48, length_mm=20.0)
 _REVERSAL = SimulationSettings(preset="reversal", vectors=48, length_mm=10.0)
@@ -66,15 +66,10 @@ MODES = ("image", "pose", "orientation")
 """In the order of the paper's tables 3 and 4: image-based, six DOF correction, orientation correction."""
 
 Rows = Mapping[str, Mapping[str, Sequence[ModeError]]]
+"""Errors by reference, then by data set."""
 
-
-@dataclass(frozen=True)
-class _Input:
-    """A sweep to be simulated into a file."""
-
-    path: Path
-    settings: SimulationSettings
-    as_published: bool
+_Input = tuple[Path, SimulationSettings, bool]
+"""File of a sweep to be simulated, its settings, and whether its orientation is the tracker's."""
 
 
 def published() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
@@ -122,15 +117,24 @@ def paper_study(
     InvalidInputError
         If a sweep cannot be simulated.
     """
-    where = scheduler or InProcess()
-    inputs = _inputs(directory, SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS})
-    _simulate(list(inputs.values()), where, simulated or (lambda done, total: None))
+    where, tell = scheduler or Scheduler(), simulated or (lambda done, total: None)
+    wanted = SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS}
+    settings = "".join(each.model_dump_json() for each in {**SWEEPS, **CURVE_SWEEPS}.values())
+    key = hashlib.sha256(f"{settings}{version('speckle3d')}".encode()).hexdigest()[:8]
+    inputs = {name: directory / "inputs" / key / f"{name}.h5" for name in wanted}
+    make_folder(directory / "inputs" / key)
+    missing = [(path, wanted[name], name in SWEEPS) for name, path in inputs.items() if not path.is_file()]
+    tell(len(inputs) - len(missing), len(inputs))
+    for done, _ in enumerate(where.run(_write_input, missing, _lost), len(inputs) - len(missing) + 1):
+        tell(done, len(inputs))
     if curves is None:
-        curves = _measured([inputs[name].path for name in CURVE_SWEEPS])
-    paths = [inputs[name].path for name in SWEEPS]
+        curves = directory / "inputs" / key / "curves.h5"
+        if not curves.is_file():
+            write_curves(curves, calibrate_curves([load_sweep(inputs[name]) for name in CURVE_SWEEPS]))
+    paths = [inputs[name] for name in SWEEPS]
     study = compare_sweeps(paths, directory, None, TRACKER, curves, scheduler=where, progress=progress)
     ours = {each.sweep: each.rows for each in study.summaries}
-    rows: Rows = {TRACKER: ours, "truth": _against_truth(study, directory)}
+    rows: Rows = {TRACKER: ours, "truth": _against_truth(study)}
     table = text_beside(rows)
     records = [
         {"reference": name, "sweep": sweep, **asdict(row)}
@@ -146,11 +150,6 @@ def paper_study(
 def beside(rows: Rows) -> list[dict[str, Any]]:
     """Means of absolute errors over all parts, by mode.
 
-    Parameters
-    ----------
-    rows : mapping of str to mapping of str to sequence of ModeError
-        By reference, then by data set.
-
     Returns
     -------
     list of dict
@@ -160,29 +159,34 @@ def beside(rows: Rows) -> list[dict[str, Any]]:
     """
     means: list[dict[str, Any]] = []
     for mode in MODES:
-        theirs = np.abs([each[mode] for each in published().values()]).mean(axis=0).tolist()
-        sizes = {name: _sizes(some, mode) for name, some in rows.items()}
-        length, tilt = ({name: mean_interval(each[k]) for name, each in sizes.items()} for k in (0, 1))
-        row = {"mode": mode, "published_percent": theirs[0], "published_deg": theirs[1]}
-        means.append({**row, "length_percent": length, "tilt_deg": tilt})
+        percent, deg = np.abs([each[mode] for each in published().values()]).mean(axis=0).tolist()
+        row: dict[str, Any] = {"mode": mode, "published_percent": percent, "published_deg": deg}
+        for name, quantity in (("length_percent", "length_error_percent"), ("tilt_deg", "tilt_error_deg")):
+            row[name] = {
+                reference: mean_interval(
+                    [abs(getattr(r, quantity)) for some in by_sweep.values() for r in some if r.mode == mode]
+                )
+                for reference, by_sweep in rows.items()
+            }
+        means.append(row)
     return means
 
 
 def text_beside(rows: Rows) -> str:
     """Both tables, part by part, published | ours, and the means of absolute errors below.
 
-    Parameters
-    ----------
-    rows : mapping of str to mapping of str to sequence of ModeError
-        By reference, then by data set; the first reference's errors are listed part by part.
+    The first reference's errors are listed part by part.
     """
     first = next(iter(rows))
     lines = [["data set", *(f"length % {mode}" for mode in MODES), *(f"tilt deg {mode}" for mode in MODES)]]
     for (name, part), theirs in published().items():
         ours = {row.mode: row for row in rows[first].get(name, ()) if row.part == part}
-        cells = [_pair(theirs[m][0], ours.get(m), "length_error_percent", 1) for m in MODES]
-        cells += [_pair(theirs[m][1], ours.get(m), "tilt_error_deg", 2) for m in MODES]
-        lines.append([f"{name} {part}", *cells])
+        line = [f"{name} {part}"]
+        for k, (quantity, digits) in enumerate((("length_error_percent", 1), ("tilt_error_deg", 2))):
+            for mode in MODES:
+                value = f"{getattr(ours[mode], quantity):+.{digits}f}" if mode in ours else "missing"
+                line.append(f"{theirs[mode][k]:+.{digits}f} | {value}")
+        lines.append(line)
     means = [["mean absolute error of all parts", "", "length %", "tilt deg"]]
     for each in beside(rows):
         printed = f"{each['published_percent']:.1f}", f"{each['published_deg']:.3f}"
@@ -196,39 +200,16 @@ def text_beside(rows: Rows) -> str:
     )
 
 
-def _inputs(directory: Path, wanted: Mapping[str, SimulationSettings]) -> dict[str, _Input]:
-    """File of each sweep, in a folder named by a hash of the settings and the version that make it."""
-    settings = "".join(each.model_dump_json() for each in {**SWEEPS, **CURVE_SWEEPS}.values())
-    key = hashlib.sha256(f"{settings}{version('speckle3d')}".encode()).hexdigest()[:8]
-    folder = directory / "inputs" / key
-    make_folder(folder)
-    return {name: _Input(folder / f"{name}.h5", each, name in SWEEPS) for name, each in wanted.items()}
+def _write_input(job: _Input) -> None:
+    """Simulate one sweep into its file."""
+    path, settings, as_published = job
+    made = simulate(settings)[0]
+    sweep = _with_tracked_orientation(made.sweep) if as_published else made.sweep
+    write_sweep(path, sweep, simulation=made.description())
 
 
-def _simulate(inputs: Sequence[_Input], where: Scheduler, simulated: Callable[[int, int], None]) -> None:
-    missing = [each for each in inputs if not each.path.is_file()]
-    done = len(inputs) - len(missing)
-    simulated(done, len(inputs))
-    for failure in where.run(_write_input, missing, _failed):
-        if failure:
-            raise InvalidInputError(failure)
-        done += 1
-        simulated(done, len(inputs))
-
-
-def _write_input(job: _Input) -> str:
-    """Simulate one sweep into its file; returns what went wrong, or an empty string."""
-    try:
-        made = simulate(job.settings)[0]
-        sweep = _with_tracked_orientation(made.sweep) if job.as_published else made.sweep
-        write_sweep(job.path, sweep, simulation=made.description())
-    except Exception as error:  # noqa: BLE001 - a job of a study returns its error as a line
-        return _failed(job, one_line(error))
-    return ""
-
-
-def _failed(job: _Input, reason: str) -> str:
-    return f"{job.path.name}: cannot be simulated: {reason}"
+def _lost(job: _Input, reason: str) -> None:
+    raise InvalidInputError(f"{job[0].name}: cannot be simulated: {reason}")
 
 
 def _with_tracked_orientation(sweep: Sweep) -> Sweep:
@@ -241,39 +222,18 @@ def _with_tracked_orientation(sweep: Sweep) -> Sweep:
     return replace(sweep, orientation=OrientationSensor(readings, mounting, tracker.time_offset_s))
 
 
-def _measured(phantoms: Sequence[Path]) -> Path:
-    path = phantoms[0].parent / "curves.h5"
-    if not path.is_file():
-        write_curves(path, calibrate_curves([load_sweep(each) for each in phantoms]))
-    return path
-
-
-def _against_truth(study: Study, directory: Path) -> dict[str, list[ModeError]]:
+def _against_truth(study: Study) -> dict[str, list[ModeError]]:
     """Errors of the same poses, and of the tracker alone, against the truth, by data set."""
     rows = {}
     for outcome in study.outcomes:
         if outcome.status == "done":
-            sweep = load_sweep(outcome.path)
-            made = read_reconstruction(directory / outcome.folder / "reconstruction.h5", with_pairs=False)
-            alone = tracker_alone(sweep)
-            poses = made.poses if alone is None else {**made.poses, TRACKER: alone}
-            assert sweep.truth is not None
-            rows[outcome.name] = compare_modes(poses, sweep.truth, sweep.grid.centre_mm, end_frames=1)
+            sweep, path = load_sweep(outcome.path), study.directory / outcome.folder / "reconstruction.h5"
+            alone, poses = tracker_alone(sweep), read_reconstruction(path, with_pairs=False).poses
+            every = poses if alone is None else {**poses, TRACKER: alone}
+            rows[outcome.name] = error_rows(every, find_reference(sweep, "truth"), sweep.grid.centre_mm)
     return rows
 
 
 def _interval(mean: MeanInterval, digits: int) -> str:
-    if mean.low is None or mean.high is None:
-        return f"{mean.mean:.{digits}f}"
-    return f"{mean.mean:.{digits}f} [{mean.low:.{digits}f}, {mean.high:.{digits}f}]"
-
-
-def _pair(published: float, ours: ModeError | None, name: str, digits: int) -> str:
-    value = "missing" if ours is None else f"{getattr(ours, name):+.{digits}f}"
-    return f"{published:+.{digits}f} | {value}"
-
-
-def _sizes(rows: Mapping[str, Sequence[ModeError]], mode: str) -> list[list[float]]:
-    """Magnitudes of a mode's errors of length (per cent), and of tilt (degrees)."""
-    own = [row for some in rows.values() for row in some if row.mode == mode]
-    return [[abs(row.length_error_percent) for row in own], [abs(row.tilt_error_deg) for row in own]]
+    interval = "" if mean.low is None else f" [{mean.low:.{digits}f}, {mean.high:.{digits}f}]"
+    return f"{mean.mean:.{digits}f}{interval}"

@@ -124,7 +124,7 @@ class Summary:
                 "sweep": self.sweep,
                 "reference": self.reference,
                 **asdict(row),
-                "sigma_mm": self.claims.get(row.mode, math.nan) * row.estimate_mm,
+                "sigma_mm": self.claims.get(row.mode, math.nan) * abs(row.estimate_mm),
                 "remark": self.remark(row),
             }
             for row in self.rows

@@ -18,7 +18,7 @@ from cache import simulated
 
 from speckle3d.simulation.presets import SimulationSettings
 from speckle3d.study.compare import compare_sweeps
-from speckle3d.study.schedulers import InProcesses
+from speckle3d.study.schedulers import Scheduler
 
 CURVES = Path(__file__).resolve().parents[2] / "data" / "curves.h5"
 
@@ -30,7 +30,7 @@ def main(sweeps=16, frames=150):
     for workers in (1, 2):
         with tempfile.TemporaryDirectory() as folder:
             began = time.perf_counter()
-            study = compare_sweeps(paths, Path(folder), curves=CURVES, scheduler=InProcesses(workers))
+            study = compare_sweeps(paths, Path(folder), curves=CURVES, scheduler=Scheduler(workers))
             seconds[workers] = time.perf_counter() - began
             done = sum(each.status == "done" for each in study.outcomes)
         sys.stdout.write(

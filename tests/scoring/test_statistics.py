@@ -43,8 +43,3 @@ def test_a_pair_sees_what_scatter_between_sweeps_hides():
     assert 0.8 < difference.low < 1.0 < difference.high < 1.2
     # All five signs alike: 2 of the 2**5 assignments are as extreme.
     assert wilcoxon_p == pytest.approx(2 / 2**5)
-
-
-def test_pairs_are_of_the_same_sweeps():
-    difference, wilcoxon_p = paired_comparison([1.0, np.nan, 3.0], [0.0, 1.0, 1.0])
-    assert (difference.sweeps, difference.mean, wilcoxon_p) == (2, 1.5, None)

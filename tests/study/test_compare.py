@@ -19,7 +19,7 @@ from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.scoring.displacements import landmark_errors
 from speckle3d.study.compare import StudyProgress, compare_sweeps, named, plan_sweep, run_sweep
 from speckle3d.study.results import SweepOutcome
-from speckle3d.study.schedulers import InProcesses
+from speckle3d.study.schedulers import Scheduler
 
 MODES = ["image", "consistent-subset", "orientation", "pose", "fused", "tracker"]
 
@@ -97,7 +97,7 @@ def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tm
 
 @pytest.mark.slow
 def test_worker_processes_give_the_same_bits(study, sweeps, tmp_path):
-    again = compare_sweeps(sweeps, tmp_path / "out", scheduler=InProcesses(2))
+    again = compare_sweeps(sweeps, tmp_path / "out", scheduler=Scheduler(2))
     assert [each.status for each in again.outcomes] == ["done", "failed", "done"]
     assert numbers(again.directory) == numbers(study.directory)
 
@@ -172,14 +172,13 @@ def test_landmarks_that_come_with_a_sweep_are_scored(sweeps, tmp_path, monkeypat
 
 
 def test_progress_knows_the_time_left_from_the_first_finished_sweep_on(tmp_path):
-    def done(frames, **more):
-        return SweepOutcome("a", tmp_path, "done", frames=frames, **more)
-
+    done = SweepOutcome("a", tmp_path, "done", frames=100)
     at = StudyProgress(sweeps=3, frames=300)
-    at.add(done(100, skipped=True), 2)
+    at.add(replace(done, skipped=True))
     assert at.remaining_s is None
-    at.add(done(100, seconds=20.0), 2)
-    # One sweep of 100 frames is left, on one of the two workers, at 0.2 s a frame.
-    assert at.remaining_s == pytest.approx(20.0)
-    at.add(SweepOutcome("c", tmp_path, "failed", "torn", frames=100), 2)
+    at._began_s -= 20.0
+    at.add(done)
+    # One sweep of 100 frames is left, at 0.2 s a frame.
+    assert at.remaining_s == pytest.approx(20.0, rel=0.01)
+    at.add(replace(done, status="failed"))
     assert (at.remaining_s, at.failed, at.done) == (0.0, 1, 3)

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.load import load_sweep
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.simulation.presets import SimulationSettings
@@ -64,12 +63,3 @@ def test_the_study_simulates_once_and_compares_with_the_tracker_and_the_truth(ti
     assert told == [(1, 1)]
     assert all(each.skipped for each in study.outcomes)
     assert again == table
-
-
-def test_a_sweep_that_cannot_be_simulated_is_named(tiny, shipped, tmp_path, monkeypatch):
-    def broken(_settings):
-        raise OSError("no space left")
-
-    monkeypatch.setattr(paper, "simulate", broken)
-    with pytest.raises(InvalidInputError, match=r"beef-1\.h5.*no space left"):
-        paper.paper_study(tmp_path, shipped / "curves.h5")

@@ -9,8 +9,9 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import ByteArray, Float32Array
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.study.images import GreyFrames, GreyImages, StoredImages
+from speckle3d.study.images import GreyImages
 
 MOST_ROWS = 640
 """Rows that are sent to the browser: more than a screen shows, and a third of what echoes are sampled at."""
@@ -68,10 +69,9 @@ class ScreenImages:
             grey = grey * np.float32(255.0 / self._sweep.signal.full_scale)
         return np.ascontiguousarray(_pooled(grey, self._pool(images.grid)).T)
 
-    def _make(self, range_db: int) -> GreyFrames:
-        if not self.of_echoes:
-            return StoredImages(self._sweep)
-        return GreyImages(self._sweep, float(range_db), settings=self._settings)
+    def _make(self, range_db: int) -> GreyImages:
+        levels: Levels = "log" if self.of_echoes else "stored"
+        return GreyImages(self._sweep, float(range_db), settings=self._settings, levels=levels)
 
     def _pool(self, grid: ImageGrid) -> int:
         return max(1, -(-grid.samples // MOST_ROWS))

@@ -1,40 +1,32 @@
 """Where the cuts in a picture lie in the world, kept in the picture itself: a PNG's text under one keyword.
 
-Whoever picks points in the picture, by its axes or by its pixels, gets points of the world.
+Whoever picks points in the picture, by its axes, gets points of the world.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.image import imsave
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.planes import ReslicePlane
-from speckle3d.io.hdf5 import atomic_path, make_folder, reading
-from speckle3d.study.figures import DOTS_PER_INCH
+from speckle3d.io.hdf5 import reading
+from speckle3d.study.reslices.places import AnyCut
 
 KEYWORD = "speckle3d.reslice"
-VERSION = 1
 
 _SAME_POSE = 1e-6
 """Of the numbers of a matrix, mm: what writing and reading may change in it."""
 
-Box = tuple[float, float, float, float]
 Anchors = Mapping[int, FloatArray]
 """Poses of some frames by their numbers, matrices from image to world: they tell whose world a cut is in."""
 
@@ -49,23 +41,26 @@ class PicturedCut:
         Whose poses place it in the world.
     cut : ReslicePlane or CurvedSheet
         Its `world_from_mm` takes what the picture's axes say.
-    boxes_px : sequence of tuple of float
-        Left, top, right and bottom of every panel that shows it, in pixels of the picture from its top left.
     anchors : mapping of int to ndarray, shape (4, 4)
         Poses of some frames; none where no frames were cut.
     """
 
     mode: str
-    cut: ReslicePlane | CurvedSheet
-    boxes_px: Sequence[Box] = ()
+    cut: AnyCut
     anchors: Anchors = field(default_factory=dict)
 
-    def mm_from_px(self, points_px: npt.ArrayLike, panel: int = 0) -> FloatArray:
-        """What the axes say at points of the picture, by column and row of its pixels: shape (n, 2), mm."""
-        left, top, right, bottom = self.boxes_px[panel]
-        x_left, x_right, y_bottom, y_top = self.cut.extent_mm
-        share = (np.asarray(points_px, dtype=float) - [left, top]) / [right - left, bottom - top]
-        return np.asarray([x_left, y_top] + share * [x_right - x_left, y_bottom - y_top])
+    def record(self) -> dict[str, Any]:
+        """The cut as the picture's text holds it; `_pictured` reads it back."""
+        cut = self.cut
+        place: dict[str, Any]
+        if isinstance(cut, CurvedSheet):
+            place = {"kind": "curved", "base_mm": cut.base_mm.tolist(), "down": cut.down.tolist()}
+        else:
+            matrix = cut.world_from_plane.as_matrix().tolist()
+            place = {"kind": "plane", "world_from_plane": matrix, "width_mm": cut.width_mm}
+        sizes = {"height_mm": cut.height_mm, "pixel_mm": cut.pixel_mm, "first_mm": list(cut.first_mm)}
+        anchors = {number: pose.tolist() for number, pose in self.anchors.items()}
+        return {"mode": self.mode, **place, **sizes, "anchors": anchors}
 
 
 def anchors_of(world_from_image: RigidTransform, numbers: IntArray | None = None) -> Anchors:
@@ -83,67 +78,16 @@ def require_same_poses(
     Parameters
     ----------
     numbers : ndarray of int, shape (n,), optional
-        Of the frames, in ascending order; by default they count from 0.
+        Of the frames; by default they count from 0.
     """
-    frames = np.arange(len(world_from_image)) if numbers is None else numbers
+    frames = range(len(world_from_image)) if numbers is None else numbers.tolist()
+    there = dict(zip(frames, world_from_image.as_matrix(), strict=True))
     for number, pose in shown.anchors.items():
-        at = np.flatnonzero(frames == number)
-        is_there = at.size == 1
-        if not (is_there and np.abs(world_from_image[int(at[0])].as_matrix() - pose).max() <= _SAME_POSE):
+        if number not in there or np.abs(there[number] - pose).max() > _SAME_POSE:
             raise InvalidInputError(
                 f"{where}: expected a picture of these poses of mode {shown.mode!r}, got one of another "
                 f"reconstruction, whose frame {number} lies elsewhere: cut this one again (speckle3d reslice)"
             )
-
-
-def save_cuts(
-    figure: Figure,
-    path: Path,
-    cuts: Mapping[str, ReslicePlane | CurvedSheet],
-    panels: Mapping[str, Axes],
-    words: Mapping[str, Any] | None = None,
-    anchors: Mapping[str, Anchors] | None = None,
-) -> Path:
-    """Write a picture of cuts as a PNG that says where they lie; it appears whole or not at all.
-
-    Parameters
-    ----------
-    figure : Figure
-    path : path
-    cuts : mapping of str to ReslicePlane or CurvedSheet
-        By mode.
-    panels : mapping of str to Axes
-        The panel that shows each.
-    words : mapping, optional
-        What else to keep: names of axes, of the input.
-    anchors : mapping of str to mapping, optional
-        Poses of some frames of each mode, by `anchors_of`.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
-    """
-    make_folder(path.parent)
-    figure.set_dpi(DOTS_PER_INCH)
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    height = canvas.get_width_height()[1]
-    records = [
-        {
-            "mode": mode,
-            **_as_record(cut),
-            "boxes_px": [_box(panels[mode], height)],
-            "anchors": {number: pose.tolist() for number, pose in (anchors or {}).get(mode, {}).items()},
-        }
-        for mode, cut in cuts.items()
-    ]
-    record = json.dumps({"version": VERSION, **(words or {}), "cuts": records})
-    with atomic_path(path) as part:
-        drawn = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
-        imsave(part, drawn, format="png", dpi=DOTS_PER_INCH, metadata={KEYWORD: record},
-               pil_kwargs={"compress_level": 3})  # fmt: skip
-    return path
 
 
 def read_cuts(path: PathLike) -> list[PicturedCut]:
@@ -167,11 +111,10 @@ def read_cuts(path: PathLike) -> list[PicturedCut]:
     if KEYWORD not in text:
         raise InvalidInputError(f"{expected}, got another picture, or one whose text was left out")
     try:
-        record = json.loads(text[KEYWORD])
-        return [_pictured(each, f"{path}: {KEYWORD}") for each in record["cuts"]]
+        return [_pictured(each, f"{path}: {KEYWORD}") for each in json.loads(text[KEYWORD])["cuts"]]
+    except Speckle3DError:
+        raise
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        if isinstance(error, (FileError, InvalidInputError)):
-            raise
         raise InvalidInputError(f"{expected}, got one whose text is damaged") from error
 
 
@@ -183,39 +126,26 @@ def read_plane(path: PathLike, mode: str | None = None) -> PicturedCut:
     FileError, InvalidInputError
         As `read_cuts`, and if the picture does not show that mode.
     """
-    cuts = read_cuts(path)
-    wanted = [each for each in cuts if mode is None or each.mode == mode]
-    if not wanted:
-        shown = ", ".join(each.mode for each in cuts)
-        raise InvalidInputError(f"{path}: expected a cut of mode {mode!r}, got {shown or 'none'}")
-    return wanted[0]
-
-
-def _box(axes: Axes, height_px: int) -> Box:
-    box = axes.get_window_extent()
-    return float(box.x0), float(height_px - box.y1), float(box.x1), float(height_px - box.y0)
-
-
-def _as_record(cut: ReslicePlane | CurvedSheet) -> dict[str, Any]:
-    shared = {"height_mm": cut.height_mm, "pixel_mm": cut.pixel_mm, "first_mm": list(cut.first_mm)}
-    if isinstance(cut, CurvedSheet):
-        return {"kind": "curved", "base_mm": cut.base_mm.tolist(), "down": cut.down.tolist(), **shared}
-    matrix = cut.world_from_plane.as_matrix().tolist()
-    return {"kind": "plane", "world_from_plane": matrix, "width_mm": cut.width_mm, **shared}
+    cuts = {each.mode: each for each in read_cuts(path)}
+    chosen = next(iter(cuts), None) if mode is None else mode
+    if chosen not in cuts:
+        raise InvalidInputError(f"{path}: expected a cut of mode {mode!r}, got {', '.join(cuts) or 'none'}")
+    return cuts[chosen]
 
 
 def _pictured(record: Any, where: str) -> PicturedCut:
-    first_x, first_y = (float(each) for each in record["first_mm"])
-    height, pixel = float(record["height_mm"]), float(record["pixel_mm"])
-    cut: ReslicePlane | CurvedSheet
+    first_x, first_y = map(float, record["first_mm"])
+    sizes = float(record["height_mm"]), float(record["pixel_mm"]), (first_x, first_y)
+    cut: AnyCut
     if record["kind"] == "curved":
-        base, down = np.array(record["base_mm"], dtype=float), np.array(record["down"], dtype=float)
-        cut = CurvedSheet(base, down, height, pixel, (first_x, first_y))
+        base, down = (np.array(record[name], dtype=float) for name in ("base_mm", "down"))
+        cut = CurvedSheet(base, down, *sizes)
     else:
         (placed,) = transforms_from_matrices([record["world_from_plane"]], where)
-        cut = ReslicePlane(placed, float(record["width_mm"]), height, pixel, (first_x, first_y))
-    boxes = [(float(a), float(b), float(c), float(d)) for a, b, c, d in record["boxes_px"]]
-    anchors = {int(number): np.array(pose, dtype=float) for number, pose in record.get("anchors", {}).items()}
-    if any(pose.shape != (4, 4) for pose in anchors.values()):
-        raise ValueError("anchors: expected matrices of shape (4, 4)")
-    return PicturedCut(str(record["mode"]), cut, boxes, anchors)
+        cut = ReslicePlane(placed, float(record["width_mm"]), *sizes)
+    anchors = record.get("anchors", {}).items()
+    return PicturedCut(
+        str(record["mode"]),
+        cut,
+        {int(number): np.array(pose, dtype=float).reshape(4, 4) for number, pose in anchors},
+    )

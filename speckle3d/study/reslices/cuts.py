@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
@@ -23,8 +23,8 @@ from speckle3d.imaging.images import Images
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import kind_of
 from speckle3d.io.reconstructions import FORMAT
-from speckle3d.scoring.lengths import END_FRAMES, ModeError, accumulated, compare_modes
-from speckle3d.scoring.references import REFERENCES, find_reference
+from speckle3d.scoring.lengths import ModeError
+from speckle3d.scoring.references import REFERENCES, Reference, error_rows, find_reference
 from speckle3d.scoring.trajectories import poses_of
 from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
@@ -60,11 +60,6 @@ class DrawnCut:
     cut: AnyCut
     frames: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
     centres: FloatArray = field(default_factory=lambda: np.empty(0))
-
-    @classmethod
-    def of_sweep(cls, image: Float32Array, cut: AnyCut, grid: ImageGrid, poses: RigidTransform) -> DrawnCut:
-        """A cut with where the frames are that it was made from."""
-        return cls(image, cut, frame_lines(cut, grid, poses), frame_centres(cut, grid, poses))
 
 
 @dataclass(frozen=True)
@@ -158,7 +153,9 @@ def open_modes(
 def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> OpenedModes:
     """Take an opened sweep at several modes; as for `open_modes`."""
     asked = list(dict.fromkeys(modes)) or [first.mode]
-    reference = reference or _known_reference(first.sweep, asked)
+    if reference is None:
+        known = find_reference(first.sweep) if len(asked) > 1 else None
+        reference = asked[0] if known is None or not known.covered.all() else known.name
     every = {mode: _posed(first, mode) for mode in dict.fromkeys([*asked, reference])}
     shared = reduce(np.intersect1d, [frames for _, frames in every.values()])
     if not shared.size:
@@ -168,12 +165,6 @@ def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None
     poses = {mode: each[np.isin(frames, shared)] for mode, (each, frames) in every.items()}
     posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
     return OpenedModes(posed, poses, reference)
-
-
-def _known_reference(sweep: Sweep, asked: Sequence[str]) -> str:
-    """What several modes are compared with, if nobody says."""
-    reference = find_reference(sweep) if len(asked) > 1 else None
-    return reference.name if reference is not None and reference.covered.all() else asked[0]
 
 
 def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
@@ -213,43 +204,54 @@ def cut_posed(
         If the place is incomplete, or shows nothing; says where the sweep is.
     """
     images, grid = made or opened.posed.images(dynamic_range_db, progress)
-    numbers = opened.posed.frames
-    placed = place.counted_in(numbers).cuts(opened.poses, grid, opened.reference)
+    poses, numbers = opened.poses, opened.posed.frames
+    placed = place.counted_in(numbers).cuts(poses, grid, opened.reference)
+    unit, limits = "dB, 0: maximum", (-dynamic_range_db, 0.0)
     if voxels is None:
-        pairs = [(opened.poses[mode], cut) for mode, cut in placed.items()]
-        levels = reslice_at(images, grid, pairs, place.reach_mm)
-        # B-mode that does not say its range stays in grey levels.
-        step_db = dynamic_range_db / 255 if opened.posed.range_is_known else 1.0
-        white = 255 if opened.posed.range_is_known else 0
-        images_of_modes = [((each - white) * step_db).astype(np.float32) for each in levels]
+        levels = reslice_at(images, grid, [(poses[mode], placed[mode]) for mode in placed], place.reach_mm)
+        if opened.posed.range_is_known:
+            levels = [((each - 255) * (dynamic_range_db / 255)).astype(np.float32) for each in levels]
+        else:
+            unit, limits = "level", (0.0, 255.0)
     else:
-        images_of_modes = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
-    there = opened.poses[opened.reference]
-    if not any(np.isfinite(each).any() for each in images_of_modes):
+        levels = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
+    there = poses[opened.reference]
+    if not any(np.isfinite(each).any() for each in levels):
         raise InvalidInputError(
             f"cut: expected one that meets the sweep, which lies {sweep_extent(there, grid)}, got one that "
             "shows nothing"
         )
-    cuts = {
-        mode: DrawnCut.of_sweep(image, cut, grid, opened.poses[mode])
-        for (mode, cut), image in zip(placed.items(), images_of_modes, strict=True)
-    }
     shown = placed[opened.reference]
-    where = ", ".join(filter(None, [place.words(grid), view_of(shown, there)]))
-    unit, limits = ("dB, 0: maximum", (-dynamic_range_db, 0.0))
-    if not opened.posed.range_is_known:
-        unit, limits = "level", (0.0, 255.0)
+    lengths = error_rows(poses, Reference.over_all(opened.reference, there), grid.centre_mm)
     return CutPicture(
-        cuts,
+        drawn_cuts(dict(zip(placed, levels, strict=True)), placed, grid, poses),
         place.axes(shown, there),
-        where,
+        ", ".join(filter(None, [place.words(grid), view_of(shown, there)])),
         unit if voxels is None else _unit_of(voxels[0]),
         limits if voxels is None else None,
         opened.posed.sweep.name,
         numbers,
-        {mode: anchors_of(poses, numbers) for mode, poses in opened.poses.items()},
-        length_words(_rows(opened, grid.centre_mm), opened.reference),
+        {mode: anchors_of(each, numbers) for mode, each in poses.items()},
+        length_words(lengths, opened.reference),
     )
+
+
+def drawn_cuts(
+    images: Mapping[str, Float32Array],
+    cuts: Mapping[str, AnyCut],
+    grid: ImageGrid,
+    poses: Mapping[str, RigidTransform],
+) -> dict[str, DrawnCut]:
+    """Cuts by mode with where the frames are that they were made from."""
+    return {
+        mode: DrawnCut(
+            image,
+            cuts[mode],
+            frame_lines(cuts[mode], grid, poses[mode]),
+            frame_centres(cuts[mode], grid, poses[mode]),
+        )
+        for mode, image in images.items()
+    }
 
 
 def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
@@ -258,23 +260,10 @@ def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
     for row in rows:
         percent = "" if np.isnan(row.length_error_percent) else f" {row.length_error_percent:+.1f} %"
         words.setdefault(row.mode, []).append(f"{row.estimate_mm:.2f} mm{percent}")
-        if row.mode == rows[0].mode and np.isfinite(row.reference_mm):
-            words.setdefault(reference, []).append(f"{row.reference_mm:.2f} mm")
+    parts = {row.part: row.reference_mm for row in rows if np.isfinite(row.reference_mm)}
+    if reference not in words:
+        words[reference] = [f"{length_mm:.2f} mm" for length_mm in parts.values()]
     return {mode: ", ".join(each) for mode, each in words.items()}
-
-
-def _rows(opened: OpenedModes, centre_mm: FloatArray) -> list[ModeError]:
-    """Lengths of the modes, against the reference if that is one."""
-    others = {mode: each for mode, each in opened.poses.items() if mode != opened.reference}
-    there = opened.poses[opened.reference]
-    if len(there) < 2:
-        return []
-    if not others:
-        length_mm = float(accumulated(there, centre_mm).length_mm[-1])
-        return [ModeError.of_estimate("all", opened.reference, len(there), length_mm)]
-    return compare_modes(
-        others, there, centre_mm, end_frames=END_FRAMES if opened.reference == "tracker" else 1
-    )
 
 
 def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:
@@ -316,10 +305,9 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     voxels: npt.NDArray[Any] = drawn.image
     if picture.levels is not None:
         low, high = picture.levels
-        # From 1 up, so that 0 means nothing was seen.
         level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
         voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
         what = f"log-compressed, {high - low:g} dB" if high == 0 else "grey levels of the B-mode"
         fields["levels"] = f"{what} from 1 to 255; 0 where nothing was seen"
-    step = drawn.cut.pixel_mm
-    return Volume(voxels[None].T, (step, step, step), drawn.cut.world_from_plane, fields)
+    spacing = (drawn.cut.pixel_mm,) * 3
+    return Volume(voxels[None].T, spacing, drawn.cut.world_from_plane, fields)

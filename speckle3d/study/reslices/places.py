@@ -97,8 +97,9 @@ class Place:
         InvalidInputError
             If the place is incomplete, or not in the sweep.
         """
-        line = self._line(grid)
-        if line is not None:
+        if self.is_along_sweep:
+            depth, lateral = self.depth_mm, self._lateral(grid)
+            line = lateral_line(grid, lateral) if depth is None else depth_line(grid, depth)
             return dict(planes_from_first_frame(poses, line, self.pixel_mm))
         there = poses[reference]
         frame = 0 if self.frame is None else self.frame
@@ -117,10 +118,10 @@ class Place:
             return self
         at = np.flatnonzero(numbers == self.frame)
         if not at.size:
-            there = f"{numbers[0]} to {numbers[-1]}" + (
-                ", with gaps" if np.ptp(numbers) >= len(numbers) else ""
+            gaps = ", with gaps" if np.ptp(numbers) >= len(numbers) else ""
+            raise InvalidInputError(
+                f"--frame: expected one with a pose, {numbers[0]} to {numbers[-1]}{gaps}, got {self.frame}"
             )
-            raise InvalidInputError(f"--frame: expected one with a pose, {there}, got {self.frame}")
         return replace(self, frame=int(at[0]))
 
     def cut_of_box(self, volume: Volume) -> AnyCut:
@@ -131,7 +132,7 @@ class Place:
         InvalidInputError
             If the place is one in frames, or misses the volume.
         """
-        if self.lateral_mm is not None or self.depth_mm is not None or self.frame is not None:
+        if any(each is not None for each in (self.lateral_mm, self.depth_mm, self.frame)):
             raise InvalidInputError(
                 "expected --points, --origin or --curve for a volume, got a place in frames: it has none"
             )
@@ -149,10 +150,8 @@ class Place:
         """Names of the cut's axes: by how it was placed, else by the directions of the sweep they follow."""
         if isinstance(cut, CurvedSheet):
             return "along the curve", _name(cut.down, world_from_image)
-        if self.depth_mm is not None:
-            return "along the sweep", "lateral"
         if self.is_along_sweep:
-            return "along the sweep", "depth"
+            return "along the sweep", "depth" if self.depth_mm is None else "lateral"
         right, down = cut.world_from_plane.rotation.as_matrix().T[:2]
         return _name(right, world_from_image), _name(down, world_from_image)
 
@@ -175,30 +174,22 @@ class Place:
             return f"along a curve through {len(self.curve_mm)} points"
         if self.depth_mm is not None:
             return f"at depth {self.depth_mm:g} mm"
-        if grid is None:
-            return "middle plane of i and j"
-        lateral = grid.width_mm / 2 if self.lateral_mm is None else self.lateral_mm
-        return f"at lateral {lateral:.4g} mm"
+        return "middle plane of i and j" if grid is None else f"at lateral {self._lateral(grid):.4g} mm"
 
-    def _line(self, grid: ImageGrid) -> FloatArray | None:
-        if self.depth_mm is not None:
-            return depth_line(grid, self.depth_mm)
-        if not self.is_along_sweep:
-            return None
-        return lateral_line(grid, grid.width_mm / 2 if self.lateral_mm is None else self.lateral_mm)
+    def _lateral(self, grid: ImageGrid) -> float:
+        return grid.width_mm / 2 if self.lateral_mm is None else self.lateral_mm
 
     def _in_world(self, grid: ImageGrid, there: RigidTransform) -> AnyCut:
         if self.curve_mm is not None:
             return self._sheet(grid, there)
         if self.frame is None:
             return covering_plane(self._spanned(), grid, there, self.reach_mm, self.pixel_mm)
-        line = lateral_line(grid, grid.width_mm / 2 if self.lateral_mm is None else self.lateral_mm)
-        placed = turned_frame_plane(there[self.frame], line[0, 0], self.angle_deg)
+        (lateral, _, _), _ = lateral_line(grid, self._lateral(grid))
+        placed = turned_frame_plane(there[self.frame], lateral, self.angle_deg)
         plane = covering_plane(placed, grid, there, self.reach_mm, self.pixel_mm)
-        if self.angle_deg:
-            return plane
         # In a frame itself x counts from the first vector.
-        return replace(plane, first_mm=(plane.first_mm[0] + line[0, 0], plane.first_mm[1]))
+        left = 0.0 if self.angle_deg else lateral
+        return replace(plane, first_mm=(plane.first_mm[0] + left, plane.first_mm[1]))
 
     def _spanned(self) -> RigidTransform:
         if self.points_mm is not None:
@@ -220,11 +211,8 @@ class Place:
     def _swept(self, down: FloatArray, around_mm: FloatArray) -> CurvedSheet:
         """Sweep the curve as far along its columns as there is something."""
         points = np.asarray(self.curve_mm, dtype=float)
-        top, bottom = 0.0, 1.0
-        if len(points):
-            along = (around_mm - points[0]) @ down / max(float(np.linalg.norm(down)), 1e-9)
-            top, bottom = float(along.min()), float(along.max())
-        return curved_sheet(points, down, (top, bottom), self.pixel_mm, self.smooth)
+        along = (around_mm - points[:1].sum(axis=0)) @ down / max(float(np.linalg.norm(down)), 1e-9)
+        return curved_sheet(points, down, (along.min(), along.max()), self.pixel_mm, self.smooth)
 
 
 def mean_directions(world_from_image: RigidTransform) -> FloatArray:
