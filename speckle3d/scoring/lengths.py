@@ -295,9 +295,9 @@ def _mode_error(part: Part, mode: str, changes: list[float], true: list[float], 
     reference_mm, sign = abs(true[0]), -1.0 if true[0] < 0 else 1.0
     error_mm = sign * (changes[0] - true[0])
     percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
-    turns = np.rad2deg(np.subtract(changes[1:], true[1:])).tolist()
+    tilt, yaw, roll = np.rad2deg(np.subtract(changes[1:], true[1:])).tolist()
     lengths = reference_mm, reference_mm + error_mm, error_mm, percent
-    return ModeError(part.name, mode, part.last - part.first + 1, *lengths, *turns, sigma_mm)
+    return ModeError(part.name, mode, part.last - part.first + 1, *lengths, tilt, yaw, roll, sigma_mm)
 
 
 def _turning_frames(length: FloatArray) -> list[int]:
