@@ -32,7 +32,7 @@ _BODY = "html, body { background: #fff; overflow-x: hidden; }"
 
 
 def shell(pages: Sequence[Page], title: str) -> Viewable:
-    """Pages as tabs below the name of what is looked at; a single one without tabs.
+    """Pages as tabs below the name of what is looked at, as high as the window; a single one without tabs.
 
     A page's view is made when its tab is first opened.
     """
@@ -40,13 +40,19 @@ def shell(pages: Sequence[Page], title: str) -> Viewable:
     header = pn.pane.HTML(
         _HEADER.format(name=escape(title, quote=True)), sizing_mode="stretch_width", margin=0
     )
-    return pn.Column(header, inside(pages), stylesheets=[STYLE], sizing_mode="stretch_width", margin=0)
+    return _styled("100vh", header, inside(pages))
 
 
 def in_notebook(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, in the app's style."""
     pn.extension(*extensions(pages))
-    return pn.Column(inside(pages), stylesheets=[STYLE], sizing_mode="stretch_width", margin=0)
+    return _styled("720px", inside(pages))
+
+
+def _styled(height: str, *parts: Viewable) -> Viewable:
+    return pn.Column(
+        *parts, stylesheets=[STYLE], styles={"height": height}, sizing_mode="stretch_both", margin=0
+    )
 
 
 def extensions(pages: Sequence[Page]) -> list[str]:
@@ -58,12 +64,12 @@ def inside(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, or a single one, without the line of the app."""
     if len(pages) == 1:
         return _viewed(pages[0])
-    views = [pn.Column(_opening(page.title), sizing_mode="stretch_width") for page in pages]
+    views = [pn.Column(_opening(page.title), sizing_mode="stretch_both", margin=0) for page in pages]
     opened = {0}
     tabs = pn.Tabs(
         *((page.title, view) for page, view in zip(pages, views, strict=True)),
         dynamic=True,
-        sizing_mode="stretch_width",
+        sizing_mode="stretch_both",
     )
 
     def make(which: int) -> None:

@@ -139,11 +139,12 @@ def _reconstructed(path: Path, sweep_file: Path | None, opened: Path) -> list[Pa
     from speckle3d.app.reconstruction.page import ReconstructionPage
     from speckle3d.study.details import recorded_doubts
     from speckle3d.study.images import open_reconstruction
+    from speckle3d.study.scenes.voxels import best_mode
 
     found, sweep = open_reconstruction(path, sweep_file)
     found = replace(found, pairs=read_reconstruction(path).pairs)
     pages = _recorded(sweep, opened, found, recorded_doubts(path, found.provenance))
-    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file)
+    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file, best_mode(path))
     # First what was asked for.
     return [viewer, *pages] if opened == path else [pages[0], viewer, *pages[1:]]
 

@@ -1,15 +1,49 @@
-"""The reconstruction viewer: trajectories in space, cuts at the poses of one mode or two, measurements."""
+"""The reconstruction viewer: three cuts that a cross hair joins, trajectories in space, measurements."""
 
 from __future__ import annotations
 
+from functools import cached_property, lru_cache
+from html import escape
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import panel as pn
+import param
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.reconstruction.cuts.material import Material
+from speckle3d.app.reconstruction.commands import code, measure_command, reslice_command
+from speckle3d.app.reconstruction.cut_plot import CutPlot
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.imaging.images import Images
+from speckle3d.report.figures import plot_outlines, plot_panels
+from speckle3d.scoring.references import find_reference, sweep_curves
+from speckle3d.study.figures import RANGE_DB, curve_panels, label_of
+from speckle3d.study.pose_errors import PICKED, caution, measure
+from speckle3d.study.posed import PosedSweep
+from speckle3d.study.reslices.cuts import OpenedModes, at_modes, cut_posed
+from speckle3d.study.reslices.places import Place
+
+KEPT_BYTES = 600_000_000
+"""Of images that are kept; those of a longer sweep are made again when they are needed."""
+_DIGITS = 4
+"""Of points' coordinates in mm: those that are measured are the ones that a command is given."""
+_LEAST_REACH_MM = 0.5
+_SIDE_PX = 250
+_COLOURS = {"frame": "#ffd700", "lateral_mm": "#4fc3ff", "depth_mm": "#8de04f"}
+"""Of sliders, and of the lines of the cross hair that they move."""
+_CUTS = {
+    "along": ("lateral_mm", ("frame", "depth_mm")),
+    "frame": ("frame", ("lateral_mm", "depth_mm")),
+    "depth": ("depth_mm", ("frame", "lateral_mm")),
+}
+"""Along the sweep, in a frame's plane, parallel to the skin: the slider that moves the cut, and those that
+move the upright and the level line in it."""
+_HELP = "Click in a cut: the cross hair, and with it the other cuts, go there."
 
 
 class ReconstructionPage:
@@ -25,28 +59,238 @@ class ReconstructionPage:
         Of the reconstruction's file.
     sweep_file : path, optional
         The sweep, if it is not where the reconstruction says: commands that are shown then name it.
+    mode : str
+        The one that is shown first.
     """
 
     title = "Reconstruction"
     extensions = ("plotly",)
 
     def __init__(
-        self, reconstruction: Reconstruction, sweep: Sweep, folder: Folder, sweep_file: Path | None = None
+        self,
+        reconstruction: Reconstruction,
+        sweep: Sweep,
+        folder: Folder,
+        sweep_file: Path | None = None,
+        mode: str = "image",
     ) -> None:
-        self._material = Material(reconstruction, sweep)
-        self._folder, self._sweep_file = folder, _named(sweep_file, reconstruction, folder)
+        self.reconstruction, self.mode, self.folder = reconstruction, mode, folder
+        self.source = Path(folder.opened.name)
+        stored = Path(reconstruction.provenance.input_path)
+        is_there = sweep_file is None and (folder.path / stored).exists()
+        self.sweep_file = None if is_there else (sweep_file or stored).resolve()
+        poses = reconstruction.poses[mode]
+        self._posed = PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
+        self.reference = find_reference(sweep)
+        whole = self.reference is not None and self.reference.covered.all()
+        self.modes = (*reconstruction.poses, *([self.reference.name] if self.reference and whole else []))
+        # Images reach twice as far as the sweep's longest steps, so that no gaps show.
+        steps = np.linalg.norm(np.diff(poses.apply(reconstruction.grid.centre_mm), axis=0), axis=1)
+        self.reach_mm = max(_LEAST_REACH_MM, round(2.0 * float(np.percentile(steps, 99)), 1))
+        self.opened = lru_cache(self._opened)
 
     def view(self) -> Viewable:
-        """Trajectories, cuts and what is measured in them."""
-        from speckle3d.app.reconstruction.viewer import Viewer
+        """Cuts, trajectories and what is measured in them."""
+        return _Viewer(self).layout()
 
-        return Viewer(self._material, self._folder, self._sweep_file).view()
+    def _opened(self, mode: str, other: str | None) -> OpenedModes:
+        return at_modes(self._posed, [mode, *([other] if other else [])], mode)
+
+    @cached_property
+    def images(self) -> tuple[Images, ImageGrid]:
+        """Images to cut, log-compressed, and their grid."""
+        images, grid = self._posed.images(RANGE_DB)
+        read = images if callable(images) else images.__getitem__
+        return lru_cache(max(KEPT_BYTES // (4 * grid.vectors * grid.samples), 1))(read), grid
 
 
-def _named(sweep_file: Path | None, reconstruction: Reconstruction, folder: Folder) -> Path | None:
-    """The sweep's path, if a command in the folder would not find it by what the reconstruction says."""
-    stored = Path(reconstruction.provenance.input_path)
-    if sweep_file is None and (folder.path / stored).exists():
-        return None
-    found = sweep_file or stored
-    return found.resolve() if found.exists() else None
+class _Viewer(param.Parameterized):  # type: ignore[misc]
+    """What one viewer sees: modes, where the cross hair is, and measured points."""
+
+    mode = param.Selector(label="mode")
+    other = param.Selector(label="compared with")
+    frame = param.Integer(label="frame")
+    lateral_mm = param.Number(label="lateral / mm", step=0.05)
+    depth_mm = param.Number(label="depth / mm", step=0.05)
+    points_mm = param.List([])
+
+    def __init__(self, page: ReconstructionPage) -> None:
+        self._page = page
+        grid = self._grid = page.reconstruction.grid
+        modes = {label_of(mode): mode for mode in page.modes}
+        self.param.mode.objects, self.param.other.objects = modes, {"(nothing)": "", **modes}
+        self.param.frame.bounds = (0, len(page.reconstruction.frame_time_s) - 1)
+        self.param.lateral_mm.bounds = (0.0, grid.width_mm)
+        self.param.depth_mm.bounds = (grid.first_sample_depth_mm, grid.depth_mm)
+        super().__init__(
+            mode=page.mode, other="", frame=self.param.frame.bounds[1] // 2,
+            lateral_mm=round(grid.width_mm / 2, 2),
+            depth_mm=round((grid.first_sample_depth_mm + grid.depth_mm) / 2, 2),
+        )  # fmt: skip
+        self._plots = {
+            name: CutPlot(name, (_COLOURS[upright], _COLOURS[level]), self._go)
+            for name, (_, (upright, level)) in _CUTS.items()
+        }
+        self._told, self._commands = pn.pane.HTML(_HELP, width=_SIDE_PX), pn.pane.HTML("", width=_SIDE_PX)
+        self._lengths = pn.pane.HTML("", width=_SIDE_PX)
+        for name, (slider, _) in _CUTS.items():
+            self.param.watch(lambda *_, name=name: self._cut(name), ["mode", "other", slider])
+            self._cut(name)
+        self.param.watch(self._placed, [*_COLOURS, "mode", "other", "points_mm"])
+        self.param.watch(lambda _: setattr(self, "points_mm", []), "mode")
+        self.param.watch(self._measured, "points_mm")
+        self._space = pn.pane.Plotly(None)
+        self._placed()
+
+    def layout(self) -> Viewable:
+        """Sliders and measurements on the left, then two tall cuts, the third, and the trajectories."""
+        chosen = {name: {"bar_color": colour} for name, colour in _COLOURS.items()}
+        controls = pn.Param(
+            self, parameters=["mode", "other", *_COLOURS], widgets=chosen, show_name=False, width=_SIDE_PX
+        )
+        half = {"width": _SIDE_PX // 2 - 10}
+        add = pn.widgets.Button(name="Add the point", button_type="primary", **half)
+        remove = pn.widgets.Button(name="Remove the last", **half)
+        add.on_click(self._add)
+        remove.on_click(lambda _: setattr(self, "points_mm", self.points_mm[:-1]))
+        commands = pn.Card(self._commands, title="The commands", collapsed=True, width=_SIDE_PX)
+        side = pn.Column(
+            controls, self._lengths, pn.Row(add, remove, margin=0), self._told, commands,
+            width=_SIDE_PX + 40, scroll="y-auto", sizing_mode="stretch_height",
+        )  # fmt: skip
+        along, frame, depth = (
+            pn.pane.Bokeh(plot.plot, sizing_mode="stretch_both") for plot in self._plots.values()
+        )
+        third = pn.Column(depth, self._trajectories(), sizing_mode="stretch_both")
+        return pn.Row(side, along, frame, third, sizing_mode="stretch_both")
+
+    def _trajectories(self) -> Viewable:
+        """Outlines of frames in space, and length and angles over the frames, of all modes."""
+        page = self._page
+        poses = {mode: page.opened(mode, None).poses[mode] for mode in page.modes}
+        self._space = pn.pane.Plotly(plot_outlines(poses, self._grid), sizing_mode="stretch_both")
+        self._space.object.update_layout(
+            height=None, margin={"l": 0, "r": 0, "t": 0, "b": 0}, font_size=10, uirevision="kept",
+            legend={"y": 1}, scene_camera={"eye": {"x": 2.0, "y": -2.8, "z": 1.2}}, scene_xaxis_nticks=3,
+            scene_yaxis_nticks=3,
+        )  # fmt: skip
+        self._space.object.add_scatter3d(mode="lines", line={"color": "#ff4fc3", "width": 6}, name="cuts")
+        trust = page.reconstruction.trust
+        curves = sweep_curves(
+            page.reconstruction.poses,
+            self._grid.centre_mm,
+            page.reference,
+            None if trust is None else trust.covariance,
+        )
+        drift = plot_panels({"": curve_panels(curves)}, 2, 300)
+        drift.update_layout(height=None)
+        over_frames = pn.pane.Plotly(drift, sizing_mode="stretch_both")
+        self._draw_planes()
+        return pn.Tabs(
+            ("in space", self._space),
+            ("over the frames", over_frames),
+            dynamic=True,
+            sizing_mode="stretch_both",
+        )
+
+    def _draw_planes(self) -> None:
+        """Draw where the cuts are in space."""
+        first = self._page.opened(*self._pair).poses[self.mode][0].inv()
+        planes = [plot.plane for plot in self._plots.values() if plot.plane is not None]
+        corners = [
+            np.vstack([first.apply(plane.hull_mm)[[0, 1, 3, 2, 0]], np.full(3, np.nan)]) for plane in planes
+        ]
+        y, z, x = np.concatenate(corners).T
+        self._space.object.data[-1].update(x=x, y=y, z=z)
+        self._space.param.trigger("object")
+
+    @property
+    def _modes(self) -> list[str]:
+        return [mode for mode in self._pair if mode]
+
+    @property
+    def _cross_mm(self) -> FloatArray:
+        """Where the cross hair is in the world of the mode, shape (3,)."""
+        pose = self._page.opened(*self._pair).poses[self.mode][self.frame]
+        return np.asarray(pose.apply([self.lateral_mm, self.depth_mm, 0.0]))
+
+    @property
+    def _pair(self) -> tuple[str, str | None]:
+        return self.mode, self.other if self.other not in ("", self.mode) else None
+
+    def _place(self, name: str) -> Place:
+        slider = _CUTS[name][0]
+        return Place(**{slider: getattr(self, slider)}, reach_mm=self._page.reach_mm)
+
+    def _cut(self, name: str) -> None:
+        opened, plot = self._page.opened(*self._pair), self._plots[name]
+        with pn.io.hold():
+            try:
+                picture = cut_posed(opened, self._place(name), RANGE_DB, made=self._page.images)
+            except Speckle3DError as error:
+                plot.plot.title.text = str(error).split(";")[0]
+                return
+            plot.show(picture, *self._pair)
+            said = "".join(f"{label_of(mode)}: {length}<br>" for mode, length in picture.lengths.items())
+            if self._pair[1]:
+                said += "green: this mode alone, magenta: the other alone, grey: both"
+            self._lengths.object = said
+
+    def _go(self, point_mm: FloatArray) -> None:
+        """Put the cross hair where the nearest frame has a point; beside the images, leave it."""
+        inside = self._page.opened(*self._pair).poses[self.mode].inv().apply(point_mm)
+        away = np.abs(inside[:, 2])
+        away[self.frame] -= 1e-6  # of frames that lie as near, the one that is shown
+        frame = int(np.argmin(away))
+        lateral, depth, _ = np.round(inside[frame], 2).tolist()
+        low, high = self.param.depth_mm.bounds
+        if (
+            0.0 <= lateral <= self._grid.width_mm
+            and low <= depth <= high
+            and away[frame] <= self._page.reach_mm
+        ):
+            self.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
+
+    def _placed(self, *_: Any) -> None:
+        """Draw the cross hair and the points, and write the commands."""
+        page = self._page
+        points = np.array(self.points_mm).reshape(-1, 3)
+        with pn.io.hold():
+            for plot in self._plots.values():
+                plot.show_points(self._cross_mm, points)
+            self._commands.object = "".join(
+                code(
+                    reslice_command(
+                        page.source, f"{name}.png", self._modes, self._place(name), page.sweep_file
+                    )
+                )
+                for name in _CUTS
+            )
+            if self._space.object is not None:
+                self._draw_planes()
+
+    def _add(self, *_: Any) -> None:
+        """Measure from and to where the cross hair is."""
+        self.points_mm = [*self.points_mm, np.round(self._cross_mm, _DIGITS)]
+
+    def _measured(self, *_: Any) -> None:
+        """Say what is between the points, as `speckle3d measure` does, and give its command."""
+        page, points = self._page, np.array(self.points_mm).reshape(-1, 3)
+        lines = [
+            f"{k + 1}: {', '.join(f'{value:.2f}' for value in point)} mm" for k, point in enumerate(points)
+        ]
+        command = ""
+        if len(points) > 1:
+            try:
+                lines += [found.line for found in measure(page.reconstruction, points, self.mode)]
+                picked_mm = PICKED * self._grid.vector_pitch_mm
+                lines.append(
+                    f"mode {self.mode}; points picked to {picked_mm:.2g} mm per axis; 95 % in brackets"
+                )
+                lines += filter(None, [caution(page.reconstruction, self.mode)])
+                command = code(measure_command(page.source, self.mode, list(points)))
+            except Speckle3DError as error:
+                lines.append(str(error))
+        self._told.object = (
+            "".join(f"<p style='margin:3px 0'>{escape(line)}</p>" for line in lines) + command or _HELP
+        )

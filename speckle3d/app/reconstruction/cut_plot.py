@@ -1,0 +1,95 @@
+"""A plot of one cut: its image in mm, the cross hair, and measured points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from bokeh.events import Tap
+from bokeh.models import ColumnDataSource, DataRange1d
+from bokeh.models.annotations import Span
+from bokeh.plotting import figure
+from matplotlib import colormaps
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.imaging.cuts.planes import ReslicePlane
+from speckle3d.study.figures import UNSEEN
+from speckle3d.study.reslices.cuts import CutPicture
+from speckle3d.study.reslices.reslice_figures import contrast_of, overlay
+
+_NEAR_MM = 0.3
+"""A point is drawn in the cuts as near as this."""
+
+
+class CutPlot:
+    """A plot of one cut.
+
+    Parameters
+    ----------
+    name : str
+        Of the plot's model, by which it is found.
+    colours : tuple of str
+        Of the upright and of the level line of the cross hair: those of the sliders that move them.
+    tapped : callable
+        Called with the point of the world that was clicked on, shape (3,), mm.
+    """
+
+    def __init__(self, name: str, colours: tuple[str, str], tapped: Callable[[FloatArray], None]) -> None:
+        self.plane: ReslicePlane | None = None
+        self.plot = figure(
+            name=f"cut-{name}", sizing_mode="stretch_both", match_aspect=True, title=" ",
+            y_range=DataRange1d(flipped=True), background_fill_color=UNSEEN,
+            tools="pan,wheel_zoom,reset,save", active_drag=None, active_scroll="wheel_zoom",
+        )  # fmt: skip
+        self.plot.toolbar.logo = None
+        self.plot.grid.visible = False
+        self.plot.title.update(text_font_size="12px", text_font_style="normal")
+        self.plot.axis.axis_label_text_font_style = "normal"
+        self._image = ColumnDataSource({name: [] for name in ("image", "x", "y", "dw", "dh")})
+        self.plot.image_rgba("image", "x", "y", "dw", "dh", source=self._image)
+        self._lines = tuple(
+            Span(dimension=dimension, line_color=colour, line_width=1.5)
+            for dimension, colour in zip(("height", "width"), colours, strict=True)
+        )
+        for line in self._lines:
+            self.plot.add_layout(line)
+        self._points = ColumnDataSource({"x": [], "y": [], "number": []})
+        self.plot.line("x", "y", color="white", line_dash=[4, 3], source=self._points)
+        self.plot.scatter("x", "y", size=8, color="#ff3030", line_color="white", source=self._points)
+        self.plot.text("x", "y", "number", x_offset=6, y_offset=-3, color="#ffe600", source=self._points)
+        self.plot.on_event(Tap, lambda event: self._tapped(tapped, event))
+
+    def show(self, picture: CutPicture, mode: str, other: str | None) -> None:
+        """Show a cut at the poses of one mode, or of another (magenta) laid over it (green)."""
+        drawn = picture.cuts[mode]
+        assert isinstance(drawn.cut, ReslicePlane)  # only along a curve there is another kind
+        low, high = picture.levels or (0.0, 255.0)
+        if other is None:
+            greys = colormaps["gray"].with_extremes(bad=UNSEEN)
+            colours = greys(np.clip((drawn.image - low) / (high - low), 0.0, 1.0), bytes=True)
+        else:
+            contrast = contrast_of(drawn.image, (low, high))
+            laid = np.rint(255 * overlay(picture.cuts[other].image, drawn.image, contrast))
+            colours = np.dstack([laid, np.full(laid.shape[:2], 255)]).astype(np.uint8)
+        left, right, bottom, top = drawn.cut.extent_mm
+        place = {"x": [left], "y": [top], "dw": [right - left], "dh": [bottom - top]}
+        self._image.data = {"image": [np.ascontiguousarray(colours).view(np.uint32)[..., 0]], **place}
+        self.plane = drawn.cut
+        self.plot.title.text = picture.place
+        self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{name} / mm" for name in picture.axes)
+
+    def show_points(self, cross_mm: FloatArray, points_mm: FloatArray) -> None:
+        """Put the cross hair at a point of the world, shape (3,), and draw others, shape (k, 3), mm."""
+        if self.plane is None:
+            return
+        inside = self.plane.world_from_plane.inv().apply(np.vstack([cross_mm, points_mm]))
+        x, y = inside[:, :2].T + np.array(self.plane.first_mm)[:, None]
+        for line, place in zip(self._lines, (x[0], y[0]), strict=True):
+            line.location = float(place)
+        x[np.abs(inside[:, 2]) > _NEAR_MM] = np.nan
+        numbers = [str(k + 1) for k in range(len(points_mm))]
+        self._points.data = {"x": x[1:], "y": y[1:], "number": numbers}
+
+    def _tapped(self, told: Callable[[FloatArray], None], event: Tap) -> None:
+        if self.plane is not None and event.x is not None and event.y is not None:
+            told(self.plane.world_from_mm(event.x, event.y))

@@ -1,1 +1,0 @@
-"""Cuts through a reconstruction: where they lie, made from voxels or frames, and drawn."""
