@@ -8,14 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ValidationError
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.reconstruction import FramePairs, Reconstruction
+from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.load import load_sweep, recording_sha256
@@ -78,24 +75,6 @@ class StudyData(BaseModel, frozen=True):
 
 
 @dataclass(frozen=True)
-class RejectedPatches:
-    """Share of the frame pairs in which each patch was left out, and of the patches in each frame.
-
-    Attributes
-    ----------
-    centre_mm : ndarray, shape (p, 2)
-    share : ndarray, shape (p,)
-        NaN for a patch that never had a distance.
-    frame_share : ndarray, shape (n,)
-        By the pair's first frame; NaN where it began no pair.
-    """
-
-    centre_mm: FloatArray
-    share: FloatArray
-    frame_share: FloatArray
-
-
-@dataclass(frozen=True)
 class SweepView:
     """One sweep of a study, ready to be shown.
 
@@ -110,7 +89,6 @@ class SweepView:
     summary: Summary
     curves: SweepCurves
     poses: dict[str, RigidTransform]
-    rejected: RejectedPatches | None
     notes: list[str] = field(default_factory=list)
 
 
@@ -179,23 +157,8 @@ def load_view(directory: Path, entry: Record) -> SweepView:
         summary,
         sweep_curves(own, made.grid.centre_mm, reference, covariance),
         poses,
-        None if made.pairs is None else rejected_patches(made.pairs, made.frame_time_s.size),
         notes,
     )
-
-
-def rejected_patches(pairs: FramePairs, frames: int) -> RejectedPatches:
-    """Count how often each patch, and each frame's patches, were left out though a distance was there."""
-    measured = np.isfinite(pairs.distance_mm)
-    left_out = measured & ~pairs.used
-    by_patch = (each.sum(axis=0) for each in (left_out, measured))
-    by_frame = (np.bincount(pairs.first, each.sum(axis=1), frames) for each in (left_out, measured))
-    return RejectedPatches(pairs.patch_centre_mm, _share(*by_patch), _share(*by_frame))
-
-
-def _share(part: npt.ArrayLike, whole: npt.ArrayLike) -> FloatArray:
-    counts = np.asarray(whole, dtype=float)
-    return np.asarray(np.divide(part, counts, out=np.full(counts.shape, np.nan), where=counts > 0))
 
 
 def _open_sweep(directory: Path, stored: str, made: Reconstruction) -> Sweep:

@@ -1,21 +1,24 @@
-"""The report's figures: what is drawn, and by plotly, how. They can be turned, enlarged and read off."""
+"""The report's figures: the overview by matplotlib for a file too; the others by plotly."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 from plotly import graph_objects as go
 from plotly.colors import hex_to_rgb
 from plotly.subplots import make_subplots
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.report.data import Record, RejectedPatches
-from speckle3d.study.figures import Panel, Series, colour_of, label_of
+from speckle3d.report.data import Record
+from speckle3d.scoring.references import SweepCurves
+from speckle3d.study.figures import CURVE_LABELS, colour_of, label_of, new_figure, spread_frames
 from speckle3d.study.overall import words_of
 
 MOST_POINTS = 240
@@ -25,13 +28,6 @@ OUTLINES = 20
 """Frames whose outlines are drawn."""
 
 _DASHES = ("solid", "dash", "dashdot", "dot", "longdash")
-_LOOKS: Mapping[str, Mapping[str, Any]] = {
-    "line": {"mode": "lines", "line": {"width": 1.8}},
-    "reference": {"mode": "lines", "line": {"width": 4}, "opacity": 0.5},
-    "points": {"mode": "markers", "marker": {"size": 9}, "opacity": 0.65},
-    "dotted": {"mode": "lines+markers", "line": {"width": 1}, "marker": {"size": 4}},
-    "bar": {"mode": "lines", "line": {"width": 10}, "opacity": 0.25, "hoverinfo": "skip"},
-}
 _LAYOUT: Mapping[str, Any] = {
     "template": "none",
     "font": {"family": "system-ui, sans-serif", "size": 13},
@@ -39,74 +35,84 @@ _LAYOUT: Mapping[str, Any] = {
 }
 
 
-def decimated(frames: int) -> npt.NDArray[np.int64]:
-    """Frames to draw: every one of a short sweep, evenly spread ones of a long one, both ends included."""
-    return np.unique(np.linspace(0, frames - 1, min(frames, MOST_POINTS)).round().astype(np.int64))
-
-
-def overview_panels(rows: Sequence[Record], modes: Sequence[str]) -> list[Panel]:
-    """Errors of length and tilt: a point for every part of every sweep, a bar at the mean magnitude."""
-    panels = []
-    for key in ("length_error_percent", "tilt_error_deg"):
-        series = []
+def draw_overview(rows: Sequence[Record], modes: Sequence[str], title: str) -> Figure:
+    """Draw errors of length and tilt: a point for every part of every sweep, a bar at the mean magnitude."""
+    figure = new_figure(9.0, 1.8 + 0.5 * len(modes))
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, key in zip(panels, ("length_error_percent", "tilt_error_deg"), strict=True):
+        axes.axvline(0.0, color="0.6", linewidth=0.8)
         for level, mode in enumerate(modes):
-            own = [row for row in rows if row["mode"] == mode and row[key] is not None]
-            if not own:
-                continue
-            size = float(np.mean([abs(row[key]) for row in own]))
-            look = label_of(mode), colour_of(mode, modes)
-            spread = level + 0.3 * (np.arange(len(own)) / max(len(own) - 1, 1) - 0.5)
-            points = np.column_stack([[row[key] for row in own], spread])
-            words = [f"{row['sweep']}, part {row['part']}" for row in own]
-            series.append(Series(*look, np.array([[-size, level], [size, level]]), "bar"))
-            series.append(Series(*look, points, "points", words=words))
-        panels.append(Panel(series, (words_of(key), ""), [label_of(mode) for mode in modes]))
-    return panels
+            errors = np.array([row[key] for row in rows if row["mode"] == mode and row[key] is not None])
+            if errors.size:
+                colour, size = colour_of(mode, modes), np.abs(errors).mean()
+                spread = level + 0.3 * np.linspace(-0.5, 0.5, errors.size) * (errors.size > 1)
+                axes.plot([-size, size], [level, level], color=colour, linewidth=6, alpha=0.25)
+                axes.plot(errors, spread, "o", color=colour, markersize=4, alpha=0.7)
+        axes.set_xlabel(words_of(key))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(visible=True, alpha=0.3)
+    panels[0].set_yticks(range(len(modes)), [label_of(mode) for mode in modes])
+    panels[0].invert_yaxis()
+    figure.suptitle(title)
+    return figure
 
 
-def plot_panels(views: Mapping[str, Sequence[Panel]], columns: int, height: int) -> go.Figure:
-    """Panels in rows of `columns`.
+def plot_curves(curves: SweepCurves) -> go.Figure:
+    """Length, tilt, yaw and roll over the frames, of every mode and the reference.
 
-    Parameters
+    With a reference, a button shows differences from it.
+
+    References
     ----------
-    views : mapping of str to sequence of Panel
-        By the name of the button that shows them, the first at once; a single view has no button.
-    height : int
-        Pixels.
+    .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
     """
-    first, *_ = views.values()
-    rows, levels = -(-len(first) // columns), first[0].levels
-    figure = make_subplots(
-        rows, columns, shared_xaxes="all" if rows > 1 else False, shared_yaxes=bool(levels),
-        horizontal_spacing=0.08, vertical_spacing=0.12,
-    )  # fmt: skip
-    figure.update_layout(
-        _LAYOUT, height=height, showlegend=not levels, legend={"orientation": "h", "y": 1.12}
-    )
+    figure = make_subplots(2, 2, shared_xaxes="all", horizontal_spacing=0.08, vertical_spacing=0.12)
+    figure.update_layout(_LAYOUT, height=620, hovermode="x unified", legend={"orientation": "h", "y": 1.12})
+    views: dict[str, FloatArray] = {"accumulated": np.zeros((len(CURVE_LABELS), curves.frames))}
+    if curves.reference is not None:
+        views[f"minus {curves.reference_name}"] = curves.reference
     shown: list[str] = []
-    for view, panels in views.items():
-        for i, panel in enumerate(panels):
-            for trace in _traces(panel, named=i == 0):
-                trace.visible = view == next(iter(views))
-                figure.add_trace(trace, i // columns + 1, i % columns + 1)
+    for view, zero in views.items():
+        for q, label in enumerate(CURVE_LABELS):
+            place = {"row": q // 2 + 1, "col": q % 2 + 1}
+            for trace in _curve_traces(curves, q, zero):
+                figure.add_trace(trace.update(visible=view == "accumulated"), **place)
                 shown.append(view)
-    for i, panel in enumerate(first):
-        place = {"row": i // columns + 1, "col": i % columns + 1}
-        figure.update_xaxes(title_text=panel.axes[0] if i + columns >= len(first) else "", **place)
-        figure.update_yaxes(title_text=panel.axes[1], **place)
-    if levels:
-        ticks = {"tickvals": list(range(len(levels))), "ticktext": list(levels)}
-        return figure.update_yaxes(autorange="reversed", automargin=True, zeroline=False, **ticks)
-    figure.update_layout(hovermode="x unified")
+            figure.update_xaxes(title_text="frame" if q > 1 else "", **place)
+            figure.update_yaxes(title_text=label, **place)
+    buttons = [
+        {"label": view, "method": "restyle", "args": [{"visible": [each == view for each in shown]}]}
+        for view in views
+    ]
     if len(views) > 1:
-        buttons = [
-            {"label": view, "method": "restyle", "args": [{"visible": [each == view for each in shown]}]}
-            for view in views
-        ]
         menu = {"type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.2,
                 "yanchor": "bottom", "buttons": buttons}  # fmt: skip
         figure.update_layout(updatemenus=[menu], margin_t=60)
     return figure
+
+
+def _curve_traces(curves: SweepCurves, q: int, zero: FloatArray) -> list[go.Scatter]:
+    """One quantity of the reference and of all modes, less `zero`; named in the legend once."""
+    frames, modes = spread_frames(curves.frames, MOST_POINTS), list(curves.modes)
+
+    def trace(values: FloatArray, name: str, line: dict[str, Any], **look: Any) -> go.Scatter:
+        look = {"showlegend": q == 0, "legendgroup": name, "mode": "lines", **look}
+        return go.Scatter(x=frames, y=_numbers((values - zero)[q, frames]), name=name, line=line, **look)
+
+    traces = []
+    if curves.reference is not None:
+        name = curves.reference_name
+        traces.append(trace(curves.reference, name, {"width": 4, "color": colour_of(name)}, opacity=0.5))
+    if curves.half_width is not None:
+        name, middle, half = "95 % interval of image", curves.modes["image"], curves.half_width
+        faint = f"rgba{(*hex_to_rgb(colour_of('image')), 0.16)}"
+        traces.append(trace(middle - half, name, {"width": 0}, hoverinfo="skip", showlegend=False))
+        band = {"fill": "tonexty", "fillcolor": faint, "hoverinfo": "skip"}
+        traces.append(trace(middle + half, name, {"width": 0}, **band))
+    for i, mode in enumerate(modes):
+        line = {"width": 1.8, "dash": _DASHES[i % len(_DASHES)], "color": colour_of(mode, modes)}
+        traces.append(trace(curves.modes[mode], label_of(mode), line, hovertemplate="%{y:.2f}"))
+    return traces
 
 
 def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> go.Figure:
@@ -118,7 +124,7 @@ def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> go.Fi
     closed, breaks = grid.corners_mm[[0, 1, 2, 3, 0]], np.full((1, 3), np.nan)
     for mode in sorted(poses, key=lambda name: name != "truth"):
         laid = poses[mode][0].inv() * poses[mode]
-        frames = np.unique(np.linspace(0, len(laid) - 1, min(len(laid), OUTLINES)).round().astype(int))
+        frames = spread_frames(len(laid), OUTLINES)
         line = np.concatenate([part for i in frames for part in (laid[int(i)].apply(closed), breaks)])
         x, y, z = (_numbers(line[:, axis]) for axis in (2, 0, 1))
         look = {"color": colour_of(mode, list(poses)), "width": 6 if mode == "truth" else 3}
@@ -133,19 +139,24 @@ def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> go.Fi
     return figure.update_layout(scene=scene, legend={"orientation": "h"}, height=520)
 
 
-def plot_rejected(rejected: RejectedPatches) -> go.Figure:
-    """Share of the pairs in which each patch was left out, and of the patches over the sweep.
+def plot_rejected(pairs: FramePairs, frames: int) -> go.Figure:
+    """Share of the frame pairs in which each patch was left out, and of the patches in each frame.
+
+    A pair's patches are those of its first frame.
 
     References
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 4.
     """
-    centres = np.round(rejected.centre_mm, 6)
+    measured = np.isfinite(pairs.distance_mm)
+    left_out = measured & ~pairs.used
+    share = _percent(left_out.sum(axis=0), measured.sum(axis=0))
+    in_frames = [np.bincount(pairs.first, each.sum(axis=1), frames) for each in (left_out, measured)]
+    by_frame = _percent(in_frames[0], in_frames[1])
+    centres = np.round(pairs.patch_centre_mm, 6)
     (across, column), (down, row) = (np.unique(each, return_inverse=True) for each in centres.T)
     table = np.full((down.size, across.size), np.nan)
-    table[row, column] = 100.0 * rejected.share
-    frames = decimated(rejected.frame_share.size)
-    line = Series("", "#404040", np.column_stack([frames, 100.0 * rejected.frame_share[frames]]), "dotted")
+    table[row, column] = share
     figure = make_subplots(1, 2, column_widths=[0.4, 0.6], horizontal_spacing=0.18)
     figure.update_layout(_LAYOUT, height=400, showlegend=False)
     figure.add_heatmap(
@@ -154,35 +165,18 @@ def plot_rejected(rejected: RejectedPatches) -> go.Figure:
         hovertemplate="lateral %{x:.1f} mm, depth %{y:.1f} mm: %{z:.0f} %<extra></extra>",
         row=1, col=1,
     )  # fmt: skip
-    figure.add_trace(_traces(Panel([line], ("", "")), named=False)[0], 1, 2)
+    at = spread_frames(frames, MOST_POINTS)
+    look = {"mode": "lines+markers", "line": {"width": 1, "color": "#404040"}, "marker": {"size": 4}}
+    figure.add_scatter(x=_numbers(at), y=_numbers(by_frame[at]), row=1, col=2, **look)
     figure.update_xaxes(title_text="lateral / mm", row=1, col=1)
     figure.update_yaxes(title_text="depth / mm", autorange="reversed", row=1, col=1)
     figure.update_xaxes(title_text="frame", row=1, col=2)
     return figure.update_yaxes(title_text="patches left out / %", range=(0.0, 100.0), row=1, col=2)
 
 
-def _traces(panel: Panel, named: bool) -> list[go.Scatter]:
-    """What draws a panel's series; `named` in the legend."""
-    traces = []
-    for each in panel.series:
-        x, y = (_numbers(column) for column in each.points.T)
-        shared = {"x": x, "name": each.label, "legendgroup": each.label}
-        if each.low is not None:
-            faint = f"rgba{(*hex_to_rgb(each.colour), 0.16)}"
-            edge = {**shared, "mode": "lines", "line": {"width": 0}, "hoverinfo": "skip"}
-            traces.append(go.Scatter(y=_numbers(each.low), showlegend=False, **edge))
-            traces.append(go.Scatter(y=y, fill="tonexty", fillcolor=faint, showlegend=named, **edge))
-            continue
-        trace = go.Scatter(y=y, showlegend=named, **shared, **_LOOKS[each.style])
-        trace.update({f"{'marker' if each.style == 'points' else 'line'}_color": each.colour})
-        if each.style == "points":
-            unit = panel.axes[0].rpartition(" / ")[2]
-            words = [html.escape(word, quote=False) for word in each.words]
-            trace.update(text=words, hovertemplate="%{text}: %{x:.2f} " + unit + "<extra></extra>")
-        elif each.style != "bar":
-            trace.update(line_dash=_DASHES[each.dash % len(_DASHES)], hovertemplate="%{y:.2f}")
-        traces.append(trace)
-    return traces
+def _percent(part: npt.NDArray[Any], whole: npt.NDArray[Any]) -> FloatArray:
+    """Shares in per cent; NaN of nothing."""
+    return np.asarray(100.0 * part / np.where(whole > 0, whole, np.nan))
 
 
 def _numbers(values: npt.ArrayLike) -> npt.NDArray[np.float32]:

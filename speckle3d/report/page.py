@@ -22,8 +22,8 @@ from speckle3d.report import figures as draw
 from speckle3d.report import tables
 from speckle3d.report.data import Record, StudyData, SweepView, load_view, read_study
 from speckle3d.scoring.displacements import MEANINGS
-from speckle3d.study.figures import curve_panels, figure_panels, save_figure
-from speckle3d.study.overall import counted
+from speckle3d.study.figures import save_figure
+from speckle3d.study.overall import counted, means_table
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure as Plot
@@ -126,7 +126,7 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
         parts=tables.parts_table(study.rows, anchors),
         drift=tables.records_table(study.drift, (), anchors),
         meanings={key.partition("_")[0]: words for key, words in MEANINGS.items() if key in drifts},
-        intervals=tables.means(study.intervals),
+        intervals=means_table(study.intervals) if study.intervals else [],
         paired=tables.pairs(study.paired),
         sections=sections,
         plots=[each for each in plots if each is not None and each.plot],
@@ -153,12 +153,9 @@ def _overview(study: StudyData, directory: Path) -> PageFigure | None:
     if not study.scored:
         return None
     modes = [mode for mode in study.modes if any(row["mode"] == mode for row in study.scored)]
-    panels = draw.overview_panels(study.scored, modes)
     caption = "a point: a part of a sweep; a bar: the mean magnitude of all, either way"
-    save_figure(figure_panels(panels, 2, (9.0, 1.8 + 0.5 * len(modes)), caption), directory / "overview.png")
-    return _plotted(
-        "overview", draw.plot_panels({"": panels}, 2, 140 + 50 * len(modes)), f"Errors: {caption}."
-    )
+    path = save_figure(draw.draw_overview(study.scored, modes, caption), directory / "overview.png")
+    return _picture(path, f"Errors: {caption}.")
 
 
 def _section(directory: Path, entry: Record, anchor: str) -> Section:
@@ -172,22 +169,19 @@ def _section(directory: Path, entry: Record, anchor: str) -> Section:
 
 
 def _plots(view: SweepView, anchor: str) -> list[PageFigure]:
-    curves, frames = view.curves, draw.decimated(view.curves.frames)
-    views = {"accumulated": curve_panels(curves, frames=frames)}
-    if curves.reference is not None:
-        views[f"minus {curves.reference_name}"] = curve_panels(curves, frames=frames, minus_reference=True)
     caption = "Accumulated length of travel, tilt, yaw and roll; the band is the 95 % interval of mode image."
-    plots = [_plotted(f"{anchor}-curves", draw.plot_panels(views, 2, 620), caption)]
+    plots = [_plotted(f"{anchor}-curves", draw.plot_curves(view.curves), caption)]
     caption = f"Outlines of {draw.OUTLINES} frames of every mode in space, first frames laid on each other."
     outlines = draw.plot_outlines(view.poses, view.reconstruction.grid)
     plots.append(_plotted(f"{anchor}-outlines", outlines, caption))
-    if view.rejected is not None and np.isfinite(view.rejected.share).any():
+    pairs = view.reconstruction.pairs
+    if pairs is not None and np.isfinite(pairs.distance_mm).any():
         caption = (
             "Patches left out of the plane of their pair of frames, because the sensed orientation or the "
             "other patches contradict them: where in the image, in how many of the pairs, and how many over "
             "the sweep."
         )
-        plots.append(_plotted(f"{anchor}-patches", draw.plot_rejected(view.rejected), caption))
+        plots.append(_plotted(f"{anchor}-patches", draw.plot_rejected(pairs, view.curves.frames), caption))
     return plots
 
 

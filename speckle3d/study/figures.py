@@ -1,14 +1,11 @@
-"""Figures of a reconstruction: what is drawn (series, labels, colours), and how matplotlib draws it in files.
-
-The report's page draws the same series by plotly. Nothing here needs pyplot or a window system.
-"""
+"""Figures of a reconstruction in files, by matplotlib without pyplot or a window system; colours of modes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import IntArray
 from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import atomic_path, make_folder
 from speckle3d.scoring.references import SweepCurves
@@ -48,61 +45,6 @@ UNSEEN = "#33415c"
 _DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (3, 1, 1, 1, 1, 1)))
 """A second cue beside colour: corrected curves often lie on each other."""
 
-_STYLES: Mapping[str, Mapping[str, Any]] = {
-    "line": {"linewidth": 1.3},
-    "reference": {"linewidth": 2.4, "alpha": 0.5},
-    "band": {"linewidth": 0, "alpha": 0.15},
-    "points": {"linestyle": "none", "marker": "o", "markersize": 4, "alpha": 0.7},
-    "dotted": {"linewidth": 0.8, "marker": ".", "markersize": 3},
-    "bar": {"linewidth": 6, "alpha": 0.25},
-}
-Style = Literal["line", "reference", "band", "points", "dotted", "bar"]
-
-
-@dataclass(frozen=True)
-class Series:
-    """One thing that a panel shows.
-
-    Attributes
-    ----------
-    points : ndarray, shape (n, 2) or (n, 3)
-        NaN breaks a line.
-    low : ndarray, shape (n,), optional
-        Lower edge of a band; `points` are the upper one.
-    dash : int
-        Which pattern of dashes a line has.
-    words : sequence of str
-        What each point is.
-    """
-
-    label: str
-    colour: str
-    points: FloatArray
-    style: Style = "line"
-    low: FloatArray | None = None
-    dash: int = 0
-    words: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Series on the same axes.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        Name and unit of each coordinate.
-    levels : sequence of str
-        Names of the heights 0, 1, ... from the top, in place of numbers.
-    limits : (low, high), optional
-        Of the vertical axis.
-    """
-
-    series: Sequence[Series]
-    axes: tuple[str, ...]
-    levels: Sequence[str] = ()
-    limits: tuple[float, float] | None = None
-
 
 def label_of(mode: str) -> str:
     """Name of a mode in figures: its own."""
@@ -121,70 +63,29 @@ def spread_frames(count: int, most: int) -> IntArray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-def curve_panels(
-    curves: SweepCurves,
-    count: int = len(CURVE_LABELS),
-    frames: npt.NDArray[np.integer] | None = None,
-    minus_reference: bool = False,
-) -> list[Panel]:
-    """Panels of length, tilt, yaw and roll over the frames, for every mode and the reference.
-
-    Parameters
-    ----------
-    count : int
-        Panels, from length on.
-    frames : ndarray of int, optional
-        Frames to draw; by default all.
-    minus_reference : bool
-        Draw differences from the reference.
+def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
+    """Draw accumulated length and tilt over the frames, for every mode and the reference.
 
     References
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
     """
-    at = np.arange(curves.frames) if frames is None else frames
-    panels = []
-    for q in range(count):
-        zero = np.zeros(curves.frames)
-        if minus_reference and curves.reference is not None:
-            zero = curves.reference[q]
-
-        def shown(values: FloatArray, zero: FloatArray = zero) -> FloatArray:
-            return np.column_stack([at, (values - zero)[at]])
-
-        series = []
+    figure, modes, frames = new_figure(10.0, 4.2), list(curves.modes), np.arange(curves.frames)
+    for q, axes in enumerate(figure.subplots(1, 2)):
         if curves.reference is not None:
-            name = curves.reference_name
-            series.append(Series(name, colour_of(name), shown(curves.reference[q]), "reference"))
+            look = {"color": colour_of(curves.reference_name), "label": curves.reference_name}
+            axes.plot(frames, curves.reference[q], linewidth=2.4, alpha=0.5, **look)
         if curves.half_width is not None:
             middle, half = curves.modes["image"][q], curves.half_width[q]
-            low, high = shown(middle - half)[:, 1], shown(middle + half)
-            series.append(Series("95 % interval of image", colour_of("image"), high, "band", low))
-        for i, (mode, values) in enumerate(curves.modes.items()):
-            colour = colour_of(mode, list(curves.modes))
-            series.append(Series(label_of(mode), colour, shown(values[q]), dash=i))
-        panels.append(Panel(series, ("frame", CURVE_LABELS[q])))
-    return panels
-
-
-def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
-    """Draw accumulated length and tilt over the frames, for every mode and the reference."""
-    return figure_panels(curve_panels(curves, 2), 2, (10.0, 4.2), title)
-
-
-def figure_panels(
-    panels: Sequence[Panel], columns: int, size_in: tuple[float, float], title: str = ""
-) -> Figure:
-    """Draw panels in rows of `columns`; panels below each other share the horizontal axis."""
-    figure = new_figure(*size_in)
-    rows = -(-len(panels) // columns)
-    named = bool(panels[0].levels)
-    places = figure.subplots(rows, columns, squeeze=False, sharex="col" if rows > 1 else False, sharey=named)
-    for i, (panel, axes) in enumerate(zip(panels, places.ravel(), strict=True)):
-        _draw_panel(axes, panel, i + columns >= len(panels))
-    if named:
-        places[0, 0].set_yticks(range(len(panels[0].levels)), panels[0].levels)
-        places[0, 0].invert_yaxis()
+            look = {"color": colour_of("image"), "label": "95 % interval of image"}
+            axes.fill_between(frames, middle - half, middle + half, linewidth=0, alpha=0.15, **look)
+        for mode, dash in zip(modes, cycle(_DASHES), strict=False):
+            look = {"color": colour_of(mode, modes), "label": label_of(mode)}
+            axes.plot(frames, curves.modes[mode][q], linestyle=dash, linewidth=1.3, **look)
+        axes.legend(frameon=False, fontsize="small")
+        axes.set(xlabel="frame", ylabel=CURVE_LABELS[q])
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(visible=True, alpha=0.3)
     name_figure(figure, title)
     return figure
 
@@ -228,19 +129,3 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def _draw_panel(axes: Axes, panel: Panel, named_below: bool) -> None:
-    if panel.levels:
-        axes.axvline(0.0, color="0.6", linewidth=0.8)
-    for each in panel.series:
-        look: dict[str, Any] = {"color": each.colour, "label": each.label, **_STYLES[each.style]}
-        if each.low is not None:
-            axes.fill_between(each.points[:, 0], each.low, each.points[:, 1], **look)
-        else:
-            axes.plot(*each.points.T, **{"linestyle": _DASHES[each.dash % len(_DASHES)], **look})
-    if not panel.levels:
-        axes.legend(frameon=False, fontsize="small")
-    axes.set(xlabel=panel.axes[0] if named_below else "", ylabel=panel.axes[1])
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(visible=True, alpha=0.3)
