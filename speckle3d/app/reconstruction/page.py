@@ -20,9 +20,9 @@ from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.imaging.images import Images
-from speckle3d.report.figures import plot_outlines, plot_panels
+from speckle3d.report.figures import plot_curves, plot_outlines
 from speckle3d.scoring.references import find_reference, sweep_curves
-from speckle3d.study.figures import RANGE_DB, curve_panels, label_of
+from speckle3d.study.figures import RANGE_DB, label_of
 from speckle3d.study.pose_errors import PICKED, caution, measure
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.reslices.cuts import OpenedModes, at_modes, cut_posed
@@ -182,7 +182,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             page.reference,
             None if trust is None else trust.covariance,
         )
-        drift = plot_panels({"": curve_panels(curves)}, 2, 300)
+        drift = plot_curves(curves)
         drift.update_layout(height=None)
         over_frames = pn.pane.Plotly(drift, sizing_mode="stretch_both")
         self._draw_planes()
