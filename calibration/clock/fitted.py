@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from calibration.clock.offset import ClockOffset, covered, delays_around, require_peak
-from calibration.clock.smoothing import smooth
+from calibration.clock.offset import ClockOffset, covered, delays_around, peak_of
+from calibration.clock.smoothing import SmoothReadings
 from calibration.motion import InadequateError
 from calibration.noise import fit_noise
 from calibration.plane import Chain, Equations, Solution, nearly_absolute, sigma_of
@@ -27,12 +27,8 @@ STEP_S = 0.02
 
 _ANEW = 15
 """Of so many offsets tried, one gets a calibration from nothing; others begin from the one beside them."""
-
-_ROUNDS = 3
-"""The next one leaves out the frames that contradict the others at the offset that was found, if it is not
-the one that the round began with."""
 _MOST_STEPS = 10
-_SETTLED = 0.1
+_CLOSE = 0.1
 """Steps end when one is below this share of the standard error."""
 _DERIVATIVE_S = 1e-3
 
@@ -71,27 +67,20 @@ def estimate_offset(
             f"expected readings from {search_s:g} s before to {search_s:g} s after some frames, to tell the "
             "clock, got none"
         )
-    points_at = _Reader(points[there], smooth(readings)).at
+    points_at = _Reader(points[there], readings).at
     tried = delays_around(around_s, search_s, STEP_S)
     misfit = _sigmas(calibrate, points_at, tried) ** 2
-    best = int(np.argmin(misfit))
-    seconds, error = float(tried[best]), np.inf
-    if 0 < best < len(tried) - 1:
-        require_peak(tried, misfit, best)
-    for _ in range(_ROUNDS):
-        begun, solution = seconds, _adequate_or_not(calibrate, points_at(seconds))
-        for _ in range(_MOST_STEPS):
-            chain, step, covariance = _joint_fit(solution, points_at, seconds)
-            solution, error = replace(solution, chain=chain), float(np.sqrt(covariance[-1, -1]))
-            seconds += float(np.clip(step, -STEP_S, STEP_S))
-            if not abs(seconds - around_s) < search_s - STEP_S:
-                raise InsufficientDataError(
-                    f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its "
-                    "end"
-                )
-            if abs(step) < _SETTLED * error:
-                break
-        if abs(seconds - begun) < STEP_S:
+    seconds = float(tried[peak_of(tried, misfit, "the motion repeats itself; move irregularly")])
+    for _ in range(_MOST_STEPS):
+        # Anew, for the frames that contradict the others depend on the offset.
+        _, step, covariance = _joint_fit(_adequate_or_not(calibrate, points_at(seconds)), points_at, seconds)
+        error = float(np.sqrt(covariance[-1, -1]))
+        seconds += float(np.clip(step, -STEP_S, STEP_S))
+        if not abs(seconds - around_s) < search_s - STEP_S:
+            raise InsufficientDataError(
+                f"expected a clock offset within {search_s:g} s of {around_s:g} s, got the best at its end"
+            )
+        if abs(step) < _CLOSE * error:
             break
     return ClockOffset(seconds, error)
 
@@ -102,7 +91,7 @@ def with_uncertain_offset(
     """Return a solution whose covariance includes that of the clock offset it was made with."""
     there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
     shown = replace(solution, points=solution.points[there], used=solution.used[there])
-    _, _, joint = _joint_fit(shown, _Reader(shown.points, smooth(readings)).at, seconds)
+    _, _, joint = _joint_fit(shown, _Reader(shown.points, readings).at, seconds)
     along, variance = joint[:-1, -1], joint[-1, -1]
     covariance = solution.covariance + np.outer(along, along) / variance
     return replace(solution, noise=replace(solution.noise, covariance=covariance))
@@ -112,12 +101,11 @@ class _Reader:
     """Points with the sensor read at another offset, each time of a frame once."""
 
     def __init__(self, points: ImagePoints, readings: TimedPoses | TimedRotations) -> None:
-        self._points, self._readings = points, readings
+        self._points, self._readings = points, SmoothReadings(readings)
         self._times, self._of_point = np.unique(points.times, return_inverse=True)
 
     def at(self, seconds: float) -> ImagePoints:
-        read: RigidTransform | Rotation = self._readings.at(self._times - seconds)
-        poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
+        poses = self._readings.at(self._times - seconds)
         return replace(self._points, world_from_sensor=poses[self._of_point])
 
 

@@ -13,21 +13,10 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.clock.offset import (
-    SEARCH_S,
-    ClockOffset,
-    covered,
-    curvature_error,
-    delays_around,
-    minimum_between,
-    require_peak,
-)
-from calibration.clock.smoothing import smooth
+from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, least_between, peak_of
+from calibration.clock.smoothing import SmoothReadings
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import autocorrelation_time
@@ -95,93 +84,49 @@ def delay_from_lines(
             f"expected readings from {search_s:g} s before to {search_s:g} s after at least {FEWEST_FRAMES} "
             f"frames with a line, got them for {there.sum()} of {len(frame_time_s)} such frames"
         )
-    wanted = signal[there, 0 if isinstance(readings, TimedPoses) else 1]
-    misfit_at = _misfit(wanted - wanted.mean(), frame_time_s[there], readings)
-    tried = delays_around(around_s, search_s, STEP_S)
-    misfit = np.array([misfit_at(float(delay)) for delay in tried], dtype=np.float64)
-    best = int(np.argmin(misfit))
-    returns = _returns(wanted, frame_time_s[there])
-    _require_clear(tried, misfit, best, returns)
-    motion = _motion(readings, frame_time_s[there] - tried[best])
-    _require_varied(wanted - wanted.mean(), motion, float(misfit[best]))
-    # Between the delays tried, samples joined by straight lines would pull the best one to a sample.
-    steady = smooth(readings)
-    misfit_at = _misfit(wanted - wanted.mean(), frame_time_s[there], steady)
-    delay, least = minimum_between(misfit_at, tried, best, 1e-5)
-    motion = _motion(steady, frame_time_s[there] - delay)
-    left = _residuals(wanted, motion)
-    free = max(1.0, len(left) / autocorrelation_time(left) - motion.shape[1])
-    error = curvature_error(misfit_at, delay, STEP_S, free)
-    if not error < search_s:
-        raise InsufficientDataError(
-            f"expected a motion that shows the delay, got {delay:+.3f} s +- {error:.3g} s, no better than "
-            f"the {search_s:g} s searched: {_IRREGULARLY if returns else _ONE_WAY}"
-        )
-    return ClockOffset(delay, error, 1.0 - least)
-
-
-def _motion(readings: TimedPoses | TimedRotations, times_s: FloatArray) -> FloatArray:
-    """Regressors of a line: one, rotation about the mean, and position, shape (m, 4 or 7)."""
-    read: RigidTransform | Rotation = readings.at(times_s)
-    turn = read if isinstance(read, Rotation) else read.rotation
-    columns = [np.ones((len(times_s), 1)), (turn.mean().inv() * turn).as_rotvec()]
-    if not isinstance(read, Rotation):
-        columns.append(read.translation - read.translation.mean(axis=0))
-    return np.concatenate(columns, axis=1)
-
-
-def _misfit(
-    wanted: FloatArray, times_s: FloatArray, readings: TimedPoses | TimedRotations
-) -> Callable[[float], float]:
-    """Share of the signal's variance that the sensor leaves unexplained, as a function of the delay."""
-    energy = float(wanted @ wanted)
+    times, wanted = frame_time_s[there], signal[there, 0 if isinstance(readings, TimedPoses) else 1]
+    wanted = wanted - wanted.mean()
     if float(np.ptp(wanted)) < _STILL:
         raise InsufficientDataError("expected a line that moves, got one that stands still")
+    steady = SmoothReadings(readings)
 
-    def at(delay_s: float) -> float:
-        left = _residuals(wanted, _motion(readings, times_s - delay_s))
-        return float(left @ left) / energy
+    def fit(delay_s: float) -> tuple[FloatArray, int]:
+        """What a constant, the rotation about its mean and the position leave of the line; their rank."""
+        turns, places = (pose := steady.at(times - delay_s)).rotation, pose.translation
+        motion = [(turns.mean().inv() * turns).as_rotvec(), places - places.mean(axis=0)]
+        matrix = np.column_stack([np.ones(len(times)), *motion])
+        answer, _, rank, _ = np.linalg.lstsq(matrix, wanted, rcond=1e-9)
+        return wanted - matrix @ answer, int(rank)
 
-    return at
+    def misfit(delay_s: float) -> float:
+        left = fit(delay_s)[0]
+        return float(left @ left / (wanted @ wanted))
 
-
-def _residuals(wanted: FloatArray, motion: FloatArray) -> FloatArray:
-    found = np.linalg.lstsq(motion, wanted, rcond=1e-9)[0]
-    return np.asarray(wanted - motion @ found)
-
-
-def _require_varied(wanted: FloatArray, motion: FloatArray, least_misfit: float) -> None:
-    """Refuse a line with so few independent values that any slow motion would explain it at some delay."""
-    # The delay is fitted too.
-    count, fitted = (
-        len(wanted) / autocorrelation_time(wanted),
-        int(np.linalg.matrix_rank(motion, rtol=1e-9)) + 1,
-    )
-    by_any = (count - 1.0) / (count - fitted) if count > fitted else float("inf")
-    if not least_misfit * by_any <= 1.0 - LEAST_FOLLOWED:
+    tried = delays_around(around_s, search_s, STEP_S)
+    misfits = np.array([misfit(float(delay)) for delay in tried])
+    if (followed := 1.0 - misfits.min()) < LEAST_FOLLOWED:
+        raise InsufficientDataError(
+            f"expected a line that follows the sensor, got {100 * followed:.0f} % of its motion explained at "
+            f"the best delay, {tried[misfits.argmin()]:+.3f} s: move the probe up and down, faster; or the "
+            "delay lies outside the range searched: --search-s"
+        )
+    trend = np.polynomial.Polynomial.fit(times, wanted, 1)(times)
+    one_way = float(np.var(wanted - trend)) <= (1.0 - _TREND) * float(np.var(wanted))
+    best = peak_of(tried, misfits, _ONE_WAY if one_way else "the motion repeats itself; move irregularly")
+    seconds, least, curvature = least_between(misfit, tried, best)
+    left, rank = fit(seconds)
+    # Of so few independent values any slow motion would explain a line at some delay, which is fitted too.
+    told, fitted = len(wanted) / autocorrelation_time(wanted), rank + 1
+    if not least * (told - 1.0) <= (1.0 - LEAST_FOLLOWED) * (told - fitted):
         raise InsufficientDataError(
             f"expected a line whose motion tells much more than the {fitted} numbers fitted to it, got one "
-            f"that turns so seldom that it tells {count:.1f}: record for longer, and {_IRREGULARLY}"
+            f"that turns so seldom that it tells {told:.1f}: record for longer, and {_IRREGULARLY}"
         )
-
-
-def _returns(wanted: FloatArray, times_s: FloatArray) -> bool:
-    """Whether the line does more than go one way at one speed."""
-    trend = np.polynomial.Polynomial.fit(times_s, wanted, 1)(times_s)
-    return float(np.var(wanted - trend)) > (1.0 - _TREND) * float(np.var(wanted))
-
-
-def _require_clear(tried_s: FloatArray, misfit: FloatArray, best: int, returns: bool) -> None:
-    """Refuse a line that does not follow the sensor, and a best delay at the range's end or with a rival."""
-    if 1.0 - misfit[best] < LEAST_FOLLOWED:
+    free = max(1.0, len(left) / autocorrelation_time(left) - rank)
+    error = float(np.sqrt(2.0 * least / free / curvature)) if curvature > 0 else np.inf
+    if not error < search_s:
         raise InsufficientDataError(
-            f"expected a line that follows the sensor, got {100 * (1 - misfit[best]):.0f} % of its motion "
-            f"explained at the best delay, {tried_s[best]:+.3f} s: move the probe up and down, faster; or "
-            "the delay lies outside the range searched: --search-s"
+            f"expected a motion that shows the delay, got {seconds:+.3f} s +- {error:.3g} s, no better than "
+            f"the {search_s:g} s searched: {_ONE_WAY if one_way else _IRREGULARLY}"
         )
-    try:
-        require_peak(tried_s, misfit, best)
-    except InsufficientDataError:
-        if returns:
-            raise
-        raise InsufficientDataError(f"expected one delay, got many that fit alike: {_ONE_WAY}") from None
+    return ClockOffset(seconds, error, 1.0 - least)

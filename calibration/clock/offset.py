@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.signal import find_peaks
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError
@@ -54,69 +55,42 @@ def delays_around(around_s: float, search_s: float, step_s: float) -> FloatArray
     return np.asarray(around_s + steps * step_s, dtype=np.float64)
 
 
-def minimum_between(
-    cost: Callable[[float], float], tried_s: FloatArray, best: int, tolerance_s: float
-) -> tuple[float, float]:
-    """Delay of the least cost between the neighbours of the best one tried, and that cost."""
-    bounds = tried_s[best - 1], tried_s[best + 1]
-    found = minimize_scalar(
-        lambda delay: cost(float(delay)), bounds=bounds, method="bounded", options={"xatol": tolerance_s}
-    )
-    return float(found.x), float(found.fun)
-
-
-def curvature_error(cost: Callable[[float], float], at: float, step: float, free: float) -> float:
-    """Standard error of one parameter of least squares, from the curvature of the cost at its minimum.
+def peak_of(tried_s: FloatArray, misfit: FloatArray, doubt: str) -> int:
+    """Index of the delay of least misfit.
 
     Parameters
     ----------
-    cost : callable
-        Sum of squares, in any unit.
-    step : float
-        To either side, for the curvature.
-    free : float
-        Independent residuals less fitted parameters.
-
-    Returns
-    -------
-    float
-        Infinite where the cost does not rise to both sides.
-    """
-    below, middle, above = (cost(at + shift) for shift in (-step, 0.0, step))
-    curvature = (below - 2.0 * middle + above) / step**2
-    return float(np.sqrt(2.0 * middle / free / curvature)) if curvature > 0 else float("inf")
-
-
-def require_peak(
-    tried_s: FloatArray,
-    misfit: FloatArray,
-    best: int,
-    why: str = "the motion repeats itself; move irregularly",
-) -> None:
-    """Refuse a best delay that lies at the end of the range, or that has a rival.
-
-    Parameters
-    ----------
-    why : str
-        Reason of a rival, for the message.
+    doubt : str
+        Likely reason of a rival, for the message.
 
     Raises
     ------
     InsufficientDataError
+        If it lies at the end of the range, or another is nearly as good.
     """
+    best = int(np.argmin(misfit))
     if best in (0, len(tried_s) - 1):
         raise InsufficientDataError(
             f"expected a delay between {tried_s[0]:g} and {tried_s[-1]:g} s, got the best at the range's "
             "end: the delay may lie outside the range searched: --search-s"
         )
-    from scipy.signal import find_peaks
-
     gain = float(np.median(misfit) - misfit[best])
     good = find_peaks(-misfit, height=-(misfit[best] + _AMBIGUOUS * gain))[0]
     # Not by find_peaks' prominence: the range may end before the misfit rises beyond a rival.
-    rivals = [
-        i for i in good[good != best] if misfit[min(i, best) : max(i, best)].max() - misfit[best] > 0.5 * gain
-    ]
-    if rivals:
-        pair = f"{tried_s[best]:+.3f} and {tried_s[rivals[0]]:+.3f} s"
-        raise InsufficientDataError(f"expected one delay, got {pair} nearly as good: {why}")
+    for rival in good[good != best]:
+        if misfit[min(rival, best) : max(rival, best)].max() - misfit[best] > 0.5 * gain:
+            pair = f"{tried_s[best]:+.3f} and {tried_s[rival]:+.3f} s"
+            raise InsufficientDataError(f"expected one delay, got {pair} nearly as good: {doubt}")
+    return best
+
+
+def least_between(
+    cost: Callable[[float], float], tried_s: FloatArray, best: int
+) -> tuple[float, float, float]:
+    """Delay of least cost between the neighbours of the best one tried, that cost, and its curvature."""
+    low, middle, high = tried_s[best - 1 : best + 2]
+    fit = minimize_scalar(
+        lambda delay: cost(float(delay)), bounds=(low, high), method="bounded", options={"xatol": 1e-5}
+    )
+    seconds, least, step = float(fit.x), float(fit.fun), float(high - middle)
+    return seconds, least, (cost(seconds - step) - 2.0 * least + cost(seconds + step)) / step**2

@@ -63,11 +63,6 @@ def test_a_rough_mounting_is_enough(recording):
     assert found.seconds == pytest.approx(0.03, abs=0.004)
 
 
-def test_a_delay_outside_the_range_is_refused(recording):
-    with pytest.raises(InsufficientDataError, match=r"\d s"):
-        delay_from_images(tracked(recording, 0.2), RigidTransform.identity(), 0.08)
-
-
 def noise(images):
     return np.random.default_rng(0).standard_normal(images.shape)
 
@@ -76,11 +71,20 @@ def reversed_in_time(images):
     return images[::-1]
 
 
-@pytest.mark.parametrize("change", [noise, pytest.param(reversed_in_time, marks=pytest.mark.slow)])
-def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change):
-    whole = tracked(recording, 0.0)
+@pytest.mark.parametrize(
+    ("change", "offset_s", "search_s"),
+    [
+        (np.asarray, 0.2, 0.08),  # outside the range
+        (noise, 0.0, 0.4),
+        pytest.param(reversed_in_time, 0.0, 0.4, marks=pytest.mark.slow),
+    ],
+)
+def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change, offset_s, search_s):
+    whole = tracked(recording, offset_s)
     with pytest.raises(InsufficientDataError, match="--search-s"):
-        delay_from_images(replace(whole, images=change(whole.images)), RigidTransform.identity(), 0.4, 20)
+        delay_from_images(
+            replace(whole, images=change(whole.images)), RigidTransform.identity(), search_s, 20
+        )
 
 
 def test_images_of_one_plane_are_refused_at_once(recording):
@@ -90,5 +94,5 @@ def test_images_of_one_plane_are_refused_at_once(recording):
     # Tremor of a millimetre across is less than a beam's width.
     path = np.column_stack([along, 0.5 * along, 0.5 * np.sin(20.0 * times)])
     readings = TimedPoses(times, RigidTransform.from_translation(path))
-    with pytest.raises(InsufficientDataError, match=r"1.0 mm"):
+    with pytest.raises(InsufficientDataError):
         delay_from_images(replace(whole, readings=readings, images=None), RigidTransform.identity(), 0.05)

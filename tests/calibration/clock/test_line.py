@@ -21,12 +21,11 @@ def hand(seed, count=5):
     return lambda t: np.sin(2 * np.pi * frequency * np.asarray(t)[..., None] + phase).sum(-1) / np.sqrt(count)
 
 
-def recorded(seed, *, seconds=12.0, rate_hz=256.0, frame_hz=25.0, noise_mm=0.1, jitter_mm=0.1):
+def recorded(seed, *, seconds=12.0, noise_mm=0.1, jitter_mm=0.1):
     """Line depth and slope in frames, and both kinds of readings whose clock is behind by `DELAY_S`."""
     rng = np.random.default_rng(seed)
     height, tilt = hand(seed), hand(seed + 1000)
-    frames = np.arange(0.0, seconds, 1 / frame_hz)
-    sensor = np.arange(-1.0, seconds + 1.0, 1 / rate_hz)
+    frames, sensor = np.arange(0.0, seconds, 1 / 25.0), np.arange(-1.0, seconds + 1.0, 1 / 256.0)
     skew = Rotation.from_rotvec([0.4, -0.2, 1.0])
     jitter = jitter_mm * rng.standard_normal((sensor.size, 3))
     place = skew.apply(np.outer(8.0 * height(sensor), [0.1, 0.0, 1.0]) + jitter)
@@ -38,13 +37,13 @@ def recorded(seed, *, seconds=12.0, rate_hz=256.0, frame_hz=25.0, noise_mm=0.1, 
     return np.column_stack([depth, slope]), frames, poses, TimedRotations(clock, turn)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["tracker", "orientation"])
-def test_a_delay_is_found_within_two_milliseconds(seed, kind):
-    signal, frames, poses, rotations = recorded(seed)
-    found = delay_from_lines(signal, frames, poses if kind == "tracker" else rotations)
-    assert found.seconds == pytest.approx(DELAY_S, abs=0.002)
-    assert found.followed > 0.9
+def test_a_delay_is_found_within_two_milliseconds(kind):
+    for seed in range(3):
+        signal, frames, poses, rotations = recorded(seed)
+        found = delay_from_lines(signal, frames, poses if kind == "tracker" else rotations)
+        assert found.seconds == pytest.approx(DELAY_S, abs=0.002)
+        assert found.followed > 0.9
 
 
 @pytest.mark.slow
@@ -58,42 +57,23 @@ def test_claimed_errors_are_those_of_repetition():
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.43)
 
 
-def test_a_periodic_motion_is_refused():
-    signal, frames, poses, _ = recorded(0)
-    wave = lambda t: 8.0 * np.sin(2 * np.pi * 4.0 * t)  # noqa: E731
-    place = np.outer(wave(poses.time_s + DELAY_S), [0.0, 0.0, 1.0])
-    swinging = TimedPoses(poses.time_s, RigidTransform.from_translation(place))
-    signal = np.column_stack([25.0 - wave(frames), np.zeros(frames.size)])
-    with pytest.raises(InsufficientDataError, match=r"[+-]\d\.\d+ and [+-]\d\.\d+ s"):
-        delay_from_lines(signal, frames, swinging)
-
-
-def test_a_line_that_does_not_follow_or_stands_still_is_refused():
-    signal, frames, poses, _ = recorded(0)
-    other, _, _, _ = recorded(50)
-    with pytest.raises(InsufficientDataError, match=r"\d %"):
-        delay_from_lines(other, frames, poses)
-    with pytest.raises(InsufficientDataError, match="stands still"):
-        delay_from_lines(np.zeros_like(signal), frames, poses)
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_a_short_slow_motion_that_anything_explains_is_refused(seed):
-    _, frames, poses, _ = recorded(seed, noise_mm=0.01, jitter_mm=0.01)
-    other, _, _, _ = recorded(seed + 50, noise_mm=0.01)
-    few = frames < 1.2
-    with pytest.raises(InsufficientDataError):
-        delay_from_lines(other[few], frames[few], poses)
-
-
-def test_a_delay_beyond_the_range_and_missing_readings_are_refused():
-    signal, frames, poses, _ = recorded(0)
-    with pytest.raises(InsufficientDataError, match="--search-s"):
-        delay_from_lines(signal, frames, poses, search_s=0.05)
-    found = delay_from_lines(signal, frames, poses, around_s=0.1, search_s=0.05)
-    assert found.seconds == pytest.approx(DELAY_S, abs=0.002)
-    with pytest.raises(InsufficientDataError, match=r"20 .* 0 of"):
-        delay_from_lines(signal, frames + 100.0, poses)
+def test_what_tells_no_one_delay_is_refused():
+    signal, frames, poses, _ = recorded(0, noise_mm=0.01, jitter_mm=0.01)
+    wave = 8.0 * np.sin(2 * np.pi * 4.0 * frames)
+    swing = 8.0 * np.sin(2 * np.pi * 4.0 * (poses.time_s + DELAY_S))
+    periodic = TimedPoses(poses.time_s, RigidTransform.from_translation(np.outer(swing, [0.0, 0.0, 1.0])))
+    other, few = recorded(50, noise_mm=0.01)[0], frames < 1.2
+    for arguments in (
+        (np.column_stack([25.0 - wave, 0.0 * wave]), frames, periodic),  # two delays alike
+        (other, frames, poses),  # of another motion
+        (other[few], frames[few], poses),  # so short that any motion explains it
+        (np.zeros_like(signal), frames, poses),  # stands still
+        (signal, frames, poses, 0.0, 0.05),  # beyond the range searched
+        (signal, frames + 100.0, poses),  # no readings
+    ):
+        with pytest.raises(InsufficientDataError):
+            delay_from_lines(*arguments)
+    assert delay_from_lines(signal, frames, poses, 0.1, 0.05).seconds == pytest.approx(DELAY_S, abs=0.002)
 
 
 @pytest.mark.slow
@@ -106,5 +86,5 @@ def test_the_real_water_tank_has_the_published_delay(realdata):
     lines = detect_lines(sweep.frames, (0.078, 0.078))
     signal = line_signal(lines.pixels, np.array([0.078, 0.078]), 409.5)
     found = delay_from_lines(signal, sweep.frame_time_s[lines.frame], readings)
-    # PLUS: TrackerLagSec -0.0648266, the same delay with its sign the other way round. Measured 0.0651.
+    # PLUS: TrackerLagSec -0.0648266, the same delay with its sign the other way round. Measured 0.0652.
     assert found.seconds == pytest.approx(0.0648266, abs=0.003)
