@@ -307,32 +307,6 @@ def pose_graph_step(poses, first, second, measured, information, huber):
     return normal[6:, 6:], gradient[6:]
 
 
-def edges_of_columns(samples, inside, sigma, threshold):
-    """Twin of `calibration.detection.edges` by slope: each run of rows convolved alone, maxima by search.
-
-    Returns the first maximum's row above the threshold, or else the largest's, (n,); NaN without one.
-    """
-    reach = int(np.ceil(3.5 * sigma))
-    t = np.arange(-reach, reach + 1)
-    kernel = t * np.exp(-0.5 * (t / sigma) ** 2)
-    kernel /= (t * kernel).sum()
-    rows = np.full(len(samples), np.nan)
-    for c, (line, held) in enumerate(zip(samples.astype(float), inside, strict=True)):
-        maxima = []
-        for run in np.split(np.arange(line.size), np.flatnonzero(np.diff(held)) + 1):
-            if not held[run[0]]:
-                continue
-            slope = np.correlate(np.pad(line[run], reach, mode="edge"), kernel, mode="valid")
-            for j in range(1, run.size - 1):
-                if slope[j] > 0 and slope[j - 1] < slope[j] >= slope[j + 1]:
-                    top = np.polyfit([-1, 0, 1], slope[j - 1 : j + 2], 2)
-                    maxima.append((slope[j], run[j] - top[1] / (2 * top[0])))
-        strong = [row for height, row in maxima if height > threshold]
-        if maxima:
-            rows[c] = strong[0] if strong else max(maxima)[1]
-    return rows
-
-
 def consensus_line(column, row, inside, tolerance):
     """Twin of `speckle3d.kernels.lines.consensus_line`: all pairs at once, then `np.polyfit` until it stays.
 
@@ -369,33 +343,6 @@ def consensus_line(column, row, inside, tolerance):
         if np.array_equal(before, agree):
             break
     return agree, could.sum(), start, slope
-
-
-def echo_fronts(levels, inside, edges, sigma):
-    """Twin of `speckle3d.kernels.lines.echo_fronts`, its crossing by `np.interp` on the rise alone."""
-    fronts, peaks = np.full((2, len(levels)), np.nan)
-    for c, edge in enumerate(edges):
-        if np.isnan(edge):
-            continue
-        held = np.flatnonzero(inside[c])
-        run = next(r for r in np.split(held, np.flatnonzero(np.diff(held) > 1) + 1) if r[0] <= edge <= r[-1])
-        rows = run[(run >= np.floor(edge - 2.5 * sigma)) & (run <= np.ceil(edge + 2 * sigma))]
-        above = levels[c, rows[rows <= max(int(edge - sigma), rows[0])]].astype(float)
-        echo = rows[rows >= max(int(edge - 0.5 * sigma), rows[0])]
-        peak = echo[np.argmax(levels[c, echo])]
-        half = (above.mean() + levels[c, peak]) / 2
-        if not levels[c, peak] > half:
-            continue
-        peaks[c] = peak
-        if rows[0] < peak < rows[-1]:
-            bend = np.polyfit([-1, 0, 1], levels[c, peak - 1 : peak + 2].astype(float), 2)
-            peaks[c] += -bend[1] / (2 * bend[0]) if bend[0] < 0 else 0.0
-        lower = [r for r in rows if r < peak and levels[c, r] < half]
-        if lower:
-            fronts[c] = np.interp(
-                half, levels[c, lower[-1] : lower[-1] + 2].astype(float), [lower[-1], lower[-1] + 1]
-            )
-    return fronts, peaks
 
 
 def cut_at(point, images, image_from_world, pixels, max_gap_mm):

@@ -2,6 +2,10 @@
 
 Each column is searched downwards for the first strong edge from dark to light; the line is the one that most
 of these edges agree with. A frame in which too few agree is dropped, with the reason.
+
+References
+----------
+.. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, appendix B.
 """
 
 from __future__ import annotations
@@ -12,24 +16,26 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d
 
-from calibration.detection.edges import Edges, first_echoes, take_profiles, typical
-from calibration.detection.region import (
-    DENSELY,
-    Columns,
-    checked_pixel,
-    lay_columns,
-    without_blank_sides,
-    without_standing,
-)
+from calibration.detection.region import DENSELY, Columns, checked_pixel, lay_columns, without_standing
 from calibration.points import Seen
-from calibration.settings import LineSettings
-from speckle3d.core.arrays import BoolArray, FloatArray
+from calibration.settings import LineSettings, Place
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import autocorrelation_time
 from speckle3d.core.sweep import Frames
 from speckle3d.kernels.lines import consensus_line
 
+_FINE = 0.25
+"""Smoothing for placing an echo, as a share of that for finding it: enough against noise, little against
+the rise of an echo."""
+_REACH = 3.5
+"""Length of the filters' sides, standard deviations."""
+_AHEAD = 2.0
+"""Farthest that an echo is brightest below its edge, standard deviations; its length is 1.5 of them."""
+_LEAST = 0.3
+"""Least slope of an edge, as a share of the median of the columns' steepest slopes."""
 _PARTS = (0.95, 0.85, 0.75, 0.65, 0.5)
 """Least brightness of an echo when no threshold is given, as shares of the median of the columns' brightest
 echoes: each is tried."""
@@ -72,43 +78,6 @@ class EchoLine:
     consensus: int
     possible: int
     inlier_px: FloatArray
-
-
-def detect_line(
-    image: npt.NDArray[Any],
-    pixel_mm: npt.ArrayLike,
-    settings: LineSettings | None = None,
-    region_px: npt.ArrayLike | None = None,
-) -> EchoLine:
-    """Find the line of a plane's echo in one image.
-
-    Parameters
-    ----------
-    image : ndarray, shape (column, row)
-        Grey levels or amplitudes of any real type, rows down from the probe.
-    pixel_mm : array_like, shape (2,)
-        Distance between columns and between rows, mm; a few per cent do not matter.
-    region_px : array_like, shape (k, 2), optional
-        Corners (column, row) of a polygon outside which nothing counts; by default the image without blank
-        columns at its sides.
-
-    Raises
-    ------
-    NoLineError
-        If too few columns agree on a line.
-    InvalidInputError
-        If an argument is not what it must be.
-    """
-    s = settings or LineSettings()
-    if image.ndim != 2 or not np.isrealobj(image):
-        raise InvalidInputError(f"image: expected real values (column, row), got {image.dtype} {image.shape}")
-    pixel = checked_pixel(pixel_mm)
-    if region_px is None:
-        dense = lay_columns(image.shape, DENSELY * s.columns, None)
-        columns = without_blank_sides(dense, image).thinned(s.columns)
-    else:
-        columns = lay_columns(image.shape, s.columns, region_px)
-    return _detect(image, pixel, s, columns)
 
 
 @dataclass(frozen=True)
@@ -175,8 +144,10 @@ def detect_lines(
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
-    pixel_mm, settings, region_px
-        See `detect_line`.
+    pixel_mm : array_like, shape (2,)
+        Distance between columns and between rows.
+    region_px : array_like, shape (k, 2), optional
+        Corners (column, row) of a polygon outside which nothing counts.
     progress : callable, optional
         Called with the number of frames done and their total.
 
@@ -202,39 +173,66 @@ def detect_lines(
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A line that some columns' edges agree with."""
+    """A line that some columns' edges agree with.
 
-    edges: Edges
+    Attributes
+    ----------
+    row : ndarray, shape (n,)
+        Of each column's echo; NaN without one.
+    agree : ndarray of bool, shape (n,)
+    """
+
+    row: FloatArray
     agree: BoolArray
     possible: int
     start: float
     slope: float
+    strength: float
 
     @property
     def agreed(self) -> int:
         return int(self.agree.sum())
 
-    @property
-    def strength(self) -> float:
-        return float(self.edges.strength[self.agree].mean())
-
 
 def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
-    samples = np.asarray(image[columns.column], np.float32)
-    held = samples[columns.inside]
-    if not np.isfinite(held).all():
+    samples, inside = np.asarray(image[columns.column], np.float32), columns.inside
+    levels = samples[inside]
+    if not np.isfinite(levels).all():
         raise NoLineError("no line: the image holds values that are not finite")
-    if held.size == 0 or np.ptp(held) == 0:
+    if levels.size == 0 or np.ptp(levels) == 0:
         raise NoLineError("no line: the image is of one level all over")
-    tolerance = s.tolerance_mm / float(pixel_mm[1])
-    profiles = take_profiles(samples, columns, s.smoothing_mm / float(pixel_mm[1]))
+    row_mm = float(pixel_mm[1])
+    tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.filled(samples)
+    levels = gaussian_filter1d(samples, _FINE * sigma, truncate=_REACH, mode="nearest")
+    slope = gaussian_filter1d(samples, sigma, order=1, truncate=_REACH, mode="nearest")
+    slope[~inside] = 0.0
+    peak = np.zeros(inside.shape, bool)
+    peak[:, 1:-1] = inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]
+    peak[:, 1:-1] &= (slope[:, 1:-1] > slope[:, :-2]) & (slope[:, 1:-1] >= slope[:, 2:])
     if s.threshold is None:
-        score = profiles.brightness()
-        thresholds = [part * typical(score, columns) for part in _PARTS]
+        column, row = np.nonzero(peak & (slope > _LEAST * _typical(slope)))
+        below = row[:, None] + np.arange(int(np.ceil(_AHEAD * sigma)) + 1)
+        bright = levels[column[:, None], np.minimum(below, levels.shape[1] - 1)].max(axis=1)
+        score = np.zeros_like(levels)
+        # Every third row: enough for a median, in a third of the time.
+        score[column, row] = np.maximum(bright - np.median(levels[:, ::3][inside[:, ::3]]), 0.0)
+        usual = _typical(score)
+        thresholds = [part * usual for part in _PARTS]
     else:
-        score, thresholds = profiles.slope, [s.threshold * float(pixel_mm[1])]
-    echoes = [first_echoes(profiles, score, threshold, s.place) for threshold in thresholds]
-    tried = [_consensus(edges, columns, tolerance) for edges in _distinct(echoes)]
+        score, thresholds = np.where(peak, slope, np.float32(0.0)), [s.threshold * row_mm]
+    tried: list[_Candidate] = []
+    before = np.zeros(0)
+    for threshold in thresholds:
+        above = score > threshold
+        edge = np.where(above.any(axis=1), above.argmax(axis=1), score.argmax(axis=1))
+        if np.array_equal(edge, before):
+            continue  # neighbouring thresholds mostly find the same
+        before, strength = edge, score[np.arange(len(edge)), edge]
+        row = _placed(levels, slope, inside, edge, sigma, s.place)
+        row[strength <= 0] = np.nan
+        agree = np.zeros(row.size, dtype=bool)
+        line = consensus_line(columns.column.astype(float), row, inside, tolerance, agree)
+        tried.append(_Candidate(row, agree, *line, float(strength[agree].mean()) if agree.any() else 0.0))
     accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
     if not accepted:
         best = max(tried, key=lambda line: line.agreed)
@@ -242,46 +240,74 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
             f"no line: {best.agreed} of {best.possible} possible columns agree, "
             f"{_needed(best, columns, s)} needed"
         )
-    return _measured(_first_strong(accepted, columns, tolerance), columns, pixel_mm)
+    # The uppermost of those nearly as strong as the strongest, as most columns see it.
+    middle, least = columns.column.mean(), _WEAKER * max(line.strength for line in accepted)
+    strong = [line for line in accepted if line.strength >= least]
+    depths = [line.start + line.slope * middle for line in strong]
+    upper = [line for line, depth in zip(strong, depths, strict=True) if depth <= min(depths) + tolerance]
+    return _measured(max(upper, key=lambda line: line.agreed), columns, pixel_mm)
 
 
-def _distinct(echoes: list[Edges]) -> list[Edges]:
-    """Leave out edges equal to those before them: neighbouring thresholds mostly find the same."""
-    kept = echoes[:1]
-    for edges in echoes[1:]:
-        if not np.array_equal(edges.row, kept[-1].row, equal_nan=True):
-            kept.append(edges)
-    return kept
+def _typical(score: Float32Array) -> float:
+    """Median of the columns' largest scores."""
+    return float(np.median(score.max(axis=1)))
 
 
 def _needed(line: _Candidate, columns: Columns, s: LineSettings) -> int:
-    shares = s.consensus * line.possible, _LEAST_SHARE * columns.held
+    shares = s.consensus * line.possible, _LEAST_SHARE * len(columns.column)
     return max(3, *(int(np.ceil(share - 1e-9)) for share in shares))
 
 
-def _first_strong(lines: list[_Candidate], columns: Columns, tolerance: float) -> _Candidate:
-    """The uppermost of the lines nearly as strong as the strongest, as most columns see it."""
-    least = _WEAKER * max(line.strength for line in lines)
-    middle = float(columns.column.mean())
-    depths = {id(line): line.start + line.slope * middle for line in lines if line.strength >= least}
-    upper = [line for line in lines if depths.get(id(line), np.inf) <= min(depths.values()) + tolerance]
-    return max(upper, key=lambda line: line.agreed)
+def _placed(
+    levels: Float32Array, slope: Float32Array, inside: BoolArray, edge: IntArray, sigma: float, place: Place
+) -> FloatArray:
+    """Where on the echo behind each column's edge the line is put, rows; NaN without an echo."""
+    column = np.arange(len(edge))
+    steepest = edge + _between(slope, column, edge)
+    if place == "slope":
+        return steepest
+    rows = edge[:, None] + np.arange(-int(2.5 * sigma) - 2, int(2.0 * sigma) + 3)
+    window = (rows >= np.floor(steepest - 2.5 * sigma)[:, None]) & (
+        rows <= np.ceil(steepest + 2.0 * sigma)[:, None]
+    )
+    rows = np.clip(rows, 0, levels.shape[1] - 1)
+    window &= inside[column[:, None], rows]
+    level = levels[column[:, None], rows].astype(float)
+    # Up to `sigma` above the echo, where the edge is found, it is dark.
+    above = window & (
+        rows <= np.maximum(np.floor(steepest - sigma), rows[column, window.argmax(axis=1)])[:, None]
+    )
+    dark = (level * above).sum(axis=1) / np.maximum(above.sum(axis=1), 1)
+    echo = np.where(window & (rows >= np.floor(steepest - 0.5 * sigma)[:, None]), level, -np.inf)
+    at = echo.argmax(axis=1)
+    half = 0.5 * (dark + level[column, at])
+    bright = level[column, at] > half
+    top = rows[column, at]
+    if place == "peak":
+        return np.where(bright, top + _between(levels, column, top), np.nan)
+    below = window & (level < half[:, None]) & (np.arange(level.shape[1]) < at[:, None])
+    last = level.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    after = np.minimum(last + 1, level.shape[1] - 1)
+    low, high = level[column, last], level[column, after]
+    front = rows[column, after] - (high - half) / np.where(high > low, high - low, 1.0)
+    return np.where(bright & below.any(axis=1), front, np.nan)
 
 
-def _consensus(edges: Edges, columns: Columns, tolerance: float) -> _Candidate:
-    agree = np.zeros(edges.row.size, dtype=bool)
-    column = columns.column.astype(float)
-    possible, start, slope = consensus_line(column, edges.row, columns.inside, tolerance, agree)
-    return _Candidate(edges, agree, possible, start, slope)
+def _between(values: Float32Array, column: IntArray, row: IntArray) -> FloatArray:
+    """How far from a row its maximum lies, by the parabola through its neighbours; zero without one."""
+    row = np.clip(row, 1, values.shape[1] - 2)
+    before, here, after = (values[column, row + step].astype(float) for step in (-1, 0, 1))
+    bend = before - 2.0 * here + after
+    return np.where(bend < 0.0, 0.5 * (before - after) / np.where(bend < 0.0, bend, -1.0), 0.0)
 
 
 def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoLine:
     # Errors of a fit's level at the mean column and of its slope are uncorrelated. At one standard deviation
     # of the columns to either side both contribute equally, so that the two points' errors are uncorrelated.
-    x, y = columns.column[line.agree].astype(float), line.edges.row[line.agree]
+    x, y = columns.column[line.agree].astype(float), line.row[line.agree]
     spread = float(x.std())
     ends = x.mean() + spread * np.array([-1.0, 1.0])
-    residual = line.edges.row - line.start - line.slope * columns.column
+    residual = line.row - line.start - line.slope * columns.column
     level_sd_mm = _level_sd(np.where(line.agree, residual, np.nan)) * float(pixel_mm[1])
     steepness = line.slope * pixel_mm[1] / pixel_mm[0]
     return EchoLine(

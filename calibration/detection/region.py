@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.polygons import polygon_corners, polygon_mask
 from speckle3d.core.sweep import Frames
@@ -32,30 +32,28 @@ class Columns:
         Numbers of the columns, ascending.
     inside : ndarray of bool, shape (n, r)
         Which rows of each are in the region.
-    spans : ndarray of int, shape (s, 3)
-        Runs of rows inside: index in `column`, first and last row.
     """
 
     column: IntArray
     inside: BoolArray
-    spans: IntArray = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        ends = np.diff(np.pad(self.inside, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-        place, first = np.nonzero(ends == 1)
-        spans = np.stack([place, first, np.nonzero(ends == -1)[1] - 1], axis=1)
-        object.__setattr__(self, "spans", spans.astype(np.int64))
+    @cached_property
+    def _nearest(self) -> IntArray:
+        """The row inside that is nearest to each row."""
+        apart = (2 * self.inside.shape[1], 1)
+        return np.asarray(distance_transform_edt(~self.inside, apart, False, True)[1])
+
+    def filled(self, samples: Float32Array) -> Float32Array:
+        """Samples, shape (n, r), with the nearest inside repeated beyond the region."""
+        if self.inside.all():
+            return samples
+        return np.take_along_axis(samples, self._nearest, axis=1)
 
     def thinned(self, count: int) -> Columns:
         """At most `count` of the columns with rows in the region, evenly spread."""
         place = np.flatnonzero(self.inside.any(axis=1))
         place = place[_spread(place.size, count)] if place.size else place
         return Columns(self.column[place], self.inside[place])
-
-    @property
-    def held(self) -> int:
-        """How many columns have rows in the region."""
-        return int(self.inside.any(axis=1).sum())
 
     def narrowed(self, inside: BoolArray) -> Columns:
         """The same columns with only those of their rows that are `inside`, shape (n, r), too."""
@@ -107,15 +105,8 @@ def lay_columns(shape: tuple[int, ...], count: int, region_px: npt.ArrayLike | N
     reach = np.asarray(region_px, dtype=float)[:, 0]
     first, last = max(0, int(np.ceil(reach.min()))), min(shape[0] - 1, int(np.floor(reach.max())))
     column = first + _spread(last - first + 1, count)
+    column = column[mask[column].any(axis=1)]
     return Columns(column, mask[column])
-
-
-def without_blank_sides(columns: Columns, image: npt.NDArray[Any]) -> Columns:
-    """Leave out columns of one grey level at the sides of an image (column, row), beyond a fan."""
-    sampled = np.asarray(image[columns.column], np.float32)
-    blank = np.ptp(sampled, axis=1) == 0
-    sides = np.logical_and.accumulate(blank) | np.logical_and.accumulate(blank[::-1])[::-1]
-    return columns.narrowed(~sides[:, None])
 
 
 def without_standing(columns: Columns, frames: Frames, smoothing_rows: float) -> Columns:
