@@ -23,12 +23,11 @@ from calibration.detection.dots import Dots
 from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.plane import Chain
 from calibration.points import ImagePoints, Seen
-from calibration.wire_fits import rigid_fits
-from calibration.wires import wire_start
+from calibration.wires import affine_equations, wire_start
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import nearest_rotation
-from speckle3d.core.leastsquares import cauchy_weights
+from speckle3d.core.leastsquares import cauchy_weights, robust_linear
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95
@@ -41,9 +40,6 @@ _LEAST_SINGULAR = 1e-4
 mm moves the answer by the image's own size."""
 _FAR = 2.698
 """Distance, in robust standard deviations (four medians), at which a point has half its weight."""
-_LEAST_TURN = 0.02
-"""Least ratio of singular values at which a phantom's pose counts as determined by the turns of the sensor:
-noise of a degree over turns of a radian."""
 
 
 def trimmed_mean_mm(errors_mm: FloatArray, share: float = _PLUS_SHARE) -> tuple[float, float]:
@@ -130,41 +126,56 @@ def pixel_matrix(chain: Chain) -> FloatArray:
     return np.asarray(chain.sensor_from_image.as_matrix() @ scale)
 
 
-def start_from_nwires(
-    points: ImagePoints, phantom: WirePhantom, pixel_mm: npt.ArrayLike | None = None
-) -> Chain:
+def start_from_nwires(points: ImagePoints, phantom: WirePhantom) -> Chain:
     """Calibrate in closed form: least squares of the errors of `nwire_errors_mm`, [1]_ (see `wire_start`).
 
     Parameters
     ----------
     points : ImagePoints
         With the wire of each.
-    pixel_mm : array_like, shape (2,), optional
-        Rough distance between columns and between rows, mm; needed only where the phantom's own pose is not
-        known. That is then found first, from the images' places among the wires.
+    phantom : WirePhantom
+        Where its own place is not known, that is found first.
 
     Raises
     ------
     InsufficientDataError
         If the points are too few, or do not determine the answer.
     InvalidInputError
-        If the points have no wires, or the pixel size is needed.
+        If the points have no wires.
 
     References
     ----------
     .. [1] R. M. Comeau et al., 1998, see this module.
     """
-    pose = phantom.world_from_phantom
-    if pose is None:
-        pose = _phantom_pose(points, phantom, pixel_mm)
     middle, phantom_mm = middle_wires(points, phantom)
     if len(middle) < _FEWEST_POINTS:
         raise InsufficientDataError(
             f"expected at least {_FEWEST_POINTS} middle dots of N to start from, got {len(middle)}"
         )
-    equations = np.broadcast_to(np.eye(3), (len(middle), 3, 3)), phantom_mm
     weights = partial(cauchy_weights, limit=_FAR)
-    return wire_start(middle, equations, pose.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)[0]
+    place = phantom.world_from_phantom
+    if place is None:
+        place = _place(middle, phantom_mm)
+    equations = np.broadcast_to(np.eye(3), (len(middle), 3, 3)), phantom_mm
+    return wire_start(middle, equations, place.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)[0]
+
+
+def _place(middle: ImagePoints, phantom_mm: FloatArray) -> RigidTransform:
+    """Find ``world_from_phantom``: linear equations of its matrix and the image's origin and axes."""
+    spread, centre = middle.pixels.std() or 1.0, middle.pixels.mean(axis=0)
+    image = affine_equations((middle.pixels - centre) / spread, middle.turns)
+    near = phantom_mm - phantom_mm.mean(axis=0)
+    phantom = affine_equations(near[:, :2], np.broadcast_to(np.eye(3), (len(near), 3, 3)))
+    third = near[:, 2, None, None] * np.eye(3)
+    matrix = np.concatenate([image, -phantom, -third], axis=2)
+    fit = robust_linear(
+        matrix, -middle.shifts_mm, partial(cauchy_weights, limit=_FAR), _REWEIGHTINGS, _LEAST_SINGULAR
+    )
+    if fit.rank < fit.parameters.size:
+        raise InsufficientDataError("the sensor turned too little to find where the phantom is")
+    axes = fit.parameters[12:].reshape(3, 3).T
+    turn = Rotation.from_matrix(nearest_rotation(axes))
+    return RigidTransform.from_components(fit.parameters[9:12] - turn.apply(phantom_mm.mean(axis=0)), turn)
 
 
 def label_and_start(
@@ -193,7 +204,7 @@ def label_and_start(
     if len(alone) == 0:
         reasons = sorted(set(alone.dropped.values())) or ["no frames"]
         raise InsufficientDataError(f"expected frames that show all wires, got none: {reasons[0]}")
-    start = start_from_nwires(alone.points(world_from_sensor[alone.frame]), phantom, pixel_mm)
+    start = start_from_nwires(alone.points(world_from_sensor[alone.frame]), phantom)
     found = label_by_calibration(dots, phantom, start, world_from_sensor)
     registered = replace(phantom, world_from_phantom=start.target_from_world.inv())
     return found, start_from_nwires(found.points(world_from_sensor[found.frame]), registered)
@@ -213,43 +224,3 @@ def _together(frame: IntArray, wire: IntArray, shape: tuple[int, ...]) -> list[I
     first = [dict(zip(frame[n].tolist(), n.tolist(), strict=True)) for n in numbers]
     common = sorted(set.intersection(*(set(found) for found in first)))
     return [np.array([found[f] for f in common], dtype=np.int64) for found in first]
-
-
-def _phantom_pose(
-    points: ImagePoints, phantom: WirePhantom, pixel_mm: npt.ArrayLike | None
-) -> RigidTransform:
-    """Find ``world_from_phantom`` from frames that show all wires of all N.
-
-    In every frame ``world_from_phantom * phantom_from_image = world_from_sensor * sensor_from_image``; the
-    rotations are found first, linearly, then the translations.
-
-    References
-    ----------
-    .. [1] M. Shah, "Solving the robot-world/hand-eye calibration problem using the Kronecker product", J.
-       Mech. Robot. 5, 2013.
-    """
-    if pixel_mm is None:
-        raise InvalidInputError("pixel_mm: expected a rough pixel size where the phantom's pose is not known")
-    wires = tuple(k for shape in phantom.n_shapes for k in shape)
-    index = np.stack(_together(points.frame, _wires(points, phantom), wires), axis=1)
-    if len(index) < 3:
-        raise InsufficientDataError(f"expected all wires in at least 3 frames, got {len(index)}")
-    seen = points.pixels[index] * np.asarray(pixel_mm, dtype=float)
-    phantom_from_image, _, _ = rigid_fits(
-        seen, np.tile(np.array(wires), (len(index), 1)), phantom, scale_tolerance=0.05
-    )
-    return _shared_pose(phantom_from_image, points.world_from_sensor[index[:, 0]])
-
-
-def _shared_pose(phantom_from_image: RigidTransform, world_from_sensor: RigidTransform) -> RigidTransform:
-    seen, held = (t.rotation.as_matrix() for t in (phantom_from_image, world_from_sensor))
-    kron = np.einsum("nij,nkl->ikjl", held, seen).reshape(9, 9)
-    left, singular, _ = np.linalg.svd(kron)
-    if 1.0 - singular[1] / singular[0] < _LEAST_TURN**2:
-        raise InsufficientDataError("the sensor turned too little to find where the phantom is")
-    matrix = left[:, 0].reshape(3, 3)
-    turn = nearest_rotation(matrix * np.sign(np.linalg.det(matrix)))
-    matrix = np.concatenate([np.tile(np.eye(3), (len(seen), 1, 1)), -held], axis=2).reshape(-1, 6)
-    wanted = world_from_sensor.translation - phantom_from_image.translation @ turn.T
-    found = np.linalg.lstsq(matrix, wanted.ravel(), rcond=None)[0]
-    return RigidTransform.from_components(found[:3], Rotation.from_matrix(turn))

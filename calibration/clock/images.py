@@ -186,7 +186,8 @@ def _direction(path_mm: FloatArray) -> FloatArray:
 def _middle(share: FloatArray, number: int) -> IntArray:
     """Frames spread over the middle of a way; at its ends the probe is too slow to show a delay."""
     inner = np.flatnonzero((share > 0.1) & (share < 0.9))
-    return inner[np.unique(np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(int))]
+    chosen = np.linspace(0, inner.size - 1, min(number, inner.size)).round().astype(np.int64)
+    return np.asarray(inner[np.unique(chosen)])
 
 
 def _from_jitter(

@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 
-from calibration.detection.everyframe import in_every_frame
-from calibration.detection.region import checked_pixel, region_mask
+from calibration.detection.region import checked_pixel, in_every_frame, region_mask
 from calibration.points import Seen
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
@@ -87,7 +87,7 @@ def crossings_in_frames(
     size, count = checked_pixel(pixel_mm), frames.shape[0]
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
     standing = standing_still(frames)
-    found = in_every_frame(frames, lambda image: _crossings(image, size, inside, standing)[0], progress)
+    found = in_every_frame(frames, lambda image: _crossings(image, size, inside, standing), progress)
     held = [len(pixels) for pixels in found]
     return Seen(
         np.repeat(np.arange(count), held),
@@ -113,25 +113,32 @@ def _crossings(
     pixel_mm: FloatArray,
     inside: BoolArray | None,
     standing: Float32Array | None,
-) -> tuple[FloatArray, FloatArray]:
+) -> FloatArray:
     grey = np.asarray(image, dtype=np.float32)
     require_finite(grey, "image")
     if standing is not None:
         grey = grey - standing
     if inside is not None:
         grey = np.where(inside, grey, np.float32(0.0))
-    peaks, scores = [], []
+    features = extra_module("skimage.feature", "calibrate", "finding crossings")
+    places, scores = [], []
     for width in _WIDTH_MM * np.array(_WIDTHS):
         coarse, step_px = _resampled(grey, pixel_mm, width)
-        pixels, score = _maxima(_two_lines(coarse, step_px * pixel_mm, width), step_px, pixel_mm)
-        peaks.append(pixels)
-        scores.append(score)
-    pixels, score = np.concatenate(peaks), np.concatenate(scores)
+        response = _two_lines(coarse, step_px * pixel_mm, width)
+        near = max(1, int(_APART_MM / 2.0 / float((step_px * pixel_mm).max())))
+        peaks = features.peak_local_max(response, near, num_peaks=_PEAKS, exclude_border=False)
+        places.append((peaks + _between(response, peaks)) * step_px)
+        scores.append(response[tuple(peaks.T)])
+    pixels, score = np.concatenate(places), np.concatenate(scores)
     if inside is not None:
-        column, row = np.clip(np.rint(pixels).astype(int), 0, np.array(image.shape) - 1).T
+        column, row = np.minimum(np.rint(pixels).astype(int), np.array(image.shape) - 1).T
         pixels, score = pixels[inside[column, row]], score[inside[column, row]]
-    pixels, score = _strongest(pixels, score, pixel_mm)
-    return np.reshape([_centred(grey, one, pixel_mm, _WIDTH_MM) for one in pixels], (-1, 2)), score
+    kept: list[int] = []
+    for one in np.argsort(-score, kind="stable"):
+        away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
+        if score[one] > 0 and (away >= _APART_MM).all() and len(kept) < _MOST_CANDIDATES:
+            kept.append(int(one))
+    return np.reshape([_centred(grey, one, pixel_mm) for one in pixels[kept]], (-1, 2))
 
 
 def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tuple[Float32Array, FloatArray]:
@@ -176,30 +183,21 @@ def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float) -> Floa
     return np.asarray(np.sqrt(first * np.maximum(second - _LEAK * first, 0.0)))
 
 
-def _maxima(
-    response: Float32Array, step_px: FloatArray, pixel_mm: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels of the maxima, between samples by parabolas, and their values."""
-    near = max(1, int(_APART_MM / 2.0 / float((step_px * pixel_mm).max())))
-    features = extra_module("skimage.feature", "calibrate", "finding crossings")
-    peaks = features.peak_local_max(response, min_distance=near, num_peaks=_PEAKS, exclude_border=False)
-    score = response[tuple(peaks.T)].astype(float)
-    offset = np.zeros(peaks.shape)
+def _between(response: Float32Array, peaks: IntArray) -> FloatArray:
+    """How far from a sample each maximum lies along both axes, by parabolas through its neighbours."""
     padded = np.pad(response, 1, mode="edge")
-    for axis, (i, j) in enumerate(((1, 0), (0, 1))):
-        column, row = peaks.T + 1
-        before, after = padded[column - i, row - j], padded[column + i, row + j]
-        bend = np.maximum(2.0 * score - before - after, np.finfo(np.float32).tiny)
-        offset[:, axis] = np.clip(0.5 * (after - before) / bend, -0.5, 0.5)
-    return (peaks + offset) * step_px, score
+    window = sliding_window_view(padded, (3, 3))[tuple(peaks.T)].astype(float)
+    before, here, after = np.stack([window[:, :, 1], window[:, 1]]).transpose(2, 1, 0)
+    bend = np.maximum(2.0 * here - before - after, np.finfo(np.float32).tiny)
+    return np.asarray(np.clip(0.5 * (after - before) / bend, -0.5, 0.5))
 
 
-def _centred(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray, width_mm: float) -> FloatArray:
+def _centred(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray) -> FloatArray:
     """Move a place to the centre of what is bright around it, by mean shift.
 
     Filters see the tail of ringing under a wire as part of it: 0.4 mm, where the centre is 0.15 mm too deep.
     """
-    reach = np.ceil(2.0 * width_mm / pixel_mm).astype(int)
+    reach = np.ceil(2.0 * _WIDTH_MM / pixel_mm).astype(int)
     start = np.maximum(np.rint(pixel).astype(int) - reach, 0)
     stop = np.rint(pixel).astype(int) + reach + 1
     window = grey[start[0] : stop[0], start[1] : stop[1]]
@@ -207,20 +205,8 @@ def _centred(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray, width_
     places = np.stack(np.meshgrid(*(np.arange(n) for n in window.shape), indexing="ij"), axis=-1) + start
     centre = pixel
     for _ in range(_SHIFTS):
-        near = weight * np.exp(-0.5 * np.sum(((places - centre) * pixel_mm / width_mm) ** 2, axis=2))
+        near = weight * np.exp(-0.5 * np.sum(((places - centre) * pixel_mm / _WIDTH_MM) ** 2, axis=2))
         if not near.sum() > 0:
             return pixel
         centre = np.asarray(np.sum(places * near[..., None], axis=(0, 1)) / near.sum())
     return centre
-
-
-def _strongest(pixels: FloatArray, score: FloatArray, pixel_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The strongest candidates of both widths that are apart."""
-    kept: list[int] = []
-    for one in np.argsort(-score, kind="stable"):
-        away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
-        if score[one] > 0 and (away >= _APART_MM).all():
-            kept.append(int(one))
-        if len(kept) == _MOST_CANDIDATES:
-            break
-    return pixels[kept], score[kept]

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from calibration.detection.everyframe import in_every_frame, require_image
-from calibration.detection.region import checked_pixel, region_mask
+from calibration.detection.region import checked_pixel, in_every_frame, region_mask
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.leastsquares import robust_sigma
@@ -32,8 +32,6 @@ _ANGLES = 24
 _LINE_REACH = 2.5
 """Distance from a peak, in `_SURROUND_MM`, at which it is tested for a line; the 24 directions are then less
 than half a millimetre apart."""
-_MOST_MAXIMA = 500
-"""Bounds the time; weaker maxima are no candidates."""
 _REACH = 2.0
 """Half the window in which a dot is placed, in `_SURROUND_MM`."""
 
@@ -105,7 +103,8 @@ def dots_in_image(
         If an argument is not what it must be.
     """
     size = checked_pixel(pixel_mm)
-    require_image(image)
+    if image.ndim != 2 or not np.isrealobj(image):
+        raise InvalidInputError(f"image: expected real values (column, row), got {image.dtype} {image.shape}")
     inside = None if region_px is None else region_mask(image.shape, region_px)
     return _dots(image, size, inside)
 
@@ -169,13 +168,10 @@ def _limit(contrast: Float32Array) -> float:
 
 def _maxima(contrast: Float32Array, limit: float, pixel_mm: FloatArray, inside: BoolArray | None) -> IntArray:
     """Columns and rows of maxima that are `_APART_MM` apart, shape (n, 2), strongest first."""
-    size = 2 * np.maximum(np.rint(_APART_MM / 2 / pixel_mm), 1).astype(int) + 1
-    around = np.ones(size, dtype=bool)
+    near = np.ones(2 * np.maximum(np.rint(_APART_MM / pixel_mm), 1).astype(int) + 1, dtype=bool)
     features = extra_module("skimage.feature", "calibrate", "finding dots of wires")
-    peaks = features.peak_local_max(contrast, footprint=around, threshold_abs=limit, exclude_border=False)
-    if inside is not None:
-        peaks = peaks[inside[tuple(peaks.T)]]
-    return _far_apart(peaks[:_MOST_MAXIMA], _APART_MM / pixel_mm)
+    peaks = features.peak_local_max(contrast, footprint=near, threshold_abs=limit, exclude_border=False)
+    return np.asarray(peaks if inside is None else peaks[inside[tuple(peaks.T)]])
 
 
 def _along_lines(contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray) -> Float32Array:
@@ -192,16 +188,6 @@ def _along_lines(contrast: Float32Array, peaks: IntArray, pixel_mm: FloatArray) 
         column, row = np.moveaxis(np.where(held[..., None], places, 0), 2, 0)
         sides.append(np.where(held, contrast[column, row], np.float32(0.0)))
     return np.asarray(np.minimum(*sides).max(axis=1, initial=0.0), dtype=np.float32)
-
-
-def _far_apart(peaks: IntArray, apart_px: FloatArray) -> IntArray:
-    """Those of the peaks, strongest first, that have no stronger one near; pixels need not be square."""
-    kept: list[int] = []
-    scaled = peaks / apart_px
-    for i, peak in enumerate(scaled):
-        if not kept or np.min(np.sum((scaled[kept] - peak) ** 2, axis=1)) >= 1.0:
-            kept.append(i)
-    return peaks[kept]
 
 
 def _placed(fine: Float32Array, peak: IntArray, pixel_mm: FloatArray) -> FloatArray:

@@ -17,12 +17,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.dots import Dots
 from calibration.plane import Chain
 from calibration.points import Seen
-from calibration.wire_fits import free_fits, rigid_fits
+from calibration.wires import affine_equations
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
@@ -47,6 +48,12 @@ _RESIDUAL_MM = 0.5
 """Largest root mean square misfit of a frame's dots."""
 _PIXEL_TOLERANCE = 0.05
 """Relative standard deviation of the pixel size that is given."""
+_DOT_MM, _SQUARE = 0.3, 0.01
+"""How far a dot is from its wire, typically, and the cosine between an image's axes from computing: what the
+pixel size's uncertainty is weighed against."""
+_RIDGE_MM2 = 1e-3
+"""Holds axes that the wires leave open near zero; a dot 10 mm off the centre weighs 100 mm^2."""
+_STEPS = 10
 _GATE_MM = 1.5
 """How far from where a calibration says it is a wire's dot may be."""
 _WIDTHS, _GAPS = (0.9, 1.1 * _STEEPEST), (0.85, 1.1 * _STEEPEST)
@@ -178,9 +185,8 @@ def _label(dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom
     chosen, nearest = _combined([found for found, _ in triples], dots_mm, score, layers)
     if len(chosen) == 0:
         raise InsufficientDataError(f"no parallel lines of dots at the layers' distances: {nearest}{few}")
-    loose = free_fits(dots_mm[chosen] - dots_mm.mean(axis=0), np.tile(wires, (len(chosen), 1)), phantom)[1]
-    chosen = chosen[np.argsort(loose)[:_REFINED]]
-    _, _, rms_mm = rigid_fits(dots_mm[chosen], np.tile(wires, (len(chosen), 1)), phantom, _PIXEL_TOLERANCE)
+    chosen = chosen[np.argsort(misfits_mm(dots_mm[chosen], wires, phantom, 0))[:_REFINED]]
+    rms_mm = misfits_mm(dots_mm[chosen], wires, phantom)
     best = float(rms_mm.min())
     if best > _RESIDUAL_MM:
         raise InsufficientDataError(
@@ -283,6 +289,46 @@ def _side_by_side(
     return np.asarray(cosine), np.asarray(distance / abs(below.height_mm - layer.height_mm))
 
 
+def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom, steps: int = _STEPS) -> FloatArray:
+    """Root mean square components of dots' distances from wires, for the pose of the image that fits best.
+
+    Equations are linear in the image's origin and its two axes, which steps of Newton's method make square
+    and, within `_PIXEL_TOLERANCE`, of length one.
+
+    Parameters
+    ----------
+    dots_mm : ndarray, shape (b, m, 2)
+        Of many hypotheses.
+    wires : ndarray of int, shape (m,)
+    steps : int
+        With none, axes are of any lengths and at any angle.
+
+    Returns
+    -------
+    ndarray, shape (b,)
+    """
+    seen = dots_mm - dots_mm.mean(axis=1, keepdims=True)
+    rows, offsets = phantom.equations(wires)
+    matrix = affine_equations(seen, np.broadcast_to(rows, (len(seen), *rows.shape)))
+    matrix, wanted = matrix.reshape(len(seen), -1, 9), offsets.ravel()
+    normal = np.swapaxes(matrix, 1, 2) @ matrix + _RIDGE_MM2 * np.eye(9)
+    pull = wanted @ matrix
+    image = np.linalg.solve(normal, pull[..., None])[..., 0]
+    weight = (_DOT_MM / np.array([_PIXEL_TOLERANCE, _PIXEL_TOLERANCE, _SQUARE]))[:, None] ** 2
+    for _ in range(steps):
+        axes = image[:, 3:].reshape(-1, 2, 3)
+        axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
+        held = np.zeros((len(seen), 3, 9))
+        held[:, 0, 3:6], held[:, 1, 6:] = held[:, 2, 6:], held[:, 2, 3:6] = axes[:, 0], axes[:, 1]
+        target = np.ones((len(seen), 3, 1))
+        target[:, 2, 0] = np.sum(axes[:, 0] * axes[:, 1], axis=1)
+        turned = np.swapaxes(held, 1, 2)
+        wanted_too = pull[..., None] + turned @ (weight * target)
+        image = np.linalg.solve(normal + turned @ (weight * held), wanted_too)[..., 0]
+    misfit = (matrix @ image[..., None])[..., 0] - wanted
+    return np.asarray(np.sqrt(np.mean(misfit**2, axis=1)))
+
+
 def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatArray:
     """Where an image cuts each wire, mm, shape (k, 2); NaN where it does not."""
     place = image_from_phantom.apply(phantom.points_mm)
@@ -297,9 +343,5 @@ def _nearest(dots_mm: FloatArray, score: FloatArray, expected_mm: FloatArray) ->
     """Pairs of dot and wire, each in one pair at most; a stronger dot may be farther away."""
     apart = np.linalg.norm(dots_mm[:, None] - expected_mm[None], axis=2)
     worth = np.where(apart < _GATE_MM, score[:, None] * np.exp(-2.0 * (apart / _GATE_MM) ** 2), 0.0)
-    pairs = []
-    while worth.size and worth.max() > 0:
-        dot, wire = (int(i) for i in np.unravel_index(int(worth.argmax()), worth.shape))
-        pairs.append((dot, wire))
-        worth[dot], worth[:, wire] = 0.0, 0.0
-    return sorted(pairs, key=lambda pair: pair[1])
+    pairs = zip(*linear_sum_assignment(worth, maximize=True), strict=True)
+    return sorted(((int(d), int(w)) for d, w in pairs if worth[d, w] > 0), key=lambda pair: pair[1])

@@ -210,24 +210,25 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
     peak[:, 1:-1] = inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]
     peak[:, 1:-1] &= (slope[:, 1:-1] > slope[:, :-2]) & (slope[:, 1:-1] >= slope[:, 2:])
     if s.threshold is None:
-        column, row = np.nonzero(peak & (slope > _LEAST * _typical(slope)))
-        below = row[:, None] + np.arange(int(np.ceil(_AHEAD * sigma)) + 1)
+        column, at = np.nonzero(peak & (slope > _LEAST * _typical(slope)))
+        below = at[:, None] + np.arange(int(np.ceil(_AHEAD * sigma)) + 1)
         bright = levels[column[:, None], np.minimum(below, levels.shape[1] - 1)].max(axis=1)
         score = np.zeros_like(levels)
         # Every third row: enough for a median, in a third of the time.
-        score[column, row] = np.maximum(bright - np.median(levels[:, ::3][inside[:, ::3]]), 0.0)
+        score[column, at] = np.maximum(bright - np.median(levels[:, ::3][inside[:, ::3]]), 0.0)
         usual = _typical(score)
         thresholds = [part * usual for part in _PARTS]
     else:
         score, thresholds = np.where(peak, slope, np.float32(0.0)), [s.threshold * row_mm]
     tried: list[_Candidate] = []
-    before = np.zeros(0)
+    before = np.zeros(0, np.int64)
     for threshold in thresholds:
         above = score > threshold
         edge = np.where(above.any(axis=1), above.argmax(axis=1), score.argmax(axis=1))
         if np.array_equal(edge, before):
             continue  # neighbouring thresholds mostly find the same
-        before, strength = edge, score[np.arange(len(edge)), edge]
+        before = edge
+        strength = score[np.arange(len(edge)), edge]
         row = _placed(levels, slope, inside, edge, sigma, s.place)
         row[strength <= 0] = np.nan
         agree = np.zeros(row.size, dtype=bool)
@@ -270,6 +271,7 @@ def _placed(
     window = (rows >= np.floor(steepest - 2.5 * sigma)[:, None]) & (
         rows <= np.ceil(steepest + 2.0 * sigma)[:, None]
     )
+    window &= (rows >= 0) & (rows < levels.shape[1])
     rows = np.clip(rows, 0, levels.shape[1] - 1)
     window &= inside[column[:, None], rows]
     level = levels[column[:, None], rows].astype(float)

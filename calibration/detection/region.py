@@ -1,18 +1,22 @@
-"""Where in an image to look: the pixels of a polygon, and columns at regular intervals with their rows."""
+"""Where in images to look: frames one at a time, the pixels of a polygon, columns at regular intervals."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.polygons import polygon_corners, polygon_mask
 from speckle3d.core.sweep import Frames
+
+Result = TypeVar("Result")
 
 _GLANCES = 48
 """Frames compared to see what stands still in all of them."""
@@ -41,7 +45,9 @@ class Columns:
     def _nearest(self) -> IntArray:
         """The row inside that is nearest to each row."""
         apart = (2 * self.inside.shape[1], 1)
-        return np.asarray(distance_transform_edt(~self.inside, apart, False, True)[1])
+        return np.asarray(
+            distance_transform_edt(~self.inside, apart, return_distances=False, return_indices=True)[1]
+        )
 
     def filled(self, samples: Float32Array) -> Float32Array:
         """Samples, shape (n, r), with the nearest inside repeated beyond the region."""
@@ -144,3 +150,26 @@ def checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
     if pixel.shape != (2,) or not (np.isfinite(pixel) & (pixel > 0)).all():
         raise InvalidInputError(f"pixel_mm: expected two values above zero, got {pixel.tolist()}")
     return pixel
+
+
+def in_every_frame(
+    frames: Frames,
+    find: Callable[[npt.NDArray[Any]], Result],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Result]:
+    """Apply a detector to every frame, read one at a time; an error names the frame.
+
+    Parameters
+    ----------
+    frames : Frames, shape (n, column, row)
+    find : callable
+    progress : callable, optional
+        Called with the number of frames done and their total.
+    """
+    found, count = [], frames.shape[0]
+    for index in range(count):
+        with naming(f"frame {index}"):
+            found.append(find(np.asarray(frames[index])))
+        if progress:
+            progress(index + 1, count)
+    return found
