@@ -9,6 +9,7 @@ from pathlib import Path
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import INERTIAL, OrientationSensor
 from speckle3d.io.clarius import READER
+from speckle3d.io.clarius.imu import MEANING
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
@@ -39,12 +40,12 @@ def _inside_probe(path: Path) -> ImuLog | None:
     """Log of the sensor inside a handheld scanner, whatever its images are; None of other recordings."""
     if find_reader(path) is not READER:
         return None
-    samples, fit = sensor_of(path)
-    clock = timeline_of_times(samples.time_s)
-    found = "is not used: it does not agree with gravity" if fit is None else f"is {fit.meaning}"
+    samples = sensor_of(path)
+    clock, fit = timeline_of_times(samples.time_s), samples.fit
+    found = "is not used: it does not agree with gravity" if fit is None else f"is {MEANING}"
     log = ImuLog(
         clock.time_s,
-        samples.accelerometer_m_s2(fit),
+        samples.accelerometer_m_s2,
         samples.gyroscope_rad_s,
         samples.magnetometer_gauss,
         world_from_sensor=None if fit is None else fit.world_from_sensor,

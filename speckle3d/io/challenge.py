@@ -17,7 +17,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,9 +28,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.printable import printable
-from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.core.sweep import Tracker
 from speckle3d.io.hdf5 import (
     PathLike,
     find_member,
@@ -40,12 +37,14 @@ from speckle3d.io.hdf5 import (
     locate,
     open_hdf5,
     read_checked,
-    read_transforms,
     reading,
     require_dataset,
 )
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import HDF5Slices
+from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Value
 from speckle3d.io.text import numbers, text_lines
 
 FORMAT = "TUS-REC scan"
@@ -53,7 +52,6 @@ FRAME_RATE_HZ = 20.0
 DYNAMIC_RANGE_DB = 83.0
 
 _CALIBRATION = "calib_matrix.csv"
-_LANDMARK_FOLDERS = ("landmark", "landmarks")
 _LEVELS = 3
 """Folders from a scan's own upwards in which what belongs to it may lie."""
 
@@ -82,8 +80,8 @@ def is_challenge_scan(file: h5py.File) -> bool:
     return "format" not in file.attrs and isinstance(find_member(file, "frames"), h5py.Dataset)
 
 
-def read_challenge_scan(path: PathLike) -> Sweep:
-    """Read a scan as a sweep with a tracker; without one where there are no transforms.
+def open_scan(scan: Path, _: ImportSettings) -> Recording:
+    """Read a scan with a tracker; without one where there are no transforms.
 
     The image frame's origin is the centre of the first pixel.
 
@@ -94,17 +92,37 @@ def read_challenge_scan(path: PathLike) -> Sweep:
     FileError
         If a file cannot be read.
     """
-    scan = Path(path)
-    frames = _frames(scan)
-    scale_mm, tool_from_image = read_challenge_calibration(_require_calibration(scan))
-    n, width, height = frames.shape
-    times = np.arange(n) / FRAME_RATE_HZ
-    poses = _tool_poses(scan, n)
-    tracker = None if poses is None else Tracker(TimedPoses(times, poses), tool_from_image)
-    grid = ImageGrid(width, height, scale_mm[0], scale_mm[1])
-    return Sweep(
-        frames, grid, BModeSettings(DYNAMIC_RANGE_DB), times, tracker=tracker, name=printable(scan.stem)
-    )
+    size_mm, tool_from_image = read_challenge_calibration(_calibration_file(scan))
+    with reading(scan), open_hdf5(scan) as file:
+        node = require_dataset(file, "frames")
+        if node.dtype != np.uint8 or node.ndim != 3 or 0 in node.shape:
+            raise InvalidInputError(
+                f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
+            )
+        n, height, width = node.shape
+        frames = HDF5Slices(scan, "frames", np.transpose, (n, width, height), node.dtype)
+    tracker, remarks = None, list[str]()
+    source = _transforms_file(scan) or scan
+    with reading(source), open_hdf5(source) as file:
+        if has_member(file, "tforms"):
+            matrices = read_checked(file, "tforms", (n, 4, 4))
+            readings, remarks = timed_poses(np.arange(n) / FRAME_RATE_HZ, matrices)
+            tracker = None if readings is None else Tracker(readings, tool_from_image)
+    published = {
+        "column_pitch_mm": Value(float(size_mm[0]), _CALIBRATION),
+        "row_spacing_mm": Value(float(size_mm[1]), _CALIBRATION),
+        "first_sample_depth_mm": Value(0.0, "the first pixel"),
+        "frame_rate_hz": Value(FRAME_RATE_HZ, "as published"),
+        "dynamic_range_db": Value(DYNAMIC_RANGE_DB, "as published"),
+    }
+    try:
+        marks = str(len(read_landmarks(scan) or ()))
+    except InvalidInputError as error:
+        marks = f"cannot be told: {error}"
+    return Recording(
+        scan, frames=frames, values=published, tracker=tracker, chain="tforms", name=scan.stem,
+        rows=(("landmarks", marks, ""),), remarks=tuple(remarks),
+    )  # fmt: skip
 
 
 def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransform]:
@@ -120,23 +138,22 @@ def read_challenge_calibration(path: PathLike) -> tuple[FloatArray, RigidTransfo
     ]
     if len(rows) != 8:
         raise InvalidInputError(f"{path}: expected eight rows of four finite numbers, got {len(rows)}")
-    matrices = np.reshape(rows, (2, 4, 4))
-    scale = matrices[0]
+    scale, pose = np.reshape(rows, (2, 4, 4))
     size = np.diag(scale)[:2].copy()
     if not (np.array_equal(scale, np.diag(np.diag(scale))) and (size > 0).all() and scale[3, 3] == 1):
         raise InvalidInputError(f"{path}: expected a scaling from pixels to mm, got another matrix")
-    tool_from_counted = transforms_from_matrices(matrices[1:], f"{path}: image to tool")[0]
+    tool_from_counted = transforms_from_matrices(pose[None], f"{path}: image to tool")[0]
     return size, tool_from_counted * RigidTransform.from_translation([*size, 0.0])
 
 
 def read_landmarks(path: PathLike) -> Landmarks | None:
     """Landmarks of a scan, by the scan's path; None where there are none for it."""
     scan = Path(path)
-    found = _landmark_file(scan)
-    if found is None:
+    source = _landmark_file(scan)
+    if source is None:
         return None
-    size, _ = read_challenge_calibration(_require_calibration(scan))
-    with reading(found), open_hdf5(found) as file:
+    size, _ = read_challenge_calibration(_calibration_file(scan))
+    with reading(source), open_hdf5(source) as file:
         if not has_member(file, scan.stem):
             return None
         rows = read_checked(file, scan.stem, ("landmark", 3))
@@ -147,30 +164,10 @@ def read_landmarks(path: PathLike) -> Landmarks | None:
     return Landmarks(rows[:, 0].astype(np.int64), points)
 
 
-def companion_files(path: PathLike) -> list[Path]:
+def companion_files(scan: Path) -> list[Path]:
     """Files beside a scan's own that say what is in it: transforms, calibration, landmarks."""
-    scan = Path(path)
-    found = (_transforms_file(scan), _calibration_file(scan), _landmark_file(scan))
-    return [each for each in found if each is not None]
-
-
-def _frames(scan: Path) -> HDF5Slices:
-    with reading(scan), open_hdf5(scan) as file:
-        node = require_dataset(file, "frames")
-        if node.dtype != np.uint8 or node.ndim != 3 or 0 in node.shape:
-            raise InvalidInputError(
-                f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
-            )
-        n, height, width = node.shape
-        return HDF5Slices(scan, "frames", np.transpose, (n, width, height), node.dtype)
-
-
-def _tool_poses(scan: Path, frames: int) -> RigidTransform | None:
-    source = _transforms_file(scan) or scan
-    with reading(source), open_hdf5(source) as file:
-        if source == scan and not has_member(file, "tforms"):
-            return None
-        return read_transforms(file, "tforms", frames)
+    files = (_transforms_file(scan), _nearby(scan, _CALIBRATION), _landmark_file(scan))
+    return [file for file in files if file is not None]
 
 
 def _transforms_file(scan: Path) -> Path | None:
@@ -179,33 +176,24 @@ def _transforms_file(scan: Path) -> Path | None:
     return beside if subject.parent.name == "frames" and beside.is_file() else None
 
 
-def _nearby(scan: Path, names: Iterable[str]) -> Path | None:
+def _nearby(scan: Path, *names: str) -> Path | None:
     """First file of these names beside or above a scan."""
     folders = list(scan.absolute().parents)[:_LEVELS]
     paths = (folder / name for folder in folders for name in names)
     return next((path for path in paths if path.is_file()), None)
 
 
-def _calibration_file(scan: Path) -> Path | None:
-    return _nearby(scan, [_CALIBRATION])
-
-
-def _require_calibration(scan: Path) -> Path:
-    found = _calibration_file(scan)
-    if found is None:
+def _calibration_file(scan: Path) -> Path:
+    if (file := _nearby(scan, _CALIBRATION)) is None:
         raise InvalidInputError(f"{scan}: expected {_CALIBRATION} beside or above it, got none")
-    return found
+    return file
 
 
 def _landmark_file(scan: Path) -> Path | None:
-    subject = scan.absolute().parent.name
-    return _nearby(scan, [f"{folder}/landmark_{subject}.h5" for folder in _LANDMARK_FOLDERS])
+    name = f"landmark_{scan.absolute().parent.name}.h5"
+    return _nearby(scan, f"landmark/{name}", f"landmarks/{name}")
 
 
 READER = Reader(
-    FORMAT,
-    hdf5_claim(is_challenge_scan),
-    lambda path, _: read_challenge_scan(path),
-    companions=companion_files,
-    takes_settings=False,
+    FORMAT, hdf5_claim(is_challenge_scan), open_scan, companions=companion_files, takes_settings=False
 )

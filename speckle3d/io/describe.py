@@ -1,7 +1,4 @@
-"""What a file holds, told in rows of description, value and unit.
-
-To add a kind of file, give `_DESCRIBERS` a function that tells its rows.
-"""
+"""What a file holds, told in rows of description, value and unit."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
-from speckle3d.io import calibrations, challenge, curves, reconstructions, sweeps
+from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.hdf5 import (
     PathLike,
@@ -30,9 +27,8 @@ from speckle3d.io.hdf5 import (
     require_dataset,
     require_group,
 )
-from speckle3d.io.import_settings import settings_for
-from speckle3d.io.load import kind_of, recording_of
-from speckle3d.io.readers import Reader, Row, find_reader
+from speckle3d.io.load import kind_of, open_recording
+from speckle3d.io.readers import Row
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volumes import is_volume, read_volume
 
@@ -41,6 +37,8 @@ _UNIT_NAMES = {"mm": "mm", "hz": "Hz", "db": "dB", "m_s": "m/s"}
 
 def describe(path: PathLike) -> list[Row]:
     """Tell what a file holds as rows of description, value and unit.
+
+    Of a recording, rows tell what its reader found, also where there is no sweep in it, and why.
 
     Raises
     ------
@@ -52,32 +50,17 @@ def describe(path: PathLike) -> list[Row]:
     if Path(path).is_file() and is_volume(path):
         return [("format", "volume", ""), *_describe_volume(path)]
     kind = kind_of(path)
-    if kind not in _DESCRIBERS:
-        reader = find_reader(path)
-        if reader is None:
-            known = ", ".join(sorted(_DESCRIBERS))
-            raise InvalidInputError(f"{path}: expected a format among {known}, got {kind!r}")
-        return [("format", kind, ""), *_told(reader, Path(path))]
-    return [("format", kind, ""), *_DESCRIBERS[kind](path)]
-
-
-def _told(reader: Reader, path: Path) -> list[Row]:
-    """Rows of a recording; where its sweep cannot be read, what its reader tells of it, and why it cannot."""
-    settings = settings_for(path)
-    own = [] if reader.describe is None else reader.describe(path, settings)
+    rows: list[Row] = [("format", kind, "")]
+    if kind in _DESCRIBERS:
+        return [*rows, *_DESCRIBERS[kind](path)]
+    recording = open_recording(path)
+    rows += recording.describe()
     try:
-        recording = recording_of(reader, path, settings)
-        own += recording.describe()
-        return [*own, *sweep_rows(recording.sweep)]
+        return [*rows, *sweep_rows(recording.sweep)]
     except (InvalidInputError, FileError) as error:
-        if not own:
+        if len(rows) == 1:
             raise
-        return [*own, ("sweep", f"none: {error}", "")]
-
-
-def _describe_scan(path: PathLike) -> list[Row]:
-    marks = str(len(challenge.read_landmarks(path) or ()))
-    return [*sweep_rows(challenge.read_challenge_scan(path)), ("landmarks", marks, "")]
+        return [*rows, ("sweep", f"none: {error}", "")]
 
 
 def sweep_rows(sweep: Sweep) -> list[Row]:
@@ -95,11 +78,6 @@ def sweep_rows(sweep: Sweep) -> list[Row]:
         *_signal_rows(sweep.signal),
         *_sensor_rows(sweep),
     ]
-
-
-def _unfinished_rows(path: PathLike) -> list[Row]:
-    is_closed = sweeps.unfinished_note(path) is None
-    return [] if is_closed else [("recording", "goes on, or was ended without being closed", "")]
 
 
 def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
@@ -274,9 +252,7 @@ def _spoken(name: str) -> tuple[str, str]:
 
 
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
-    sweeps.FORMAT: lambda path: [*sweep_rows(sweeps.read_sweep(path)), *_unfinished_rows(path)],
     reconstructions.FORMAT: _describe_reconstruction,
     curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,
-    challenge.FORMAT: _describe_scan,
 }

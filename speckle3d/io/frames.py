@@ -73,6 +73,11 @@ class FileFrames:
             require_finite(frame, where)
         return frame
 
+    def take(self, rows: npt.NDArray[Any], axis: int = 0) -> FileFrames:
+        """Some of the frames, as `numpy.take` along the axis of frames."""
+        chosen = [self.chosen[i] for i in rows.tolist()]
+        return FileFrames(self.path, self.open_file, self.shape, self.dtype, self.stored_dtype, chosen)
+
     def close(self) -> None:
         """Close the file; the next frame opens it again."""
         with self._lock:

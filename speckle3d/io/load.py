@@ -84,10 +84,7 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
         )
     with reading(path), naming(str(path)):
         made = reader.read(path, settings)
-    if isinstance(made, Recording):
-        return made
-    remarks = tuple(reader.notes(path, settings))
-    return Recording(path, settings, ready=made, remarks=remarks)
+    return made if isinstance(made, Recording) else Recording(path, settings, ready=made)
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import Frames, Sweep
+from speckle3d.core.sweep import Sweep
+
+ROUNDING_TOLERANCE = 2e-3
+"""How far R^T R of a pose may be from the identity before it is made rigid. An electromagnetic tracker that
+rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
 
 _FASTEST_MM_S, _SLACK_MM = 300.0, 3.0
 """Of a point of the probe between two readings. The fastest path at hand, a motor's, has 255 mm/s, freehand
@@ -22,6 +28,7 @@ _LEVER_MM = 50.0
 
 _MOST_JUMPING = 0.2
 """Share of poses after jumps, above which these are no faults of readings but how the probe was placed."""
+
 _MOST_PIECES = 2000
 """Of a path cut at its jumps; with more it is no path."""
 
@@ -42,21 +49,75 @@ def rising(times: FloatArray) -> IntArray:
     tails: list[float] = []
     last: list[int] = []
     before = np.full(times.size, -1)
-    for i, time in enumerate(times.tolist()):
-        if not np.isfinite(time):
-            continue
-        place = len(tails) if not tails or time > tails[-1] else int(np.searchsorted(tails, time))
+    for i in np.flatnonzero(np.isfinite(times)).tolist():
+        place = int(np.searchsorted(tails, times[i])) if tails and times[i] <= tails[-1] else len(tails)
         before[i] = last[place - 1] if place else -1
         if place == len(tails):
-            tails.append(time)
+            tails.append(times[i])
             last.append(i)
-        elif time < tails[place]:
-            tails[place], last[place] = time, i
+        elif times[i] < tails[place]:
+            tails[place], last[place] = times[i], i
     chosen, i = [], last[-1] if last else -1
     while i >= 0:
         chosen.append(i)
         i = int(before[i])
     return np.array(chosen[::-1], dtype=int)
+
+
+def usable(what: str, time_s: FloatArray, faults: Sequence[str] | None = None) -> tuple[IntArray, list[str]]:
+    """Choose the rows of a recording that are of use, and tell what is left out and why.
+
+    Parameters
+    ----------
+    what : str
+        Rows of what, as "poses".
+    time_s : ndarray, shape (n,)
+        NaN where a row has none.
+    faults : sequence of str, length n, optional
+        Why a row is of no use, as "without a valid pose"; empty where it is.
+
+    Returns
+    -------
+    rows : ndarray of int
+    notes : list of str
+        A line where rows are left out.
+    """
+    reasons = np.array(faults or [""] * time_s.size, dtype=object)
+    reasons[(reasons == "") & ~np.isfinite(time_s)] = "without a time"
+    rows = np.flatnonzero(reasons == "")
+    rows = rows[rising(time_s[rows])]
+    other = np.setdiff1d(np.flatnonzero(reasons == ""), rows)
+    repeated = np.isin(time_s[other], time_s[rows])
+    reasons[other] = np.where(repeated, "with a repeated time", "with a time out of order")
+    return rows, left_out(what, time_s.size, Counter(filter(None, reasons)), time_s[rows])
+
+
+def timed_poses(
+    time_s: FloatArray, matrices: FloatArray, faults: Sequence[str] | None = None
+) -> tuple[TimedPoses | None, list[str]]:
+    """Poses of use among matrices, shape (n, 4, 4), in mm, and a line of those left out; None of none."""
+    exact, own = rigid(matrices)
+    reasons = [given or fault for given, fault in zip(faults or own, own, strict=True)]
+    rows, notes = usable("poses", time_s, reasons)
+    if not rows.size:
+        return None, notes
+    return TimedPoses(time_s[rows], RigidTransform.from_matrix(exact[rows])), notes
+
+
+def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
+    """Make rounded rotations exact; a matrix farther off becomes the identity, with the reason."""
+    r, bottom = matrices[:, :3, :3], matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2))
+        near = np.maximum(off, np.abs(bottom).max(axis=1)) < ROUNDING_TOLERANCE
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    near &= finite
+    near[near] = np.linalg.det(r[near]) > 0
+    exact = np.tile(np.eye(4), (len(r), 1, 1))
+    exact[near, :3, 3] = matrices[near, :3, 3]
+    exact[near, :3, :3] = nearest_rotation(r[near])
+    reasons = np.where(finite, np.where(near, "", "whose pose is not rigid"), "whose pose is not finite")
+    return exact, reasons.tolist()
 
 
 def left_out(what: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
@@ -84,28 +145,24 @@ def checked_path(sweep: Sweep, chain: str) -> tuple[Sweep, list[str]]:
     if tracker is None:
         return sweep, []
     readings, notes = _without_jumps(tracker.readings)
-    checked = replace(sweep, tracker=replace(tracker, readings=readings))
-    assert checked.tracker is not None
-    covered = checked.tracker.covers(sweep.frame_time_s)
-    exact = np.isin(sweep.frame_time_s - tracker.time_offset_s, readings.time_s)
-    between = np.count_nonzero(covered & ~exact)
+    times = sweep.frame_time_s - tracker.time_offset_s
+    covered = readings.covers(times)
+    between = np.count_nonzero(covered & ~np.isin(times, readings.time_s))
+    notes += _repeats(readings, sweep, times)
+    extent = float(np.linalg.norm(np.ptp(readings.world_from_sensor.translation, axis=0)))
+    width = sweep.grid.width_mm
+    if len(readings) > 1 and extent < _LEAST_OF_WIDTH * width:
+        notes.append(
+            f"poses: the path spans {extent:.3g} mm and the image is {width:.4g} mm wide: the probe stood "
+            "still, or the poses are in metres"
+        )
+    elif extent > _LONGEST_MM:
+        notes.append(f"poses: the path spans {extent:.3g} mm: are they in micrometres?")
     matched = (
         f"poses of {chain}, mm: {len(readings)} poses, {len(sweep)} images, {np.count_nonzero(covered)} "
         "matched" + (f", {between} of them between two poses" if between else "")
     )
-    notes += _repeats(readings, sweep.frames, sweep.frame_time_s - tracker.time_offset_s)
-    places = readings.world_from_sensor.translation
-    extent = float(np.linalg.norm(np.ptp(places, axis=0)))
-    width = sweep.grid.width_mm
-    if len(readings) > 1 and (extent < _LEAST_OF_WIDTH * width or extent > _LONGEST_MM):
-        unit = "metres" if extent < width else "micrometres"
-        notes.append(
-            f"poses: the path spans {extent:.3g} mm and the image is {width:.4g} mm wide: the probe stood "
-            f"still, or the poses are in {unit}"
-            if extent < width
-            else f"poses: the path spans {extent:.3g} mm: are they in {unit}?"
-        )
-    return checked, [*notes, matched]
+    return replace(sweep, tracker=replace(tracker, readings=readings)), [*notes, matched]
 
 
 def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
@@ -113,51 +170,50 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
 
     Where that leaves out more than a fifth, poses are single placements and not a path: all stay.
     """
-    points, time_s = _points(readings.world_from_sensor), readings.time_s
+    matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
+    points = _points(matrices)
     moved, steps = _apart(points[1:], points[:-1]), np.diff(time_s)
     jumps = np.flatnonzero(moved > _reach(steps))
     if not jumps.size:
         return readings, []
     worst = int(jumps[0])
     told = f"{moved[worst]:.3g} mm in {1e3 * steps[worst]:.3g} ms at {time_s[worst + 1]:.3f} s"
-    starts, ends = np.r_[0, jumps + 1], np.r_[jumps, len(readings) - 1]
-    keep = _largest_chain(points, time_s, starts, ends)
-    if keep is None or np.count_nonzero(~keep) > _MOST_JUMPING * len(readings):
+    # A tool that is lost is often written as the identity: such pieces count for nothing.
+    weight = (matrices != np.eye(4)).any(axis=(1, 2)).astype(float)
+    rows = _largest_chain(points, time_s, np.split(np.arange(len(readings)), jumps + 1), weight)
+    if rows.size < (1.0 - _MOST_JUMPING) * len(readings):
         return readings, [f"poses: {jumps.size} jumps that no hand makes, as {told}: all are kept"]
-    notes = left_out("poses", len(readings), {f"after jumps, as {told}": int(np.sum(~keep))}, time_s[keep])
-    kept = replace(readings, time_s=time_s[keep], world_from_sensor=readings.world_from_sensor[keep])
-    return kept, notes
+    reasons = {f"after jumps, as {told}": len(readings) - rows.size}
+    notes = left_out("poses", len(readings), reasons, time_s[rows])
+    return replace(readings, time_s=time_s[rows], world_from_sensor=readings.world_from_sensor[rows]), notes
 
 
 def _largest_chain(
-    points: FloatArray, time_s: FloatArray, starts: IntArray, ends: IntArray
-) -> BoolArray | None:
-    """Which poses are in the pieces, between jumps, that follow each other within reach and hold the most."""
-    if starts.size > _MOST_PIECES:
-        return None
-    sizes = (ends - starts + 1).astype(float)
-    # A tool that is lost is often written as the identity: such pieces count for nothing.
-    lost = _apart(points, _points(RigidTransform.identity(1))) == 0
-    sizes[[bool(lost[a : b + 1].all()) for a, b in zip(starts, ends, strict=True)]] = 0.0
-    best, before = sizes.copy(), np.full(starts.size, -1)
-    for k in range(1, starts.size):
+    points: FloatArray, time_s: FloatArray, pieces: list[IntArray], weight: FloatArray
+) -> IntArray:
+    """Rows of the pieces that follow each other within reach and weigh the most; none of too many."""
+    if len(pieces) > _MOST_PIECES:
+        return np.array([], dtype=int)
+    starts, ends = np.array([(piece[0], piece[-1]) for piece in pieces]).T
+    sizes = np.array([weight[piece].sum() for piece in pieces])
+    best, before = sizes.copy(), np.full(len(pieces), -1)
+    for k in range(1, len(pieces)):
         apart = _apart(points[starts[k]], points[ends[:k]])
         within = np.flatnonzero(apart <= _reach(time_s[starts[k]] - time_s[ends[:k]]))
         if within.size:
-            i = int(within[np.argmax(best[within])])
-            best[k], before[k] = best[i] + sizes[k], i
-    keep, k = np.zeros(len(points), dtype=bool), int(np.argmax(best))
+            before[k] = within[np.argmax(best[within])]
+            best[k] += best[before[k]]
+    chain, k = [np.array([], dtype=int)], int(np.argmax(best))
     while k >= 0:
-        keep[starts[k] : ends[k] + 1] = sizes[k] > 0
+        chain += [pieces[k]] if sizes[k] else []
         k = int(before[k])
-    return keep
+    return np.concatenate(chain[::-1])
 
 
-def _points(poses: RigidTransform) -> FloatArray:
+def _points(matrices: FloatArray) -> FloatArray:
     """The sensor's origin and three points beside it, shape (m, 4, 3)."""
-    matrices = poses.as_matrix()
-    around = matrices[:, None, :3, 3] + _LEVER_MM * matrices[:, :3, :3].transpose(0, 2, 1)
-    return np.concatenate([matrices[:, None, :3, 3], around], axis=1)
+    origin = matrices[:, None, :3, 3]
+    return np.concatenate([origin, origin + _LEVER_MM * matrices[:, :3, :3].transpose(0, 2, 1)], axis=1)
 
 
 def _apart(points: FloatArray, others: FloatArray) -> FloatArray:
@@ -168,21 +224,21 @@ def _reach(time_s: FloatArray) -> FloatArray:
     return _SLACK_MM + _FASTEST_MM_S * time_s
 
 
-def _repeats(readings: TimedPoses, frames: Frames, frame_time_s: FloatArray) -> list[str]:
+def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> list[str]:
     """Tell the longest run of one pose while images change."""
     matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
     changes = np.flatnonzero((matrices[1:] != matrices[:-1]).any(axis=(1, 2))) + 1
-    starts, stops = np.r_[0, changes], np.r_[changes, len(readings)]
-    lengths = stops - starts
+    runs = np.split(np.arange(len(readings)), changes)
+    lengths = np.array([run.size for run in runs])
     odd = lengths > max(_MOST_ALIKE, _MOST_TIMES * float(np.median(lengths)))
     if changes.size == 0 or not odd.any():
         return []
-    k = int(np.argmax(lengths))
-    first_s, last_s = time_s[starts[k]], time_s[stops[k] - 1]
+    first_s, last_s = time_s[runs[int(np.argmax(lengths))][[0, -1]]]
     inside = np.flatnonzero((frame_time_s >= first_s) & (frame_time_s <= last_s))
-    if inside.size < 2 or np.array_equal(frames[int(inside[0])], frames[int(inside[-1])]):
+    if inside.size < 2 or np.array_equal(sweep.frames[int(inside[0])], sweep.frames[int(inside[-1])]):
         return []
     return [
-        f"poses: {np.count_nonzero(odd)} run(s) of one pose while images change, the longest of {lengths[k]} "
-        f"poses, {last_s - first_s:.3g} s from {first_s:.3f} s: the tracker's output stood still"
+        f"poses: {np.count_nonzero(odd)} run(s) of one pose while images change, the longest of "
+        f"{lengths.max()} poses, {last_s - first_s:.3g} s from {first_s:.3f} s: the tracker's output stood "
+        "still"
     ]

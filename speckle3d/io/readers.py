@@ -34,10 +34,6 @@ def _nothing_beside(_: Path) -> Sequence[Path]:
     return ()
 
 
-def _nothing_to_say(_: Path, __: ImportSettings) -> Sequence[str]:
-    return ()
-
-
 @dataclass(frozen=True)
 class Reader:
     """How sweeps of one format are told and read.
@@ -51,14 +47,9 @@ class Reader:
         none for a folder. It raises nothing.
     read : callable
         The sweep of a recording, with `ImportSettings` for what it does not say; or a `Recording`, which
-        makes the sweep and describes itself.
-    describe : callable, optional
-        Rows of what a recording holds, also where it is no sweep; by default the sweep's or
-        the `Recording`'s.
+        makes the sweep, describes itself, also where it is none, and tells what was assumed or left out.
     companions : callable
         Other files that the sweep's content depends on.
-    notes : callable
-        What a user should know of how a sweep was made: what was assumed, measured or left out.
     takes_settings : bool
         Whether `read` uses its settings; false of formats that say all themselves.
     """
@@ -66,9 +57,7 @@ class Reader:
     format: str
     claims: Callable[[Path, bytes], bool]
     read: Callable[[Path, ImportSettings], Sweep | Recording]
-    describe: Callable[[Path, ImportSettings], list[Row]] | None = None
     companions: Callable[[Path], Sequence[Path]] = _nothing_beside
-    notes: Callable[[Path, ImportSettings], Sequence[str]] = _nothing_to_say
     takes_settings: bool = True
 
 
@@ -80,23 +69,18 @@ def find_reader(path: PathLike) -> Reader | None:
     FileError
         If there is no such file or folder, or it cannot be read.
     """
-    place = Path(path)
-    start = first_bytes(place)
-    return next((reader for reader in readers() if _claims(reader, place, start)), None)
-
-
-def _claims(reader: Reader, path: Path, start: bytes) -> bool:
-    """Ask a reader; one of another package that fails is told of and does not claim."""
-    if reader in _own():
-        return reader.claims(path, start)
-    try:
-        return reader.claims(path, start)
-    except Exception as error:  # noqa: BLE001 - a lab's own code must not stop all others
-        warnings.warn(
-            f"reader of {reader.format}: left out for {path}: it fails: {type(error).__name__}: {error}",
-            stacklevel=2,
-        )
-        return False
+    place, start = Path(path), first_bytes(path)
+    for reader in readers():
+        try:
+            if reader.claims(place, start):
+                return reader
+        except Exception as error:
+            if reader in _own():
+                raise
+            # A lab's own code must not stop all others.
+            fault = f"it fails: {type(error).__name__}: {error}"
+            warnings.warn(f"reader of {reader.format}: left out for {path}: {fault}", stacklevel=2)
+    return None
 
 
 def first_bytes(path: PathLike) -> bytes:
@@ -118,7 +102,7 @@ def first_bytes(path: PathLike) -> bytes:
 @cache
 def readers() -> tuple[Reader, ...]:
     """All readers, those of other packages first."""
-    return (*_others(), *_own())
+    return *_others(), *_own()
 
 
 @cache
@@ -128,16 +112,16 @@ def _own() -> tuple[Reader, ...]:
 
 def _others() -> tuple[Reader, ...]:
     """Readers of other packages; one that cannot be loaded is told of and left out."""
-    found = []
-    for entry in sorted(entry_points(group=GROUP), key=lambda each: each.name):
+    loaded = []
+    for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
             reader = entry.load()
         except Exception as error:  # noqa: BLE001 - a lab's own code must not stop all others
             fault = f"it cannot be loaded: {type(error).__name__}: {error}"
         else:
             if isinstance(reader, Reader):
-                found.append(reader)
+                loaded.append(reader)
                 continue
             fault = f"expected a Reader, got {type(reader).__name__}"
         warnings.warn(f"entry point {entry.name} of {GROUP}: left out: {fault}", stacklevel=2)
-    return tuple(found)
+    return tuple(loaded)

@@ -7,31 +7,22 @@ at once. Readers fill a `Recording`; it makes the sweep, describes itself and te
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, cast
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.files import PathLike
 from speckle3d.core.printable import printable
-from speckle3d.core.sweep import (
-    BModeSettings,
-    Frames,
-    ImageGrid,
-    OrientationSensor,
-    RFSettings,
-    Sweep,
-    Tracker,
-)
+from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings, settings_file, settings_for
 from speckle3d.io.plausible import require_plausible
-from speckle3d.io.pose_paths import checked_path
+from speckle3d.io.pose_paths import checked_path, usable
 
 Row = tuple[str, str, str]
 """Description, value, unit."""
@@ -42,6 +33,7 @@ SPREAD = 1e-3
 CONTRADICTION = 0.01
 """Difference, as a share, above which a number that is given contradicts what a file says."""
 
+_RATES = ("sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
 _UNITS = {"hz": "Hz", "mm": "mm", "db": "dB", "s": "m/s"}
 _ASSUMED = "assumed"
 
@@ -83,13 +75,14 @@ class Recording:
     settings : ImportSettings
         What is given over the recording's own numbers.
     frames : Frames, optional
-        uint8 for B-mode, real for RF, complex for I/Q.
+        uint8 for B-mode, real for RF, complex for I/Q; a NumPy array, or with its method `take`.
     values : mapping of str to Value
         By the name of a setting.
     sample_spacing_mm : float, optional
         Of RF and I/Q whose samples' depths the file gives, in place of a sampling rate.
     time_s : ndarray, shape (n,), optional
-        By default of the frame rate, from 0.
+        NaN where a frame has none; frames whose time is not after the one before are left out. By default
+        of the frame rate, from 0.
     chain : str
         Transforms that the tracker's poses were made of.
     asked : mapping of str to str
@@ -108,7 +101,7 @@ class Recording:
 
     path: Path
     settings: ImportSettings = field(default_factory=ImportSettings)
-    frames: Frames | None = None
+    frames: Any = None
     values: Mapping[str, Value] = field(default_factory=dict)
     sample_spacing_mm: float | None = None
     time_s: FloatArray | None = None
@@ -124,6 +117,15 @@ class Recording:
     remarks: tuple[str, ...] = ()
     fault: InvalidInputError | FileError | None = None
     ready: Sweep | None = None
+
+    @classmethod
+    def of(cls, path: Path, settings: ImportSettings, rows: list[Row], make: Callable[[], Recording]) -> Self:
+        """What a reader makes, after rows of facts; where it cannot, those facts and why."""
+        try:
+            made = make()
+        except (InvalidInputError, FileError) as error:
+            return cls(path, settings, fault=error, rows=tuple(rows))
+        return cast("Self", replace(made, rows=(*rows, *made.rows)))
 
     @property
     def sweep(self) -> Sweep:
@@ -148,12 +150,12 @@ class Recording:
         ]
         assumed += self.assumptions
         told = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
-        return [*self.contradictions(), *self.remarks, *self._checked[1], *told]
+        return [*self.contradictions(), *self._timed[2], *self.remarks, *self._checked[1], *told]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
         numbers = [] if self.fault else [self._row(name, one) for name, one in self.needed.items()]
-        remarks = list(self.remarks)
+        remarks = [*self._timed[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._checked[1]
         return [*self.rows, *numbers, *(("note", text, "") for text in remarks)]
@@ -168,7 +170,7 @@ class Recording:
             words, unit = _words(name)
             source = f" ({one.source})" if one.source else ""
             notes.append(
-                f"{words} {_shown(given, unit)} {unit}, {self._given(name)}: {one.said_by} says "
+                f"{words} {_shown(given, unit)} {unit}, {self._giver(name)}: {one.said_by} says "
                 f"{_shown(one.value, unit)}{source}"
             )
         return notes
@@ -178,25 +180,37 @@ class Recording:
         """The numbers that a sweep of these frames needs, by the names of their settings."""
         if self.frames is None:
             return {}
+        dtype = np.dtype(self.frames.dtype)
         names = ["first_sample_depth_mm"]
-        if self.frames.dtype == np.uint8:
+        if dtype == np.uint8:
             names += ["column_pitch_mm", "row_spacing_mm", "dynamic_range_db"]
         else:
-            names += ["vector_pitch_mm", "speed_of_sound_m_s", "sampling_rate_hz", "centre_frequency_hz"]
-            names += ["bandwidth_hz"]
-        if self.frames.dtype.kind == "c":
+            names += ["vector_pitch_mm", "speed_of_sound_m_s", *_RATES]
+        if dtype.kind == "c":
             names.append("demodulation_frequency_hz")
-        given_rate = self.settings.frame_rate_hz is not None
-        if given_rate or (self.time_s is None and self.frames.shape[0] > 1):
+        times, given_rate = self._timed[0], self.settings.frame_rate_hz is not None
+        if given_rate or (times is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
         needed = {name: self.values.get(name, ASSUMED.get(name, Value())) for name in names}
-        if given_rate and self.time_s is not None and "frame_rate_hz" not in self.values:
-            needed["frame_rate_hz"] = Value(rate_of(self.time_s), "of its times")
+        if given_rate and times is not None and "frame_rate_hz" not in self.values:
+            needed["frame_rate_hz"] = Value(rate_of(times), "of its times")
         if "sampling_rate_hz" in needed and self.sample_spacing_mm is not None:
-            speed = self.settings.speed_of_sound_m_s or needed["speed_of_sound_m_s"].value
+            speed = speed_of(self.settings, self.values)
             source = f"of samples {self.sample_spacing_mm:.6g} mm apart at {speed:g} m/s"
             needed["sampling_rate_hz"] = Value(1e3 * speed / (2.0 * self.sample_spacing_mm), source)
         return needed
+
+    @cached_property
+    def _timed(self) -> tuple[FloatArray | None, Any, list[str]]:
+        """Times of the frames that have one, those frames, and a line of the frames left out."""
+        if self.time_s is None:
+            return None, self.frames, []
+        rows, notes = usable("images", self.time_s)
+        if rows.size < min(2, self.time_s.size):
+            return None, self.frames, []
+        if self.settings.frame_rate_hz is not None or not notes:
+            return self.time_s[rows], self.frames, []
+        return self.time_s[rows], self.frames.take(rows, 0), notes
 
     @cached_property
     def _checked(self) -> tuple[Sweep, list[str]]:
@@ -210,8 +224,9 @@ class Recording:
     def _made(self) -> Sweep:
         if self.fault is not None:
             raise self.fault
-        if self.frames is None or 0 in self.frames.shape:
-            shape = None if self.frames is None else self.frames.shape
+        times, frames, _ = self._timed
+        if frames is None or 0 in frames.shape:
+            shape = None if frames is None else frames.shape
             raise InvalidInputError(f"{self.path}: expected frames, got shape {shape}")
         wanted = {name: one.value for name, one in self.needed.items()}
         lacking = {
@@ -220,53 +235,28 @@ class Recording:
         }
         self.settings.over(self.path, **lacking)  # asks for what is missing by the easiest name
         values = self.settings.over(self.path, **wanted)
-        self._require_depths(values)
-        signal = self._signal(values)
-        is_rf = isinstance(signal, RFSettings)
-        pitch = values["vector_pitch_mm" if is_rf else "column_pitch_mm"]
-        spacing = signal.sample_spacing_mm if isinstance(signal, RFSettings) else values["row_spacing_mm"]
+        if (rate_hz := values.get("frame_rate_hz")) is not None:
+            times = np.arange(frames.shape[0]) / float(rate_hz)
+        signal: RFSettings | BModeSettings
+        if "dynamic_range_db" in values:
+            signal = BModeSettings(values["dynamic_range_db"], self.full_scale)
+            pitch, spacing = values["column_pitch_mm"], values["row_spacing_mm"]
+        else:
+            names = ("speed_of_sound_m_s", *_RATES, "demodulation_frequency_hz")
+            signal = RFSettings(**{name: values[name] for name in names if name in values})
+            pitch, spacing = values["vector_pitch_mm"], signal.sample_spacing_mm
         return Sweep(
-            frames=self.frames,
-            grid=ImageGrid(*self.frames.shape[1:], pitch, spacing, values["first_sample_depth_mm"]),
+            frames=frames,
+            grid=ImageGrid(frames.shape[1], frames.shape[2], pitch, spacing, values["first_sample_depth_mm"]),
             signal=signal,
-            frame_time_s=self._times(values.get("frame_rate_hz")),
+            frame_time_s=np.zeros(1) if times is None else times,
             tracker=self.tracker,
             orientation=self.orientation,
             name=printable(self.name or self.path.name.split(".")[0]),
             probe=self.probe or self.settings.probe or "",
         )
 
-    def _require_depths(self, values: Mapping[str, Any]) -> None:
-        """Refuse a sampling rate that contradicts where the recording says its samples lie."""
-        rate, spacing = values.get("sampling_rate_hz"), self.sample_spacing_mm
-        if rate is None or spacing is None:
-            return
-        speed = values["speed_of_sound_m_s"]
-        implied = 1e3 * speed / (2.0 * spacing)
-        if abs(rate - implied) > SPREAD * implied:
-            raise InvalidInputError(
-                f"sampling_rate_hz: expected {implied:.7g} of samples that lie {spacing:.6g} mm apart at "
-                f"{speed:g} m/s, got {rate:.7g}"
-            )
-
-    def _signal(self, values: Mapping[str, Any]) -> RFSettings | BModeSettings:
-        if "dynamic_range_db" in values:
-            return BModeSettings(values["dynamic_range_db"], self.full_scale)
-        return RFSettings(
-            values["sampling_rate_hz"],
-            values["speed_of_sound_m_s"],
-            values["centre_frequency_hz"],
-            tuple(values["bandwidth_hz"]),
-            values.get("demodulation_frequency_hz"),
-        )
-
-    def _times(self, rate_hz: float | None) -> FloatArray:
-        assert self.frames is not None
-        if rate_hz is None:
-            return np.zeros(1) if self.time_s is None else self.time_s
-        return np.arange(self.frames.shape[0]) / float(rate_hz)
-
-    def _given(self, name: str) -> str:
+    def _giver(self, name: str) -> str:
         """Who gives a setting: the file of settings beside the recording, or an option."""
         file = settings_file(self.path)
         own = None if file is None else getattr(settings_for(self.path), name)
@@ -276,14 +266,20 @@ class Recording:
         words, unit = _words(name)
         given = getattr(self.settings, name)
         own = None if one.value is None else _shown(one.value, unit)
-        if given is None and own is None:
+        if given is not None:
+            shown = _shown(given, unit)
+            is_other = not one.is_assumed and own not in (None, shown)
+            against = f", {one.said_by} says {own}" if is_other else ""
+            return words, f"{shown} ({self._giver(name)}{against})", unit
+        if own is None:
             return words, f"missing: --{self.asked.get(name, name).replace('_', '-')}", ""
-        if given is None:
-            return words, f"{own} ({one.source})" if one.source else str(own), unit
-        shown = _shown(given, unit)
-        is_said = own is not None and not one.is_assumed
-        against = f", {one.said_by} says {own}" if is_said and own != shown else ""
-        return words, f"{shown} ({self._given(name)}{against})", unit
+        return words, f"{own} ({one.source})" if one.source else own, unit
+
+
+def speed_of(settings: ImportSettings, values: Mapping[str, Value]) -> float:
+    """Speed of sound that is given, that the recording says, or that is assumed."""
+    own = values.get("speed_of_sound_m_s", ASSUMED["speed_of_sound_m_s"]).value
+    return float(settings.speed_of_sound_m_s or own or SPEED_OF_SOUND_M_S)
 
 
 def differs(given: Any, own: Any) -> bool:
@@ -332,8 +328,3 @@ def _words(name: str) -> tuple[str, str]:
 
 def _shown(value: Any, unit: str) -> str:
     return " to ".join(f"{number / (1e6 if unit == 'MHz' else 1.0):.7g}" for number in np.ravel(value))
-
-
-def where_of(path: PathLike, name: str) -> str:
-    """A place in a file, for messages."""
-    return f"{path}: /{name.lstrip('/')}"

@@ -48,6 +48,7 @@ from speckle3d.io.hdf5 import (
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.lazy import HDF5Slices
 from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording
 from speckle3d.io.records import read_record
 
 FORMAT = "speckle3d.sweep"
@@ -261,15 +262,12 @@ def unfinished_note(path: PathLike) -> str | None:
     )
 
 
-def _notes(path: Path, _: ImportSettings) -> list[str]:
-    note = unfinished_note(path)
-    return [] if note is None else [note]
+def _open(path: Path, _: ImportSettings) -> Recording:
+    sweep, note = read_sweep(path), unfinished_note(path)
+    if note is None:
+        return Recording(path, ready=sweep)
+    rows = (("recording", "goes on, or was ended without being closed", ""),)
+    return Recording(path, ready=sweep, rows=rows, remarks=(note,))
 
 
-READER = Reader(
-    FORMAT,
-    hdf5_claim(lambda file: has_format(file, FORMAT)),
-    lambda path, _: read_sweep(path),
-    notes=_notes,
-    takes_settings=False,
-)
+READER = Reader(FORMAT, hdf5_claim(lambda file: has_format(file, FORMAT)), _open, takes_settings=False)

@@ -9,7 +9,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.challenge import read_challenge_calibration, read_landmarks
 from speckle3d.io.describe import describe
-from speckle3d.io.load import companion_files, load_landmarks, load_sweep
+from speckle3d.io.load import companion_files, load_landmarks, load_sweep, open_recording
 
 
 @pytest.fixture(params=["one file", "two files"])
@@ -96,7 +96,6 @@ def test_a_wrong_calibration_is_named(tmp_path, content, message):
         ("frames", np.zeros((12, 6, 8)), "/frames"),
         ("frames", np.zeros((12, 8), dtype=np.uint8), "/frames"),
         ("tforms", np.tile(np.eye(4), (11, 1, 1)), "/tforms"),
-        ("tforms", 2 * np.tile(np.eye(4), (12, 1, 1)), "rigid 4x4"),
     ],
 )
 def test_a_wrong_scan_is_named(tmp_path, name, values, message):
@@ -106,6 +105,18 @@ def test_a_wrong_scan_is_named(tmp_path, name, values, message):
         file[name] = values
     with pytest.raises(InvalidInputError, match=message):
         load_sweep(path)
+
+
+@pytest.mark.parametrize("bad", [np.nan, 2.0])
+def test_a_pose_of_no_use_is_left_out_and_told(tmp_path, bad):
+    path, _, poses, _ = examples.write_data_set(tmp_path, split=False)
+    poses[4, :3, :3] *= bad
+    with h5py.File(path, "r+") as file:
+        file["tforms"][:] = poses
+    recording = open_recording(path)
+    assert len(recording.sweep.tracker.readings) == 11
+    assert any("poses: 1 of 12 left out" in note for note in recording.notes)
+    assert any("11 poses, 12 images, 12 matched" in note for note in recording.notes)
 
 
 def test_a_landmark_is_in_a_frame(tmp_path):

@@ -104,7 +104,6 @@ def folders(monkeypatch):
         "folder of a lab",
         lambda path, start: not start and (path / "frames.npy").is_file(),
         read,
-        lambda path, _: [("frames", "as many as there are", "")],
         lambda path: [path / "frames.npy"],
     )
     monkeypatch.setattr(readers, "_others", lambda: (reader,))
@@ -120,10 +119,9 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path):
     assert find_reader(scan) is folders
     with pytest.raises(MissingSettingsError, match=r"--frame-rate-hz.*--column-pitch-mm"):
         load_sweep(scan)
-    told = {name: value for name, value, _ in describe(scan)}
-    assert told["format"] == "folder of a lab"
-    assert "--frame-rate-hz" in told["sweep"]
     (tmp_path / "scan.toml").write_text("frame_rate_hz = 10\ncolumn_pitch_mm = 0.3\n")
+    told = {name: value for name, value, _ in describe(scan)}
+    assert (told["format"], told["frames"]) == ("folder of a lab", "3")
     sweep = load_sweep(scan)
     assert sweep.frame_time_s.tolist() == [0.0, 0.1, 0.2]
     assert recording_files(scan) == [scan / "frames.npy", tmp_path / "scan.toml"]

@@ -31,8 +31,8 @@ References
 from __future__ import annotations
 
 import re
-from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -40,11 +40,11 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import RIGID_TOLERANCE
-from speckle3d.core.streams import DEFAULT_MAX_GAP_S, TimedRotations
+from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.clarius.sidecars import Fields, fields_of
-from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.clarius.sidecars import fields_of
+from speckle3d.io.pose_paths import usable
 from speckle3d.io.recordings import Row
 
 G_M_S2 = 9.80665
@@ -87,12 +87,65 @@ class SensorSamples:
     def __len__(self) -> int:
         return int(self.time_s.size)
 
-    def accelerometer_m_s2(self, fit: Fit | None) -> FloatArray:
+    @cached_property
+    def fit(self) -> Fit | None:
+        """The quaternion where it agrees with gravity; None where there is none, or it does not."""
+        norms = np.linalg.norm(self.accelerometer_g, axis=1)
+        felt = norms > 0
+        if self.quaternion is None or not felt.any():
+            return None
+        turned = Rotation.from_quat(self.quaternion, scalar_first=True)
+        along = turned[felt].apply(self.accelerometer_g[felt])[:, 2] / norms[felt]
+        sign = 1.0 if along.mean() >= 0 else -1.0
+        off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
+        return Fit(turned, sign, float(off)) if off < _MOST_OFF_DEG else None
+
+    @property
+    def accelerometer_m_s2(self) -> FloatArray:
         """Specific force, shape (m, 3): what is measured, or against it, as the quaternion's z tells.
 
         Against it where the quaternion is not believed, as in both public recordings.
         """
-        return (-1.0 if fit is None else fit.vertical) * G_M_S2 * self.accelerometer_g
+        return (-1.0 if self.fit is None else self.fit.vertical) * G_M_S2 * self.accelerometer_g
+
+    @property
+    def orientation(self) -> OrientationSensor | None:
+        """Stream of a sweep, whose world is z up; None where the quaternion is not believed."""
+        if self.fit is None:
+            return None
+        return OrientationSensor(
+            TimedRotations(self.time_s, self.fit.world_from_sensor),
+            accelerometer_m_s2=self.accelerometer_m_s2,
+            gyroscope_rad_s=self.gyroscope_rad_s,
+            magnetometer_au=self.magnetometer_gauss,
+        )
+
+    def rows(self) -> list[Row]:
+        """Tell what the sensor recorded, and whether its quaternion agrees with gravity."""
+        steps, fit = np.diff(self.time_s), self.fit
+        rows = [
+            ("sensor samples", str(len(self)), ""),
+            ("sensor pauses", str(np.sum(steps > _PAUSE_S)), f"over {1e3 * _PAUSE_S:g} ms"),
+            ("sensor, longest pause", f"{steps.max(initial=0.0):.3f}", "s"),
+            ("accelerometer, median norm", f"{_norm(self.accelerometer_g):.3f}", "g"),
+        ]
+        if fit is None:
+            words = "none in the file" if self.quaternion is None else "none that agrees with gravity"
+            return [*rows, ("quaternion", f"{words}: see `speckle3d imu orient`", "")]
+        sign = "specific force" if fit.vertical > 0 else "gravity (against the world's z): negated"
+        rows += [
+            ("quaternion", f"{MEANING} (checked against the accelerometer)", ""),
+            ("quaternion, off the vertical", f"{fit.off_vertical_deg:.2f}", "deg RMS"),
+            ("accelerometer taken as", sign, ""),
+        ]
+        if self.magnetometer_gauss is not None:
+            x, y, z = fit.world_from_sensor.apply(self.magnetometer_gauss).mean(axis=0)
+            rows += [
+                ("magnetometer, median norm", f"{_norm(self.magnetometer_gauss):.3f}", "gauss"),
+                ("magnetic field, from the world's x", f"{np.rad2deg(np.arctan2(y, x)):.0f}", "deg"),
+                ("magnetic field, dip", f"{np.rad2deg(np.arctan2(-z, np.hypot(x, y))):.0f}", "deg"),
+            ]
+        return rows
 
 
 @dataclass(frozen=True)
@@ -110,7 +163,6 @@ class Fit:
     world_from_sensor: Rotation
     vertical: float
     off_vertical_deg: float
-    meaning: str = MEANING
 
 
 def read_samples(member: Member) -> SensorSamples:
@@ -126,113 +178,46 @@ def read_samples(member: Member) -> SensorSamples:
     where = member.where
     documents = [text for text in _BREAK.split(member.text()) if text.strip()]
     table = np.full((len(documents), 13), np.nan)
-    stamps = np.full(len(documents), np.nan)
-    reasons: Counter[str] = Counter()
-    fault: InvalidInputError | None = None
-    start_ns: int | None = None
+    stamps, faults, first = np.full(len(documents), np.nan), [""] * len(documents), ""
     for i, text in enumerate(documents):
         try:
-            fields = Fields(fields_of(text, f"{where}: sample {i}"), f"{where}: sample {i}")
-            time_ns = fields.whole("timestamp")
-            start_ns = time_ns if start_ns is None else start_ns
-            table[i] = _row(fields)
-            stamps[i] = time_ns - start_ns  # exact, which seconds since 1970 would not be
+            fields = fields_of(text, f"{where}: sample {i}")
+            turn = fields.below("orientation")
+            values = [fields.optional(name) for name in _NAMES] + [turn.optional(f"q{k}") for k in range(4)]
+            table[i], stamps[i] = values, fields.whole("timestamp") / 1e9
         except InvalidInputError as error:
-            fault = fault or error
-            reasons["that cannot be read"] += 1
+            faults[i], first = "that cannot be read", first or f": {error}"
     wanted = np.isfinite(table).mean(axis=0) > 0.5  # a magnetometer and a quaternion are in some files alone
     table[:, ~wanted] = 0.0
-    sound = np.isfinite(stamps) & np.isfinite(table).all(axis=1)
+    sound = np.isfinite(table).all(axis=1)
     if wanted[9:].all():
         sound &= np.abs(np.linalg.norm(table[:, 9:], axis=1) - 1.0) < RIGID_TOLERANCE
-    reasons["without a value, or a quaternion of unit length"] = int(np.sum(np.isfinite(stamps) & ~sound))
-    rows = np.flatnonzero(sound)
-    again = np.r_[False, (np.diff(table[rows], axis=0) == 0).all(axis=1)] if rows.size else rows.astype(bool)
-    reasons["with the values of the one before"] = int(again.sum())
-    rows = rows[~again]
-    kept = rows[rising(stamps[rows])]
-    reasons["with a time that is not after the one before"] = rows.size - kept.size
-    if not kept.size or start_ns is None or not wanted[:6].all():
-        raise fault or InvalidInputError(f"{where}: expected samples of the sensor, got none of use")
-    table, time_s = table[kept], (start_ns + stamps[kept].astype(np.int64)) / 1e9
-    remarks = left_out("samples of the sensor", len(documents), reasons, time_s)
+    before = np.zeros(13)
+    for i in [i for i, fault in enumerate(faults) if not fault]:
+        same = np.array_equal(table[i], before)
+        faults[i] = "with the values of the one before" if same else ""
+        faults[i] = faults[i] if sound[i] else "without a value, or a quaternion of unit length"
+        before = table[i] if sound[i] else before
+    rows, remarks = usable("samples of the sensor", stamps, faults)
+    if not rows.size or not wanted[:6].all():
+        raise InvalidInputError(f"{where}: expected samples of the sensor, got none of use{first}")
+    table = table[rows]
     norm_g = _norm(table[:, :3])
     if not _LEAST_G <= norm_g <= _MOST_G:
         guess = " (in m/s^2?)" if _LEAST_G <= norm_g / G_M_S2 <= _MOST_G else ""
         remarks.append(
             f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale "
-            "is "
-            f"another than assumed{guess}"
+            f"is another than assumed{guess}"
         )
+    accelerometer, gyroscope, magnetometer, quaternion = np.split(table, [3, 6, 9], axis=1)
     return SensorSamples(
-        time_s,
-        table[:, :3],
-        table[:, 3:6],
-        table[:, 6:9] if wanted[6:9].all() else None,
-        table[:, 9:] if wanted[9:].all() else None,
+        stamps[rows],
+        accelerometer,
+        gyroscope,
+        magnetometer if wanted[6:9].all() else None,
+        quaternion if wanted[9:].all() else None,
         tuple(remarks),
     )
-
-
-def fit_of(samples: SensorSamples) -> Fit | None:
-    """Check the quaternion against gravity; None where there is none, or it does not agree."""
-    norms = np.linalg.norm(samples.accelerometer_g, axis=1)
-    felt = norms > 0
-    if samples.quaternion is None or not felt.any():
-        return None
-    turned = Rotation.from_quat(samples.quaternion, scalar_first=True)
-    along = turned[felt].apply(samples.accelerometer_g[felt])[:, 2] / norms[felt]
-    sign = 1.0 if along.mean() >= 0 else -1.0
-    off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
-    return Fit(turned, sign, float(off)) if off < _MOST_OFF_DEG else None
-
-
-def orientation_sensor(samples: SensorSamples, fit: Fit) -> OrientationSensor:
-    """Make the orientation stream of a sweep; its world is z up, its accelerometer specific force."""
-    return OrientationSensor(
-        TimedRotations(samples.time_s, fit.world_from_sensor),
-        accelerometer_m_s2=samples.accelerometer_m_s2(fit),
-        gyroscope_rad_s=samples.gyroscope_rad_s,
-        magnetometer_au=samples.magnetometer_gauss,
-    )
-
-
-def sensor_rows(samples: SensorSamples, fit: Fit | None) -> list[Row]:
-    """Tell what the sensor recorded, and whether its quaternion agrees with gravity."""
-    steps = np.diff(samples.time_s)
-    unbridged = f"over {DEFAULT_MAX_GAP_S:g} s"
-    rows = [
-        ("sensor samples", str(len(samples)), ""),
-        ("sensor pauses", str(np.sum(steps > _PAUSE_S)), f"over {1e3 * _PAUSE_S:g} ms"),
-        ("sensor pauses not bridged", str(np.sum(steps > DEFAULT_MAX_GAP_S)), unbridged),
-        ("sensor, longest pause", f"{steps.max(initial=0.0):.3f}", "s"),
-        ("accelerometer, median norm", f"{_norm(samples.accelerometer_g):.3f}", "g"),
-    ]
-    if samples.magnetometer_gauss is not None:
-        rows.append(("magnetometer, median norm", f"{_norm(samples.magnetometer_gauss):.3f}", "gauss"))
-    if fit is None:
-        words = "none in the file" if samples.quaternion is None else "none that agrees with gravity"
-        return [*rows, ("quaternion", f"{words}: see `speckle3d imu orient`", "")]
-    sign = "specific force" if fit.vertical > 0 else "gravity (against the world's z): negated"
-    rows += [
-        ("quaternion", f"{fit.meaning} (checked against the accelerometer)", ""),
-        ("quaternion, off the vertical", f"{fit.off_vertical_deg:.2f}", "deg RMS"),
-        ("accelerometer taken as", sign, ""),
-    ]
-    if samples.magnetometer_gauss is not None:
-        x, y, z = fit.world_from_sensor.apply(samples.magnetometer_gauss).mean(axis=0)
-        rows.append(("magnetic field, from the world's x", f"{np.rad2deg(np.arctan2(y, x)):.0f}", "deg"))
-        rows.append(("magnetic field, dip", f"{np.rad2deg(np.arctan2(-z, np.hypot(x, y))):.0f}", "deg"))
-    return rows
-
-
-def _row(fields: Fields) -> list[float]:
-    """Accelerometer, gyroscope, magnetometer and quaternion of a sample; NaN of what it lacks."""
-    values = [fields.optional(name) for name in _NAMES]
-    turn = fields.values.get("orientation")
-    inner = Fields(turn if isinstance(turn, dict) else {}, f"{fields.where}: orientation")
-    values += [inner.optional(f"q{i}") for i in range(4)]
-    return [np.nan if value is None else value for value in values]
 
 
 def _norm(vectors: FloatArray) -> float:

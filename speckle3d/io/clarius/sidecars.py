@@ -42,18 +42,11 @@ _UNITS = {
     "bytes": {"bytes": 1.0, "byte": 1.0},
     "deg": {"°": 1.0, "deg": 1.0},
 }
-_USED = frozenset(
-    {
-        "frames", "frame rate", "transmit frequency", "imaging depth", "focal depth", "tgc", "size", "type",
-        "compression", "sampling rate", "delay samples", "lines", "roi", "vsound", "speed of sound", "probe",
-        "focus",
-    }
-)  # fmt: skip
 _LONGEST = 60
-"""Letters of a wrong value that a message shows."""
+"""Letters of a value that a message shows, and that a number has at most."""
 
 
-def fields_of(text: str, where: str) -> Mapping[str, Any]:
+def fields_of(text: str, where: str) -> Fields:
     """Parse a YAML document of fields; their values are text, lists, or mappings.
 
     Raises
@@ -69,7 +62,7 @@ def fields_of(text: str, where: str) -> Mapping[str, Any]:
         raise InvalidInputError(f"{where}: expected YAML, got an error: {words}") from error
     if not isinstance(document, dict):
         raise InvalidInputError(f"{where}: expected fields, got {_shown(document)}")
-    return document
+    return Fields(document, where)
 
 
 @dataclass(frozen=True)
@@ -80,11 +73,19 @@ class Fields:
     where: str
 
     def below(self, name: str) -> Fields:
-        """Fields of a field."""
-        inner = self.values.get(name)
+        """Fields of a field; none where it is missing."""
+        inner = self.values.get(name) or {}
         if not isinstance(inner, dict):
             raise InvalidInputError(f"{self.where}: {name}: expected fields, got {_shown(inner)}")
         return Fields(inner, f"{self.where}: {name}")
+
+    def listed(self, name: str) -> list[Fields]:
+        """Fields of each entry of a list; none where it is missing."""
+        entries = self.values.get(name)
+        named = {
+            f"{name}[{i}]": entry for i, entry in enumerate(entries if isinstance(entries, list) else ())
+        }
+        return [Fields(named, self.where).below(entry) for entry in named]
 
     def number(self, name: str, unit: str = "", least: float = -math.inf) -> float:
         """A number with its unit, as ``"60 MHz"``, in the base unit `unit`."""
@@ -112,17 +113,7 @@ class Fields:
 def _shown(value: object) -> str:
     if isinstance(value, str):
         return repr(printable(value[:_LONGEST])) + ("..." if len(value) > _LONGEST else "")
-    return "fields" if isinstance(value, dict) else "a list" if isinstance(value, list) else "nothing"
-
-
-@dataclass(frozen=True)
-class Roi:
-    """First and last line and sample that hold data."""
-
-    start_line: int
-    end_line: int
-    start_sample: int
-    end_sample: int
+    return "nothing" if value is None else f"a {type(value).__name__}"
 
 
 @dataclass(frozen=True)
@@ -140,45 +131,42 @@ class Receive:
 
 @dataclass(frozen=True)
 class Description:
-    """What the yml of a raw file says; None where it does not.
+    """The yml of a raw file.
 
     Attributes
     ----------
+    fields : Fields
+        Of all that is asked for by name.
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
     receive_element, angle_deg : ndarray, shape (line,)
         Where lines are received, in elements of the array, and how they are steered.
-    delay_samples : float, optional
-        Samples between transmission and the first sample.
-    gain : tuple of pairs
-        Depth in mm and gain in dB.
-    element_pitch_mm, radius_mm : float, optional
-        Of the probe, in files that give them.
-    unused : tuple of str
-        Fields that are not read.
+    gain : Curve
+    roi : pair of slice, optional
+        Lines and samples that hold data.
+    receive : Receive, optional
+        None in older files, and where it differs between foci or filters.
     """
 
-    where: str
+    fields: Fields
     kind: str
-    frames: int
     lines: int
     samples: int
-    sample_bytes: int
-    sampling_rate_hz: float
     receive_element: FloatArray
     angle_deg: FloatArray
-    delay_samples: float | None
-    frame_rate_hz: float | None
-    transmit_frequency_hz: float | None
-    imaging_depth_mm: float | None
-    speed_of_sound_m_s: float | None
-    element_pitch_mm: float | None
-    radius_mm: float | None
-    probe: str
     gain: Curve
-    roi: Roi | None
+    roi: tuple[slice, slice] | None
     receive: Receive | None
-    unused: tuple[str, ...]
+
+    @property
+    def probe(self) -> str:
+        """Model of the probe; empty where only its measures, or nothing, is said."""
+        named = self.fields.values.get("probe")
+        return named if isinstance(named, str) else ""
+
+    def of_probe(self, name: str) -> float | None:
+        """A measure of the probe in mm."""
+        return None if self.probe else self.fields.below("probe").optional(name, "mm")
 
 
 def read_description(member: Member) -> Description:
@@ -192,45 +180,21 @@ def read_description(member: Member) -> Description:
         Naming the field that is missing or has another unit.
     """
     where, text = member.where, member.text()
-    gain_text = "".join(_GAIN_LINE.findall(text))
-    fields = Fields(fields_of(_GAIN_LINE.sub("", text), where), where)
-    size = fields.below("size")
-    word = fields.values.get("type")
-    if not isinstance(word, str) or word.strip().lower() not in _KINDS:
-        raise InvalidInputError(f"{where}: type: expected RF, IQ or B pre-scan, got {_shown(word)}")
+    gain = _knots("".join(_GAIN_LINE.findall(text)), where)
+    fields = fields_of(_GAIN_LINE.sub("", text), where)
+    kind = _KINDS.get(str(fields.values.get("type")).strip().lower())
     packing = fields.values.get("compression", "none")
-    if str(packing).lower() != "none":
+    if kind is None or str(packing).lower() != "none":
         raise InvalidInputError(
-            f"{where}: compression: expected none, got {_shown(packing)}: frames are not decoded"
+            f"{where}: type, compression: expected RF, IQ or B pre-scan, and none, got "
+            f"{_shown(fields.values.get('type'))} and {_shown(packing)}"
         )
-    probe = fields.values.get("probe")
-    of_probe = Fields(probe if isinstance(probe, dict) else {}, f"{where}: probe")
-    lines = size.whole("number of lines")
-    samples = size.whole("samples per line")
-    element, angle = _lines(fields, lines)
+    size = fields.below("size")
+    lines, samples = size.whole("number of lines"), size.whole("samples per line")
     return Description(
-        where=where,
-        kind=_KINDS[word.strip().lower()],
-        frames=fields.whole("frames"),
-        lines=lines,
-        samples=samples,
-        sample_bytes=size.whole("sample size", "bytes"),
-        sampling_rate_hz=fields.number("sampling rate", "Hz", 1.0),
-        receive_element=element,
-        angle_deg=angle,
-        delay_samples=fields.optional("delay samples"),
-        frame_rate_hz=fields.optional("frame rate", "Hz"),
-        transmit_frequency_hz=fields.optional("transmit frequency", "Hz"),
-        imaging_depth_mm=fields.optional("imaging depth", "mm"),
-        speed_of_sound_m_s=fields.optional("vsound", "m/s") or fields.optional("speed of sound", "m/s"),
-        element_pitch_mm=of_probe.optional("pitch", "mm"),
-        radius_mm=of_probe.optional("radius", "mm"),
-        probe=probe if isinstance(probe, str) else "",
-        gain=_knots(gain_text, where),
-        roi=_roi(fields, lines, samples),
-        receive=_receive(fields),
-        unused=tuple(sorted(set(map(str, fields.values)) - _USED)),
-    )
+        fields, kind, lines, samples, *_lines(fields, lines), gain, _roi(fields, lines, samples),
+        _receive(fields),
+    )  # fmt: skip
 
 
 def read_gains(member: Member) -> dict[int, Curve]:
@@ -243,53 +207,45 @@ def read_gains(member: Member) -> dict[int, Curve]:
     InvalidInputError
         If a curve makes no sense.
     """
-    text, where = member.text(), member.where
-    _, *parts = _STAMP.split(text)
-    curves: dict[int, Curve] = {}
-    alike: dict[Curve, Curve] = {}
-    for stamp, part in zip(parts[::2], parts[1::2], strict=True):
-        curve = _knots(part, f"{where}: timestamp {stamp}")
-        curves[int(stamp)] = alike.setdefault(curve, curve)
-    return curves
+    _, *parts = _STAMP.split(member.text())
+    return {
+        int(stamp): _knots(part, f"{member.where}: timestamp {stamp}")
+        for stamp, part in zip(parts[::2], parts[1::2], strict=True)
+    }
 
 
 def _lines(fields: Fields, count: int) -> tuple[FloatArray, FloatArray]:
     """Places and angles of the lines; files may give the first and the last alone."""
-    where, entries = f"{fields.where}: lines", fields.values.get("lines")
-    if not isinstance(entries, list) or len(entries) not in (2, count) or not entries:
-        got = len(entries) if isinstance(entries, list) else _shown(entries)
-        raise InvalidInputError(f"{where}: expected {count} lines, got {got}")
-    rows = np.empty((len(entries), 2))
-    for i, entry in enumerate(entries):
-        line = Fields(entry if isinstance(entry, dict) else {}, f"{where}[{i}]")
-        rows[i] = line.number("rx element"), line.number("angle", "deg")
+    rows = np.array(
+        [(line.number("rx element"), line.number("angle", "deg")) for line in fields.listed("lines")]
+    )
+    if len(rows) not in (2, count) or not count:
+        raise InvalidInputError(f"{fields.where}: lines: expected {count} lines, got {len(rows)}")
     if len(rows) != count:
         rows = rows[0] + np.linspace(0.0, 1.0, count)[:, None] * (rows[1] - rows[0])
     return rows[:, 0], rows[:, 1]
 
 
-def _roi(fields: Fields, lines: int, samples: int) -> Roi | None:
-    if fields.values.get("roi") in (None, ""):
+def _roi(fields: Fields, lines: int, samples: int) -> tuple[slice, slice] | None:
+    if not fields.values.get("roi"):
         return None
-    below = fields.below("roi")
-    roi = Roi(*(below.whole(name) for name in ("start line", "end line", "start sample", "end sample")))
-    if not (roi.start_line < roi.end_line < lines and roi.start_sample < roi.end_sample < samples):
-        raise InvalidInputError(
-            f"{below.where}: expected one within {lines} lines of {samples} samples, got {roi}"
-        )
-    return roi
+    roi = fields.below("roi")
+    parts = []
+    for name, length in (("line", lines), ("sample", samples)):
+        start, end = roi.whole(f"start {name}"), roi.whole(f"end {name}")
+        if not start < end < length:
+            raise InvalidInputError(f"{roi.where}: expected {name}s within {length}, got {start} to {end}")
+        parts.append(slice(start, end + 1))
+    return parts[0], parts[1]
 
 
 def _receive(fields: Fields) -> Receive | None:
-    """Read the demodulation frequency; None in older files, and where it differs between foci or filters."""
-    foci = fields.values.get("focus")
-    ends = set()
-    for i, focus in enumerate(foci if isinstance(foci, list) else ()):
-        filters = focus.get("receive") if isinstance(focus, dict) else None
-        for entry in filters if isinstance(filters, list) else ():
-            part = Fields(entry if isinstance(entry, dict) else {}, f"{fields.where}: focus[{i}]: receive")
-            names = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
-            ends.add(Receive(*(part.number(name, unit, 1e-6) for name, unit in names)))
+    names = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
+    ends = {
+        Receive(*(part.number(name, unit, 1e-6) for name, unit in names))
+        for focus in fields.listed("focus")
+        for part in focus.listed("receive")
+    }
     return ends.pop() if len(ends) == 1 else None
 
 

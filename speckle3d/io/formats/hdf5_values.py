@@ -13,53 +13,38 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.files import plausible_bytes
 from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, ReadFrame
-from speckle3d.io.hdf5 import open_hdf5, reading
-from speckle3d.io.recordings import where_of
+from speckle3d.io.hdf5 import has_member, locate, open_hdf5, reading, require_dataset
 
 Turn: TypeAlias = Callable[[Sequence[npt.NDArray[Any]]], npt.NDArray[Any]]
 
 ENVELOPE_RANGE_DB = 80.0
 """Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6
 dB."""
+
+_MOST_TIMES_STORED = 1032
+"""Deflate packs a byte into no less than 1/1032 of one [RFC 1951: 258 bytes in 2 bits]."""
 _NOTHING_DB = -1e6
 
 
-def member(group: h5py.Group, name: str) -> Any:
-    """What a group holds under a path; None if there is none.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is a link into another file, which a stranger's recording may not name.
-    """
-    node: Any = group
-    for part in filter(None, name.split("/")):
-        if not isinstance(node, h5py.Group):
-            return None
-        link = node.get(part, getlink=True)
-        if isinstance(link, h5py.ExternalLink):
-            raise InvalidInputError(
-                f"{where_of(group.file.filename, name)}: expected data in the file itself, got a link to "
-                "another file"
-            )
-        node = None if link is None else node.get(part)
-    return node
-
-
 def dataset(group: h5py.Group, name: str) -> h5py.Dataset:
-    """A data set of numbers, refused if there is none or it is something else."""
-    node = member(group, name)
-    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "fiubcV" or node.shape is None:
-        got = "none" if node is None else "something else"
-        raise InvalidInputError(f"{_where(group, name)}: expected a data set of numbers, got {got}")
+    """A data set of numbers, refused if there is none, or more is claimed than was written."""
+    node = require_dataset(group, name)
+    if node.dtype.kind not in "fiubcV" or node.shape is None:
+        raise InvalidInputError(f"{locate(group, name)}: expected numbers, got {node.dtype}")
+    stored = node.id.get_storage_size()
+    if node.nbytes > plausible_bytes(stored, _MOST_TIMES_STORED) or (node.nbytes and not stored):
+        raise InvalidInputError(
+            f"{locate(group, name)}: expected {node.shape} numbers, got {stored} bytes: never written"
+        )
     return node
 
 
 def flat(group: h5py.Group, name: str) -> FloatArray:
     """Read finite numbers along one axis, whatever other axes of length 1 there are."""
-    node, where = dataset(group, name), _where(group, name)
+    node, where = dataset(group, name), locate(group, name)
     if node.dtype.kind not in "fiu" or sum(n > 1 for n in node.shape) > 1:
         raise InvalidInputError(f"{where}: expected numbers along one axis, got {node.shape} {node.dtype}")
     with reading(where):
@@ -77,27 +62,23 @@ def single(group: h5py.Group, name: str) -> float | None:
     InvalidInputError
         If there are several that differ, as one per transmission may.
     """
-    if member(group, name) is None:
-        return None
-    values = flat(group, name)
-    if values.size == 0:
-        return None
-    if (values != values[0]).any():
+    values = flat(group, name) if has_member(group, name) else np.zeros(0)
+    if values.size and np.ptp(values):
         raise InvalidInputError(
-            f"{_where(group, name)}: expected one number, got {values.min():g} to {values.max():g}"
+            f"{locate(group, name)}: expected one number, got {values.min():g} to {values.max():g}"
         )
-    return float(values[0])
+    return float(values[0]) if values.size else None
 
 
 def text_attribute(node: h5py.HLObject, name: str) -> str:
     """Text of an attribute, of the first if there are several; empty where there is none."""
-    value = np.ravel(node.attrs.get(name, ""))
-    first = value[0] if value.size else ""
+    return text_of(node.attrs.get(name, ""))
+
+
+def text_of(value: Any) -> str:
+    """Text of what HDF5 holds, of the first if there are several."""
+    first = next(iter(np.ravel(value)), "")
     return printable(first.decode("utf-8", "replace") if isinstance(first, bytes) else str(first)).strip("\0")
-
-
-def _where(group: h5py.Group, name: str) -> str:
-    return where_of(group.file.filename, f"{group.name}/{name}".replace("//", "/"))
 
 
 @dataclass(frozen=True)
@@ -124,12 +105,8 @@ class Grid:
             parts = [parts[0][..., 0], parts[0][..., 1]]
         elif parts[0].dtype.names:
             parts = [parts[0]["real"], parts[0]["imag"]]
-        turned = [
-            np.moveaxis(part.reshape(self.shape), self.axes, (0, 1)).reshape(
-                self.shape[self.axes[0]], self.shape[self.axes[1]]
-            )
-            for part in parts
-        ]
+        size = [self.shape[axis] for axis in self.axes]
+        turned = [np.moveaxis(part.reshape(self.shape), self.axes, (0, 1)).reshape(size) for part in parts]
         if len(turned) == 1:
             return turned[0]
         made = turned[0].astype(np.complex64)
@@ -184,8 +161,7 @@ class HDF5File:
         before = (slice(None),) * (self.axis or 0)
 
         def read(i: int) -> npt.NDArray[Any]:
-            index = () if self.axis is None else (*before, i)
-            return self.turn([node[index] for node in nodes])
+            return self.turn([node[() if self.axis is None else (*before, i)] for node in nodes])
 
         return read
 
@@ -215,5 +191,4 @@ class HDF5File:
         if not (decibels or top > 0):
             raise InvalidInputError(f"{self.path}: expected echoes, got amplitudes up to {top:g}")
         span = dynamic_range_db or ENVELOPE_RANGE_DB
-        levels = Levels(grid, decibels, top, span)
-        return replace(self, turn=levels).frames(shape, np.uint8), top, span
+        return replace(self, turn=Levels(grid, decibels, top, span)).frames(shape, np.uint8), top, span

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import FileError
 from speckle3d.core.extras import extra_module
-from speckle3d.core.images import Images
-from speckle3d.core.printable import printable
-from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.core.images import ImageFrames, Images
 from speckle3d.io.hdf5 import one_line, reading
-from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Value
 
 FORMAT = "arrays, pictures or video"
 
@@ -79,60 +78,34 @@ def _pictures(folder: Path) -> list[Path]:
 
 def _claims(path: Path, start: bytes) -> bool:
     if path.is_dir():
-        own = [each for each in path.iterdir() if each.suffix != ".toml" and not each.name.startswith(".")]
-        return bool(own) and all(each.suffix.lower() in _PICTURES for each in own)
+        own = [one for one in path.iterdir() if one.suffix != ".toml" and not one.name.startswith(".")]
+        return bool(own) and all(one.suffix.lower() in _PICTURES for one in own)
     return start.startswith(_ARRAY) or path.suffix.lower() in _VIDEOS
 
 
-def _images(path: Path) -> Images:
+def open_pictures(path: Path, settings: ImportSettings) -> Recording:
+    """Read an array, a folder of pictures or a video."""
+    images: Images
     if path.is_dir():
-        return PictureFolder(path)
-    if path.suffix.lower() in _VIDEOS:
-        return Video(path)
-    with reading(path):
-        images: Images = np.load(path, mmap_mode="r", allow_pickle=False)
-    return images
-
-
-def _read(path: Path, settings: ImportSettings) -> Sweep:
-    images = _images(path)
-    rate = {"frame_rate_hz": getattr(images, "rate_hz", None)}
-    signal = None
-    if images.dtype == np.uint8:
-        pixels = {"column_pitch_mm": None, "row_spacing_mm": None, "dynamic_range_db": None}
-        values = settings.over(path, **pixels, **rate)
-        pitch = values["column_pitch_mm"], values["row_spacing_mm"]
+        images = PictureFolder(path)
+    elif path.suffix.lower() in _VIDEOS:
+        images = Video(path)
     else:
-        names = ("vector_pitch_mm", "sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
-        carrier = {"demodulation_frequency_hz": None} if np.dtype(images.dtype).kind == "c" else {}
-        speed = {"speed_of_sound_m_s": SPEED_OF_SOUND_M_S}
-        values = settings.over(path, **dict.fromkeys(names), **speed, **carrier, **rate)
-        pitch = values["vector_pitch_mm"], 1.0  # the rows' is that of the samples
-        signal = RFSettings(**{name: values[name] for name in (*names[1:], *speed, *carrier)})
-    if len(images.shape) not in (3, 4):
-        raise InvalidInputError(f"{path}: expected images of shape (n, row, column), got {images.shape}")
-    return Sweep.from_arrays(
-        images,
-        pitch_mm=pitch,
-        frame_rate_hz=values["frame_rate_hz"],
-        dynamic_range_db=values.get("dynamic_range_db"),
-        signal=signal,
-        first_row_depth_mm=settings.first_sample_depth_mm or 0.0,
-        name=printable(path.stem),
-        probe=settings.probe or "",
+        with reading(path):
+            images = np.load(path, mmap_mode="r", allow_pickle=False)
+    rate = {"frame_rate_hz": Value(getattr(images, "rate_hz", None), "of the video")}
+    colours = "pictures are in colour: taken as grey by luminance; what is drawn over the image stays"
+    return Recording(
+        path,
+        settings,
+        ImageFrames(images),
+        rate,
+        name=path.stem,
+        assumptions=("parallel lines, as of a linear probe",),
+        remarks=(colours,) if len(images.shape) == 4 else (),
     )
 
 
-def _notes(path: Path, settings: ImportSettings) -> list[str]:
-    images = _images(path)
-    notes = ["lines are taken for parallel, as of a linear probe"]
-    if len(images.shape) == 4:
-        notes.append("pictures are in colour: taken as grey by luminance; what is drawn over the image stays")
-    if images.dtype != np.uint8 and settings.speed_of_sound_m_s is None:
-        notes.append(f"speed of sound {SPEED_OF_SOUND_M_S:g} m/s, assumed")
-    return [f"{path}: {note}" for note in notes]
-
-
 READER = Reader(
-    FORMAT, _claims, _read, companions=lambda path: _pictures(path) if path.is_dir() else (), notes=_notes
+    FORMAT, _claims, open_pictures, companions=lambda path: _pictures(path) if path.is_dir() else ()
 )

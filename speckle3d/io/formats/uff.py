@@ -25,12 +25,12 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, flat, member, single, text_attribute
+from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, flat, single, text_attribute
 from speckle3d.io.frames import FileFrames
-from speckle3d.io.hdf5 import hdf5_claim, open_hdf5, reading
-from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
+from speckle3d.io.hdf5 import find_member, has_member, hdf5_claim, locate, open_hdf5, reading
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, step_of, where_of
+from speckle3d.io.recordings import Recording, Row, Value, speed_of, step_of
 
 FORMAT = "USTB .uff"
 
@@ -46,54 +46,55 @@ def open_uff(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q on a linear scan; real data of one sign become grey levels."""
     with reading(path), open_hdf5(path) as file:
         rows: list[Row] = [("object", f"{name}: {kind}", "") for name, kind in _objects(file).items()]
-        try:
-            return _recording(path, settings, file, rows)
-        except InvalidInputError as error:
-            return Recording(path, settings, rows=tuple(rows), fault=error)
+        return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
 
 
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
     name = _chosen(file, path, settings)
     group = file[name]
-    x_mm, z_mm = _axes(path, group)
+    x_mm, z_mm = _axes(group)
     data = f"{name}/data"
-    is_complex = isinstance(member(file, data), h5py.Group)
+    is_complex = isinstance(find_member(file, data), h5py.Group)
     parts = (f"{data}/real", f"{data}/imag") if is_complex else (data,)
     shapes = {dataset(file, part).shape for part in parts}
-    axis, count = _frame_axis(where_of(path, data), shapes.pop() if len(shapes) == 1 else (), x_mm, z_mm)
-    modulation_hz = single(group, "modulation_frequency") or 0.0
-    spacing = step_of(z_mm, where_of(path, f"{name}/scan/z_axis"))
+    pixels = x_mm.size * z_mm.size
+    axis, count = _frame_axis(locate(file, data), shapes.pop() if len(shapes) == 1 else (), pixels)
+    spacing = step_of(z_mm, locate(group, "scan/z_axis"))
     if (video := single(group, "frame_rate")) is not None:
         rows.append(("frame rate of videos made of it, not used", f"{video:g}", "frames/s"))
-    pitch = step_of(x_mm, where_of(path, f"{name}/scan/x_axis"))
+    pitch = Value(step_of(x_mm, locate(group, "scan/x_axis")), f"in {name}/scan/x_axis")
+    modulation_hz = single(group, "modulation_frequency") or 0.0
     values = {
-        "vector_pitch_mm": Value(pitch, f"in {name}/scan/x_axis"),
+        "vector_pitch_mm": pitch,
         "first_sample_depth_mm": Value(float(z_mm[0]), f"in {name}/scan/z_axis"),
-        **_speed(file),
+        "demodulation_frequency_hz": Value(modulation_hz, f"in {name}/modulation_frequency"),
         **_pulse(group, f"in {name}", modulation_hz),
     }
+    for other, kind in _objects(file).items():
+        if kind == _CHANNELS and (speed := single(file, f"{other}/sound_speed")):
+            values["speed_of_sound_m_s"] = Value(speed, f"{other}/sound_speed")
     grid, shape = Grid((x_mm.size, z_mm.size), (0, 1)), (count, x_mm.size, z_mm.size)
     source = HDF5File(path, parts, axis, grid)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
-    if is_complex:
-        if settings.demodulation_frequency_hz is None and count:
-            _require_phase(path, frames, values, modulation_hz, spacing, settings)
-        values["demodulation_frequency_hz"] = Value(modulation_hz, f"in {name}/modulation_frequency")
-    elif count and (kind := _kind_of(frames)) != "RF":
+    if is_complex and count and settings.demodulation_frequency_hz is None:
+        rate_hz = 1e3 * speed_of(settings, values) / (2.0 * spacing)
+        with naming(str(path)):
+            _require_phase(frames, values, modulation_hz, rate_hz)
+    elif count and not is_complex and (kind := _kind_of(frames)) != "RF":
         given = settings.dynamic_range_db
         frames, top, span = source.grey_frames(shape, grid, kind == "decibels", given)
         rows.append(("data", f"of one sign: {kind}, made grey levels here", ""))
         values |= {
-            "column_pitch_mm": values["vector_pitch_mm"],
+            "column_pitch_mm": pitch,
             "row_spacing_mm": Value(spacing, f"in {name}/scan/z_axis"),
             "dynamic_range_db": Value(span, f"of grey levels made here below {top:g}"),
         }
-    return Recording(path, settings, frames, values, sample_spacing_mm=spacing, rows=tuple(rows))
+    return Recording(path, settings, frames, values, sample_spacing_mm=spacing)
 
 
 def _objects(file: h5py.File) -> dict[str, str]:
     """Classes of the root's groups, by their names."""
-    groups = {str(name): member(file, name) for name in file}
+    groups = {str(name): find_member(file, name) for name in file}
     kinds = {
         printable(name): text_attribute(group, "class")
         for name, group in groups.items()
@@ -111,97 +112,79 @@ def _kind_of(frames: FileFrames) -> str:
 
 
 def _require_phase(
-    path: Path,
-    frames: FileFrames,
-    values: dict[str, Value],
-    modulation_hz: float,
-    spacing_mm: float,
-    settings: ImportSettings,
+    frames: FileFrames, values: dict[str, Value], modulation_hz: float, rate_hz: float
 ) -> None:
     """Refuse a modulation frequency that contradicts how the phase of the data turns."""
-    carried = modulation_hz or values.get("centre_frequency_hz", Value(0.0)).value
-    if not carried:
-        return
-    own = values.get("speed_of_sound_m_s", Value(SPEED_OF_SOUND_M_S)).value
-    rate_hz = 1e3 * (settings.speed_of_sound_m_s or own) / (2.0 * spacing_mm)
-    with naming(str(path)):
-        shift_hz = demodulation_of(frames, carried, rate_hz)
-        if shift_hz is not None and bool(shift_hz) != bool(modulation_hz):
-            says = f"shifted down by {carried:g} Hz" if shift_hz else f"still carrying {carried:g} Hz"
-            raise InvalidInputError(
-                f"modulation_frequency: expected that of data {says}, as their phase tells, got "
-                f"{modulation_hz:g}: give --demodulation-frequency-hz, 0 where it is still carried"
-            )
+    carried = modulation_hz or values.get("centre_frequency_hz", Value()).value
+    shift_hz = demodulation_of(frames, carried, rate_hz) if carried else None
+    if shift_hz is not None and bool(shift_hz) != bool(modulation_hz):
+        says = f"shifted down by {carried:g} Hz" if shift_hz else f"still carrying {carried:g} Hz"
+        raise InvalidInputError(
+            f"modulation_frequency: expected that of data {says}, as their phase tells, got "
+            f"{modulation_hz:g}: give --demodulation-frequency-hz, 0 where it is still carried"
+        )
 
 
 def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> str:
     """Name of the beamformed data to read."""
     objects = _objects(file)
     names = [name for name, kind in objects.items() if kind == _BEAMFORMED]
-    asked = settings.arrays.get("data")
+    asked = settings.arrays.get("data", names[0] if len(names) == 1 else None)
     if asked in names:
-        return str(asked)
-    if len(names) == 1 and asked is None:
-        return names[0]
+        return asked
     if names:
         raise InvalidInputError(
             f"{path}: expected one {_BEAMFORMED}, got {', '.join(names)}: say which by arrays = "
             f'{{ data = "{names[0]}" }} in {path.name}.toml beside it'
         )
-    held = ", ".join(sorted(set(objects.values())))
+    got = ", ".join(sorted(set(objects.values())))
     advice = f": beamform it by USTB's das on a {_LINEAR}" if _CHANNELS in objects.values() else ""
-    raise InvalidInputError(f"{path}: expected {_BEAMFORMED}, got {held}{advice}")
+    raise InvalidInputError(f"{path}: expected {_BEAMFORMED}, got {got}{advice}")
 
 
-def _axes(path: Path, group: h5py.Group) -> tuple[FloatArray, FloatArray]:
+def _axes(group: h5py.Group) -> tuple[FloatArray, FloatArray]:
     """Lateral positions and depths, mm; pixels must be in USTB's order where the file lists their places."""
-    scan = member(group, "scan")
+    scan, where = find_member(group, "scan"), locate(group, "scan")
     kind = text_attribute(scan, "class") if isinstance(scan, h5py.Group) else ""
-    where = where_of(path, f"{group.name}/scan")
     if kind != _LINEAR:
         raise InvalidInputError(
             f"{where}: expected a {_LINEAR}, got {kind or 'none'}: beamform onto a {_LINEAR}, whose lines "
-            "are "
-            "parallel"
+            "are parallel"
         )
     x, z = flat(scan, "x_axis"), flat(scan, "z_axis")
     for name, expected in (("x", np.repeat(x, z.size)), ("z", np.tile(z, x.size))):
-        if member(scan, name) is None:
-            continue
-        held, scale = flat(scan, name), float(np.abs(expected).max(initial=0.0)) or 1.0
-        if held.shape != expected.shape or np.abs(held - expected).max(initial=0.0) > 1e-4 * scale:
+        listed = flat(scan, name) if has_member(scan, name) else expected
+        scale = float(np.abs(expected).max(initial=0.0)) or 1.0
+        if listed.shape != expected.shape or np.abs(listed - expected).max(initial=0.0) > 1e-4 * scale:
             raise InvalidInputError(
                 f"{where}/{name}: expected those of {x.size} x {z.size} pixels, z fastest, got others"
             )
     return 1e3 * x, 1e3 * z
 
 
-def _frame_axis(
-    where: str, shape: tuple[int, ...], x_mm: FloatArray, z_mm: FloatArray
-) -> tuple[int | None, int]:
+def _frame_axis(where: str, shape: tuple[int, ...], pixels: int) -> tuple[int | None, int]:
     """Axis of the frames in the file, None where it has none, and their number.
 
     MATLAB leaves out axes of length 1 at its end, which is the beginning in the file; pyuff keeps MATLAB's
     order.
     """
-    pixels, full = x_mm.size * z_mm.size, len(shape) == 4
+    full = len(shape) == 4
     reverse = shape[-1:] == (pixels,) and set(shape[1:-1] if full else shape[:-1]) <= {1}
     forward = shape[:1] == (pixels,) and set(shape[1:3]) <= {1}
-    if len(shape) <= 4 and (reverse != forward or (reverse and not full)):
-        if not full:
-            return None, 1
-        axis = 0 if reverse else 3
-        return axis, shape[axis]
-    raise InvalidInputError(
-        f"{where}: expected {pixels} pixels ({x_mm.size} x {z_mm.size}) of one channel and one wave, summed, "
-        f"got (MATLAB's order) {shape[::-1]}"
-    )
+    if len(shape) > 4 or not (reverse or forward) or (full and reverse and forward):
+        raise InvalidInputError(
+            f"{where}: expected {pixels} pixels of one channel and one wave, summed, got (MATLAB's order) "
+            f"{shape[::-1]}"
+        )
+    if not full:
+        return None, 1
+    axis = 0 if reverse else 3
+    return axis, shape[axis]
 
 
 def _pulse(group: h5py.Group, where: str, modulation_hz: float) -> dict[str, Value]:
     """Centre frequency, of the pulse or else what the data were shifted down by, and the pulse's band."""
-    centre = single(group, "pulse/center_frequency")
-    share = single(group, "pulse/fractional_bandwidth")
+    centre, share = (single(group, f"pulse/{name}") for name in ("center_frequency", "fractional_bandwidth"))
     values = {}
     if centre:
         values["centre_frequency_hz"] = Value(centre, f"{where}/pulse/center_frequency")
@@ -211,14 +194,6 @@ def _pulse(group: h5py.Group, where: str, modulation_hz: float) -> dict[str, Val
         band = (centre * (1.0 - share / 2.0), centre * (1.0 + share / 2.0))
         values["bandwidth_hz"] = Value(band, f"{where}/pulse/fractional_bandwidth")
     return values
-
-
-def _speed(file: h5py.File) -> dict[str, Value]:
-    """Speed of sound of the channel data in the same file, if there is one."""
-    for name, kind in _objects(file).items():
-        if kind == _CHANNELS and (speed := single(file, f"{name}/sound_speed")):
-            return {"speed_of_sound_m_s": Value(speed, f"{name}/sound_speed")}
-    return {}
 
 
 READER = Reader(FORMAT, hdf5_claim(is_uff), open_uff)

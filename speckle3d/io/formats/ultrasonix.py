@@ -30,17 +30,9 @@ FORMAT = "Ultrasonix"
 _HEADER = struct.Struct("<19i")
 _TAG_BYTES = 4
 _MOST_FRAMES, _MOST_LENGTH = 10**6, 2**16
-
-_TYPES = {
-    1: "screen", 2: "B-mode before scan conversion (.bpr)", 4: "B-mode (.b8)", 8: "B-mode of 32 bits (.b32)",
-    16: "RF (.rf)", 32: "M-mode (.mpr)", 64: "M-mode (.m)", 128: "pulsed Doppler RF (.drf)",
-    256: "pulsed Doppler spectrum (.pw)", 512: "colour Doppler RF (.crf)", 1024: "colour Doppler (.col)",
-    2048: "colour velocity and variance (.cvv)", 4096: "elastography (.el)", 8192: "elastography",
-    16384: "elastography", 32768: "elastography", 65536: "ECG", 131072: "position sensor (.gps)",
-    262144: "position sensor (.gps)", 524288: "position sensor",
-}  # fmt: skip
-_BITS = {2: 8, 4: 8, 16: 16}
-"""Of the types that are read."""
+_BMODE, _RF, _LAST_TYPE = 4, 16, 2**19
+_READ = {2: ("B-mode before scan conversion (.bpr)", 8), 4: ("B-mode (.b8)", 8), 16: ("RF (.rf)", 16)}
+"""Name and bits of the types that are read; all are powers of two."""
 _SUFFIXES = (".rf", ".bpr", ".b8", ".b32", ".mpr", ".drf", ".pw", ".crf", ".col", ".cvv", ".el", ".gps")
 
 
@@ -63,17 +55,17 @@ class _Header:
         return cls(*values[:5], *values[13:18])
 
     @property
+    def name(self) -> str:
+        return _READ[self.kind][0] if self.kind in _READ else f"type {self.kind}"
+
+    @property
     def frame_bytes(self) -> int:
         return self.width * self.height * self.bits // 8
 
     def is_sound(self) -> bool:
         sides = 0 < self.width <= _MOST_LENGTH and 0 < self.height <= _MOST_LENGTH
-        return (
-            self.kind in _TYPES
-            and 0 <= self.frames <= _MOST_FRAMES
-            and sides
-            and self.bits in (8, 16, 24, 32)
-        )
+        is_type = 0 < self.kind <= _LAST_TYPE and self.kind.bit_count() == 1
+        return is_type and 0 <= self.frames <= _MOST_FRAMES and sides and self.bits in (8, 16, 24, 32)
 
     def tag_bytes(self, size: int) -> int | None:
         """Bytes before each frame, by the file's size; None if it fits neither."""
@@ -85,8 +77,8 @@ def _claims(path: Path, start: bytes) -> bool:
     if len(start) < _HEADER.size:
         return False
     header = _Header.unpacked(start)
-    named = path.suffix.lower() in _SUFFIXES
-    return header.is_sound() and (named or header.tag_bytes(path.stat().st_size) is not None)
+    is_named = path.suffix.lower() in _SUFFIXES
+    return header.is_sound() and (is_named or header.tag_bytes(path.stat().st_size) is not None)
 
 
 def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:
@@ -97,44 +89,40 @@ def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:
     with open_regular(path) as stream:
         header = _Header.unpacked(stream.read(_HEADER.size))
         size = stream.seek(0, 2)
-    rows: tuple[Row, ...] = (
-        ("recorded", _TYPES[header.kind], ""),
+    rows: list[Row] = [
+        ("recorded", header.name, ""),
         ("probe's number", str(header.probe), ""),
         ("line density", str(header.line_density), "lines"),
-    )
-    try:
-        frames = _frames(path, header, size)
-    except (InvalidInputError, FileError) as error:
-        return Recording(path, settings, rows=rows, fault=error)
+    ]
     values = {
         "sampling_rate_hz": Value(float(header.sampling_hz) or None, "in the header"),
         "centre_frequency_hz": Value(float(header.transmit_hz) or None, "in the header: transmitted"),
         "frame_rate_hz": Value(max(header.frame_rate_hz, 0) or None, "in the header"),
     }
-    lines = () if header.kind == 4 else ("parallel lines",)
-    return Recording(path, settings, frames, values, assumptions=lines, rows=rows)
+    lines = () if header.kind == _BMODE else ("parallel lines",)
+    return Recording.of(
+        path, settings, rows,
+        lambda: Recording(path, settings, _frames(path, header, size), values, assumptions=lines),
+    )  # fmt: skip
 
 
 def _frames(path: Path, header: _Header, size: int) -> FileFrames:
-    if header.kind not in _BITS:
-        raise InvalidInputError(f"{path}: expected RF or B-mode of 8 bits, got {_TYPES[header.kind]}")
-    if header.bits != _BITS[header.kind]:
+    _, bits = _READ.get(header.kind, ("", 0))
+    if header.bits != bits or not header.frames:
         raise InvalidInputError(
-            f"{path}: expected samples of {_BITS[header.kind]} bits, got {header.bits} bits"
+            f"{path}: expected frames of RF, of 16 bits, or B-mode, of 8, got {header.frames} of "
+            f"{header.name}, of {header.bits} bits"
         )
-    if not header.frames:
-        raise InvalidInputError(f"{path}: expected frames, got none")
-    tag = header.tag_bytes(size)
-    if tag is None:
+    if (tag := header.tag_bytes(size)) is None:
         expected = _HEADER.size + header.frames * header.frame_bytes
         if size < expected:
             whole = (size - _HEADER.size) // header.frame_bytes
             raise FileError(f"{path}: ends early: {whole} of {header.frames} frames")
         longer = expected + header.frames * _TAG_BYTES
         raise FileError(f"{path}: expected {expected} bytes, or {longer} with frame numbers, got {size}")
-    is_image = header.kind == 4
+    is_image = header.kind == _BMODE
     shape = (header.height, header.width) if is_image else (header.width, header.height)
-    dtype = np.dtype("<i2" if header.kind == 16 else "u1")
+    dtype = np.dtype("<i2" if header.kind == _RF else "u1")
     turn = np.transpose if is_image else np.asarray
     source = RawFile(path, _HEADER.size + tag, tag + header.frame_bytes, dtype, shape, turn)
     return FileFrames(path, source, (header.frames, header.width, header.height), dtype.newbyteorder("="))

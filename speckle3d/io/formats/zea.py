@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -29,16 +28,14 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
-from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, member, single, text_attribute
-from speckle3d.io.frames import FileFrames
-from speckle3d.io.hdf5 import hdf5_claim, open_hdf5, reading
-from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
-from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, single, text_attribute, text_of
+from speckle3d.io.hdf5 import find_member, has_member, hdf5_claim, locate, open_hdf5, reading
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, step_of, where_of
+from speckle3d.io.recordings import Recording, Row, Value, speed_of, step_of
 
 FORMAT = "zea"
 
@@ -63,17 +60,22 @@ class _Array:
     name : str
         Data set, from the root.
     home : str
-        Group that holds ``data`` and ``scan``: the root, or a track.
+        What stands before ``data`` and ``scan``: nothing at the root, or a track.
     kind : str
         One of `_READ`.
-    coordinates : str, optional
-        Data set of the pixels' positions.
+    is_placed : bool
+        Whether ``coordinates`` beside the values say where pixels lie.
     """
 
     name: str
     home: str
     kind: str
-    coordinates: str | None
+    is_placed: bool = False
+
+    @property
+    def group(self) -> str:
+        """What holds the values, their coordinates and their times."""
+        return self.name.removesuffix("/values")
 
 
 @dataclass(frozen=True)
@@ -89,32 +91,30 @@ def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
     names = (*_READ, *_NOT_BEAMFORMED)
     return "format" not in file.attrs and any(
-        member(file, f"{home}data/{name}") is not None for home in _homes(file) for name in names
+        find_member(file, f"{home}data/{name}") is not None for home in _homes(file) for name in names
     )
 
 
 def open_zea(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
     with reading(path), open_hdf5(path) as file:
-        rows = _facts(file)
-        try:
-            return _recording(path, settings, file, rows)
-        except InvalidInputError as error:
-            return Recording(path, settings, rows=tuple(rows), fault=error)
+        facts = {"zea_version": "written by zea", "us_machine": "scanner"}
+        rows: list[Row] = [(words, text_attribute(file, name), "") for name, words in facts.items()]
+        rows = [*filter(lambda row: row[1], rows), ("holds", _contents(file), "")]
+        return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
 
 
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
     array = _chosen(file, path, settings)
     rows.append(("read", array.name, ""))
     node = dataset(file, array.name)
-    count, first, second, channels = _shape(path, node, array)
-    pixels = None if array.coordinates is None else _pixels(path, file, array, (count, first, second))
-    values = _scan(file, array)
+    count, first, second, channels = _shape(node, array)
+    pixels = _pixels(dataset(file, f"{array.group}/coordinates"), node.shape[:3]) if array.is_placed else None
     x_first = pixels is not None and pixels.x_first
     shape = (count, first, second) if x_first else (count, second, first)
     trailing = node.shape[3:] if channels == 1 else ()
     grid = Grid((first, second, *trailing), (0, 1) if x_first else (1, 0), channels == 2)
-    source = HDF5File(path, (array.name,), 0, grid)
+    source, values = HDF5File(path, (array.name,), 0, grid), _scan(file, array)
     if array.kind == "beamformed_data" or node.dtype == np.uint8:
         dtype = np.complex64 if channels == 2 else np.uint8 if node.dtype == np.uint8 else np.float32
         frames = source.frames(shape, dtype)
@@ -124,40 +124,45 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         values["dynamic_range_db"] = Value(span, f"of grey levels made here below {top:g}")
     spacing = None
     if pixels is not None:
-        where, source_text = where_of(path, str(array.coordinates)), "of the coordinates"
-        pitch, spacing = step_of(pixels.x_mm, f"{where} x"), step_of(pixels.z_mm, f"{where} z")
+        where, source_text = locate(file, f"{array.group}/coordinates"), "of the coordinates"
+        pitch = Value(step_of(pixels.x_mm, f"{where} x"), source_text)
+        spacing = step_of(pixels.z_mm, f"{where} z")
         values |= {
-            "vector_pitch_mm": Value(pitch, source_text),
-            "column_pitch_mm": Value(pitch, source_text),
+            "vector_pitch_mm": pitch,
+            "column_pitch_mm": pitch,
             "row_spacing_mm": Value(spacing, source_text),
             "first_sample_depth_mm": Value(float(pixels.z_mm[0]), source_text),
         }
-        if channels == 2:
-            values["demodulation_frequency_hz"] = _demodulation(path, file, frames, values, settings, spacing)
-    tracker, remarks = _tracker(path, file, pixels)
+        shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
+        shift_hz = shifts.pop() if len(shifts) == 1 else None
+        if channels == 2 and shift_hz and settings.demodulation_frequency_hz is None:
+            with naming(str(path)):
+                by_phase = demodulation_of(frames, shift_hz, 1e3 * speed_of(settings, values) / (2 * spacing))
+            source_text = "of scan/demodulation_frequency and the phase of the data"
+            values["demodulation_frequency_hz"] = Value(by_phase, source_text)
+    tracker, remarks = _tracker(file, pixels)
     return Recording(
         path,
         settings,
         frames,
         values,
         sample_spacing_mm=spacing,
-        time_s=_times(path, file, array, count),
+        time_s=_times(file, array, count),
         tracker=tracker,
         chain=_POSES,
         probe=settings.probe or text_attribute(file, "probe_name") or text_attribute(file, "probe"),
         assumptions=() if pixels is not None else ("parallel lines",),
-        rows=tuple(rows),
         remarks=tuple(remarks),
     )
 
 
 def _homes(file: h5py.File) -> list[str]:
-    """Groups that hold ``data``: the root as an empty text, or tracks with a slash at the end."""
-    if isinstance(member(file, "data"), h5py.Group):
-        return [""]
-    tracks = member(file, "tracks")
+    """What stands before ``data``: nothing at the root, or tracks with a slash at the end."""
+    tracks = find_member(file, "tracks")
     names = sorted(map(str, tracks)) if isinstance(tracks, h5py.Group) else []
-    return [f"tracks/{name}/" for name in names if isinstance(member(tracks, f"{name}/data"), h5py.Group)]
+    homes = ["", *(f"tracks/{name}/" for name in names)]
+    homes = [home for home in homes if isinstance(find_member(file, f"{home}data"), h5py.Group)]
+    return homes[:1] if homes[:1] == [""] else homes
 
 
 def _arrays(file: h5py.File) -> list[_Array]:
@@ -166,13 +171,11 @@ def _arrays(file: h5py.File) -> list[_Array]:
     for home in _homes(file):
         for kind in _READ:
             name = f"{home}data/{kind}"
-            node = member(file, name)
-            if isinstance(node, h5py.Dataset):
-                arrays.append(_Array(name, home, kind, None))
-            elif member(file, f"{name}/values") is not None:
-                placed = member(file, f"{name}/coordinates") is not None
-                places = f"{name}/coordinates" if placed else None
-                arrays.append(_Array(f"{name}/values", home, kind, places))
+            if isinstance(find_member(file, name), h5py.Dataset):
+                arrays.append(_Array(name, home, kind))
+            elif has_member(file, f"{name}/values"):
+                is_placed = has_member(file, f"{name}/coordinates")
+                arrays.append(_Array(f"{name}/values", home, kind, is_placed))
     return arrays
 
 
@@ -181,55 +184,49 @@ def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> _Array:
     arrays = _arrays(file)
     asked = settings.arrays.get("data")
     if asked is not None:
-        arrays = [one for one in arrays if asked.strip("/") in (one.name, one.name.removesuffix("/values"))]
-    elif all(one.coordinates is None for one in arrays) and any(one.kind == "image_sc" for one in arrays):
+        arrays = [one for one in arrays if asked.strip("/") in (one.name, one.group)]
+    elif not any(one.is_placed for one in arrays):
         # What came before scan conversion may be polar, and says nothing of it.
-        arrays = [one for one in arrays if one.kind == "image_sc"]
+        arrays = [one for one in arrays if one.kind == "image_sc"] or arrays
     if not arrays:
-        raise InvalidInputError(f"{path}: expected {' or '.join(_READ[:3])}, got {_held(file)}")
+        raise InvalidInputError(f"{path}: expected {' or '.join(_READ[:3])}, got {_contents(file)}")
     first = min((one.kind for one in arrays), key=_READ.index)
-    candidates = [one for one in arrays if one.kind == first]
-    if len(candidates) > 1:
-        listed = ", ".join(one.name for one in candidates)
+    names = [one.name for one in arrays if one.kind == first]
+    if len(names) > 1:
         raise InvalidInputError(
-            f"{path}: expected one track, got {listed}: say which by arrays = "
-            f'{{ data = "{candidates[0].name}" }} in {path.name}.toml beside it'
+            f"{path}: expected one track, got {', '.join(names)}: say which by arrays = "
+            f'{{ data = "{names[0]}" }} in {path.name}.toml beside it'
         )
-    return candidates[0]
+    return next(one for one in arrays if one.kind == first)
 
 
-def _held(file: h5py.File) -> str:
+def _contents(file: h5py.File) -> str:
     names = [f"{home}data/{printable(str(name))}" for home in _homes(file) for name in file[f"{home}data"]]
     text = ", ".join(names) or "nothing"
     if any(name.endswith(_NOT_BEAMFORMED) for name in names):
         return f"{text}: channel data need beamforming, by zea's Pipeline, and its result written"
-    if any(member(file, f"{name}/pixels") is not None for name in names):
+    if any(find_member(file, f"{name}/pixels") is not None for name in names):
         return f"{text}: pixels with an extent, whose axes are not certain: write it by zea 0.0.12 or later"
     return text
 
 
-def _shape(path: Path, node: h5py.Dataset, array: _Array) -> tuple[int, int, int, int]:
+def _shape(node: h5py.Dataset, array: _Array) -> tuple[int, int, int, int]:
     """Frames, the two axes of the image, and channels."""
     is_beamformed = array.kind == "beamformed_data"
-    is_channelled = is_beamformed and node.ndim == 4
-    sound = node.dtype.kind == "f" or (array.kind.startswith("image") and node.dtype == np.uint8)
-    shaped = node.ndim == 3 or (is_channelled and node.shape[3] in (1, 2))
-    if not sound or not shaped or 0 in node.shape:
+    is_number = node.dtype.kind == "f" or (array.kind.startswith("image") and node.dtype == np.uint8)
+    channels = node.shape[3] if is_beamformed and node.ndim == 4 else 1
+    if not is_number or node.ndim != 3 + (is_beamformed and node.ndim == 4) or channels not in (1, 2):
         expected = "(frame, z, x, 1 or 2)" if is_beamformed else "(frame, z, x)"
         raise InvalidInputError(
-            f"{where_of(path, array.name)}: expected echoes of shape {expected}, got {node.shape} "
-            f"{node.dtype}"
+            f"{locate(node)}: expected echoes of shape {expected}, got {node.shape} {node.dtype}"
         )
-    count, first, second = node.shape[:3]
-    return count, first, second, node.shape[3] if is_channelled else 1
+    return *node.shape[:3], channels
 
 
-def _pixels(path: Path, file: h5py.File, array: _Array, shape: tuple[int, int, int]) -> _Pixels:
+def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> _Pixels:
     """Axes of the pixels, whose positions must be those of a Cartesian grid, the same in all frames."""
-    assert array.coordinates is not None
-    where = where_of(path, array.coordinates)
-    node = dataset(file, array.coordinates)
-    if node.shape != (*shape, 3) or node.dtype.kind != "f":
+    where = locate(node)
+    if node.shape != (*shape, 3) or node.dtype.kind != "f" or not shape[0]:
         raise InvalidInputError(f"{where}: expected shape {(*shape, 3)}, got {node.shape} {node.dtype}")
     start = np.asarray(node[0], dtype=np.float64)
     for i in np.unique(np.linspace(0, shape[0] - 1, _FRAMES_CHECKED).astype(int)).tolist():
@@ -262,100 +259,66 @@ def _scan(file: h5py.File, array: _Array) -> dict[str, Value]:
     return values
 
 
-def _demodulation(
-    path: Path,
-    file: h5py.File,
-    frames: FileFrames,
-    values: dict[str, Value],
-    settings: ImportSettings,
-    spacing_mm: float,
-) -> Value:
-    """Frequency that I/Q were shifted down by, as their phase tells."""
-    named = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
-    shift_hz = named.pop() if len(named) == 1 else None
-    if settings.demodulation_frequency_hz is not None or not shift_hz:
-        return Value()
-    own = values.get("speed_of_sound_m_s", Value(SPEED_OF_SOUND_M_S)).value
-    rate_hz = 1e3 * (settings.speed_of_sound_m_s or own) / (2.0 * spacing_mm)
-    with naming(str(path)):
-        by_phase = demodulation_of(frames, shift_hz, rate_hz)
-    return Value(by_phase, "of scan/demodulation_frequency and the phase of the data")
+def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:
+    """Time of each frame after the first transmission: of the data, or of the times between transmissions.
 
-
-def _times(path: Path, file: h5py.File, array: _Array, count: int) -> FloatArray | None:
-    """Time of each frame after the first transmission: of the data, or of the times between transmissions."""
-    group = array.name.removesuffix("/values")
-    if array.coordinates is not None and member(file, f"{group}/timestamps") is not None:
+    Where one of a frame's is not known, the next frame has no time, and later ones count the median for it.
+    """
+    group, name = array.group, f"{array.home}scan/time_to_next_transmit"
+    if array.name != group and has_member(file, f"{group}/timestamps"):
         stamps = np.asarray(dataset(file, f"{group}/timestamps")[()], dtype=np.float64)
-        if stamps.shape == (count,) and (np.diff(stamps) > 0).all():
+        if stamps.shape == (count,):
             return stamps + (single(file, f"{group}/start_time_offset") or 0.0)
-    name = f"{array.home}scan/time_to_next_transmit"
-    if len(_homes(file)) > 1 or member(file, name) is None:
+    if len(_homes(file)) > 1 or not has_member(file, name):
         return None
     steps = np.asarray(dataset(file, name)[()], dtype=np.float64)
     if steps.ndim != 2 or len(steps) != count:
-        raise InvalidInputError(f"{where_of(path, name)}: expected {count} rows, got shape {steps.shape}")
+        raise InvalidInputError(f"{locate(file, name)}: expected {count} rows, got shape {steps.shape}")
     # The last transmission of all has no next one.
-    last = steps[:-1].sum(axis=1)
-    if not (last > 0).all():
-        raise InvalidInputError(f"{where_of(path, name)}: expected times above 0, got others")
-    return np.concatenate([[0.0], np.cumsum(last)])
+    lengths = steps[:-1].sum(axis=1)
+    known = np.isfinite(lengths)
+    if not known.any():
+        return None
+    times = np.cumsum([0.0, *np.where(known, lengths, np.median(lengths[known]))])
+    times[1:][~known] = np.nan
+    return times
 
 
-def _tracker(path: Path, file: h5py.File, pixels: _Pixels | None) -> tuple[Tracker | None, list[str]]:
+def _tracker(file: h5py.File, pixels: _Pixels | None) -> tuple[Tracker | None, list[str]]:
     """The probe's poses, with the image on the probe where the file says where its pixels lie."""
-    node = member(file, _POSES)
+    node = find_member(file, _POSES)
     if node is None:
         return None, []
-    kind = _text(member(node, "rotation_representation")) if isinstance(node, h5py.Group) else ""
+    name = f"{_POSES}/rotation_representation"
+    kind = text_of(file[name][()]) if isinstance(find_member(file, name), h5py.Dataset) else ""
     if kind not in _ROTATIONS:
-        return None, [
-            f"{_POSES}: not read: expected a rotation_representation of zea ({', '.join(_ROTATIONS)})"
-        ]
+        return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
     places, turns = (np.asarray(dataset(node, name)[()], float) for name in ("translation", "rotation"))
-    rate = single(node, "sampling_frequency")
-    count = len(places)
+    rate, count = single(node, "sampling_frequency"), len(places)
     stamps = np.arange(count) / rate if rate else np.asarray(dataset(node, "timestamps")[()], dtype=float)
-    if not places.shape == (count, 3) or turns.shape != (count, 3 if kind == "euler_xyz" else 4):
+    if places.shape != (count, 3) or turns.shape != (count, 3 if kind == "euler_xyz" else 4):
         raise InvalidInputError(
-            f"{where_of(path, _POSES)}: expected as many translations as rotations ({kind}), got shapes "
+            f"{locate(node)}: expected as many translations as rotations ({kind}), got shapes "
             f"{places.shape} and {turns.shape}"
         )
-    sound = np.isfinite(places).all(axis=1) & np.isfinite(turns).all(axis=1)
-    if kind != "euler_xyz":
-        sound &= np.linalg.norm(turns, axis=1) > 0
-    kept = np.flatnonzero(sound)
-    kept = kept[rising(stamps[kept])]
-    late = int(sound.sum()) - kept.size
-    reasons = {"not finite": count - int(sound.sum()), "without a time after the one before": late}
-    times = stamps[kept] + (single(node, "start_time_offset") or 0.0)
-    remarks = left_out("poses", count, reasons, times)
-    if not kept.size:
-        return None, [*remarks, f"{_POSES}: no pose is of use"]
+    matrices = np.full((count, 4, 4), np.nan)
+    matrices[:, :3, 3], matrices[:, 3] = 1e3 * places, [0.0, 0.0, 0.0, 1.0]
+    sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | (kind == "euler_xyz"))
+    remarks = []
     if kind == "euler_xyz":
-        turned = Rotation.from_euler("xyz", turns[kept])
+        turned = Rotation.from_euler("xyz", turns[sound])
         remarks.append(f"{_POSES}: euler_xyz is taken for radians about fixed axes x, y, z: zea does not say")
     else:
-        turned = Rotation.from_quat(turns[kept], scalar_first=kind == "quaternion_wxyz")
+        turned = Rotation.from_quat(turns[sound], scalar_first=kind == "quaternion_wxyz")
+    matrices[sound, :3, :3] = turned.as_matrix()
+    readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
+    if readings is None:
+        return None, [*notes, f"{_POSES}: no pose is of use"]
     mounting = None
     if pixels is not None:
         place = [float(pixels.x_mm[0]), 0.0, 0.0]
         mounting = RigidTransform.from_components(place, Rotation.from_matrix(_TIP_FROM_IMAGE))
-    readings = TimedPoses(times, RigidTransform.from_components(1e3 * places[kept], turned))
-    return Tracker(readings, mounting), remarks
-
-
-def _text(node: Any) -> str:
-    value = node[()] if isinstance(node, h5py.Dataset) else ""
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-
-
-def _facts(file: h5py.File) -> list[Row]:
-    rows: list[Row] = []
-    for name, words in (("zea_version", "written by zea"), ("us_machine", "scanner")):
-        if text := text_attribute(file, name):
-            rows.append((words, text, ""))
-    return [*rows, ("holds", _held(file), "")]
+    return Tracker(readings, mounting), [*notes, *remarks]
 
 
 READER = Reader(FORMAT, hdf5_claim(is_zea), open_zea)

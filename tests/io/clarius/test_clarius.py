@@ -13,32 +13,30 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import RFSettings, stored_dtype
-from speckle3d.io.clarius import imu
-from speckle3d.io.clarius.package import Member, find_files
+from speckle3d.io.clarius.imu import read_samples
+from speckle3d.io.clarius.package import Member
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import companion_files, import_notes, load_sweep
 from speckle3d.io.readers import find_reader
 
-BAND = {"bandwidth_hz": (4e6, 8e6)}
 SECOND = f"{{rx element: {0.3 / examples.ELEMENT_MM!r}"
 TIMES_S = examples.bursts_s(100.0, 102.0)
 
 
-def rows_of(path):
-    return dict(row[:2] for row in describe(path))
+def told(package, words, given=GIVEN):
+    return any(words in note for note in import_notes(package, given))
 
 
 def require_equal(got, expected):
     assert got.frames.shape == expected.frames.shape
     for i in range(len(expected)):
-        assert got.frames[i].dtype == got.frames.dtype == expected.frames.dtype
         np.testing.assert_array_equal(got.frames[i], expected.frames[i])
+    assert got.frames.dtype == expected.frames.dtype
     np.testing.assert_array_equal(got.frame_time_s, expected.frame_time_s)
     # Places are printed in elements and samples, and come back to rounding.
-    for name, value in vars(expected.grid).items():
-        assert getattr(got.grid, name) == pytest.approx(value, rel=1e-12), name
+    assert list(vars(got.grid).values()) == pytest.approx(list(vars(expected.grid).values()), rel=1e-12)
     assert got.signal == expected.signal
     ours, theirs = got.orientation, expected.orientation
     np.testing.assert_array_equal(ours.readings.time_s, theirs.readings.time_s)
@@ -49,8 +47,7 @@ def require_equal(got, expected):
 
 
 @pytest.mark.parametrize("kind", ["rf", "iq", "env"])
-@pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("place", ["package.tar", "folder"])
+@pytest.mark.parametrize(("packed", "place"), [(False, "folder"), (True, "package.tar")])
 def test_what_is_written_is_read(tmp_path, kind, packed, place):
     sweep = sweep_of(kind)
     got = load_sweep(examples.write_package(tmp_path / place, sweep, packed=packed), GIVEN)
@@ -68,11 +65,10 @@ def test_tar_with_sub_folders_and_hidden_files(tmp_path):
     require_equal(load_sweep(tar, GIVEN), sweep)
     with tarfile.open(tar) as archive:
         last = archive.getmembers()[-1]
-    tar.write_bytes(tar.read_bytes()[: last.offset_data + -(-last.size // 512) * 512])
-    assert any("without the blocks that close" in note for note in import_notes(tar, GIVEN))
-    tar.write_bytes(tar.read_bytes()[:1500])
-    with pytest.raises(Speckle3DError, match=r"x\.tar"):
-        load_sweep(tar, GIVEN)
+    for cut in (last.offset_data + 9, 1500):
+        tar.write_bytes(tar.read_bytes()[:cut])
+        with pytest.raises(Speckle3DError, match=r"x\.tar"):
+            load_sweep(tar, GIVEN)
 
 
 def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
@@ -83,28 +79,26 @@ def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     require_equal(load_sweep(raw, GIVEN), iq)
     parts = {path.name.split("_")[1] for path in companion_files(raw)}
     assert parts == {"iq.yml", "iq.tgc", "rf.tgc", "imu.yml"}
-    second = {name.replace("2024", "2025"): b"" for name in examples.package_files(rf)}
-    examples.write_files(folder, second)
+    examples.write_files(folder, {name.replace("2024", "2025"): b"" for name in examples.package_files(rf)})
     with pytest.raises(InvalidInputError, match=r"got 2: 2024.*, 2025"):
-        find_files(folder)
-    other = examples.write_files(
-        tmp_path / "conda", {"my_env.yml": b"name: work\ndependencies:\n  - numpy\n"}
-    )
-    assert find_reader(other) is None
+        load_sweep(folder)
+    conda = examples.write_files(tmp_path / "conda", {"my_env.yml": b"name: work\ndependencies:\n  - x\n"})
+    assert find_reader(conda) is None
     # Newer software may call I/Q rf.raw.
     renamed = examples.write_package(tmp_path / "p", iq, kind="rf", yml_kind="iq")
     require_equal(load_sweep(renamed, GIVEN), iq)
 
 
-def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
-    for kind, asked in (("rf", ("probe", "bandwidth_hz")), ("env", ("probe", "dynamic_range_db"))):
-        with pytest.raises(MissingSettingsError) as caught:
-            load_sweep(examples.write_package(tmp_path / kind, sweep_of(kind)))
-        assert caught.value.settings == asked
-    old = examples.yml_text(sweep_of("iq")).split("focus:")[0]
+@pytest.mark.parametrize(
+    ("kind", "asked"),
+    [("rf", ("probe", "bandwidth_hz")), ("env", ("probe", "dynamic_range_db")), ("iq", None)],
+)
+def test_all_that_is_missing_is_asked_for_at_once(tmp_path, kind, asked):
+    old = examples.yml_text(sweep_of(kind)).split("focus:")[0]
+    package = examples.write_package(tmp_path / kind, sweep_of(kind), yml=old)
     with pytest.raises(MissingSettingsError) as caught:
-        load_sweep(examples.write_package(tmp_path / "iq", sweep_of("iq"), yml=old), GIVEN)
-    assert caught.value.settings == ("demodulation_frequency_hz",)
+        load_sweep(package, GIVEN if kind == "iq" else None)
+    assert caught.value.settings == (asked or ("demodulation_frequency_hz",))
 
 
 def test_settings_replace_what_the_package_says_and_it_is_told(tmp_path):
@@ -117,9 +111,8 @@ def test_settings_replace_what_the_package_says_and_it_is_told(tmp_path):
     got = load_sweep(package, given)
     assert got.signal == RFSettings(14e6, 1500.0, 5.5e6, (3e6, 7e6), 5e6)
     assert (got.grid.vector_pitch_mm, got.grid.first_sample_depth_mm) == (0.4, 1.25)
-    notes = " ".join(import_notes(package, given))
-    assert "centre frequency 5.5 MHz, given: its yml says 6" in notes
-    assert "lines are 1.5 elements apart" in notes
+    assert told(package, "centre frequency 5.5 MHz, given: its yml says 6", given)
+    assert told(package, "lines are 1.5 elements apart", given)
 
 
 def curve(gain):
@@ -133,31 +126,26 @@ def test_differing_gain_is_undone_relative_to_the_first_frame(tmp_path, kind):
     gains = [20 + depth_mm / 40 * (last - 20) for last in (30.0, 36.0, 24.0)]
     louder = [10 ** ((gain - gains[0]) / 20) for gain in gains]
     recorded = replace(sweep, frames=np.stack([sweep.frames[i] * louder[i] for i in range(3)]))
-    curves = [curve(last) for last in (30.0, 36.0, 24.0)]
-    package = examples.write_package(tmp_path / "p", recorded, tgc=curves)
+    package = examples.write_package(tmp_path / "p", recorded, tgc=[curve(g) for g in (30.0, 36.0, 24.0)])
     got = load_sweep(package, GIVEN)
     assert got.frames.dtype == stored_dtype(got.frames) == (np.float32 if kind == "rf" else np.complex64)
     for i in range(3):
         # The scanner rounds to whole numbers, which is then divided by the gain.
         np.testing.assert_allclose(got.frames[i], sweep.frames[i], atol=0.75)
-    assert any("undone" in note for note in import_notes(package, GIVEN))
+    assert told(package, "undone")
 
 
 def test_gain_files_of_other_kinds_and_forms(tmp_path):
     sweep = sweep_of("rf", frames=2)
     same = examples.write_package(tmp_path / "same", sweep, tgc=[curve(30.0)] * 2)
     require_equal(load_sweep(same, GIVEN), sweep)
-    empty = examples.package_files(sweep) | {
-        f"{examples.NAME}_rf.tgc": b"# tgc curves per frame\n\nframes: 0\n"
-    }
-    require_equal(load_sweep(examples.write_files(tmp_path / "empty", empty), GIVEN), sweep)
     files = examples.package_files(sweep, tgc=[curve(30.0), curve(50.0)])
     files = {name.replace("_rf.tgc", "_env.tgc.yml"): content for name, content in files.items()}
     assert load_sweep(examples.write_files(tmp_path / "p", files), GIVEN).frames.dtype == np.float32
-    late = examples.package_files(sweep)
-    late[f"{examples.NAME}_rf.tgc"] = examples.tgc_text(examples.frame_times_ns(sweep)[1:]).encode()
+    late = examples.tgc_text(examples.frame_times_ns(sweep)[1:]).encode()
+    files = examples.package_files(sweep) | {f"{examples.NAME}_rf.tgc": late}
     with pytest.raises(InvalidInputError, match=r"rf\.tgc: expected the gain of the frame at \d+ ns"):
-        load_sweep(examples.write_files(tmp_path / "late", late), GIVEN)
+        load_sweep(examples.write_files(tmp_path / "late", files), GIVEN)
 
 
 def test_region_of_interest_without_data_around_is_cut_out(tmp_path):
@@ -165,71 +153,56 @@ def test_region_of_interest_without_data_around_is_cut_out(tmp_path):
     frames = np.zeros_like(sweep.frames)
     frames[:, 1:4, 8:30] = sweep.frames[:, 1:4, 8:30]
     padded = replace(sweep, frames=frames)
-    roi = "roi: {start line: 1, end line: 3, start sample: 8, end sample: 29}\n"
-    got = load_sweep(
-        examples.write_package(tmp_path / "p", padded, yml=examples.yml_text(padded) + roi), GIVEN
-    )
+    roi = examples.yml_text(padded) + "roi: {start line: 1, end line: 3, start sample: 8, end sample: 29}\n"
+    got = load_sweep(examples.write_package(tmp_path / "p", padded, yml=roi), GIVEN)
     np.testing.assert_array_equal(got.frames[2], sweep.frames[2][1:4, 8:30])
     first_mm = sweep.grid.first_sample_depth_mm + 8 * sweep.grid.sample_spacing_mm
     assert got.grid.first_sample_depth_mm == pytest.approx(first_mm, rel=1e-12)
-    full = examples.write_package(tmp_path / "q", sweep, yml=examples.yml_text(sweep) + roi)
+    full = examples.write_package(tmp_path / "q", sweep, yml=roi)
     require_equal(load_sweep(full, GIVEN), sweep)  # data beyond the region is kept
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "named"),
     [
-        ("frames: 4", "frames: 5", "expected frames 5 as in the yml, got 4"),
-        ("number of lines: 5", "number of lines: 6", "expected 6 lines, got 5"),
-        ("samples per line: 40", "samples per line: 41", "samples per line 41 as in the yml, got 40"),
-        ("sample size: 2 bytes", "sample size: 4 bytes", "expected sample size 4"),
-        ("type: RF", "type: IQ", "type IQ 4 as in the yml, got 2"),
-        ("type: RF", "type: M", "type: expected RF, IQ or B pre-scan, got 'M'"),
-        ("compression: none", "compression: jpeg", "compression: expected none, got 'jpeg'"),
-        ("40.0 MHz", "40.0", "sampling rate: expected a number of Hz.*, got '40.0'"),
+        ("frames: 4", "frames: 5", r"raw: header: .*\(5, 5, 40, 2\), got \(4, 5, 40, 2\)"),
+        ("number of lines: 5", "number of lines: 6", "lines"),
+        ("type: RF", "type: IQ", "header: .*IQ"),
+        ("type: RF", "type: M", "type"),
+        ("compression: none", "compression: jpeg", "compression"),
+        ("40.0 MHz", "40.0", "sampling rate: expected a number of Hz"),
         ("40.0 MHz", "-40.0 MHz", "sampling rate"),
-        ("angle: 0 °}\n  - {rx", "angle: 7 °}\n  - {rx", r"lines\[0\]: angle: expected 0 .*got 7 deg"),
+        ("angle: 0 °}\n  - {rx", "angle: 7 °}\n  - {rx", r"lines\[0\]: angle"),
         (SECOND, "{rx element: 0.0", r"lines\[1\]: rx element"),
-        (SECOND, "{rx element: 1.9", r"lines\[1\]: rx element: expected evenly spaced lines"),
-        ("{ 40.00mm, 26.00dB }", "{ 40.00, 26.00dB }", "expected a gain as"),
-        ("type: RF", "type: [", "expected YAML, got an error"),
-        ("type: RF", "type: RF\nprobe: {radius: 45 mm}", "parallel lines, got a curved array of 45 mm"),
-        ("frames: 4", "frames: 0x" + "f" * 9000, "frames: expected a number"),
-        ("frames: 4", "frames: " + "[" * 9000, "expected YAML|frames: expected"),
+        (SECOND, "{rx element: 1.9", r"lines\[1\]: rx element"),
+        ("{ 40.00mm, 26.00dB }", "{ 40.00, 26.00dB }", "gain"),
+        ("type: RF", "type: RF\nprobe: {radius: 45 mm}", "curved array of 45 mm"),
+        ("frames: 4", "frames: " + "[" * 9000, "YAML|frames"),
         ("frames: 4", "frames: 4\nroi: {start line: 0, end line: 4, start sample: 0, end sample: 40}", "roi"),
     ],
 )
-def test_contradictions_are_named(tmp_path, old, new, message):
+def test_contradictions_are_named_in_one_line(tmp_path, old, new, named):
     text = examples.yml_text(sweep_of("rf"))
     assert old in text
     package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=text.replace(old, new, 1))
-    with pytest.raises(InvalidInputError, match=message) as caught:
+    with pytest.raises(InvalidInputError, match=rf"_rf\..*{named}") as caught:
         load_sweep(package, GIVEN)
     assert "\n" not in str(caught.value)
-    assert "_rf." in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("frame rate: 11 Hz", "frame rate: 11 kHz", "times of another unit"),
-        ("imaging depth: ", "imaging depth: 9", "the imaging depth in the yml"),
-    ],
+    ("old", "new", "odd"), [("depth: ", "depth: 9", True), ("depth: ", "depth: ", False)]
 )
-def test_contradictions_that_may_be_right_are_told(tmp_path, old, new, words):
-    text = examples.yml_text(sweep_of("rf")).replace(old, new, 1)
+def test_an_imaging_depth_that_the_samples_miss_is_told(tmp_path, old, new, odd):
+    text = examples.yml_text(sweep_of("rf")).replace(f"imaging {old}", f"imaging {new}", 1)
     package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=text)
-    assert any(words in note for note in import_notes(package, GIVEN))
-    assert not any(
-        words in note for note in import_notes(examples.write_package(tmp_path / "q", sweep_of("rf")), GIVEN)
-    )
+    assert told(package, "the imaging depth in the yml") == odd
 
 
-@pytest.mark.parametrize("delay", ["0", "-5"])
-def test_a_delay_that_cannot_be_is_asked_for(tmp_path, delay):
-    text = examples.yml_text(sweep_of("rf"), delay=delay)
+def test_a_delay_that_cannot_be_is_asked_for(tmp_path):
+    text = examples.yml_text(sweep_of("rf"), delay="-5").replace("'", "")
     with pytest.raises(MissingSettingsError) as caught:
-        load_sweep(examples.write_package(tmp_path / "p", sweep_of("rf"), yml=text.replace("'", "")), GIVEN)
+        load_sweep(examples.write_package(tmp_path / "p", sweep_of("rf"), yml=text), GIVEN)
     assert caught.value.settings == ("first_sample_depth_mm",)
     whole = examples.write_package(tmp_path / "q", sweep_of("rf"), delay=39.5)  # at 40 MHz
     assert load_sweep(whole, GIVEN).grid.first_sample_depth_mm == 0.0
@@ -244,31 +217,30 @@ def test_lines_given_by_the_first_and_last(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "own", "expected"),
+    ("given", "own", "pitch_mm", "differs"),
     [
-        ({"element_pitch_mm": 0.26}, None, 1.5 * 0.26),
-        ({"element_pitch_mm": 0.3}, "0.2 mm", 0.45),
-        ({"vector_pitch_mm": 0.26}, None, 0.26),
-        ({"probe": "l15hd3"}, None, 1.5 * 0.26),
-        ({"probe": "Clarius L15-HD3"}, None, 1.5 * 0.26),
-        ({"probe": "L15 HD3"}, "0.2 mm", r"0.2 mm .*0.26 mm|0.26 mm .*0.2 mm"),
-        ({"probe": "L15 HD3", "vector_pitch_mm": 0.26}, None, "0.1733 mm"),
-        ({"element_pitch_mm": 0.26, "vector_pitch_mm": 0.26}, None, "0.1733 mm"),
-        ({"probe": "C3 HD3", "element_pitch_mm": 0.3}, None, "expected parallel lines"),
-        ({"probe": "L7"}, None, "expected a model whose element pitch"),
+        ({"element_pitch_mm": 0.26}, None, 1.5 * 0.26, False),
+        ({"element_pitch_mm": 0.3}, "{pitch: 0.2 mm}", 0.45, True),
+        ({"vector_pitch_mm": 0.26}, None, 0.26, False),
+        ({"probe": "Clarius L15-HD3"}, None, 1.5 * 0.26, False),
+        ({"probe": "L15 HD3"}, "{pitch: 0.2 mm}", 0.3, True),
+        ({"probe": "L15 HD3", "vector_pitch_mm": 0.26}, None, 0.26, True),
+        ({"probe": "L7"}, None, MissingSettingsError, False),
+        ({"probe": "C3 HD3", "element_pitch_mm": 0.3}, None, InvalidInputError, False),
+        ({}, "L7 HD3", 0.3, False),
     ],
 )
-def test_pitches_are_taken_in_turn_and_contradictions_refused(tmp_path, given, own, expected):
+def test_pitches_are_taken_in_turn_and_contradictions_told(tmp_path, given, own, pitch_mm, differs):
     """Lines of the examples are 0.3 mm apart, of 0.2 mm elements: 1.5 elements."""
-    yml = examples.yml_text(sweep_of("rf")) + (f"probe: {{pitch: {own}}}\n" if own else "")
+    yml = examples.yml_text(sweep_of("rf")) + (f"probe: {own}\n" if own else "")
     package = examples.write_package(tmp_path / "p", sweep_of("rf"), yml=yml, sensor=False)
-    if isinstance(expected, float):
-        assert load_sweep(package, ImportSettings(**given, **BAND)).grid.vector_pitch_mm == pytest.approx(
-            expected
-        )
+    settings = ImportSettings(**given, bandwidth_hz=(4e6, 8e6))
+    if not isinstance(pitch_mm, float):
+        with pytest.raises(pitch_mm):
+            load_sweep(package, settings)
         return
-    with pytest.raises(InvalidInputError, match=expected):
-        load_sweep(package, ImportSettings(**given, **BAND))
+    assert load_sweep(package, settings).grid.vector_pitch_mm == pytest.approx(pitch_mm)
+    assert told(package, "distances between elements", settings) == differs
 
 
 def test_frames_of_a_repeated_time_are_left_out_and_cut_files_told(tmp_path):
@@ -276,9 +248,8 @@ def test_frames_of_a_repeated_time_are_left_out_and_cut_files_told(tmp_path):
     stamps = examples.frame_times_ns(sweep)
     stamps[2] = stamps[1]
     package = examples.write_package(tmp_path / "p", sweep, stamps=stamps)
-    got = load_sweep(package, GIVEN)
-    np.testing.assert_array_equal(got.frames[2], sweep.frames[3])
-    assert any("images: 1 of 4 left out" in note for note in import_notes(package, GIVEN))
+    np.testing.assert_array_equal(load_sweep(package, GIVEN).frames[2], sweep.frames[3])
+    assert told(package, "images: 1 of 4 left out")
     raw = next((tmp_path / "p").glob("*.raw"))
     whole = raw.read_bytes()
     for cut, count in ((whole[:-1], 3), (whole[: len(whole) // 2 + 50], 2), (whole[:30], 0)):
@@ -287,12 +258,15 @@ def test_frames_of_a_repeated_time_are_left_out_and_cut_files_told(tmp_path):
             load_sweep(package, GIVEN)
 
 
+def falling(sweep, shallow, deep):
+    said = f"shallowfreq: {shallow} MHz, deepfreq: {deep} MHz, filterdepth: 40 mm"
+    return examples.yml_text(sweep).split("focus:")[0] + f"focus:\n  - receive:\n      - {{{said}}}\n"
+
+
 @pytest.mark.parametrize(("shallow", "deep"), [(11, 8), (5, 5)])
 def test_demodulation_frequency_is_that_of_the_lines_middle(tmp_path, shallow, deep):
     sweep = sweep_of("iq", samples=400)
-    said = f"shallowfreq: {shallow} MHz, deepfreq: {deep} MHz, filterdepth: 40 mm"
-    yml = examples.yml_text(sweep).split("focus:")[0] + f"focus:\n  - receive:\n      - {{{said}}}\n"
-    package = examples.write_package(tmp_path / "p", sweep, yml=yml)
+    package = examples.write_package(tmp_path / "p", sweep, yml=falling(sweep, shallow, deep))
     middle_mm = sweep.grid.first_sample_depth_mm + 199.5 * sweep.grid.sample_spacing_mm
     got = load_sweep(package, GIVEN).signal.demodulation_frequency_hz
     assert got == pytest.approx(1e6 * (shallow + (deep - shallow) * middle_mm / 40))
@@ -307,23 +281,17 @@ def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
     sweep = sweep_of("iq", samples=samples)
     frames = np.tile(np.round(8000 * np.exp(1j * phase)), (len(sweep), 5, 1)).astype(np.complex64)
     sweep = replace(sweep, frames=frames, grid=replace(sweep.grid, first_sample_depth_mm=0.0))
-    said = "shallowfreq: 9 MHz, deepfreq: 6 MHz, filterdepth: 40 mm"
-    yml = examples.yml_text(sweep).split("focus:")[0] + f"focus:\n  - receive:\n      - {{{said}}}\n"
-    got = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=yml), GIVEN)
+    got = load_sweep(examples.write_package(tmp_path / "p.tar", sweep, yml=falling(sweep, 9, 6)), GIVEN)
     line = got.frames[1][2]
     turn_hz = np.angle(line[1:] * line[:-1].conj()) * rate_hz / (2 * np.pi)
     # Rounding of 8000 to whole numbers: 1e-4 rad, 200 Hz.
     np.testing.assert_allclose(turn_hz + got.signal.demodulation_frequency_hz, 7e6, atol=1e3)
 
 
-def sensor_member(tmp_path, text):
+def samples_of(tmp_path, text):
     path = tmp_path / "x_imu.yml"
     path.write_text(text)
-    return Member(path, path.name, 0, path.stat().st_size)
-
-
-def samples_of(tmp_path, sensor, quaternions=None):
-    return imu.read_samples(sensor_member(tmp_path, examples.sensor_text(sensor, quaternions)))
+    return read_samples(Member(path, path.name, 0, path.stat().st_size))
 
 
 def moving(degrees=25.0):
@@ -333,12 +301,14 @@ def moving(degrees=25.0):
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_accelerometer_becomes_specific_force_whatever_its_sign(tmp_path, sign):
     sensor = moving()
-    samples = samples_of(tmp_path, replace(sensor, accelerometer_m_s2=sign * sensor.accelerometer_m_s2))
-    fit = imu.fit_of(samples)
-    assert fit.off_vertical_deg < 0.6  # noise of 0.05 m/s^2 tilts by 0.4 deg
-    made = imu.orientation_sensor(samples, fit)
-    np.testing.assert_allclose(made.accelerometer_m_s2, sensor.accelerometer_m_s2, rtol=1e-12, atol=1e-14)
-    assert (fit.world_from_sensor.inv() * sensor.readings.world_from_sensor).magnitude().max() < 1e-9
+    other = replace(sensor, accelerometer_m_s2=sign * sensor.accelerometer_m_s2)
+    samples = samples_of(tmp_path, examples.sensor_text(other))
+    assert samples.fit.off_vertical_deg < 0.6  # noise of 0.05 m/s^2 tilts by 0.4 deg
+    np.testing.assert_allclose(
+        samples.orientation.accelerometer_m_s2, sensor.accelerometer_m_s2, rtol=1e-12, atol=1e-14
+    )
+    apart = samples.fit.world_from_sensor.inv() * sensor.readings.world_from_sensor
+    assert apart.magnitude().max() < 1e-9
 
 
 def test_a_quaternion_that_gravity_contradicts_is_not_believed(tmp_path):
@@ -348,33 +318,25 @@ def test_a_quaternion_that_gravity_contradicts_is_not_believed(tmp_path):
         turn.as_quat(),  # scalar last
         turn.inv().as_quat(scalar_first=True),
     ):
-        assert imu.fit_of(samples_of(tmp_path, moving(), other)) is None
-    sweep = sweep_of("rf")
-    wrong = sweep.orientation.readings.world_from_sensor.as_quat()
-    text = examples.sensor_text(sweep.orientation, wrong)
-    package = examples.write_package(tmp_path / "p", sweep, imu_text=text)
-    assert load_sweep(package, GIVEN).orientation is None
-    assert any("agree with gravity" in note for note in import_notes(package, GIVEN))
+        assert samples_of(tmp_path, examples.sensor_text(moving(), other)).fit is None
 
 
 @pytest.mark.parametrize(
     "change",
     [
         lambda row: row.replace("timestamp: ", "timestamp: -"),
-        lambda row: row.replace("timestamp", "time"),
         lambda row: row.replace("gyroscope y", "gyro"),
         lambda row: row.replace("q0: ", "q0: 9"),
-        lambda row: row.replace("magnetometer", "m"),
         lambda row: row.replace("scope x: ", "scope x: .nan #"),
         lambda row: "[1, 2]\n",
         lambda row: "timestamp: {\n",
     ],
-)  # fmt: skip
+)
 def test_one_bad_sample_is_left_out_and_counted(tmp_path, change):
     rows = examples.sensor_text(moving()).split("---\n")
-    whole = imu.read_samples(sensor_member(tmp_path, "---\n".join(rows)))
+    whole = samples_of(tmp_path, "---\n".join(rows))
     rows[7] = change(rows[7])
-    samples = imu.read_samples(sensor_member(tmp_path, "---\n".join(rows)))
+    samples = samples_of(tmp_path, "---\n".join(rows))
     np.testing.assert_array_equal(samples.time_s, np.delete(whole.time_s, 7))
     np.testing.assert_array_equal(samples.quaternion, np.delete(whole.quaternion, 7, axis=0))
     assert any(f"1 of {len(rows)} left out" in remark for remark in samples.remarks)
@@ -382,21 +344,20 @@ def test_one_bad_sample_is_left_out_and_counted(tmp_path, change):
 
 def test_repeats_of_any_share_and_samples_out_of_order_are_left_out(tmp_path):
     rows = examples.sensor_text(moving()).split("---\n")
-    plain = imu.read_samples(sensor_member(tmp_path, "---\n".join(rows)))
+    plain = samples_of(tmp_path, "---\n".join(rows))
     # Each sample is sent again with other values; the last burst, too; one has the values of the one before.
     twice = [part for row in rows for part in (row, row.replace("x: ", "x: 0.5 #", 1))]
     again = twice[:18] + twice[12:18] + [rows[8].replace("timestamp: 10", "timestamp: 11")] + twice[18:]
-    samples = imu.read_samples(sensor_member(tmp_path, "---\n".join(again)))
-    np.testing.assert_array_equal(samples.time_s, plain.time_s)
+    np.testing.assert_array_equal(samples_of(tmp_path, "---\n".join(again)).time_s, plain.time_s)
     with pytest.raises(InvalidInputError):
-        imu.read_samples(sensor_member(tmp_path, "[1, 2]"))
+        samples_of(tmp_path, "[1, 2]")
 
 
 def test_an_accelerometer_in_other_units_is_told(tmp_path):
     sweep = sweep_of("rf")
     strong = replace(sweep.orientation, accelerometer_m_s2=9.81 * sweep.orientation.accelerometer_m_s2)
     package = examples.write_package(tmp_path / "q", replace(sweep, orientation=strong))
-    assert any("9.81 g" in note and "m/s^2" in note for note in import_notes(package, GIVEN))
+    assert told(package, "m/s^2")
 
 
 def test_damaged_blocks_of_lzop_are_named(tmp_path):
@@ -406,9 +367,8 @@ def test_damaged_blocks_of_lzop_are_named(tmp_path):
         spoiled = bytearray(files[name])
         spoiled[at : at + len(change)] = change
         package = examples.write_files(tmp_path / f"p{at}", files | {name: bytes(spoiled)})
-        with pytest.raises(Speckle3DError, match=r"_rf\.raw\.lzo") as caught:
+        with pytest.raises(Speckle3DError, match=r"_rf\.raw\.lzo"):
             [frame.sum() for frame in map(load_sweep(package, GIVEN).frames.__getitem__, range(4))]
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.realdata
@@ -417,11 +377,11 @@ def test_damaged_blocks_of_lzop_are_named(tmp_path):
     [("carotid/carotid", 84, 0.921, 0.75, 73), ("wirephantom/phantom", 57, 0.955, 0.47, 61)],
 )
 def test_real_sensors(realdata, name, count, norm, off_deg, dip_deg):
-    samples, fit = sensor_of(realdata / "clarius" / f"{name}_imu.yml")
+    samples = sensor_of(realdata / "clarius" / f"{name}_imu.yml")
     assert len(samples) == count
-    assert fit.vertical == -1.0
-    assert fit.off_vertical_deg == pytest.approx(off_deg, abs=0.01)
-    made = imu.orientation_sensor(samples, fit)
+    assert samples.fit.vertical == -1.0
+    assert samples.fit.off_vertical_deg == pytest.approx(off_deg, abs=0.01)
+    made = samples.orientation
     norms = np.linalg.norm(made.accelerometer_m_s2, axis=1)
     assert np.median(norms) == pytest.approx(norm * 9.80665, abs=0.01)
     x, y, z = made.readings.world_from_sensor.apply(made.magnetometer_au).mean(axis=0)
@@ -432,7 +392,7 @@ def test_real_sensors(realdata, name, count, norm, off_deg, dip_deg):
 @pytest.mark.realdata
 def test_real_packages(realdata):
     for name, frames in (("carotid", "17"), ("wirephantom", "13")):
-        rows = rows_of(realdata / "clarius" / name)
+        rows = dict(row[:2] for row in describe(realdata / "clarius" / name))
         assert rows["rf: frames"] == frames
         assert "expected a raw file" in rows["sweep"]
     doppler = realdata / "clarius" / "carotid" / "doppler"

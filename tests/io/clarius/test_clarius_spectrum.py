@@ -8,7 +8,7 @@ import pytest
 from clarius_examples import GIVEN, sweep_of
 from scipy.signal import hilbert
 
-from speckle3d.io.clarius.spectrum import measured_band_hz, measured_centres_hz
+from speckle3d.io.clarius.spectrum import Echoes
 from speckle3d.io.load import import_notes
 
 RATE_HZ = 40e6
@@ -34,58 +34,41 @@ def as_iq(rf, shift_hz, step=2):
     return (hilbert(rf) * np.exp(-2j * np.pi * shift_hz * time_s))[..., ::step].astype(np.complex64)
 
 
-@pytest.mark.parametrize("snr_db", [40, 10, 0])
+@pytest.mark.parametrize("snr_db", [40, 0])
 @pytest.mark.parametrize(("low", "high", "transmit"), [(4.0, 8.0, 7.0), (6.0, 12.0, 10.0)])
 def test_band_of_rf_and_of_its_iq(low, high, transmit, snr_db):
-    rf = echoes(low * 1e6, high * 1e6, snr_db)
-    by_rf = measured_band_hz(rf, RATE_HZ, transmit * 1e6, None)
-    by_iq = measured_band_hz(as_iq(rf, transmit * 1e6), RATE_HZ / 2, transmit * 1e6, transmit * 1e6)
-    for found in (by_rf, by_iq):
+    rf, sent_hz = echoes(low * 1e6, high * 1e6, snr_db), transmit * 1e6
+    for spectrum in (Echoes(rf, RATE_HZ, sent_hz), Echoes(as_iq(rf, sent_hz), RATE_HZ / 2, sent_hz, sent_hz)):
         # Some 4,000 spectra of 0.5 MHz, a window that widens the edges by 0.1, and rounding to 0.1.
-        np.testing.assert_allclose(np.array(found) / 1e6, [low, high], atol=0.35)
+        np.testing.assert_allclose(np.array(spectrum.band_hz) / 1e6, [low, high], atol=0.35)
 
 
-def attenuated():
+def test_attenuation_lowers_the_centre_and_the_other_sign_of_q_raises_it(tmp_path):
     """Echoes whose band falls by 1 MHz along the lines."""
-    near, middle, far = (echoes(low, low + 4e6, 30, samples=400) for low in (4.5e6, 4e6, 3.5e6))
-    return np.concatenate([near, middle, far], axis=-1)
-
-
-def test_attenuation_lowers_the_centre_and_the_other_sign_of_q_raises_it():
-    rf = attenuated()
-    iq = as_iq(rf, 6e6)
-    by_rf = measured_centres_hz(rf, RATE_HZ, 6e6, None)
-    by_iq = measured_centres_hz(iq, RATE_HZ / 2, 6e6, 6e6)
-    np.testing.assert_allclose(np.array([by_rf, by_iq]) / 1e6, [[6.5, 5.5]] * 2, atol=0.2)
-    mirrored = measured_centres_hz(iq.conj(), RATE_HZ / 2, 6e6, 6e6)
-    np.testing.assert_allclose(np.array(mirrored) / 1e6, [5.5, 6.5], atol=0.2)
-
-
-def test_a_package_with_the_other_sign_of_q_is_noted(tmp_path):
-    rf = attenuated()[:, :12]
-    for iq, odd in ((as_iq(rf, 6e6), False), (as_iq(rf, 6e6).conj(), True)):
+    parts = (echoes(low, low + 4e6, 30, samples=400) for low in (4.5e6, 4e6, 3.5e6))
+    rf = np.concatenate(list(parts), axis=-1)
+    np.testing.assert_allclose(np.array(Echoes(rf, RATE_HZ, 6e6).centres_hz) / 1e6, [6.5, 5.5], atol=0.2)
+    for iq, near, far in ((as_iq(rf, 6e6), 6.5, 5.5), (as_iq(rf, 6e6).conj(), 5.5, 6.5)):
+        centres = Echoes(iq, RATE_HZ / 2, 6e6, 6e6).centres_hz
+        np.testing.assert_allclose(np.array(centres) / 1e6, [near, far], atol=0.2)
         sweep = sweep_of("iq", frames=3, vectors=12, samples=iq.shape[-1])
         signal = replace(sweep.signal, sampling_rate_hz=RATE_HZ / 2)
         grid = replace(sweep.grid, sample_spacing_mm=signal.sample_spacing_mm)
-        sweep = replace(sweep, frames=np.round(10 * iq), signal=signal, grid=grid)
-        package = examples.write_package(tmp_path / f"{odd}.tar", sweep)
-        assert any("Q has the other sign" in each for each in import_notes(package, GIVEN)) == odd
+        sweep = replace(sweep, frames=np.round(10 * iq[:, :12]), signal=signal, grid=grid)
+        package = examples.write_package(tmp_path / f"{near}.tar", sweep)
+        assert any("Q has the other sign" in note for note in import_notes(package, GIVEN)) == (far > near)
 
 
-def test_noise_has_no_band():
-    rng = np.random.default_rng(2)
-    assert measured_band_hz(rng.normal(size=(3, 40, 1024)), RATE_HZ, 7e6, None) is None
-    assert measured_band_hz(echoes(4e6, 8e6, -20), RATE_HZ, 7e6, None) is None
-
-
-@pytest.mark.parametrize("shape", [(1, 2, 64), (1, 40, 16), (3, 1, 1024), (1, 40, 8)])
-def test_too_few_samples_tell_nothing(shape):
-    assert measured_band_hz(np.random.default_rng(0).normal(size=shape), RATE_HZ, 7e6, None) is None
-
-
-def test_echoes_of_nothing_tell_nothing():
-    assert measured_band_hz(np.zeros((2, 40, 1024)), RATE_HZ, 7e6, None) is None
-
-
-def test_a_band_elsewhere_than_the_transmit_frequency_is_not_taken():
-    assert measured_band_hz(echoes(12e6, 16e6, 40), RATE_HZ, 4e6, None) is None
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.random.default_rng(2).normal(size=(3, 40, 1024)),
+        np.random.default_rng(0).normal(size=(3, 1, 1024)),
+        np.random.default_rng(0).normal(size=(1, 40, 8)),
+        np.zeros((2, 40, 1024)),
+        echoes(4e6, 8e6, -20),
+        echoes(15.5e6, 18e6, 40),  # twice the transmit frequency and more
+    ],
+)
+def test_no_band_is_found_in_noise_in_nothing_or_elsewhere(frames):
+    assert Echoes(frames, RATE_HZ, 7e6).band_hz is None
