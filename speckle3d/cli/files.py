@@ -144,9 +144,9 @@ def _is_reconstruction(path: Path) -> bool:
 def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
     """Write a reconstruction's images with its poses; other options than those of that have no effect."""
     from speckle3d.io.import_settings import ImportSettings
-    from speckle3d.io.plus.write import SUFFIXES
+    from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.scenes.sequences import PosedSequence
+    from speckle3d.study.scenes.sequences import slicer_sequence
 
     if out.suffix.lower() not in SUFFIXES:
         raise InvalidInputError(f"{out}: expected a name ending in {', '.join(SUFFIXES)} of a reconstruction")
@@ -157,4 +157,5 @@ def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
     posed = open_posed(source, options["mode"], options["sweep_file"])
     range_db, packs = options["dynamic_range_db"] or 60.0, options["compression"] != "none"
     with progress_bar(f"writing {out.name}") as progress:
-        PosedSequence.of(posed, range_db).write(out, progress, packs)
+        sweep, poses = slicer_sequence(posed, range_db)
+        write_sequence(out, sweep, progress, packs, poses)

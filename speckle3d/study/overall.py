@@ -90,16 +90,6 @@ def over_sweeps(
     return intervals, paired
 
 
-def beats(paired: Sequence[Row], quantity: str, mode: str, other: str) -> bool:
-    """Whether the sweeps show that a mode has less error than another in a quantity."""
-    return any(
-        row["quantity"] == quantity
-        and {row["mode"], row["against"]} == {mode, other}
-        and row["better"] == mode
-        for row in paired
-    )
-
-
 def overall_text(
     intervals: Sequence[Row], paired: Sequence[Row], references: Mapping[str, str] | None = None
 ) -> str:

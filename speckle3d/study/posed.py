@@ -14,7 +14,7 @@ from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
@@ -64,16 +64,12 @@ class PosedSweep:
     def images(
         self, dynamic_range_db: float = USUAL_RANGE_DB, progress: Callable[[int, int], None] | None = None
     ) -> tuple[Images, ImageGrid]:
-        """Log-compressed images of the frames that have a pose, in the order of their poses, and their grid.
+        """Images of the frames that have a pose, in the order of their poses, and their grid, for cuts.
 
-        B-mode of unknown range is taken to be of this one: its grey levels stay as they are, but for their
-        brightest. Images lie where a tracker's whole calibration puts them, as for `source`.
+        Log-compressed; B-mode of unknown range as it is stored.
         """
-        sweep, signal = self.sweep, self.sweep.signal
-        if not self.range_is_known and isinstance(signal, BModeSettings):
-            sweep = replace(sweep, signal=replace(signal, dynamic_range_db=dynamic_range_db))
-        every = grey_images(sweep, dynamic_range_db, progress, self.reconstruction)
-        return ChosenImages(every, self.frames), replace(every.grid, skew_rad=self.skew_rad)
+        source, _ = self.source("log" if self.range_is_known else "stored", dynamic_range_db, progress)
+        return source.images, source.grid
 
     def source(
         self,

@@ -3,7 +3,7 @@
 import csv
 import io
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,12 +30,6 @@ METRES = Doubt("tracker", "units", "expected 23 mm, got 0.023", True)
 SPIKES = Doubt("orientation sensor", "spikes", "3 of 90 readings jump", False, ((3, 3), (7, 9)))
 
 
-@dataclass(frozen=True)
-class Extra:
-    spread: np.ndarray
-    best: float
-
-
 def row(mode="image", **changes):
     values = {
         "part": "f", "mode": mode, "frames": 100, "reference_mm": 20.0, "estimate_mm": 23.0,
@@ -49,28 +43,36 @@ def summary(reference="tracker", rows=None, **more):
     return Summary("beef, 1", reference, 100, 0.95, rows or [row(), row("orientation")], **more)
 
 
-def test_json_holds_every_number_and_null_where_there_is_none():
-    details = {"extra": Extra(np.array([1.0, np.nan]), np.float64(2.5)), "note": "ok"}
-    (sweep,) = json.loads(json_text({"sweeps": [summary(details=details)]}))["sweeps"]
+def test_json_and_csv_hold_every_number_and_nothing_where_there_is_none():
+    details = {"spread": np.array([1.0, np.nan]), "best": np.float64(2.5)}
+    of = summary(details=details, claims={"image": 0.08})
+    (sweep,) = json.loads(json_text({"sweeps": [of]}))["sweeps"]
     assert sweep["rows"][0]["tilt_error_deg"] == -1.254
-    assert sweep["details"] == {"extra": {"spread": [1.0, None], "best": 2.5}, "note": "ok"}
-    with pytest.raises(InvalidInputError, match="'object'"):
+    assert sweep["details"] == {"spread": [1.0, None], "best": 2.5}
+    with pytest.raises(InvalidInputError):
         json_text({"a": [object()]})
+    line, _ = csv.DictReader(io.StringIO(csv_text(of.records())))
+    assert (line["sweep"], line["mode"]) == ("beef, 1", "image")
+    assert (float(line["tilt_error_deg"]), float(line["sigma_mm"])) == (-1.254, 0.08 * 23.0)
 
 
-def test_csv_reads_back_at_full_precision_even_with_commas_in_names():
-    lines = list(csv.DictReader(io.StringIO(csv_text(summary(claims={"image": 0.08}).records()))))
-    assert [line["mode"] for line in lines] == ["image", "orientation"]
-    assert lines[0]["sweep"] == "beef, 1"
-    assert (float(lines[0]["tilt_error_deg"]), float(lines[0]["sigma_mm"])) == (-1.254, 0.08 * 23.0)
+def test_what_numbers_do_not_say_stands_below_the_table():
+    for reference, mode, doubted, words in (
+        ("tracker", "pose", {"pose": "clock"}, "fitted to this tracker; in doubt: clock"),
+        ("truth", "pose", {}, ""),
+        ("tracker", "tracker", {}, "the reference itself"),
+    ):
+        of = summary(reference, [row(), row(mode)], doubted=doubted)
+        assert of.remark(of.rows[1]) == of.records()[1]["remark"] == words
+        assert (f"beef, 1: {mode}: {words}" in summary_text([of])) is bool(words)
+    # A length that has the other sign is as sure.
+    assert summary(rows=[row(estimate_mm=-23.0)], claims={"image": 0.1}).records()[0]["sigma_mm"] > 0
 
 
 def test_the_table_is_aligned_narrow_and_says_of_what_its_intervals_are():
     rows = [row(), row("orientation", tilt_error_deg=float("nan"))]
     text = summary_text([summary("truth", rows, claims={"image": 0.08})])
     lines = text.splitlines()
-    assert max(map(len, lines)) < 110
-    assert len({len(line) for line in lines[1:4]}) == 1
     # 95 % of 8 % of 23 mm.
     assert lines[2].split()[-8:] == ["image", "23.00", "3.61", "20.00", "+15.0", "-1.25", "+0.10", "+0.00"]
     assert lines[3].split()[-7:] == ["23.00", "-", "20.00", "+15.0", "-", "+0.10", "+0.00"]
@@ -78,30 +80,11 @@ def test_the_table_is_aligned_narrow_and_says_of_what_its_intervals_are():
     assert "reference: truth" in lines[5]
 
 
-@pytest.mark.parametrize(
-    ("reference", "mode", "doubted", "words"),
-    [
-        ("tracker", "pose", {}, "fitted to this tracker"),
-        ("truth", "pose", {}, ""),
-        ("tracker", "tracker", {}, "the reference itself"),
-        ("truth", "orientation", {"orientation": "spikes"}, "in doubt: spikes"),
-        ("tracker", "pose", {"pose": "clock"}, "fitted to this tracker; in doubt: clock"),
-    ],
-)  # fmt: skip
-def test_what_numbers_do_not_say_stands_below_the_table(reference, mode, doubted, words):
-    of = summary(reference, [row(), row(mode)], doubted=doubted)
-    assert of.remark(of.rows[1]) == words
-    assert (f"beef, 1: {mode}: {words}" in summary_text([of])) is bool(words)
-    assert of.records()[1]["remark"] == words
-
-
 def test_a_length_that_the_tracker_made_worse_is_told_with_the_jitters_share():
     rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-2.6)]
     text = summary_text([summary("truth", rows, claims={"tracker": 0.01})])
     assert "pose is farther from the truth (-2.6 %) than image (+0.6 %)" in text
     assert "jitter is +- 2.0 % of its length (95 %)" in text
-    rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-0.5)]
-    assert "farther" not in summary_text([summary("truth", rows, claims={"pose": 0.01})])
 
 
 def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
@@ -135,8 +118,6 @@ def test_doubts_are_found_again_beside_the_reconstruction_they_belong_to(tmp_pat
     write_summary(tmp_path, Summary("s", "none", 9, 0.0, [], {"provenance": made}, [METRES, SPIKES]))
     assert recorded_doubts(path, made) == (METRES, SPIKES)
     assert recorded_doubts(path, Provenance("s.h5", "cd34", "1.0")) is None
-    (tmp_path / "summary.json").write_text("[1]")
-    assert recorded_doubts(path, made) is None
 
 
 def test_a_study_takes_the_place_of_the_one_before_with_all_that_was_made_from_it(tmp_path, monkeypatch):

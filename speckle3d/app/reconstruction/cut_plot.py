@@ -15,8 +15,9 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.study.figures import UNSEEN
 from speckle3d.study.reslices.cuts import CutPicture
-from speckle3d.study.reslices.reslice_figures import contrast_of, overlay
 
+_OVERLAY_PERCENTILES = (5.0, 99.5)
+"""Levels that are dark and bright where one cut is laid over another, so that the colours are strong."""
 _NEAR_MM = 0.3
 """A point is drawn in the cuts as near as this."""
 
@@ -68,9 +69,12 @@ class CutPlot:
             greys = colormaps["gray"].with_extremes(bad=UNSEEN)
             colours = greys(np.clip((drawn.image - low) / (high - low), 0.0, 1.0), bytes=True)
         else:
-            contrast = contrast_of(drawn.image, (low, high))
-            laid = np.rint(255 * overlay(picture.cuts[other].image, drawn.image, contrast))
-            colours = np.dstack([laid, np.full(laid.shape[:2], 255)]).astype(np.uint8)
+            # Of what the other is laid over: dark and bright, so that the colours are strong.
+            dark, bright = np.nanpercentile(drawn.image, _OVERLAY_PERCENTILES)
+            both = np.stack([picture.cuts[other].image, drawn.image])
+            magenta, green = np.nan_to_num(np.clip((both - dark) / max(bright - dark, 1e-3), 0.0, 1.0))
+            seen = np.isfinite(both).any(axis=0)
+            colours = np.rint(255 * np.dstack([magenta, green, magenta, seen])).astype(np.uint8)
         left, right, bottom, top = drawn.cut.extent_mm
         place = {"x": [left], "y": [top], "dw": [right - left], "dh": [bottom - top]}
         self._image.data = {"image": [np.ascontiguousarray(colours).view(np.uint32)[..., 0]], **place}

@@ -212,7 +212,7 @@ def cut_posed(
         if opened.posed.range_is_known:
             levels = [((each - 255) * (dynamic_range_db / 255)).astype(np.float32) for each in levels]
         else:
-            unit, limits = "level", (0.0, 255.0)
+            unit, limits = "level", (0.0, getattr(opened.posed.sweep.signal, "full_scale", 255.0))
     else:
         levels = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
     there = poses[opened.reference]

@@ -22,7 +22,7 @@ from speckle3d.imaging.cuts.oblique import (
     turned_frame_plane,
     vector_words,
 )
-from speckle3d.imaging.cuts.outlines import crossings, frame_outlines, sheet_crossings
+from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
 from speckle3d.imaging.cuts.planes import (
     DEFAULT_PIXEL_MM,
     ReslicePlane,
@@ -35,9 +35,6 @@ AnyCut = ReslicePlane | CurvedSheet
 
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))
 """An axis goes by the name of a direction of the sweep within so much of it."""
-
-_SHEET_ROWS = 33
-"""Points of the line in which a frame crosses a curved sheet."""
 
 _VIEWS = {
     "lateral": ("the first vector's side", "the last vector's side"),
@@ -231,16 +228,11 @@ def view_of(cut: AnyCut, world_from_image: RigidTransform) -> str:
 
 
 def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
-    """Lines in which frames cross a cut, by its axes, shape (n, m, 2), mm; NaN where they do not."""
-    if not isinstance(cut, CurvedSheet):
-        lines = crossings(frame_outlines(grid, world_from_image), cut.world_from_plane)
-        return np.asarray(lines + np.array(cut.first_mm))
-    heights = np.linspace(0.0, cut.height_mm, _SHEET_ROWS)
-    columns = sheet_crossings(grid, world_from_image, cut.base_mm, cut.down, heights)
-    y = np.broadcast_to(cut.first_mm[1] + heights, columns.shape)
-    lines = np.stack([cut.first_mm[0] + columns * cut.pixel_mm, y], axis=-1)
-    lines[np.isnan(columns)] = np.nan
-    return lines
+    """Lines in which frames cross a plane, by its axes, (n, 2, 2), mm; NaN for none; none on a sheet."""
+    if isinstance(cut, CurvedSheet):
+        return np.empty((0, 2, 2))
+    lines = crossings(frame_outlines(grid, world_from_image), cut.world_from_plane)
+    return np.asarray(lines + np.array(cut.first_mm))
 
 
 def frame_centres(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:

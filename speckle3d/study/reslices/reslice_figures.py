@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, FigureBase
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform
@@ -30,7 +29,6 @@ from speckle3d.scoring.lengths import ModeError
 from speckle3d.scoring.references import Reference
 from speckle3d.study.figures import (
     RANGE_DB,
-    UNSEEN,
     colour_of,
     label_of,
     name_figure,
@@ -46,9 +44,6 @@ from speckle3d.study.reslices.places import view_of
 
 _BRIGHTEST_PERCENTILE = 99.9
 """Taken as the maximum: a single specular echo must not darken the tissue."""
-
-_OVERLAY_PERCENTILES = (5.0, 99.5)
-"""Levels of the reference that are dark and bright in an overlay, so that its colours are strong."""
 
 _DEEP_MM, _LONG_MM = 12.0, 16.0
 """Part of a cut that is enlarged: about as deep as a short sweep is long."""
@@ -219,32 +214,6 @@ def save_outlines(opened: OpenedModes, path: Path) -> Path:
     axes.legend(frameon=False, fontsize="small")
     name_figure(figure, f"{opened.posed.sweep.name}: frames, all from the first one's place")
     return save_figure(figure, path)
-
-
-def overlay(image: Float32Array, reference: Float32Array, contrast: tuple[float, float]) -> FloatArray:
-    """Colours of an image laid over another, shape (rows, columns, 3), 0 to 1: magenta over green.
-
-    Parameters
-    ----------
-    image, reference : ndarray of float32, shape (rows, columns)
-        NaN where nothing was seen.
-    contrast : tuple of float
-        Levels that are dark and bright; see `contrast_of`.
-    """
-    low, high = contrast
-    one, other = (np.clip((each - low) / (high - low), 0.0, 1.0) for each in (image, reference))
-    colours = np.nan_to_num(np.stack([one, other, one], axis=-1))
-    colours[np.isnan(one) & np.isnan(other)] = to_rgb(UNSEEN)
-    return np.asarray(colours)
-
-
-def contrast_of(image: Float32Array, levels: tuple[float, float]) -> tuple[float, float]:
-    """Levels that are dark and bright in an overlay on this image; `levels` if it shows nothing."""
-    finite = image[np.isfinite(image)]
-    if not finite.size:
-        return levels
-    low, high = (float(each) for each in np.percentile(finite, _OVERLAY_PERCENTILES))
-    return (low, high) if high > low else levels
 
 
 def busiest_rows(image: Float32Array, count: int) -> int:

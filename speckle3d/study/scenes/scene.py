@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,12 @@ from speckle3d.core.progress import Progress
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
+from speckle3d.io.plus.write import write_sequence, write_transforms
 from speckle3d.io.shapes.polylines import write_polylines
 from speckle3d.io.shapes.transforms import write_transform
 from speckle3d.scoring.references import REFERENCES
 from speckle3d.study.posed import PosedSweep
-from speckle3d.study.scenes.sequences import PosedSequence
+from speckle3d.study.scenes.sequences import slicer_sequence
 from speckle3d.study.scenes.voxels import (
     BEST_FIRST,
     GridRequest,
@@ -70,9 +72,8 @@ class SceneRequest:
 
     def files(self, mode: str) -> dict[str, str]:
         """Names of a mode's files that are written."""
-        left_out = [] if self.with_deviation else ["deviation"]
-        left_out += [] if self.with_images else ["images", "poses"]
-        return {what: name.format(mode) for what, name in _NAMES.items() if what not in left_out}
+        wanted = {"deviation": self.with_deviation, "images": self.with_images, "poses": self.with_images}
+        return {what: name.format(mode) for what, name in _NAMES.items() if wanted.get(what, True)}
 
 
 def write_scene(
@@ -114,7 +115,8 @@ def write_scene(
     reports = []
     with FileSet(SCENE, tuple(names), _stale(target, names)).replaced(target) as part:
         for i, each in enumerate(posed):
-            report = _write_mode(part, each, asked, _part_of(progress, i, len(posed)))
+            shown = None if progress is None else partial(_told, progress, i, len(posed))
+            report = _write_mode(part, each, asked, shown)
             reports.append(replace(report, path=target / report.path.name))
         (part / SCENE).write_text(_scene_text(posed, asked), encoding="utf-8")
     return reports
@@ -144,11 +146,9 @@ def _stale(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(sorted(name for name in ours - {*names} if (folder / name).exists()))
 
 
-def _part_of(progress: Progress | None, i: int, count: int) -> Progress | None:
-    """Progress of one mode as a part of that of all."""
-    if progress is None:
-        return None
-    return lambda done, total: progress(i * total + done, count * total)
+def _told(progress: Progress, i: int, count: int, done: int, total: int) -> None:
+    """Tell the progress of one mode as a part of that of all."""
+    progress(i * total + done, count * total)
 
 
 def _write_mode(
@@ -159,13 +159,13 @@ def _write_mode(
         files["volume"], request.settings, request.grid, None, files["state"], files.get("deviation")
     )
     report = write_voxels(posed, voxels, progress)
-    sequence = PosedSequence.of(posed, request.settings.dynamic_range_db)
-    outlines = frame_outlines(sequence.sweep.grid, posed.world_from_image)
+    sweep, poses = slicer_sequence(posed, request.settings.dynamic_range_db)
+    outlines = frame_outlines(sweep.grid, posed.world_from_image)
     write_polylines(files["outlines"], outlines, {"frame": posed.frames.astype(np.float64)})
     write_transform(files["first"], posed.world_from_image[0])
     if request.with_images:
-        sequence.write(files["images"])
-        sequence.write_poses(files["poses"])
+        write_sequence(files["images"], sweep, None, True, poses)
+        write_transforms(files["poses"], sweep.frame_time_s, poses)
     return report
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, Segment
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import ImageGrid
@@ -151,9 +151,14 @@ class VolumeReport:
     size_bytes: int
     seconds: float
 
+    @property
+    def shares(self) -> dict[str, float]:
+        """Share of the voxels in each state."""
+        parts = (self.counts / self.counts.sum()).tolist()
+        return {"measured": parts[MEASURED], "filled": parts[FILLED], "empty": parts[EMPTY]}
+
     def summary(self) -> dict[str, Any]:
         """Everything as JSON has it."""
-        shares = self.counts / self.counts.sum()
         return {
             "file": str(self.path),
             "size_bytes": self.size_bytes,
@@ -161,20 +166,14 @@ class VolumeReport:
             "shape": list(self.grid.shape),
             "spacing_mm": list(self.grid.spacing_mm),
             "world_from_grid": self.grid.world_from_grid.as_matrix().tolist(),
-            "measured": float(shares[MEASURED]),
-            "filled": float(shares[FILLED]),
-            "empty": float(shares[EMPTY]),
+            **self.shares,
             "seconds": self.seconds,
         }
 
     @property
     def line(self) -> str:
         """File, size, voxels, and the share of each state in one line."""
-        shares = 100 * self.counts / self.counts.sum()
-        named = ", ".join(
-            f"{shares[state]:.1f} % {word}"
-            for state, word in ((MEASURED, "measured"), (FILLED, "filled"), (EMPTY, "empty"))
-        )
+        named = ", ".join(f"{100 * share:.1f} % {word}" for word, share in self.shares.items())
         size = f"{self.size_bytes / 1e6:.3g} MB"
         return f"{self.path}: {size}, mode {self.mode}, {self.grid}: {named}; {self.seconds:.1f} s"
 
@@ -212,35 +211,24 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     mask = None if request.region is None else request.region.mask(source.grid)
     weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
     fields = fields_of(posed, request, meaning)
-    deviation = None
+    volume = compound_onto(grid, source, settings, weights, mask)
+    state, labels = volume.state.T, {"segments": STATE_SEGMENTS}
+    made: dict[Path | None, tuple[str, Any, dict[str, str], dict[str, Any]]] = {
+        request.path: (settings.voxel_type, volume.voxels.T, fields, {}),
+        request.state_path: ("uint8", state, fields, labels),
+    }
     if request.deviation_path is not None:
-        deviation = DeviationField(_errors(posed, "the deviation of position"), source.grid, grid)
+        errors = DeviationField(_errors(posed, "the deviation of position"), source.grid, grid)
+        words = fields | {"levels": _DEVIATION}
+        made[request.deviation_path] = ("float32", errors.planes(0, len(state), state), words, {})
     with ExitStack() as files:
-
-        def opened(
-            path: Path, kind: str, levels: str = meaning, segments: tuple[Segment, ...] | None = None
-        ) -> VolumeWriter:
-            place = grid.shape, grid.spacing_mm, grid.world_from_grid
-            return files.enter_context(
-                VolumeWriter(path, *place, kind, fields | {"levels": levels}, segments=segments)
-            )
-
-        voxels = opened(request.path, settings.voxel_type)
-        states = opened(request.state_path, "uint8", meaning, STATE_SEGMENTS) if request.state_path else None
-        deviations = None
-        if request.deviation_path is not None:
-            deviations = opened(request.deviation_path, "float32", _DEVIATION)
-        volume = compound_onto(grid, source, settings, weights, mask)
-        state = volume.state.T
-        voxels.append(volume.voxels.T)
-        if states is not None:
-            states.append(state)
-        if deviations is not None and deviation is not None:
-            deviations.append(deviation.planes(0, len(state), state))
-        counts = np.bincount(state.ravel(), minlength=3)
-        if progress is not None:
-            progress(grid.shape[2], grid.shape[2])
-    seconds = time.perf_counter() - began
+        for path, (kind, voxels, words, more) in made.items():
+            if path is not None:
+                place = grid.shape, grid.spacing_mm, grid.world_from_grid
+                files.enter_context(VolumeWriter(path, *place, kind, words, **more)).append(voxels)
+    if progress is not None:
+        progress(grid.shape[2], grid.shape[2])
+    counts, seconds = np.bincount(state.ravel(), minlength=3), time.perf_counter() - began
     return VolumeReport(request.path, posed.mode, grid, counts, request.path.stat().st_size, seconds)
 
 
