@@ -79,7 +79,7 @@ class CutPlot:
         place = {"x": [left], "y": [top], "dw": [right - left], "dh": [bottom - top]}
         self._image.data = {"image": [np.ascontiguousarray(colours).view(np.uint32)[..., 0]], **place}
         self.plane = drawn.cut
-        self.plot.title.text = picture.place
+        self.plot.title.text = picture.place.split(", seen")[0]
         self.plot.xaxis.axis_label, self.plot.yaxis.axis_label = (f"{name} / mm" for name in picture.axes)
 
     def show_points(self, cross_mm: FloatArray, points_mm: FloatArray) -> None:

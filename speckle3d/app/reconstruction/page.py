@@ -144,7 +144,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     def layout(self) -> Viewable:
         """Sliders and measurements on the left, then two tall cuts, the third, and the trajectories."""
-        chosen = {name: {"bar_color": colour} for name, colour in _COLOURS.items()}
+        chosen: dict[str, Any] = {name: {"bar_color": colour} for name, colour in _COLOURS.items()}
+        chosen |= {name: {"width": _SIDE_PX} for name in ("mode", "other")}
         controls = pn.Param(
             self, parameters=["mode", "other", *_COLOURS], widgets=chosen, show_name=False, width=_SIDE_PX
         )
@@ -171,8 +172,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._space = pn.pane.Plotly(plot_outlines(poses, self._grid), sizing_mode="stretch_both")
         self._space.object.update_layout(
             height=None, margin={"l": 0, "r": 0, "t": 0, "b": 0}, font_size=10, uirevision="kept",
-            legend={"y": 1}, scene_camera={"eye": {"x": 2.0, "y": -2.8, "z": 1.2}}, scene_xaxis_nticks=3,
-            scene_yaxis_nticks=3,
+            legend={"y": 1}, scene_camera={"eye": {"x": 2.4, "y": -3.3, "z": 1.4}, "center": {"z": -0.05}},
+            scene_xaxis_nticks=3, scene_yaxis_nticks=3,
         )  # fmt: skip
         self._space.object.add_scatter3d(mode="lines", line={"color": "#ff4fc3", "width": 6}, name="cuts")
         trust = page.reconstruction.trust

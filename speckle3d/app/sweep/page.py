@@ -1,27 +1,42 @@
-"""The sweep player."""
+"""The sweep player: frames, their patches, flags, doubts and sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+import time
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from html import escape
+from typing import Any
 
+import numpy as np
+import panel as pn
+import param
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.sweep.findings import FrameFindings
-from speckle3d.app.sweep.pairs import SweepPairs
-from speckle3d.app.sweep.player import Player
-from speckle3d.app.sweep.screen import ScreenImages
-from speckle3d.app.sweep.streams import streams_of
+from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, SweepPairs
+from speckle3d.app.sweep.plots import FLAGGED, ImagePlot, TimePlots
 from speckle3d.config import Config, stored_config
+from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import Sweep
-from speckle3d.examine.sensors import believed
+from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
+from speckle3d.study.images import GreyImages
+
+MOST_ROWS = 640
+"""Rows that are sent to the browser: more than a screen shows, and a third of what echoes are sampled at."""
+_MOST_DB, _USUAL_DB = 90, 50
+"""Dynamic range of the images that are sent, and of what is shown of it at first."""
+_JUDGING_S, _JUDGING_MS = 0.02, 40
+"""Time at once, and how often, for looking at frames that nobody has judged."""
+
+Stream = tuple[str, tuple[str, str, str], FloatArray, FloatArray]
+"""Label, names of three parts, times on the images' clock, and values, shape (m, 3)."""
 
 
 class SweepPage:
-    """Frames of a sweep with a slider and the keyboard, their patches, flags, doubts and sensors.
+    """Frames of a sweep with a player, their patches, flags, doubts and sensors.
 
     Parameters
     ----------
@@ -43,37 +58,181 @@ class SweepPage:
         reconstruction: Reconstruction | None = None,
         doubts: Sequence[Doubt] | None = None,
     ) -> None:
-        self._sweep, self._folder = sweep, folder
-        self._reconstruction, self._doubts = reconstruction, doubts
+        self.sweep = sweep
+        toml = "" if reconstruction is None else reconstruction.config_toml
+        config = stored_config(toml) if toml else Config()
+        self._images = GreyImages(sweep, _MOST_DB, settings=config.intensity)
+        self.pairs = SweepPairs(sweep, config, None if reconstruction is None else reconstruction.pairs)
+        self.findings = FrameFindings(sweep, config, reconstruction, doubts)
 
     def view(self) -> Viewable:
-        """Frames with a slider."""
-        made, config = self._reconstruction, self._config
-        return Player(
-            self._sweep,
-            self._images,
-            SweepPairs(self._sweep, config, None if made is None else made.pairs, self._by_orientation),
-            FrameFindings(self._sweep, config, made, self._doubts),
-            streams_of(self._sweep),
-        ).view()
+        """Frames with a player."""
+        return _Player(self).layout()
 
     @cached_property
-    def _config(self) -> Config:
-        made = self._reconstruction
-        return stored_config(made.config_toml) if made is not None and made.config_toml else Config()
+    def grid(self) -> ImageGrid:
+        """Of the images that are shown."""
+        return pooled_grid(self._images.grid)
 
-    @property
-    def _by_orientation(self) -> bool:
-        """Whether the reconstruction had a sensed orientation to choose patches by."""
-        if self._reconstruction is None:
-            return False
-        sensor = believed(self._sweep, self._doubts or ()).orientation_source
-        # A calibration that was given then is not in the sweep.
-        mounted = bool(self._reconstruction.provenance.calibrations)
-        if sensor is None or not (mounted or sensor.sensor_from_image is not None):
-            return False
-        return self._config.sensors.consistent_subset and bool(sensor.covers(self._sweep.frame_time_s).all())
+    def image(self, frame: int) -> ByteArray:
+        """Picture of a frame, shape (row, column): 255 is the maximum, a level less 90/255 dB less."""
+        grid, grey = self.grid, self._images[frame]
+        pool = self._images.grid.samples // grid.samples
+        parts: Float32Array = grey[:, : pool * grid.samples].reshape(grid.vectors, grid.samples, pool)
+        # NumPy's mean takes more than twice as long over so short an axis.
+        mean = np.einsum("vrp->rv", parts) / np.float32(pool)
+        return np.asarray(np.rint(np.clip(mean, 0, 255)), dtype=np.uint8, order="C")
 
-    @cached_property
-    def _images(self) -> ScreenImages:
-        return ScreenImages(self._sweep, self._config.intensity)
+
+class _Player(param.Parameterized):  # type: ignore[misc]
+    """What one viewer sees of a sweep."""
+
+    frame = param.Integer(0)
+    colour = param.Selector(label="patches coloured by")
+    lag = param.Integer(-1, bounds=(-NEIGHBOURS, NEIGHBOURS), label="paired with the frame later by")
+    opacity = param.Integer(50, bounds=(10, 100), label="opacity / %")
+    range_db = param.Integer(_USUAL_DB, bounds=(30, _MOST_DB), label="dynamic range / dB")
+
+    def __init__(self, page: SweepPage) -> None:
+        self._page, self._findings = page, page.findings
+        last = len(page.sweep) - 1
+        quantities = ["distance", "sigma", "correlation"] if page.pairs.are_reconstructed else ["correlation"]
+        self.param.frame.bounds = (0, max(last, 1))
+        self.param.colour.objects = ["none", *quantities]
+        super().__init__(colour=quantities[0] if page.pairs.are_reconstructed else "none")
+        self._picture = ImagePlot(page.grid, page.pairs.patch_mm)
+        self._times = TimePlots(page.sweep, self.go)
+        self._told = pn.pane.HTML("", sizing_mode="stretch_width")
+        self._state = pn.pane.HTML("", sizing_mode="stretch_width")
+        self.param.watch(self._draw, ["frame", "colour", "lag", "opacity"])
+        self.param.watch(self._draw_levels, "range_db")
+        self._draw()
+        self._draw_levels()
+        self._draw_findings()
+
+    def layout(self) -> Viewable:
+        """The image on the left, as high as the window; all else on the right."""
+        sweep, wide = self._page.sweep, {"sizing_mode": "stretch_width"}
+        player = pn.widgets.Player.from_param(
+            self.param.frame, interval=max(round(1000 * self._times.interval_s), 10), show_value=True,
+            show_loop_controls=False, disabled=len(sweep) == 1, height=75, **wide,
+        )  # fmt: skip
+        colour = pn.widgets.RadioButtonGroup.from_param(self.param.colour, button_style="outline")
+        sliders = [
+            pn.widgets.IntSlider.from_param(self.param[name], width=170) for name in ("opacity", "range_db")
+        ]
+        streams = [pn.pane.Bokeh(self._times.stream(*each), **wide) for each in streams_of(sweep)]
+        if self._findings.flags is None:
+            self._clock = pn.state.add_periodic_callback(self._judge, period=_JUDGING_MS)
+        right = pn.Column(
+            player,
+            pn.Row(pn.pane.HTML("<b>patches coloured by</b>", margin=(10, 5)), colour),
+            pn.Row(pn.widgets.IntSlider.from_param(self.param.lag, width=215), *sliders),
+            self._told,
+            self._state,
+            *self._doubts(),
+            pn.pane.Bokeh(self._times.marks, **wide),
+            *(streams or [pn.pane.HTML("No sensor was recorded with this sweep.")]),
+            sizing_mode="stretch_both", scroll="y-auto",
+        )  # fmt: skip
+        left = pn.pane.Bokeh(self._picture.plot, sizing_mode="stretch_both", max_width=700)
+        return pn.Row(left, right, sizing_mode="stretch_both")
+
+    def go(self, frame: int) -> None:
+        """Show a frame."""
+        self.frame = int(np.clip(frame, 0, len(self._page.sweep) - 1))
+
+    def _doubts(self) -> Iterator[Viewable]:
+        """What is doubted of the recording, with buttons that lead to the frames of each."""
+        for doubt in self._findings.doubts:
+            yield pn.pane.HTML(f"&bull; {escape(doubt.consequence)}")
+            buttons = []
+            for first, last in doubt.frames[:6]:
+                name = f"frame {first}" if first == last else f"frames {first}–{last}"
+                buttons.append(pn.widgets.Button(name=name, button_style="outline", margin=(0, 3)))
+                buttons[-1].on_click(partial(lambda frame, _: self.go(frame), first))
+            yield pn.Row(*buttons, margin=(0, 10))
+
+    def _judge(self) -> None:
+        """Look at more frames, as long as some are not judged."""
+        until = time.monotonic() + _JUDGING_S
+        while self._findings.flags is None and time.monotonic() < until:
+            self._findings.judge_next()
+        if self._findings.flags is not None:
+            self._clock.stop()
+        self._draw_findings()
+
+    def _draw_findings(self) -> None:
+        self._times.mark(self._findings.flags, self._findings.doubts)
+        self._state.object = escape(self._findings.state())
+
+    def _draw_levels(self, *_: Any) -> None:
+        self._picture.levels.low = 255.0 * (1.0 - self.range_db / _MOST_DB)
+
+    def _draw(self, *_: Any) -> None:
+        frame, pairs = self.frame, self._page.pairs
+        # Where the sweep ends, the other way.
+        other = frame + self.lag if 0 <= frame + self.lag < len(self._page.sweep) else frame - self.lag
+        values = None
+        if self.colour != "none" and self.lag and 0 <= other < len(self._page.sweep):
+            values = pairs.values(frame, other, self.colour == "correlation")
+        with pn.io.hold():
+            self._picture.show(self._page.image(frame))
+            most = pairs.most(self.colour, self.lag)
+            self._picture.colour(values, self.colour, most, self.opacity / 100)
+            self._times.move(frame)
+            self._told.object = "<br>".join(self._words(frame, other, values))
+
+    def _words(self, frame: int, other: int, values: PatchValues | None) -> Iterator[str]:
+        """What is shown, as HTML."""
+        time_s = self._page.sweep.frame_time_s
+        yield f"<b>Frame {frame}</b> of 0 to {len(time_s) - 1}, at {time_s[frame] - time_s[0]:.3f} s"
+        for reason in self._findings.reasons(frame):
+            yield f'<span style="color:{FLAGGED}">&#9873; {escape(reason)}</span>'
+        if values is None:
+            return
+        words = [f"<b>With frame {other}</b>"]
+        if values.moved_mm is not None:
+            moved, sigma = values.moved_mm
+            words.append(
+                f"the image's centre is {moved:.3f} mm away, elevational (standard deviation {sigma:.3f})"
+            )
+        if np.isfinite(values.correlation).any():
+            words.append(f"median correlation {np.nanmedian(values.correlation):.3f}, computed anew")
+        yield "; ".join(words)
+        if values.used is not None:
+            left_out = np.isfinite(values.distance_mm) & ~values.used
+            yield f"{values.used.sum()} patches used, {left_out.sum()} left out (red crosses)"
+        elif self._page.pairs.are_reconstructed:
+            yield "The reconstruction did not use this pair."
+
+
+def pooled_grid(grid: ImageGrid) -> ImageGrid:
+    """Grid of images whose rows are means of so many samples that at most `MOST_ROWS` are left."""
+    pool = -(-grid.samples // MOST_ROWS)
+    first_mm = grid.first_sample_depth_mm + (pool - 1) / 2 * grid.sample_spacing_mm
+    rows, row_mm = grid.samples // pool, pool * grid.sample_spacing_mm
+    return ImageGrid(grid.vectors, rows, grid.vector_pitch_mm, row_mm, first_mm)
+
+
+def streams_of(sweep: Sweep) -> Iterator[Stream]:
+    """How a sweep's sensors turned and moved the image, or themselves where they are not calibrated to it."""
+    orientation, tracker = sweep.orientation, sweep.tracker
+    if orientation is not None:
+        turns, names = orientation.readings.world_from_sensor, ("x", "y", "z")
+        if orientation.sensor_from_image is not None:
+            turns, names = turns * orientation.sensor_from_image, ("tilt", "yaw", "roll")
+        yield "sensor / °", names, *_with_gaps(orientation, np.degrees((turns[0].inv() * turns).as_rotvec()))
+    if tracker is not None:
+        poses, names, at = tracker.readings.world_from_sensor, ("x", "y", "z"), np.zeros(3)
+        if tracker.sensor_from_image is not None:
+            poses, names = poses * tracker.sensor_from_image, ("lateral", "axial", "elevational")
+            at = sweep.grid.centre_mm
+        yield "tracker / mm", names, *_with_gaps(tracker, (poses[0].inv() * poses).apply(at) - at)
+
+
+def _with_gaps(sensor: OrientationSensor | Tracker, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Times on the images' clock and values, with a break where readings are too far apart to be joined."""
+    time_s = sensor.readings.time_s + sensor.time_offset_s
+    gaps = np.flatnonzero(np.diff(time_s) > sensor.readings.max_gap_s) + 1
+    return np.insert(time_s, gaps, time_s[gaps]), np.insert(values, gaps, np.nan, axis=0)

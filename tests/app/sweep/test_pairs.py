@@ -1,7 +1,9 @@
+"""Patches of frame pairs, as kept in a reconstruction or correlated anew."""
+
 import numpy as np
 import pytest
 
-from speckle3d.app.sweep.pairs import SweepPairs, nearest_lag
+from speckle3d.app.sweep.pairs import SweepPairs
 from speckle3d.config import Config
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.matching.frames import match_sweep
@@ -47,42 +49,25 @@ def test_correlations_computed_anew_are_those_that_the_pipeline_reads(part, matc
     # In-plane motion is looked for anew, from another start.
     np.testing.assert_allclose(values.correlation, table.correlation[row], atol=2e-3)
     assert values.used is None
-    assert np.isnan(values.distance_mm).all()
 
 
 def test_what_a_reconstruction_keeps_of_a_pair_is_shown_as_it_is_kept(part, kept):
-    values = SweepPairs(part, Config(), kept).values(3, 2, with_correlation=False)
+    pairs = SweepPairs(part, Config(), kept)
+    values = pairs.values(3, 2, with_correlation=False)
     np.testing.assert_array_equal(values.distance_mm, kept.distance_mm[0])
     np.testing.assert_array_equal(values.sigma_mm, kept.sigma_mm[0])
     np.testing.assert_array_equal(values.used, kept.used[0])
     assert values.moved_mm == pytest.approx((0.3, 0.04))
-    assert np.isnan(values.correlation).all()
+    unpaired = pairs.values(8, 7, with_correlation=False)
+    assert unpaired.used is None
+    assert np.nanmedian(unpaired.correlation) > 0.5
 
 
 def test_patches_lie_in_the_later_frame_where_the_earlier_ones_are_found_again(part, kept):
     pairs = SweepPairs(part, Config(), kept)
     there, at_rest = pairs.values(3, 2, False), pairs.values(2, 3, False)
     np.testing.assert_array_equal(at_rest.centre_mm, kept.patch_centre_mm)
-    assert at_rest.turn_rad == 0.0
-    assert there.turn_rad == pytest.approx(-0.02)
+    assert (at_rest.turn_rad, there.turn_rad) == (0.0, pytest.approx(-0.02))
     inside = np.column_stack([there.centre_mm, np.zeros(len(there.centre_mm)), np.ones(len(there.centre_mm))])
     back = inside @ kept.first_from_second[0].T
     np.testing.assert_allclose(back[:, :2], kept.patch_centre_mm, atol=1e-9)
-
-
-def test_frames_are_compared_with_those_of_their_pairs_and_their_neighbours(part, kept):
-    assert SweepPairs(part, Config(), kept).others(5) == [3, 4, 6]
-    assert SweepPairs(part, Config(), kept).others(0) == [1]
-    assert SweepPairs(part, Config()).others(11) == list(range(3, 11))
-    values = SweepPairs(part, Config(), kept).values(8, 7, with_correlation=False)
-    assert values.used is None
-    assert np.nanmedian(values.correlation) > 0.5
-
-
-def test_the_same_distance_in_frames_is_kept_then_the_nearer_then_the_one_before():
-    assert nearest_lag(10, [7, 9, 11], -1) == 9
-    assert nearest_lag(10, [7, 11], -2) == 7
-    assert nearest_lag(0, [1, 2], -1) == 1
-    assert nearest_lag(10, [7, 9], -2) == 9
-    assert nearest_lag(10, [9, 11], 0) == 9
-    assert nearest_lag(3, [], -1) is None

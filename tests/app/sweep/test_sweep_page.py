@@ -1,21 +1,21 @@
-"""The sweep player as a browser shows it."""
+"""The sweep player, without a browser and in one."""
 
-import json
-import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from browsers import chromium, needs_browser, opened, viewing
+from browsers import needs_browser, opened, viewing
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.app.sweep.screen import ScreenImages
+from speckle3d.app.folder import Folder
+from speckle3d.app.sweep.page import SweepPage, _Player, streams_of
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.study.details import recorded_doubts
 from speckle3d.study.job import run_job
-
-pytestmark = needs_browser
 
 LIFTED = slice(30, 35)
 
@@ -41,129 +41,114 @@ def files(sweep, curves, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def page(files):
+def made(files):
+    return read_reconstruction(files[1])
+
+
+@pytest.fixture
+def player(files, made):
     recording, reconstruction = files
-    with viewing(recording, "--reconstruction", reconstruction) as address, chromium() as browser:
-        page = opened(browser, address)
-        page.set_default_timeout(20_000)
-        page.own = address.split("?")[0]
-        page.get_by_text("Frame 0", exact=True).wait_for()
-        yield page
-        assert page.complaints == []
-        assert [each for each in page.requests if not each.startswith(page.own)] == []
+    doubts = recorded_doubts(reconstruction, made.provenance)
+    player = _Player(SweepPage(load_sweep(recording), Folder(recording), made, doubts))
+    player.layout()
+    return player
 
 
-@pytest.fixture(autouse=True)
-def from_the_first(page):
-    page.keyboard.press("Home")
-    at(page, 0)
+def told(player):
+    return player._told.object
 
 
-def at(page, frame):
-    page.get_by_text(f"Frame {frame}", exact=True).wait_for()
-
-
-def shown(page):
-    """The image that the browser holds, shape (row, column)."""
-    held = page.evaluate(
-        """() => {
-          const [image] = Bokeh.documents[0].get_model_by_name("sweep image").data.image
-          return {shape: image.shape, values: Array.from(image)}
-        }"""
+def test_a_sample_lies_where_the_axes_say(player):
+    x, y = np.meshgrid(np.arange(8), np.arange(1500), indexing="ij")
+    frames = np.where((x == 5) & (abs(y - 900) < 40), 255, 0)[None].astype(np.uint8)
+    sweep = Sweep(
+        np.repeat(frames, 2, axis=0), ImageGrid(8, 1500, 0.5, 0.02, 1.0), BModeSettings(90.0), np.arange(2.0)
     )
-    return np.array(held["values"], dtype=np.uint8).reshape(held["shape"])
+    page = SweepPage(sweep, Folder(Path("s.h5")))
+    rows, columns = np.nonzero(page.image(1) > 200)
+    assert set(columns) == {5}
+    assert page.grid.first_sample_depth_mm + rows.mean() * page.grid.sample_spacing_mm == pytest.approx(
+        19.0, abs=0.03
+    )
+    np.testing.assert_array_equal(player._picture._image.data["image"][0], player._page.image(player.frame))
 
 
-def test_keys_step_leap_and_end_wherever_the_focus_is(page, files):
-    page.keyboard.press("ArrowRight")
-    at(page, 1)
-    page.keyboard.press("Shift+ArrowRight")
-    at(page, 11)
-    images = ScreenImages(load_sweep(files[0]))
-    np.testing.assert_array_equal(shown(page), images.image(11))
-    page.get_by_text("patches in the consistent subset").wait_for()
-    # On a button, which Space would press, and on a slider, which arrows would move.
-    page.get_by_role("button", name="none").focus()
-    page.keyboard.press("End")
-    at(page, 47)
-    page.locator(".noUi-handle").first.focus()
-    page.keyboard.press("ArrowLeft")
-    at(page, 46)
-    page.keyboard.press("PageUp")
-    at(page, 36)
+def test_patches_of_a_pair_are_counted_as_the_file_has_them(player, made):
+    player.param.update(frame=10, colour="distance", lag=-2)
+    row = int(np.flatnonzero((made.pairs.first == 8) & (made.pairs.second == 10))[0])
+    used, known = made.pairs.used[row], np.isfinite(made.pairs.distance_mm[row])
+    assert f"{used.sum()} patches used, {(known & ~used).sum()} left out" in told(player)
+    assert f"{abs(made.pairs.first_from_second[row] @ centre(player))[2]:.3f} mm away" in told(player)
+    shown = player._picture._patches.data
+    np.testing.assert_array_equal(shown["value"], made.pairs.distance_mm[row])
+    assert list(shown["state"]).count("left out") == (known & ~used).sum()
+    player.colour = "correlation"
+    assert "computed anew" in told(player)
+    player.colour = "none"
+    assert len(player._picture._patches.data["value"]) == 0
 
 
-def test_in_a_text_field_keys_write(page):
-    page.evaluate("document.body.insertAdjacentHTML('beforeend', '<input id=note style=\"position:fixed\">')")
-    page.locator("#note").focus()
-    for key in ("a", " ", "ArrowLeft", "b"):
-        page.keyboard.press(key)
-    assert page.locator("#note").input_value() == "ab "
-    page.evaluate("document.getElementById('note').remove()")
-    page.keyboard.press("ArrowRight")
-    at(page, 1)
+def centre(player):
+    return np.append(player._page.sweep.grid.centre_mm, 1.0)
 
 
-def test_the_slider_moves_the_frame(page):
-    bar = page.locator(".noUi-connects").last.bounding_box()
-    page.mouse.click(bar["x"] + bar["width"] / 2, bar["y"] + bar["height"] / 2)
-    page.get_by_text("Frame 0", exact=True).wait_for(state="detached")
-    middle = page.locator("b", has_text="Frame ").first.inner_text()
-    assert abs(int(middle.split()[1]) - 23) <= 2
+def test_flags_and_doubts_are_marked_at_their_frames_and_a_click_goes_there(player, made):
+    flagged = np.flatnonzero(made.trust.flags)
+    assert f"{len(flagged)} of 48 frames flagged" in player._state.object
+    player.frame = LIFTED.start
+    assert "lifted: no contact" in told(player)
+    marks = player._times._marks.data
+    time_s = player._page.sweep.frame_time_s
+    (spikes,) = (at for at, words in enumerate(marks["words"]) if "(suspect: spikes)" in words)
+    tracker = player._page.sweep.tracker
+    assert (
+        marks["left"][spikes] < tracker.readings.time_s[60] + tracker.time_offset_s < marks["right"][spikes]
+    )
+    player._times._jump(int(np.argmin(np.abs(time_s - marks["left"][spikes]))))
+    assert abs(time_s[player.frame] - marks["left"][spikes]) < 0.04
+    assert player._times.cursor.location == time_s[player.frame]
 
 
-def test_patches_of_a_pair_are_counted_as_the_file_has_them(page, files):
-    pairs = read_reconstruction(files[1]).pairs
-    page.keyboard.press("Shift+ArrowRight")
-    at(page, 10)
-    page.get_by_role("button", name="distance").click()
-    page.get_by_text("With frame 9").wait_for()
-    row = int(np.flatnonzero((pairs.first == 9) & (pairs.second == 10))[0])
-    used, known = pairs.used[row], np.isfinite(pairs.distance_mm[row])
-    page.get_by_text(f"{used.sum()} patches in the consistent subset").wait_for()
-    page.get_by_text(f"{(known & ~used).sum()} rejected: the sensed orientation").wait_for()
-    page.locator("select").first.select_option(label="frame 8 (2 before)")
-    page.get_by_text("With frame 8").wait_for()
-    moved = abs((pairs.first_from_second[(pairs.first == 8) & (pairs.second == 10)][0] @ centre(files))[2])
-    page.get_by_text(f"{moved:.3f} ± ").wait_for()
-    page.get_by_role("button", name="none").click()
-    page.get_by_text("With frame 8").wait_for(state="detached")
+def test_a_recording_alone_is_judged_in_the_background(sweep, shipped):
+    player = _Player(SweepPage(sweep.part(0, 6), Folder(shipped / "phantom.h5")))
+    player.layout()
+    assert "0 of 6" in player._state.object
+    for _ in range(100):
+        player._judge()
+    assert "None of 6 frames flagged" in player._state.object
 
 
-def centre(files):
-    return np.append(load_sweep(files[0]).grid.centre_mm, 1.0)
+def test_streams_are_the_images_path_and_turn(sweep):
+    (_, about, _, turn), (_, parts, time_s, path) = streams_of(sweep)
+    assert (about[0], parts[2]) == ("tilt", "elevational")
+    frame = np.interp(sweep.frame_time_s, time_s, path[:, 2])
+    expected = (sweep.truth[0].inv() * sweep.truth).apply(sweep.grid.centre_mm)[:, 2]
+    assert np.abs(frame - frame[0] - expected).max() < 1.0
+    assert np.nanmax(np.abs(turn)) < 2.0
 
 
-def test_what_the_checks_found_leads_to_its_frames_which_say_why(page, files):
-    flagged = np.count_nonzero(read_reconstruction(files[1]).trust.flags)
-    page.get_by_text(f"{flagged} of 48 frames flagged").wait_for()
-    summary = json.loads((files[1].parent / "summary.json").read_text())["sweeps"][0]
-    (doubt,) = [each for each in summary["doubts"] if each["suspect"] == "spikes"]
-    ((first, last),) = doubt["frames"]
-    name = f"frame {first}" if first == last else f"frames {first}–{last}"
-    page.get_by_role("button", name=name, exact=True).click()
-    at(page, first)
-    page.keyboard.press("Home")
-    for _ in range(3):
-        page.keyboard.press("PageDown")
-    at(page, LIFTED.start)
-    page.get_by_text("lifted: no contact").wait_for()
-    page.get_by_text("unmatched: no earlier frame").wait_for()
-
-
-def test_space_plays_at_the_recordings_rate(page):
-    page.keyboard.press(" ")
-    page.get_by_role("button", name="pause").wait_for()
-    at(page, 47)
-    page.get_by_role("button", name="play").wait_for()
-    page.keyboard.press("Home")
-    at(page, 0)
-    page.keyboard.press(" ")
-    began = time.monotonic()
-    page.wait_for_timeout(1000)
-    page.keyboard.press(" ")
-    page.get_by_role("button", name="play").wait_for()
-    took = time.monotonic() - began
-    frame = int(page.locator("b", has_text="Frame ").first.inner_text().split()[1])
-    # No faster than 25 frames a second; how much slower is the machine's affair.
-    assert 1 <= frame <= 25 * took + 2
+@pytest.mark.slow
+@needs_browser[1]
+@needs_browser[2]
+def test_in_the_browser_it_plays_and_the_image_fills_the_height(browser, files):
+    recording, reconstruction = files
+    with viewing(recording, "--reconstruction", reconstruction) as address:
+        page = opened(browser, address)
+        page.set_default_timeout(30_000)
+        page.get_by_text("of 0 to 47").wait_for()
+        plot = page.locator(".bk-Figure").first.bounding_box()
+        assert plot["height"] > 650
+        assert plot["y"] + plot["height"] <= 768
+        slider = page.locator("input[type=range]").first
+        slider.focus()
+        page.keyboard.press("ArrowRight")
+        page.get_by_text("Frame 1", exact=True).wait_for()
+        page.keyboard.press("End")
+        page.get_by_text("Frame 47", exact=True).wait_for()
+        page.keyboard.press("Home")
+        page.get_by_text("Frame 0", exact=True).wait_for()
+        page.locator("button.play").click()
+        page.get_by_text("Frame 47", exact=True).wait_for()
+        assert page.complaints == []
+        assert [each for each in page.requests if not each.startswith(address.split("?")[0])] == []
+        page.close()
