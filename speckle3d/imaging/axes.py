@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import fmin
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
@@ -83,7 +83,9 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
     InvalidInputError
         If there are no poses.
     """
-    points = _extreme_points(image_corners(grid, world_from_image).reshape(-1, 3))
+    points = image_corners(grid, world_from_image).reshape(-1, 3)
+    # Joggled, so that points in a plane have a hull as well.
+    points = points[ConvexHull(points, qhull_options="QJ").vertices]
     try:
         lateral_first = sweep_axes(world_from_image)
     except InsufficientDataError:
@@ -126,14 +128,6 @@ def line_along(directions: FloatArray) -> FloatArray:
     """
     line = np.asarray(np.linalg.eigh(directions.T @ directions)[1][:, -1], dtype=float)
     return line if directions[0] @ line >= 0 else -line
-
-
-def _extreme_points(points: FloatArray) -> FloatArray:
-    """Corners of the convex hull; all points if they lie in a plane."""
-    try:
-        return np.asarray(points[ConvexHull(points).vertices])
-    except QhullError:
-        return points
 
 
 def _spread_axes(points: FloatArray) -> Rotation:

@@ -52,8 +52,7 @@ class PosedImages:
 
     def __post_init__(self) -> None:
         require_poses(self.world_from_image)
-        shape = getattr(self.images, "shape", None) or [len(self)]
-        known = len(self.images) if isinstance(self.images, Sized) else shape[0]
+        known = len(self.images) if isinstance(self.images, Sized) else len(self)
         if known != len(self):
             raise MismatchError(
                 f"world_from_image: expected {known} poses for {known} images, got {len(self)}"
@@ -65,7 +64,7 @@ class PosedImages:
     @property
     def any_thread(self) -> bool:
         """Whether images may be read by several threads at once."""
-        return isinstance(self.images, np.ndarray) or getattr(self.images, "any_thread", False)
+        return _any_thread(self.images)
 
     def read(self, index: int) -> Float32Array:
         """Image number `index`, shape (vector, sample), contiguous; raises what `read_as_stored` does."""
@@ -92,12 +91,8 @@ class PosedImages:
 
     def index_from_image(self) -> FloatArray:
         """Affine map from image coordinates (x, y, z, 1) in mm to (vector, sample, z in mm), shape (3, 4)."""
-        plane = np.zeros((3, 4))
-        image_from_sample = self.grid.image_from_sample
-        plane[:2, :2] = np.linalg.inv(image_from_sample[:2, :2])
-        plane[:2, 3] = -plane[:2, :2] @ image_from_sample[:2, 2]
-        plane[2, 2] = 1.0
-        return plane
+        elevational = [0.0, 0.0, 1.0, 0.0]
+        return np.asarray(np.linalg.inv(np.insert(self.grid.image_from_sample, 2, elevational, axis=1))[:3])
 
 
 @dataclass(frozen=True)
@@ -125,7 +120,11 @@ class ChosenImages:
     @property
     def any_thread(self) -> bool:
         """Whether images may be read by several threads at once."""
-        return isinstance(self.images, np.ndarray) or getattr(self.images, "any_thread", False)
+        return _any_thread(self.images)
+
+
+def _any_thread(images: Images) -> bool:
+    return isinstance(images, np.ndarray) or getattr(images, "any_thread", False)
 
 
 def require_poses(world_from_image: RigidTransform) -> None:

@@ -39,9 +39,7 @@ class Rectangle:
     high_mm: Pair
 
     def __post_init__(self) -> None:
-        if not (
-            np.isfinite([self.low_mm, self.high_mm]).all() and (np.less(self.low_mm, self.high_mm)).all()
-        ):
+        if not (np.isfinite([self.low_mm, self.high_mm]).all() and np.less(self.low_mm, self.high_mm).all()):
             raise InvalidInputError(
                 f"rectangle: expected two finite corners, the lower values first, got {self.low_mm} and "
                 f"{self.high_mm} mm"
@@ -49,13 +47,9 @@ class Rectangle:
 
     def mask(self, grid: ImageGrid) -> BoolArray:
         """Which samples are inside or on a side, shape (vector, sample)."""
-        inside = [
-            (position >= low - _HAIR * step) & (position <= high + _HAIR * step)
-            for position, step, low, high in zip(
-                _positions_mm(grid), _steps_mm(grid), self.low_mm, self.high_mm, strict=True
-            )
-        ]
-        return np.asarray(inside[0] & inside[1])
+        position, hair = np.stack(_positions_mm(grid), axis=-1), _hair_mm(grid)
+        low, high = np.array(self.low_mm) - hair, np.array(self.high_mm) + hair
+        return np.asarray(((position >= low) & (position <= high)).all(axis=-1))
 
 
 @dataclass(frozen=True)
@@ -91,7 +85,7 @@ class Fan:
     def mask(self, grid: ImageGrid) -> BoolArray:
         """Which samples are inside or on a side, shape (vector, sample)."""
         x, y = (position - apex for position, apex in zip(_positions_mm(grid), self.apex_mm, strict=True))
-        hair = _HAIR * min(_steps_mm(grid))
+        hair = _hair_mm(grid)
         radius = np.hypot(x, y)
         between = (radius >= self.radii_mm[0] - hair) & (radius <= self.radii_mm[1] + hair)
         left, right = np.radians(self.angles_deg)
@@ -206,8 +200,8 @@ def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray]:
     return x, y
 
 
-def _steps_mm(grid: ImageGrid) -> tuple[float, float]:
-    return grid.vector_pitch_mm, grid.sample_spacing_mm
+def _hair_mm(grid: ImageGrid) -> float:
+    return _HAIR * min(grid.vector_pitch_mm, grid.sample_spacing_mm)
 
 
 def _shape(part: str, text: str) -> Shape:

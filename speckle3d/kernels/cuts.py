@@ -177,23 +177,14 @@ def cut_voxels(
         begin, end = _clip(0.0, points - 1.0, u, du, -EDGE_TOLERANCE, last_i + EDGE_TOLERANCE)
         begin, end = _clip(begin, end, v, dv, -EDGE_TOLERANCE, last_j + EDGE_TOLERANCE)
         begin, end = _clip(begin, end, w, dw, -EDGE_TOLERANCE, last_k + EDGE_TOLERANCE)
-        first, stop = points, points
-        if begin <= end:
-            first, stop = math.ceil(begin), int(end) + 1
-        for point in range(first):
-            out[line, point] = np.nan
-        for point in range(stop, points):
-            out[line, point] = np.nan
-        # Along a line that follows an axis of the grid, its neighbours across that axis stay the same.
-        still_v, still_w = abs(dv) * points < EDGE_TOLERANCE, abs(dw) * points < EDGE_TOLERANCE
-        j, b, step_j = _neighbours(v, last_j, strides[1])
-        k, c, step_k = _neighbours(w, last_k, strides[2])
+        out[line] = np.nan
+        if begin > end:
+            continue
+        first, stop = math.ceil(begin), int(end) + 1
         for point in range(first, stop):
             i, a, step_i = _neighbours(u + du * point, last_i, strides[0])
-            if not still_v:
-                j, b, step_j = _neighbours(v + dv * point, last_j, strides[1])
-            if not still_w:
-                k, c, step_k = _neighbours(w + dw * point, last_k, strides[2])
+            j, b, step_j = _neighbours(v + dv * point, last_j, strides[1])
+            k, c, step_k = _neighbours(w + dw * point, last_k, strides[2])
             at = i + j + k
             if stated:
                 level = _counted(voxels, state, at, step_i, step_j, step_k, a, b, c)

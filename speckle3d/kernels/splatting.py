@@ -6,18 +6,13 @@ voxels gets exactly what it gets as part of all. Lines are cut to the voxels wan
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.kernels.samples import POSITION_BITS, SHARE_BITS, Samples
 
-POSITION_BITS = 40
-"""Bits of a position behind the point; 23 before it and a sign."""
-SHARE_BITS = 10
-"""Bits behind the point of a position between eight voxels."""
 COUNT_BITS = 40
 """Where a voxel's number of samples begins in the word that also holds their sum."""
 
@@ -29,7 +24,6 @@ _SHARES = (1 << SHARE_BITS) - 1
 _LEAST_SHARE = 0.125
 """Of a sample, for the maximum and the latest: its share if it lies in the middle of eight voxels."""
 
-Numbers = npt.NDArray[Any]
 Words = npt.NDArray[np.uint64]
 Tags = npt.NDArray[np.uint32]
 
@@ -68,26 +62,21 @@ def _same_cell(x: int, y: int, z: int, i: int, j: int, k: int) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def count_nearest(
-    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, offset: int, table: Words
-) -> None:
-    """Add whole levels of several images to the voxels that their samples lie in.
+def count_nearest(samples: Samples, box: IntArray, table: Words, offset: int) -> None:
+    """Add whole levels of several images to the voxels that their samples lie in; all weights are one.
 
     Parameters
     ----------
-    images : ndarray of integers, shape (n, line, sample)
-    maps : ndarray, shape (n, 3, 3)
-        From (line, sample, 1) to positions (i, j, k) in units of 2^-40 voxel; voxel n reaches from n to n + 1
-        whole ones.
-    spans : ndarray, shape (m, 3)
-        Line, first sample and end of what is used of every image.
+    samples : Samples
+        Of whole numbers.
     box : ndarray, shape (3, 2)
         First voxel and end along i, j and k; others are left alone.
-    offset : int
-        Added to each level, so that none is below zero.
     table : ndarray, shape (n_k, n_j, n_i), changed in place
         Sum of levels in the lower 40 bits, number of samples above.
+    offset : int
+        Added to each level, so that none is below zero.
     """
+    images, _, maps, spans, _, _ = samples
     n_j, n_i = table.shape[1:]
     words = table.reshape(-1)
     place = np.empty(images.shape[2] + 1, np.int64)
@@ -118,34 +107,19 @@ def count_nearest(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def add_nearest(
-    images: Numbers,
-    weights: Float32Array,
-    maps: IntArray,
-    spans: IntArray,
-    box: IntArray,
-    first_tag: int,
-    table: FloatArray,
-    tags: Tags,
-) -> None:
+def add_nearest(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -> None:
     """Add weighted levels of several images to the voxels that their samples lie in.
 
     Parameters
     ----------
-    images : ndarray, shape (n, line, sample)
-        NaN does not count.
-    weights : ndarray, shape (n, line, sample)
-        Samples whose weight is not above zero do not count.
-    maps, spans, box
+    samples, box
         As for `count_nearest`.
-    first_tag : int
-        With 0 all images count; else the last that has a sample in a voxel: this is the first one's tag, and
-        the others' follow.
     table : ndarray, shape (n_k, n_j, n_i, 2), changed in place
         Sum of weighted levels, and of weights.
     tags : ndarray, shape (n_k, n_j, n_i), changed in place
         Tag of the image that a voxel's sum is of; not read without tags.
     """
+    images, weights, maps, spans, first_tag, _ = samples
     n_j, n_i = table.shape[1:3]
     sums, marks = table.reshape(-1, 2), tags.reshape(-1)
     for n in range(images.shape[0]):
@@ -187,28 +161,15 @@ def _large(share: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def add_linear(
-    images: Numbers,
-    weights: Float32Array,
-    maps: IntArray,
-    spans: IntArray,
-    box: IntArray,
-    first_tag: int,
-    table: FloatArray,
-    tags: Tags,
-) -> None:
+def add_linear(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -> None:
     """Share weighted levels of several images out to the eight voxel centres around each sample.
 
     Parameters
     ----------
-    images, weights, spans, box, table, tags
-        As for `add_nearest`.
-    maps : ndarray, shape (n, 3, 3)
-        As for `add_nearest`, but the centre of voxel n is n, and positions are half of 2^-10 voxel ahead:
-        shares are of positions rounded to 2^-10 voxel.
-    first_tag : int
+    samples, box, table, tags
         As for `add_nearest`; with tags, shares below 1/8 do not count.
     """
+    images, weights, maps, spans, first_tag, _ = samples
     n_j, n_i = table.shape[1:3]
     row, plane, one = np.uint64(n_i), np.uint64(n_j * n_i), np.uint64(1)
     sums, marks = table.reshape(-1, 2), tags.reshape(-1)
@@ -286,22 +247,17 @@ def add_linear(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def keep_largest(
-    images: Numbers, maps: IntArray, spans: IntArray, box: IntArray, linear: bool, table: Float32Array
-) -> None:
-    """Keep the largest level in each voxel.
+def keep_largest(samples: Samples, box: IntArray, table: Float32Array) -> None:
+    """Keep the largest level in each voxel; shared out, a sample counts where its share is at least 1/8.
 
     Parameters
     ----------
-    images, spans, box
+    samples, box
         As for `add_nearest`.
-    maps : ndarray, shape (n, 3, 3)
-        As for `add_nearest`, or for `add_linear`.
-    linear : bool
-        Whether a sample counts in all voxels around it of which its share is at least 1/8.
     table : ndarray, shape (n_k, n_j, n_i), changed in place
         NaN where no sample was.
     """
+    images, _, maps, spans, _, linear = samples
     for n in range(images.shape[0]):
         m = maps[n]
         for span in range(spans.shape[0]):
@@ -331,16 +287,7 @@ def keep_largest(
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def means_of_counts(table: Words, offset: int, voxels: Float32Array) -> None:
-    """Turn what `count_nearest` made into means.
-
-    Parameters
-    ----------
-    table : ndarray, shape (n_k, n_j, n_i)
-    offset : int
-        What was added to each level.
-    voxels : ndarray, shape (n_k, n_j, n_i), filled in
-        NaN where no sample was.
-    """
+    """Turn what `count_nearest` made into means; NaN where no sample was."""
     words, means = table.reshape(-1), voxels.reshape(-1)
     for at in range(words.size):
         count = np.int64(words[at] >> np.uint64(COUNT_BITS))

@@ -12,23 +12,20 @@ import numpy.typing as npt
 from numba import njit
 
 from speckle3d.core.arrays import ByteArray, IntArray
-from speckle3d.kernels.splatting import POSITION_BITS, cut_to_box
+from speckle3d.kernels.samples import PLUS_BITS, POSITION_BITS, Samples
+from speckle3d.kernels.splatting import cut_to_box
 
-PLACE_BITS = 14
-"""Bits of a place and of a share behind the point."""
-
-_DROPPED = POSITION_BITS - PLACE_BITS
-_ONE = 1 << PLACE_BITS
+_DROPPED = POSITION_BITS - PLUS_BITS
+_ONE = 1 << PLUS_BITS
 _HALF = _ONE >> 1
 _FRACTION = (1 << POSITION_BITS) - 1
 _PIXEL = 256
 """Weight of a pixel."""
 _MOST = 65535
 """Largest weight, where 16 bits end: more is cut to it."""
-_TO_WEIGHT = PLACE_BITS - 8
+_TO_WEIGHT = PLUS_BITS - 8
 """Bits by which a share is finer than a weight."""
 
-Pixels = npt.NDArray[np.uint8]
 Weights = npt.NDArray[np.uint16]
 
 
@@ -40,22 +37,13 @@ def _share(x: int, above: int) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _within(x: int, first: int, end: int) -> bool:
+def _within(x: int, voxels: int) -> bool:
     """Whether both voxels beside a position are in the grid; one that lies on a voxel needs no other."""
-    return first <= x >> POSITION_BITS and (x + _FRACTION) >> POSITION_BITS < end
+    return x >= 0 and (x + _FRACTION) >> POSITION_BITS < voxels
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def add_whole(
-    images: Pixels,
-    maps: IntArray,
-    spans: IntArray,
-    box: IntArray,
-    linear: bool,
-    room: IntArray,
-    levels: ByteArray,
-    weights: Weights,
-) -> None:
+def add_whole(samples: Samples, box: IntArray, levels: ByteArray, weights: Weights) -> None:
     """Move the means of voxels by the pixels that lie in them or around them, to whole levels each time.
 
     With nearest, a mean is cut after every pixel, so that it can only fall below the exact one, and voxels
@@ -67,22 +55,17 @@ def add_whole(
 
     Parameters
     ----------
-    images : ndarray of uint8, shape (n, row, column)
-    maps : ndarray, shape (n, 3, 3)
-        From (row, column, 1) to positions (i, j, k) in units of 2^-40 voxel, all of them whole multiples of
-        2^-14 voxel. With nearest, voxel n reaches from n to n + 1 whole ones; with linear its centre is n.
-    spans : ndarray, shape (m, 3)
-        Row, first column and end of what is used of every image, in the order in which it counts.
+    samples : Samples
+        Of uint8, lines are rows, in the order in which they count; all weights are one. Positions are whole
+        multiples of 2^-14 voxel, not ahead where they are shared out.
     box : ndarray, shape (3, 2)
         First voxel and end along i, j and k; others are left alone.
-    linear : bool
-        Whether pixels are shared out to the eight voxels around them.
-    room : ndarray, shape (3, 2)
-        First voxel and end of the whole grid along i, j and k.
     levels : ndarray, shape (n_k, n_j, n_i), changed in place
     weights : ndarray, shape (n_k, n_j, n_i), changed in place
         Units of 1/256 pixel.
     """
+    images, _, maps, spans, _, linear = samples
+    n_k, n_j, n_i = levels.shape
     for n in range(images.shape[0]):
         m = maps[n]
         for span in range(spans.shape[0]):
@@ -97,15 +80,11 @@ def add_whole(
                         weights[k, j, i] = weight + _PIXEL
                     else:
                         levels[k, j, i] = (level + 255 * mean) >> 8
-                elif (
-                    _within(x, room[0, 0], room[0, 1])
-                    and _within(y, room[1, 0], room[1, 1])
-                    and _within(z, room[2, 0], room[2, 1])
-                ):
+                elif _within(x, n_i) and _within(y, n_j) and _within(z, n_k):
                     for corner in range(8):
                         u, v, w = corner & 1, corner >> 1 & 1, corner >> 2
-                        share = (_share(y, v) * _share(z, w) + _HALF) >> PLACE_BITS
-                        share = (_share(x, u) * share + _HALF) >> PLACE_BITS
+                        share = (_share(y, v) * _share(z, w) + _HALF) >> PLUS_BITS
+                        share = (_share(x, u) * share + _HALF) >> PLUS_BITS
                         if (
                             share == 0
                             or not box[0, 0] <= i + u < box[0, 1]
@@ -118,7 +97,7 @@ def add_whole(
                         total = share * level + before * np.int64(levels[at])
                         # To the nearest 2^-14 of a level, halves to even, and only then to a whole one.
                         fine = np.int64(np.rint(total / (share + before) * _ONE))
-                        levels[at] = (fine + _HALF) >> PLACE_BITS
+                        levels[at] = (fine + _HALF) >> PLUS_BITS
                         after = (share + before + (1 << _TO_WEIGHT >> 1)) >> _TO_WEIGHT
                         weights[at] = after if after < _MOST else _MOST
                 x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]

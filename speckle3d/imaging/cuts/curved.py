@@ -10,14 +10,14 @@ from scipy.interpolate import make_interp_spline
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, outer_borders, require_pixels
+from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, Cut, require_pixels
 
 _DENSITY = 8
 """Points per pixel along the curve from which equal steps are read off: errors of a hundredth of a pixel."""
 
 
 @dataclass(frozen=True)
-class CurvedSheet:
+class CurvedSheet(Cut):
     """A sheet that runs down from a curve, and the pixels it is cut into.
 
     Its columns are straight; neighbours are one pixel apart. Laid flat, lengths and angles on it are kept.
@@ -47,16 +47,6 @@ class CurvedSheet:
         """Distance between the first and the last column along the sheet."""
         return (len(self.base_mm) - 1) * self.pixel_mm
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Shape (rows, columns) of the resliced image."""
-        return round(self.height_mm / self.pixel_mm) + 1, len(self.base_mm)
-
-    @property
-    def extent_mm(self) -> tuple[float, float, float, float]:
-        """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
-        return outer_borders(self.shape, self.first_mm, self.pixel_mm)
-
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm; NaN beyond the ends."""
         x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
@@ -64,19 +54,6 @@ class CurvedSheet:
         known = np.arange(len(self.base_mm))
         base = [np.interp(column, known, values, np.nan, np.nan) for values in self.base_mm.T]
         return np.stack(base, axis=-1) + (y - self.first_mm[1])[..., None] * self.down
-
-    def lines(self) -> FloatArray:
-        """Of each column the first pixel's centre and the step to the next, shape (columns, 2, 3), mm."""
-        step = np.broadcast_to(self.down * self.pixel_mm, self.base_mm.shape)
-        return np.stack([self.base_mm, step], axis=1)
-
-    along_rows = False
-    """Lines are columns of the picture."""
-
-    @property
-    def hull_mm(self) -> FloatArray:
-        """Ends of all columns, shape (2 columns, 3), mm in the world."""
-        return np.concatenate([self.base_mm, self.base_mm + self.height_mm * self.down])
 
 
 def curved_sheet(

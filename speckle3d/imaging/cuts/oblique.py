@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
+from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_around
 
 _LEAST_SINE = 1e-4
@@ -46,15 +46,13 @@ def spanned_plane(
     """
     if not np.isfinite(origin_mm).all():
         raise InvalidInputError(f"plane: expected a finite origin, got {vector_words(np.asarray(origin_mm))}")
-    x, y = (np.asarray(each, dtype=float) for each in (right, down))
-    lengths = [float(np.linalg.norm(each)) for each in (x, y)]
-    got = f"got directions {vector_words(x)} and {vector_words(y)}"
-    if min(lengths) == 0 or not np.isfinite(lengths).all():
-        raise InvalidInputError(f"plane: expected {expected}, {got}")
-    x, y = x / lengths[0], y / lengths[1]
+    x, y = np.asarray(right, dtype=float), np.asarray(down, dtype=float)
+    sizes = np.linalg.norm([x, y], axis=1)
+    x, y = np.divide([x, y], np.where(sizes > 0, sizes, 1.0)[:, None])
     across = y - (y @ x) * x
-    if np.linalg.norm(across) < _LEAST_SINE:
-        raise InvalidInputError(f"plane: expected {expected}, {got}")
+    if not (np.isfinite(sizes).all() and np.linalg.norm(across) >= _LEAST_SINE and sizes[0] > 0):
+        got = f"directions {vector_words(np.asarray(right))} and {vector_words(np.asarray(down))}"
+        raise InvalidInputError(f"plane: expected {expected}, got {got}")
     y = across / np.linalg.norm(across)
     turned = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)]))
     return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), turned)
@@ -103,18 +101,8 @@ def covering_plane(
         If no frame comes near the plane; says where the sweep is.
     """
     outlines = frame_outlines(grid, world_from_image)
-    corners = placed.inv().apply(outlines[:, :4].reshape(-1, 3))
-    near = corners[np.abs(corners[:, 2]) < reach_mm, :2]
-    ends = crossings(outlines, placed).reshape(-1, 2)
-    points = np.concatenate([near, ends[np.isfinite(ends[:, 0])]])
-    if not len(points):
-        low, high = outlines.min(axis=(0, 1)), outlines.max(axis=(0, 1))
-        away = float(np.abs(corners[:, 2]).min())
-        raise InvalidInputError(
-            f"plane: expected one that meets a frame within {reach_mm:g} mm, got one {away:.1f} mm from the "
-            f"nearest; the sweep lies between {vector_words(low)} and {vector_words(high)} mm"
-        )
-    return plane_around(placed, points, pixel_mm)
+    sides = np.stack([outlines[:, :-1], outlines[:, 1:]], axis=2).reshape(-1, 2, 3)
+    return _covering(placed, sides, reach_mm, pixel_mm, f"a frame within {reach_mm:g} mm")
 
 
 def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
@@ -133,18 +121,25 @@ def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float
     InvalidInputError
         If the plane misses the box; says where that is.
     """
-    there = placed.inv().apply(corners_mm)
-    edges = np.array([(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit])
-    start, stop = there[edges[:, 0]], there[edges[:, 1]]
-    near = np.abs(there[:, 2]) <= 1e-6 * np.ptp(there, axis=0).max()
-    crossed = start[:, 2] * stop[:, 2] < 0
-    share = start[crossed, 2] / (start[crossed, 2] - stop[crossed, 2])
-    points = np.concatenate([there[near], start[crossed] + share[:, None] * (stop - start)[crossed]])[:, :2]
+    edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
+    touching_mm = 1e-6 * float(np.ptp(corners_mm, axis=0).max())
+    return _covering(placed, corners_mm[edges], touching_mm, pixel_mm, "the volume")
+
+
+def _covering(
+    placed: RigidTransform, edges_mm: FloatArray, reach_mm: float, pixel_mm: float, what: str
+) -> ReslicePlane:
+    """Plane as large as where it crosses edges, shape (n, 2, 3), or passes their ends."""
+    there = placed.inv().apply(edges_mm.reshape(-1, 3)).reshape(edges_mm.shape)
+    start, stop = there[there[:, 0, 2] * there[:, 1, 2] < 0].swapaxes(0, 1)
+    share = start[:, 2:] / (start[:, 2:] - stop[:, 2:])
+    away = np.abs(there[..., 2])
+    points = np.concatenate([there[away <= reach_mm], start + share * (stop - start)])[:, :2]
     if not len(points):
-        low, high = corners_mm.min(axis=0), corners_mm.max(axis=0)
+        low, high = edges_mm.min(axis=(0, 1)), edges_mm.max(axis=(0, 1))
         raise InvalidInputError(
-            f"plane: expected one that meets the volume, which lies between {vector_words(low)} and "
-            f"{vector_words(high)} mm, got one {np.abs(there[:, 2]).min():.1f} mm from it"
+            f"plane: expected one that meets {what}, all between {vector_words(low)} and "
+            f"{vector_words(high)} mm, got one {away.min():.1f} mm from there"
         )
     return plane_around(placed, points, pixel_mm)
 

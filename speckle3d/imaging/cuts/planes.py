@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +26,62 @@ _LEAST_CROSSING = 0.5
 """Sine of the angle between a frame and a plane at which the frame is said to cross it."""
 
 
+class Cut:
+    """Straight columns of square pixels side by side in the world: a plane, or a sheet that is laid flat.
+
+    Attributes
+    ----------
+    base_mm : ndarray, shape (columns, 3)
+        Centre of every column's first pixel, in the world.
+    down : ndarray, shape (3,)
+        Unit vector along which columns run.
+    height_mm, pixel_mm : float
+        Distance between the centres of the first and the last pixel of a column, to the nearest whole pixel,
+        and of neighbours.
+    first_mm : tuple of float
+        What the axes of a picture say at the centre of the first pixel: x and y.
+    """
+
+    height_mm: float
+    pixel_mm: float
+    first_mm: tuple[float, float]
+
+    if TYPE_CHECKING:
+
+        @property
+        def base_mm(self) -> FloatArray:
+            """Of the first pixels."""
+
+        @property
+        def down(self) -> FloatArray:
+            """Along the columns."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Shape (rows, columns) of the resliced image."""
+        return round(self.height_mm / self.pixel_mm) + 1, len(self.base_mm)
+
+    @property
+    def extent_mm(self) -> tuple[float, float, float, float]:
+        """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
+        rows, columns = self.shape
+        left, top = (first - self.pixel_mm / 2 for first in self.first_mm)
+        return left, left + columns * self.pixel_mm, top + rows * self.pixel_mm, top
+
+    def lines(self) -> FloatArray:
+        """Of each column the first pixel's centre and the step to the next, shape (columns, 2, 3), mm."""
+        step = np.broadcast_to(self.down * self.pixel_mm, self.base_mm.shape)
+        return np.stack([self.base_mm, step], axis=1)
+
+    @property
+    def hull_mm(self) -> FloatArray:
+        """First pixels of all columns, then last ones, shape (2 columns, 3), mm in the world."""
+        below = (self.shape[0] - 1) * self.pixel_mm * self.down
+        return np.concatenate([self.base_mm, self.base_mm + below])
+
+
 @dataclass(frozen=True)
-class ReslicePlane:
+class ReslicePlane(Cut):
     """A rectangle in the world and the pixels it is cut into.
 
     Parameters
@@ -59,42 +114,22 @@ class ReslicePlane:
             raise InvalidInputError("world_from_plane: expected a single transform, got a row of them")
         require_pixels(self.width_mm, self.height_mm, self.pixel_mm)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Shape (rows, columns) of the resliced image."""
-        return round(self.height_mm / self.pixel_mm) + 1, round(self.width_mm / self.pixel_mm) + 1
+    @cached_property
+    def base_mm(self) -> FloatArray:
+        """Centre of every column's first pixel."""
+        columns = np.arange(round(self.width_mm / self.pixel_mm) + 1)
+        return self.world_from_plane.apply(np.outer(columns * self.pixel_mm, [1.0, 0.0, 0.0]))
 
-    @property
-    def extent_mm(self) -> tuple[float, float, float, float]:
-        """What the axes say at the outer borders of the pixels: left, right, bottom and top."""
-        return outer_borders(self.shape, self.first_mm, self.pixel_mm)
+    @cached_property
+    def down(self) -> FloatArray:
+        """Unit vector along the columns."""
+        return self.world_from_plane.rotation.apply([0.0, 1.0, 0.0])
 
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm."""
         x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
         local = np.stack([x - self.first_mm[0], y - self.first_mm[1], np.zeros(x.shape)], axis=-1)
         return np.asarray(self.world_from_plane.apply(local.reshape(-1, 3)).reshape(local.shape))
-
-    def world_from_pixel(self) -> FloatArray:
-        """Affine map from (column, row, 1) to homogeneous world coordinates in mm, shape (4, 3)."""
-        matrix = self.world_from_plane.as_matrix()[:, [0, 1, 3]]
-        return np.asarray(matrix * [self.pixel_mm, self.pixel_mm, 1.0])
-
-    def lines(self) -> FloatArray:
-        """Of each row the first pixel's centre and the step to the next, shape (rows, 2, 3), mm."""
-        across, down, origin = self.world_from_pixel()[:3].T
-        starts = origin + np.arange(self.shape[0])[:, None] * down
-        return np.stack([starts, np.broadcast_to(across, starts.shape)], axis=1)
-
-    along_rows = True
-    """Lines are rows of the picture."""
-
-    @property
-    def hull_mm(self) -> FloatArray:
-        """Corners, shape (4, 3), mm in the world."""
-        rows, columns = self.shape
-        corners = np.array([[0, 0, 1], [columns - 1, 0, 1], [0, rows - 1, 1], [columns - 1, rows - 1, 1]])
-        return np.asarray((corners @ self.world_from_pixel().T)[:, :3])
 
 
 def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
@@ -107,15 +142,6 @@ def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
             f"reslice of {width_mm:g} x {height_mm:g} mm: expected at most {MAX_PIXELS} "
             f"pixels, got more with pixels of {pixel_mm:g} mm"
         )
-
-
-def outer_borders(
-    shape: tuple[int, int], first_mm: tuple[float, float], pixel_mm: float
-) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of pixels of which the first one's centre is at `first_mm`, mm."""
-    rows, columns = shape
-    left, top = (first - pixel_mm / 2 for first in first_mm)
-    return left, left + columns * pixel_mm, top + rows * pixel_mm, top
 
 
 def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:

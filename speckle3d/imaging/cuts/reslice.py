@@ -7,41 +7,24 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
+from speckle3d.core.arrays import ByteArray, Float32Array
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
+from speckle3d.imaging.cuts.planes import Cut, image_plane
 from speckle3d.imaging.cuts.planes import ReslicePlane as ReslicePlane
-from speckle3d.imaging.cuts.planes import image_plane
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
-from speckle3d.imaging.nearest import LookUp, NearestImages, in_one_pass
+from speckle3d.imaging.nearest import NearestImages, look_up
 
 _GRAIN = 32
 """Lines of a cut below which a slice is not worth another thread's while."""
-
-
-class Cut(Protocol):
-    """Pixels somewhere in the world, on straight lines of even steps: `ReslicePlane`, `CurvedSheet`."""
-
-    along_rows: bool
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Shape (rows, columns) of the resliced image."""
-
-    @property
-    def hull_mm(self) -> FloatArray:
-        """Points in whose convex hull all pixels lie, shape (m, 3), mm in the world."""
-
-    def lines(self) -> FloatArray:
-        """Of each line the first pixel's centre and the step to the next, shape (n, 2, 3), mm."""
 
 
 def reslice_frames(
@@ -93,16 +76,13 @@ def reslice_at(
 ) -> list[Float32Array]:
     """Make several cuts, each at poses of its own, in one pass over the images; else as `reslice_frames`."""
     sought = [
-        LookUp(
-            NearestImages(PosedImages(images, grid, poses), max_distance_mm),
-            cut.lines(),
-            _points_per_line(cut),
-            cut.hull_mm,
+        NearestImages(
+            PosedImages(images, grid, poses), cut.lines(), cut.shape[0], cut.hull_mm, max_distance_mm
         )
         for poses, cut in wanted
     ]
-    found = in_one_pass(sought)
-    return [_upright(cut, sides.blended()[0]) for sides, (_, cut) in zip(found, wanted, strict=True)]
+    look_up(sought)
+    return [np.ascontiguousarray(each.blended()[0].T) for each in sought]
 
 
 def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> Float32Array:
@@ -152,24 +132,14 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
     held = np.empty(0, np.uint8) if state is None else _flat(state.astype(np.uint8, copy=False), order)
     index_from_world = np.array(np.linalg.inv(volume.world_from_index)[:3], dtype=float)
     lines, sides = cut.lines(), np.array(volume.shape)
-    out = np.empty((len(lines), _points_per_line(cut)), np.float32)
+    out = np.empty((len(lines), cut.shape[0]), np.float32)
 
     def fill(first: int, stop: int) -> None:
         band = slice(first, stop)
         cut_voxels(flat, held, strides, sides, index_from_world, lines[band], out[band])
 
     in_parallel(fill, len(lines), _GRAIN)
-    return _upright(cut, out)
-
-
-def _points_per_line(cut: Cut) -> int:
-    rows, columns = cut.shape
-    return columns if cut.along_rows else rows
-
-
-def _upright(cut: Cut, lines: Float32Array) -> Float32Array:
-    """Lines of a cut as an image, shape (rows, columns)."""
-    return lines if cut.along_rows else np.ascontiguousarray(lines.T)
+    return np.ascontiguousarray(out.T)
 
 
 def _flat(values: npt.NDArray[Any], order: Literal["C", "F"]) -> npt.NDArray[Any]:

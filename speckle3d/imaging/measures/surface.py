@@ -129,10 +129,7 @@ def known_voxels(volume: Volume) -> BoolArray:
     voxels = volume.voxels
     if voxels.dtype.kind == "f":
         return np.asarray(np.isfinite(voxels))
-    part, _ = ndimage.label(voxels == 0)
-    faces = [np.take(part, at, axis) for axis in range(3) for at in (0, -1)]
-    outside = np.unique(np.concatenate([face.ravel() for face in faces]))
-    return np.asarray(~np.isin(part, outside[outside > 0]))
+    return np.asarray(ndimage.binary_fill_holes(voxels != 0))
 
 
 def smoothed(surface: Surface, passes: int) -> Surface:
@@ -245,7 +242,8 @@ def _marched(volume: Volume, values: FloatArray, level: float, inside: Inside, k
             level,
             spacing=volume.spacing_mm[::-1],
             gradient_direction="descent" if inside == "above" else "ascent",
-            mask=_whole_cells(known.T),
+            # Cells all of whose corners are known, at the index of the farthest corner.
+            mask=ndimage.minimum_filter(known.T, 2),
         )
     except RuntimeError:
         raise InsufficientDataError(
@@ -254,13 +252,3 @@ def _marched(volume: Volume, values: FloatArray, level: float, inside: Inside, k
     world = volume.world_from_grid.apply(vertices[:, ::-1].astype(float))
     side = f"{inside} {level:g}"
     return Surface(world, triangles.astype(np.int64), {**volume.fields, "inside": side})
-
-
-def _whole_cells(known: BoolArray) -> BoolArray:
-    """Cells all of whose corners are known, at the index of the farthest corner, as scikit-image wants it."""
-    whole = known.copy()
-    for axis in range(3):
-        whole = np.moveaxis(whole, axis, 0)
-        whole[1:] &= whole[:-1].copy()
-        whole = np.moveaxis(whole, 0, axis)
-    return np.ascontiguousarray(whole)

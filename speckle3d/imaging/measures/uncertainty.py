@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.pose_errors import PosedErrors
@@ -16,8 +17,10 @@ _AT_ONCE = 2**15
 """Points worked on at a time."""
 
 
-class DeviationField:
-    """Standard deviation of position along the sweep, on the grid of a volume.
+def deviation_volume(
+    errors: PosedErrors, grid: ImageGrid, voxel_grid: VoxelGrid, state: ByteArray | None = None
+) -> Float32Array:
+    """Standard deviation of position along the sweep in every voxel, shape (n_k, n_j, n_i), mm.
 
     A voxel moves with the frames nearest to it (`belonging_of`), and along the sweep is the direction of
     their elevational axis. Deviations are computed on a coarse grid and interpolated, which is off by some
@@ -29,40 +32,25 @@ class DeviationField:
     errors : PosedErrors
     grid : ImageGrid
     voxel_grid : VoxelGrid
+    state : ndarray of uint8, shape (n_k, n_j, n_i), optional
+        Where it is 0, empty, the result is NaN.
     """
-
-    def __init__(self, errors: PosedErrors, grid: ImageGrid, voxel_grid: VoxelGrid) -> None:
-        self._grid = voxel_grid
-        extent = (np.array(voxel_grid.shape) - 1) * voxel_grid.spacing_mm
-        counts = np.maximum(np.ceil(extent / COARSE_MM), 1).astype(int) + 1
-        axes = [np.linspace(0.0, size, count) for size, count in zip(extent, counts, strict=True)]
-        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        world = voxel_grid.world_from_grid.apply(points)
-        values = [
-            deviations(errors, grid, world[first : first + _AT_ONCE])
-            for first in range(0, len(world), _AT_ONCE)
-        ]
-        self._coarse = np.concatenate(values).reshape(counts)
-        # Voxels to steps of the coarse grid; a grid of one voxel has no steps.
-        self._step = (counts - 1) / np.maximum(np.array(voxel_grid.shape) - 1, 1)
-
-    def planes(self, first: int, stop: int, state: ByteArray | None = None) -> Float32Array:
-        """Deviations of the voxels of some planes along k, shape (k, j, i), mm.
-
-        Parameters
-        ----------
-        state : ndarray of uint8, shape (k, j, i), optional
-            State of these voxels; where it is 0, empty, the result is NaN.
-        """
-        n_i, n_j, _ = self._grid.shape
-        along = [np.arange(n_i) * self._step[0], np.arange(n_j) * self._step[1]]
-        along.append(np.arange(first, stop) * self._step[2])
-        # Linear along one axis after the other: a hundred times as fast as voxel by voxel.
-        values = _linear(_linear(_linear(self._coarse, along[2], 2), along[1], 1), along[0], 0)
-        found = np.ascontiguousarray(values.T, dtype=np.float32)
-        if state is not None:
-            found[state == 0] = np.nan
-        return found
+    extent = (np.array(voxel_grid.shape) - 1) * voxel_grid.spacing_mm
+    counts = np.maximum(np.ceil(extent / COARSE_MM), 1).astype(int) + 1
+    axes = [np.linspace(0.0, size, count) for size, count in zip(extent, counts, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    world = voxel_grid.world_from_grid.apply(points)
+    parts = range(0, len(world), _AT_ONCE)
+    values = np.concatenate([deviations(errors, grid, world[k : k + _AT_ONCE]) for k in parts])
+    values = values.reshape(counts)
+    # Linear along one axis after the other: a hundred times as fast as voxel by voxel.
+    for axis in (2, 1, 0):
+        at = np.linspace(0.0, counts[axis] - 1, voxel_grid.shape[axis])
+        values = make_interp_spline(np.arange(counts[axis]), values, k=1, axis=axis)(at)
+    found = np.ascontiguousarray(values.T, dtype=np.float32)
+    if state is not None:
+        found[state == 0] = np.nan
+    return found
 
 
 def deviations(errors: PosedErrors, grid: ImageGrid, points_mm: FloatArray) -> FloatArray:
@@ -70,11 +58,3 @@ def deviations(errors: PosedErrors, grid: ImageGrid, points_mm: FloatArray) -> F
     near = belonging_of(points_mm, grid, errors.world_from_image)
     along = errors.world_from_image.rotation[near.frames[:, 0]].apply([0.0, 0.0, 1.0])
     return np.sqrt(np.maximum(errors.variance(points_mm, along, near), 0.0))
-
-
-def _linear(values: FloatArray, at: FloatArray, axis: int) -> FloatArray:
-    """Values at fractional places along one axis."""
-    last = max(values.shape[axis] - 2, 0)
-    low = np.clip(np.floor(at).astype(int), 0, last)
-    share = (at - low).reshape([-1 if number == axis else 1 for number in range(3)])
-    return np.asarray(np.take(values, low, axis) * (1.0 - share) + np.take(values, low + 1, axis) * share)

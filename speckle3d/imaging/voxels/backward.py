@@ -10,7 +10,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.nearest import NearestImages
+from speckle3d.imaging.nearest import NearestImages, look_up
 from speckle3d.imaging.voxels.grid import VoxelGrid
 
 
@@ -49,10 +49,7 @@ def look_up_voxels(
     .. [1] W. Wein et al., "Backward-warping ultrasound reconstruction for improving diagnostic value and
        registration", MICCAI, 2006.
     """
-    images, (n_i, n_j, n_k) = NearestImages(source, reach_mm, region), voxel_grid.shape
-    # Half a voxel along the axis that an image is most nearly perpendicular to, of the most upright one.
-    along = images.normals @ voxel_grid.world_from_grid.rotation.as_matrix()
-    half_mm = 0.5 * float(np.abs(along * voxel_grid.spacing_mm).max())
+    n_i, n_j, n_k = voxel_grid.shape
     pose = voxel_grid.world_from_grid.as_matrix()[:3]
     steps = pose[:, :3] * voxel_grid.spacing_mm
     j, k = np.arange(n_j)[:, None], np.arange(n_k)[:, None, None]
@@ -60,5 +57,9 @@ def look_up_voxels(
     rows = np.stack([starts, np.broadcast_to(steps[:, 0], starts.shape)], axis=1)
     corners = starts[[0, n_j - 1, -n_j, -1]]
     hull = np.concatenate([corners, corners + (n_i - 1) * steps[:, 0]])
-    voxels, state = images.beside(rows, n_i, hull).blended(half_mm)
+    nearest = NearestImages(source, rows, n_i, hull, reach_mm)
+    look_up([nearest], region)
+    # Half a voxel along the axis that an image is most nearly perpendicular to, of the most upright one.
+    normals = source.world_from_image.rotation.apply([0.0, 0.0, 1.0])
+    voxels, state = nearest.blended(0.5 * float(np.abs(normals @ steps).max()))
     return voxels.reshape(n_k, n_j, n_i), state.reshape(n_k, n_j, n_i)

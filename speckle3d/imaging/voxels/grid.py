@@ -16,9 +16,6 @@ from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import image_corners
 from speckle3d.imaging.voxels.settings import VoxelType
 
-MAX_VOXELS_ALONG = 1_000_000
-"""Most voxels along an axis, to catch wrong units: 100 m at 0.1 mm."""
-
 _ROUND_SPACINGS = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 """Between a power of ten and the next."""
 
@@ -87,7 +84,7 @@ def grid_around(
         grid would end before its origin.
     """
     i, j, k = _three(np.broadcast_to(spacing_mm, 3) if np.ndim(spacing_mm) == 0 else spacing_mm, "spacing_mm")
-    spacing, axes = (i, j, k), _single(world_from_axes)
+    spacing, axes = (i, j, k), world_from_axes or Rotation.identity()
     low, high = _bounds(grid, world_from_image, axes)
     if origin_mm is not None:
         low = axes.inv().apply(_three(origin_mm, "origin_mm", -np.inf))
@@ -100,11 +97,6 @@ def grid_around(
         counts = _counts(low, high, spacing) if shape is None else np.array(_three(shape, "shape"))
     if (counts < 1).any():
         raise InvalidInputError("origin_mm: expected an origin before the images' end, got one beyond it")
-    if (counts > MAX_VOXELS_ALONG).any() or (counts != np.floor(counts)).any():
-        raise InvalidInputError(
-            f"voxels: expected whole numbers up to {MAX_VOXELS_ALONG} along each axis, got "
-            f"{' x '.join(f'{count:g}' for count in counts)} of {spacing} mm"
-        )
     n_i, n_j, n_k = (int(count) for count in counts)
     origin = axes.apply(low) if origin_mm is None else np.asarray(origin_mm, dtype=float)
     return VoxelGrid((n_i, n_j, n_k), spacing, RigidTransform.from_components(origin, axes))
@@ -153,7 +145,7 @@ def spacing_within(
     0.15
     """
     finest = min(grid.vector_pitch_mm, grid.sample_spacing_mm) * (1 - 1e-9)
-    low, high = _bounds(grid, world_from_image, _single(world_from_axes))
+    low, high = _bounds(grid, world_from_image, world_from_axes or Rotation.identity())
     most = max_gb * 1e9 / np.dtype(voxel_type).itemsize
     # As decimal text, so that 0.3 is 0.3 and not 3 x 0.1.
     for spacing in (float(f"{step}e{power}") for power in range(-6, 3) for step in _ROUND_SPACINGS):
@@ -174,13 +166,6 @@ def _counts(low: FloatArray, high: FloatArray, spacing: float | Triple) -> Float
     """Voxels from a corner to another."""
     # A corner half a voxel past the last centre would round up, and so may one a rounding error short of it.
     return np.asarray(np.floor((high - low) / np.asarray(spacing) + 0.5 + 1e-6) + 1)
-
-
-def _single(world_from_axes: Rotation | None) -> Rotation:
-    axes = Rotation.identity() if world_from_axes is None else world_from_axes
-    if not axes.single:
-        raise InvalidInputError("world_from_axes: expected a single rotation, got a row of them")
-    return axes
 
 
 def _three(values: npt.ArrayLike, name: str, above: float = 0.0) -> list[float]:

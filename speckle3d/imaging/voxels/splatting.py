@@ -20,6 +20,7 @@ of the origin; by that much, 0.0005 mm, some pixels fall into another voxel.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,14 +32,13 @@ from speckle3d.core.threads import cores, in_parallel
 from speckle3d.imaging.images import Images, PosedImages
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.settings import Rule, Splat
+from speckle3d.kernels.samples import PLUS_BITS, POSITION_BITS, SHARE_BITS, Samples
 
 Weights = npt.NDArray[Any] | Images
 """Weight of each frame, shape (n,), or of each sample: images of weights."""
 
-_COUNTED, _SUMMED = ("uint8", "int16", "uint16", "float32"), ("uint8", "float32")
-"""Types that kernels read as they are, counting and otherwise; others become float32."""
-_POSITION_BITS, _SHARE_BITS, _PLUS_BITS = 40, 10, 14
-"""As the kernels have them."""
+_DIRECT = ("uint8", "int16", "uint16", "float32")
+"""Types that kernels read as they are; others become float32."""
 _MOST_COUNTED = 2**23
 """Samples in a voxel for which sum and count fit into one word, and as many to spare."""
 _BORDER = 2.0**-24
@@ -87,80 +87,61 @@ def splat_images(
         If a pose or a weight is not finite, no sample counts, an image reaches too far beyond the grid, or
         with "plus" images are not of uint8.
     """
-    from speckle3d.kernels import splatting as kernels
-    from speckle3d.kernels.whole_levels import add_whole
-
     weights, mask = _checked_weights(weights, rule, len(source)), _checked_mask(mask, source)
     maps, shape = index_from_sample(source, voxel_grid), voxel_grid.shape[::-1]
-    room = np.array([[0, n] for n in voxel_grid.shape], dtype=np.int64)
-    tags = np.zeros(shape if rule == "latest" else (1, 1, 1), np.uint32)
-    table: npt.NDArray[Any] | None = None
-    offset = 0
-    levels, pixels = (
-        np.zeros(shape if rule == "plus" else (1, 1, 1), kind) for kind in (np.uint8, np.uint16)
-    )
-    spans = np.empty((0, 3), np.int64)
-    countable = (splat, rule) == ("nearest", "mean") and _few_samples(source, voxel_grid)
-    near, direct = _frames_near(maps, source, voxel_grid), _COUNTED if countable else _SUMMED
-    for images, frames, turned in _batches(source, near, direct, rule == "plus"):
-        if rule == "plus" and images.dtype != np.uint8:
-            raise InvalidInputError(
-                f"rule plus: expected images of type uint8, B-mode as stored, got {images.dtype}"
-            )
-        if table is None:
-            spans, kind = _spans(mask, turned), images.dtype.kind
-            offset = 2**15 if kind == "i" else 0
-            if rule in ("maximum", "plus"):
-                table = np.full(shape if rule == "maximum" else 1, np.nan, np.float32)
-            elif countable and kind in "iu":
-                table = np.zeros(shape, np.uint64)
-            else:
-                table = np.zeros((*shape, 2))
-        bits = _PLUS_BITS if rule == "plus" else _POSITION_BITS
-        fixed = _fixed_maps(maps[frames], splat, bits, turned)
+    near = _frames_near(maps, source, voxel_grid)
+    if not near.size:
+        return np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
+    first = source.read_as_stored(int(near[0]))
+    kernel, tables = _kernel(splat, rule, first.dtype, _few_samples(source, voxel_grid), shape)
+    turned = rule == "plus" or (first.flags.f_contiguous and not first.flags.c_contiguous)
+    spans = _spans(mask, turned)
+    for images, frames in _batches(source, near, first, turned):
+        fixed = _fixed_maps(maps[frames], splat, PLUS_BITS if rule == "plus" else POSITION_BITS, turned)
         share = _weights_of(weights, source, frames, images, turned)
         tag = int(frames[0]) + 1 if rule == "latest" else 0
-
-        def work(
-            box: IntArray,
-            images: Any = images,
-            maps: IntArray = fixed,
-            spans: IntArray = spans,
-            share: Float32Array = share,
-            table: Any = table,
-            tag: int = tag,
-            offset: int = offset,
-        ) -> None:
-            if rule == "plus":
-                add_whole(images, maps, spans, box, splat == "linear", room, levels, pixels)
-            elif rule == "maximum":
-                kernels.keep_largest(images, maps, spans, box, splat == "linear", table)
-            elif table.dtype == np.uint64:
-                kernels.count_nearest(images, maps, spans, box, offset, table)
-            else:
-                add = kernels.add_nearest if splat == "nearest" else kernels.add_linear
-                add(images, share, maps, spans, box, tag, table, tags)
-
-        _share_out(work, room, fixed, images.shape[1])
-    if table is None:
-        return np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
-    if rule == "plus":
-        voxels = np.where(pixels > 0, levels, np.float32(np.nan))
-    else:
-        voxels = table if rule == "maximum" else _means(table, offset)
+        samples = Samples(images, share, fixed, spans, tag, splat == "linear")
+        _share_out(partial(kernel, samples), tables, fixed, images.shape[1])
+    voxels = _levels(rule, tables)
     return voxels, (~np.isnan(voxels)).view(np.uint8)
 
 
-def _means(table: npt.NDArray[Any], offset: int) -> Float32Array:
-    """Means from sums and numbers of samples, in one word or beside each other; NaN where none was."""
+def _kernel(
+    splat: Splat, rule: Rule, stored: np.dtype[Any], few_samples: bool, shape: tuple[int, ...]
+) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    """What adds samples to the voxels of a box, and the tables that it adds them to."""
+    from speckle3d.kernels import splatting as kernels
+    from speckle3d.kernels.whole_levels import add_whole
+
+    if rule == "plus":
+        if stored != np.uint8:
+            raise InvalidInputError(
+                f"rule plus: expected images of type uint8, B-mode as stored, got {stored}"
+            )
+        return add_whole, (np.zeros(shape, np.uint8), np.zeros(shape, np.uint16))
+    if rule == "maximum":
+        return kernels.keep_largest, (np.full(shape, np.nan, np.float32),)
+    if (splat, rule) == ("nearest", "mean") and few_samples and stored.name in _DIRECT[:3]:
+        return kernels.count_nearest, (np.zeros(shape, np.uint64), 2**15 if stored.kind == "i" else 0)
+    tags = np.zeros(shape if rule == "latest" else (1, 1, 1), np.uint32)
+    return (kernels.add_linear if splat == "linear" else kernels.add_nearest), (np.zeros((*shape, 2)), tags)
+
+
+def _levels(rule: Rule, tables: tuple[Any, ...]) -> Float32Array:
+    """Levels of voxels by what was added; NaN where no sample was."""
     from speckle3d.kernels.splatting import means_of_counts
 
+    table, other = tables[0], tables[-1]
+    if rule == "maximum":
+        return np.asarray(table)
     voxels = np.empty(table.shape[:3], np.float32)
 
     def work(first: int, stop: int) -> None:
         part = slice(first, stop)
-        if table.dtype == np.uint64:
-            means_of_counts(table[part], offset, voxels[part])
+        if rule == "plus":
+            voxels[part] = np.where(other[part] > 0, table[part], np.float32(np.nan))
+        elif table.dtype == np.uint64:
+            means_of_counts(table[part], other, voxels[part])
         else:
             with np.errstate(divide="ignore", invalid="ignore"):
                 voxels[part] = table[part, :, :, 0] / table[part, :, :, 1]
@@ -223,38 +204,32 @@ def _checked_mask(mask: BoolArray | None, source: PosedImages) -> BoolArray:
 
 
 def _batches(
-    source: PosedImages, frames: IntArray, direct: tuple[str, ...], by_row: bool
-) -> Iterator[tuple[npt.NDArray[Any], IntArray, bool]]:
-    """Read frames a few at a time: images (n, line, sample), their numbers, and whether lines are rows.
+    source: PosedImages, frames: IntArray, first: npt.NDArray[Any], turned: bool
+) -> Iterator[tuple[npt.NDArray[Any], IntArray]]:
+    """Read frames a few at a time: images, shape (n, line, sample), and their numbers.
 
     Images keep the order that the first has in memory, since turning them takes as long as the work on them.
     """
-    if frames.size == 0:
-        return
-    first = source.read_as_stored(int(frames[0]))
-    stored = first.dtype
-    kind = stored if stored.name in direct and stored.isnative else np.dtype(np.float32)
-    turned = by_row or (first.flags.f_contiguous and not first.flags.c_contiguous)
+    kind = first.dtype if first.dtype.name in _DIRECT and first.dtype.isnative else np.dtype(np.float32)
     size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES, frames.size)
     images = np.empty((size, *(first.T if turned else first).shape), kind)
-    del first
+
+    def read(some: IntArray, low: int, stop: int) -> None:
+        for n in range(low, stop):
+            image = source.read_as_stored(int(some[n]))
+            if image.dtype != first.dtype:
+                raise MismatchError(
+                    f"images[{some[n]}]: expected {first.dtype} as the others, got {image.dtype}"
+                )
+            images[n] = image.T if turned else image
+
     for start in range(0, frames.size, size):
         some = frames[start : start + size]
-
-        def read(low: int, stop: int, some: IntArray = some) -> None:
-            for n in range(low, stop):
-                image = source.read_as_stored(int(some[n]))
-                if image.dtype != stored:
-                    raise MismatchError(
-                        f"images[{some[n]}]: expected {stored} as the others, got {image.dtype}"
-                    )
-                images[n] = image.T if turned else image
-
         if source.any_thread:
-            in_parallel(read, some.size)
+            in_parallel(partial(read, some), some.size)
         else:
-            read(0, some.size)
-        yield images[: some.size], some, turned
+            read(some, 0, some.size)
+        yield images[: some.size], some
 
 
 def _spans(mask: BoolArray, turned: bool) -> IntArray:
@@ -268,29 +243,30 @@ def _spans(mask: BoolArray, turned: bool) -> IntArray:
 def _fixed_maps(maps: FloatArray, splat: Splat, bits: int, turned: bool) -> IntArray:
     """Maps from (line, sample, 1) to positions in units of 2^-40 voxel, rounded to so many bits."""
     fixed = np.rint((maps[:, :, [1, 0, 2]] if turned else maps) * 2.0**bits).astype(np.int64)
-    if bits == _PLUS_BITS:
+    if bits == PLUS_BITS:
         ahead = 0.5 if splat == "nearest" else 0.0
     else:
-        ahead = 0.5 + _BORDER if splat == "nearest" else 0.5 ** (_SHARE_BITS + 1)
+        ahead = 0.5 + _BORDER if splat == "nearest" else 0.5 ** (SHARE_BITS + 1)
     fixed[:, :, 2] += int(ahead * 2.0**bits)
-    return np.ascontiguousarray(fixed << (_POSITION_BITS - bits))
+    return np.ascontiguousarray(fixed << (POSITION_BITS - bits))
 
 
-def _share_out(work: Callable[[IntArray], None], room: IntArray, maps: IntArray, lines: int) -> None:
-    """Call a function with boxes of voxels that make up the grid, several at once.
+def _share_out(work: Callable[..., None], tables: tuple[Any, ...], maps: IntArray, lines: int) -> None:
+    """Call a function with boxes of voxels that make up the grid, several at once, and with all tables.
 
     Threads share out voxels, not images: what is added to one comes in the same order. Boxes follow each
     other along the axis along which the lines of images do, so that few lines are cut.
     """
-    extent = np.abs(maps[:, :, 0]).astype(float).mean(axis=0) * lines / 2.0**_POSITION_BITS
-    axis = int(np.argmax(np.minimum(extent, room[:, 1])))
+    sides = np.array(tables[0].shape[2::-1])
+    extent = np.abs(maps[:, :, 0]).astype(float).mean(axis=0) * lines / 2.0**POSITION_BITS
+    axis = int(np.argmax(np.minimum(extent, sides)))
 
     def part(first: int, stop: int) -> None:
-        box = room.copy()
+        box = np.stack([np.zeros(3, np.int64), sides], axis=1)
         box[axis] = first, stop
-        work(box)
+        work(box, *tables)
 
-    count = int(room[axis, 1])
+    count = int(sides[axis])
     in_parallel(part, count, max(_LEAST_BLOCK, -(-count // (2 * cores()))))
 
 

@@ -211,8 +211,7 @@ def _rounded(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> n
 
     def work(first: int, stop: int) -> None:
         for k in range(first, stop):
-            levels = np.where(state[k] > 0, voxels[k], np.float32(0.0))
-            out[k] = np.clip(np.rint(levels), limits.min, limits.max)
+            out[k] = np.clip(np.rint(np.where(state[k] > 0, voxels[k], 0)), limits.min, limits.max)
 
     in_parallel(work, len(voxels))
     return out

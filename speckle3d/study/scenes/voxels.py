@@ -19,7 +19,7 @@ from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
-from speckle3d.imaging.measures.uncertainty import DeviationField
+from speckle3d.imaging.measures.uncertainty import deviation_volume
 from speckle3d.imaging.region import Region
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, grid_like, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
@@ -218,9 +218,9 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
         request.state_path: ("uint8", state, fields, labels),
     }
     if request.deviation_path is not None:
-        errors = DeviationField(_errors(posed, "the deviation of position"), source.grid, grid)
-        words = fields | {"levels": _DEVIATION}
-        made[request.deviation_path] = ("float32", errors.planes(0, len(state), state), words, {})
+        errors = _errors(posed, "the deviation of position")
+        deviation, words = deviation_volume(errors, source.grid, grid, state), fields | {"levels": _DEVIATION}
+        made[request.deviation_path] = ("float32", deviation, words, {})
     with ExitStack() as files:
         for path, (kind, voxels, words, more) in made.items():
             if path is not None:

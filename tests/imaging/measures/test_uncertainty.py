@@ -1,13 +1,14 @@
 """Deviation of position per voxel: along the sweep, smooth, empty where there is nothing."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.measures.belonging import belonging_of
-from speckle3d.imaging.measures.uncertainty import DeviationField, deviations
-from speckle3d.imaging.voxels.grid import grid_around
+from speckle3d.imaging.measures.uncertainty import deviation_volume, deviations
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
 
 GRID = ImageGrid(31, 41, 0.5, 0.5)
 
@@ -26,7 +27,7 @@ def scaled(frames=41, turn_deg=0.0, sigma=0.05):
 def test_an_error_of_scale_grows_along_the_sweep():
     errors = PosedErrors(PoseErrors(scaled().errors.factors[:1]), scaled().world_from_image, GRID.centre_mm)
     grid = grid_around(GRID, errors.world_from_image, 0.5)
-    found = DeviationField(errors, GRID, grid).planes(0, grid.shape[2])
+    found = deviation_volume(errors, GRID, grid)
     assert found.shape == grid.shape[::-1]
     assert found.dtype == np.float32
     z = grid.world_from_grid.translation[2] + 0.5 * np.arange(grid.shape[2])
@@ -41,19 +42,29 @@ def test_interpolated_deviations_are_those_of_the_voxels_themselves():
     world = grid.world_from_grid.apply(index * np.array(grid.spacing_mm))
     swept = belonging_of(world, GRID, errors.world_from_image).gap_mm < 1e-9
     index, world = index[swept], world[swept]
-    found = DeviationField(errors, GRID, grid).planes(0, grid.shape[2])[tuple(index[:, ::-1].T)]
+    found = deviation_volume(errors, GRID, grid)[tuple(index[:, ::-1].T)]
     exact = deviations(errors, GRID, world)
     assert len(index) > 500
     assert np.abs(found - exact).max() < 0.01 * exact.max()
 
 
-def test_slabs_are_the_whole_and_empty_voxels_have_no_value():
+def test_empty_voxels_have_no_value_and_one_voxel_has_its_own():
     errors = scaled()
     grid = grid_around(GRID, errors.world_from_image, 0.9)
-    field = DeviationField(errors, GRID, grid)
-    whole = field.planes(0, grid.shape[2])
-    parts = [field.planes(k, min(k + 5, grid.shape[2])) for k in range(0, grid.shape[2], 5)]
-    assert len(parts) > 2
-    np.testing.assert_array_equal(np.concatenate(parts), whole)
-    state = np.random.default_rng(0).integers(0, 3, whole.shape).astype(np.uint8)
-    np.testing.assert_array_equal(np.isnan(field.planes(0, grid.shape[2], state)), state == 0)
+    state = np.random.default_rng(0).integers(0, 3, grid.shape[::-1]).astype(np.uint8)
+    np.testing.assert_array_equal(np.isnan(deviation_volume(errors, GRID, grid, state)), state == 0)
+    centre = RigidTransform.from_translation(errors.world_from_image[20].apply(GRID.centre_mm))
+    one = deviation_volume(errors, GRID, VoxelGrid((1, 1, 1), (0.5, 0.5, 0.5), centre))
+    # Half of the sweep at 5 % of 20 mm.
+    assert one[0, 0, 0] == pytest.approx(0.5, rel=1e-3)
+
+
+def test_variances_by_neighbours_are_those_of_all_displacements():
+    rng = np.random.default_rng(2)
+    poses = scaled(turn_deg=8.0).world_from_image
+    errors = PosedErrors(PoseErrors(np.cumsum(rng.normal(size=(9, 41, 6)), axis=1)), poses, GRID.centre_mm)
+    points = rng.uniform([0, 0, -1], [15, 20, 21], (300, 3))
+    directions = Rotation.random(300, rng=rng).apply([0.0, 0.0, 1.0])
+    near = belonging_of(points, GRID, poses)
+    moved = np.einsum("mka,ka->mk", errors.displacements(points, near), directions)
+    np.testing.assert_allclose(errors.variance(points, directions, near), (moved**2).sum(axis=0))

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core import threads
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
@@ -76,15 +75,6 @@ def test_boxes_in_mm_are_those_of_brute_force(seed, spacing, radius_mm):
     np.testing.assert_array_equal(voxels[state == FILLED], expected[0][state == FILLED])
 
 
-def test_boxes_in_mm_reach_as_far_along_each_axis():
-    # 0.6 / 0.2 is a hair below three in floating point.
-    np.testing.assert_array_equal(
-        boxes_within(0.6, (0.2, 0.3, 1.0)), [[0, 0, 1], [0, 1, 1], [0, 1, 2], [0, 2, 3]]
-    )
-    np.testing.assert_array_equal(boxes_within(0.6, (0.2, 0.2, 0.2)), [[1, 1, 1], [2, 2, 2], [3, 3, 3]])
-    assert boxes_within(0.0, (0.2, 0.2, 0.2)).shape == (0, 3)
-
-
 def test_compounding_fills_as_far_in_mm_along_each_axis():
     # Two images, 2 mm apart, of voxels much longer along the sweep than across; then the other way round.
     grid = ImageGrid(11, 11, 0.2, 0.2)
@@ -110,13 +100,3 @@ def test_any_number_of_threads_gives_the_same(many_threads):
         fill_holes(*alone, 3)
     for found, expected in zip(shared, alone, strict=True):
         np.testing.assert_array_equal(found, expected)
-
-
-def test_wrong_radii_are_refused():
-    voxels, state = some_voxels(np.random.default_rng(8), (4, 5, 6), 0.5)
-    for bad in (-1, 256):
-        with pytest.raises(InvalidInputError, match="radius"):
-            fill_holes(voxels, state, bad)
-    for bad in (-1.0, np.inf):
-        with pytest.raises(InvalidInputError, match="radius_mm"):
-            boxes_within(bad, (1.0, 1.0, 1.0))
