@@ -4,13 +4,16 @@ The field that a moving sensor reads is the room's, plus what the place adds (an
 rest and for the movement between), plus a stray that changes as it moves on, plus the field of iron on the
 sensor, all as vectors. Norm and dip, which tell nothing of the heading, tell how large the stray is here: it
 is followed as the readings come, so that a quiet room's field is followed closely and a poor one's hardly.
-There are three filters: without iron on the sensor, with iron put on it later, and with iron on it from the
-start. Iron must prove itself: a sensor that is turned while it is carried through an uneven field shows
-nearly the same. Each filter's evidence is its weight in the mean.
+
+There are three filters: north is the field's where the sensor was at first; the first place was beside
+iron; iron is on the sensor. A resting sensor cannot tell the first two apart: the field is the same. When it
+changes against the gyroscope, either the earlier field was the wrong one or the later one is. So their odds
+are by how long each field lasted in movement, not by how well it fits, and sigma covers both headings. Iron
+on the sensor must prove itself: one that is turned while it is carried through an uneven field shows nearly
+the same.
 
 Two properties of the sensor are found on the way: the lag of its magnetometer (its readings are older than
-the gyroscope's), and the gyroscope's bias in movement, which is not quite that at rest. North is the field's
-where the sensor was at first.
+the gyroscope's), and the gyroscope's bias in movement, which is not quite that at rest.
 
 References
 ----------
@@ -25,7 +28,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,49 +36,31 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.kernels.orientation import heading as kernel
 from xsens.fusion.settings import FusionSettings
 
+_FIRST, _BESIDE, _IRON = range(3)
+"""The three filters."""
 
-class _Iron(NamedTuple):
-    """Iron on the sensor: deviations of its field at the start and of iron put on later, as fractions.
+_ODDS = np.array([0.0, 3.0, 100.0])
+"""Logarithms of the odds against each: one recording in twenty begins beside iron. Of BROAD's undisturbed
+trials, six have less than 25 of evidence for iron that is not there, one 240; a magnet of a tenth of the
+field has 170 in a minute of turning."""
 
-    `handicap` is the logarithm of the evidence that the filter without iron must lack.
-    """
-
-    at_start: float
-    put_on: float = 0.0
-    handicap: float = 0.0
-
-
-_IRON = (_Iron(0.002), _Iron(0.02, 0.15, 100.0), _Iron(0.7, 0.15, 100.0))
-"""None but what a calibration leaves; put on later; from the start. Of BROAD's undisturbed trials, six have
-less than 25 of evidence for iron that is not there, one 240; a magnet of a tenth of the field has 170 in a
-minute of turning."""
+_STRAY = 0.01
+"""At first: of the norm, per component; a room without iron near."""
 
 _MEMORY_S = 300.0
 """Time over which evidence is weighed while samples arrive; a recording is weighed as a whole."""
-
-_ROOM = {
-    "stray": 0.01,  # at first: of the norm, per component; a room without iron near
-    "least_stray": 0.005,
-    "most_stray": 0.3,
-    "stray_s": 2.0,  # how long it persists: a hand's length at a hand's speed
-    "adapts_s": 60.0,  # how fast its variance is followed
-    "bias_s": 10.0,  # how long what is left of the gyroscope's bias persists
-    "walk_sqrt_s": 0.0003,  # the room's random walk: 1 % in twenty minutes
-    "freedom": 3.0,  # of Student's distribution of the readings' errors
-    "outlier": 25.0,  # squared misfit that shows iron put on or off: one in 10^5 with normal errors
-    "hold_s": 3.0,  # how long putting it on takes
-}
 
 _FIRST_STRAY = 0.25
 """The first reading's stray while samples arrive, as a fraction: the first readings are all there is, and a
 rough room would swing the heading about. A recording tells it in full."""
 
 _DISTRUSTED = 0.5
+
 _ROUNDING = 1e-12
 """Variance that keeps covariances invertible: (1 microradian)^2, a millionth of the field, 1 microsecond."""
 
-_NEGLIGIBLE = 5.0
-"""Filters whose evidence is less by this, in logarithms, are not smoothed: their weight is below 1 %."""
+_NEGLIGIBLE = 0.005
+"""Filters of less weight are not smoothed."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +75,7 @@ class Headings:
     stray : ndarray, shape (n,)
         How much the field changes from place to place: a fraction of its norm, per component.
     iron : ndarray, shape (n,)
-        Weight of the filters that take iron to be on the sensor, 0 to 1.
+        Weight of the filter that takes iron to be on the sensor, 0 to 1.
     """
 
     turn_rad: FloatArray
@@ -104,25 +89,23 @@ class HeadingFilter:
     """The three filters, bin by bin; `online` if the readings so far are all there is."""
 
     def __init__(self, settings: FusionSettings, online: bool = True) -> None:
-        shared = _ROOM | {
-            "place": settings.field_place,
-            "first_place": settings.field_first_place,
-            "white_sqrt_s": settings.field_noise_sqrt_s,
-            "lag_s": settings.magnetometer_lag_s,
-            "first_stray": _FIRST_STRAY if online else 1.0,
-        }
-        self._room = np.array([tuple(shared[name] for name in kernel.ROOMS.names or ())], kernel.ROOMS)
-        self._kept = np.zeros(len(_IRON), kernel.KEPT)
-        self._kept["iron"] = [iron.at_start for iron in _IRON]
-        self._kept["iron_put_on"] = [iron.put_on for iron in _IRON]
-        self._handicap = np.array([iron.handicap for iron in _IRON])
-        self._scores = np.zeros(len(_IRON))
+        self._models = np.zeros(len(_ODDS), kernel.MODEL)
+        self._models["iron"] = 0.002  # what a calibration leaves
+        self._models["iron"][_IRON], self._models["iron_put_on"][_IRON] = 0.7, 0.15
+        self._models["first_place"], self._models["first_place"][_BESIDE] = settings.field_first_place, 0.3
+        self._models["beside_iron"][_BESIDE] = True
+        self._models["place"] = settings.field_place
+        self._models["white_sqrt_s"] = settings.field_noise_sqrt_s
+        self._models["lag_s"] = settings.magnetometer_lag_s
+        self._models["first_stray"] = _FIRST_STRAY if online else 1.0
+        self._filters = _fresh(_STRAY)
+        self._evidence, self._doubt = np.zeros(len(_ODDS)), np.zeros(len(_ODDS))
         self._norm = math.nan
         self._bias: FloatArray | None = None
 
     def resume(self) -> None:
         """Find north again after a pause; keep iron, lag and the evidence."""
-        self._kept["begun"] = False
+        self._filters["begun"] = False
         self._bias = None
 
     def follow(self, bins: Any, bias_rad_s: FloatArray) -> Headings:
@@ -131,59 +114,80 @@ class HeadingFilter:
         before = bias_rad_s[:1] if self._bias is None else self._bias[None]
         bins["bias_change"] = np.diff(bias_rad_s, axis=0, prepend=before)
         self._bias = bias_rad_s[-1].copy()
-        found = self._run(bins, 1)
-        weights = np.array([self._weights(*each) for each in zip(bins, found["evidence"], strict=True)])
+        found = self._run(self._scaled(bins, 1), self._filters)
+        weights = np.empty(found.shape)
+        for k in np.arange(len(bins)):
+            if not bins["resting"][k]:  # a sensor at rest repeats itself and proves nothing
+                keep = math.exp(-bins["span_s"][k] / _MEMORY_S)
+                self._evidence = keep * self._evidence + found["evidence"][k]
+                self._doubt = self._doubt + found["doubt"][k]
+            weights[k] = _weights(self._evidence, self._doubt)
         return _mean(found, weights, bins)
 
     def smooth(self, bins: Any) -> Headings:
-        """North over a whole stretch, smoothed backward."""
-        n = len(bins)
-        kept = [np.zeros((len(_IRON), n, *rest)) for rest in ((kernel.SIZE,), *3 * [2 * (kernel.SIZE,)])]
-        found = self._run(bins, n, kept)
-        evidence = np.nan_to_num(found["evidence"]).sum(axis=0) - self._handicap
-        likely = np.where(evidence > evidence.max() - _NEGLIGIBLE, evidence, -np.inf)
-        weights = np.tile(_shares(likely), (n, 1))
-        for j in np.flatnonzero(weights[0]):
+        """North over a whole stretch, smoothed backward; the stray at first is the recording's."""
+        bins, moving = self._scaled(bins, len(bins)), ~bins["resting"]
+        found, stray = self._run(bins, self._filters), _STRAY
+        if moving.any():
+            best = _weights(*_sums(found, moving)).argmax()
+            stray = max(float(np.median(found["stray"][moving, best])), _STRAY)
+        shapes = ((kernel.SIZE,), *3 * [(kernel.SIZE, kernel.SIZE)])
+        kept = [np.zeros((len(_ODDS), len(bins), *shape)) for shape in shapes]
+        found = self._run(bins, _fresh(stray), kept)
+        weights = _weights(*_sums(found, moving))
+        for j in np.flatnonzero(weights > _NEGLIGIBLE):
             found["turn_rad"][:, j], found["variance"][:, j] = _backward(bins, *(each[j] for each in kept))
-        return _mean(found, weights, bins)
+        return _mean(found, np.tile(np.where(weights > _NEGLIGIBLE, weights, 0.0), (len(bins), 1)), bins)
 
-    def _run(self, bins: Any, readings: int, kept: list[FloatArray] | None = None) -> Any:
-        """What each filter finds in each bin, shape (n, filters); the norm is that of the first readings."""
+    def _scaled(self, bins: Any, readings: int) -> Any:
+        """Bins whose fields are fractions of the norm, which is that of the first readings."""
         if not math.isfinite(self._norm) and bins["seen"].any():
             first = bins["field"][bins["seen"]][:readings]
             self._norm = float(np.median(np.linalg.norm(first, axis=1)))
         if self._norm > 0.0:
             bins["field"] /= self._norm
             bins["field_rate"] /= self._norm
-        found = np.zeros((len(_IRON), len(bins)), kernel.FOUND)
+        return bins
+
+    def _run(self, bins: Any, filters: Any, kept: list[FloatArray] | None = None) -> Any:
+        """What each filter finds in each bin, shape (n, filters)."""
+        found = np.zeros((len(_ODDS), len(bins)), kernel.HEADING)
         none = [np.zeros((0, kernel.SIZE)), *3 * [np.zeros((0, kernel.SIZE, kernel.SIZE))]]
-        for j in range(len(_IRON)):
+        for j in range(len(_ODDS)):
             into = none if kept is None else [each[j] for each in kept]
-            kernel.find_headings(bins, self._room, self._kept[j : j + 1], found[j], *into)
+            kernel.find_headings(bins, self._models[j : j + 1], filters[j : j + 1], found[j], *into)
         return found.T
 
-    def _weights(self, bin_: Any, evidence: FloatArray) -> FloatArray:
-        """Weights of the filters after one more bin; a sensor at rest repeats itself and proves nothing."""
-        if not bin_["resting"]:
-            self._scores = math.exp(-bin_["span_s"] / _MEMORY_S) * self._scores + np.nan_to_num(evidence)
-        return _shares(self._scores - self._handicap)
+
+def _fresh(stray: float) -> Any:
+    """The filters before the first reading."""
+    filters = np.zeros(len(_ODDS), kernel.FILTER)
+    filters["stray"] = stray
+    return filters
 
 
-def _shares(evidence: FloatArray) -> FloatArray:
-    """Weights by logarithms of evidence."""
-    likely = np.exp(evidence - evidence.max())
+def _sums(found: Any, moving: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Evidence and doubt of each filter over a recording."""
+    return found["evidence"].sum(axis=0), found["doubt"][moving].sum(axis=0)
+
+
+def _weights(evidence: FloatArray, doubt: FloatArray) -> FloatArray:
+    """Weights of the filters: iron on the sensor by its evidence over the better one of the other two."""
+    against = _ODDS - [0.0, 0.0, evidence[_IRON] - evidence[:_IRON].max()]
+    against[:_IRON] += doubt[:_IRON]
+    against[:_IRON] -= against[:_IRON].min()
+    likely = np.exp(against.min() - against)
     return np.asarray(likely / likely.sum())
 
 
 def _mean(found: Any, weights: FloatArray, bins: Any) -> Headings:
-    """Mean and deviation of the filters' angles by weights, shape (n, filters)."""
+    """The likeliest filter's angle, and deviation of all from it by their weights, shape (n, filters)."""
     best = np.take_along_axis(found["turn_rad"], weights.argmax(axis=1)[:, None], axis=1)
     off = np.angle(np.exp(1j * (found["turn_rad"] - best)))
-    mean = (weights * off).sum(axis=1)
-    variance = (weights * (found["variance"] + (off - mean[:, None]) ** 2)).sum(axis=1)
+    variance = (weights * (found["variance"] + off**2)).sum(axis=1)
     trust, stray = ((weights * found[name]).sum(axis=1) for name in ("trust", "stray"))
     disturbed = bins["seen"] & (trust < _DISTRUSTED)
-    return Headings(best[:, 0] + mean, np.sqrt(variance), disturbed, stray, 1.0 - weights[:, 0])
+    return Headings(best[:, 0], np.sqrt(variance), disturbed, stray, weights[:, _IRON])
 
 
 def _backward(

@@ -34,28 +34,22 @@ BIN = np.dtype(
 )
 """A quarter of a second of the sensor's movement."""
 
-ROOMS = np.dtype(
+MODEL = np.dtype(
     [
-        ("stray", "f8"),
-        ("least_stray", "f8"),
-        ("most_stray", "f8"),
-        ("first_stray", "f8"),
-        ("stray_s", "f8"),
-        ("adapts_s", "f8"),
-        ("place", "f8"),
-        ("first_place", "f8"),
-        ("white_sqrt_s", "f8"),
-        ("bias_s", "f8"),
-        ("walk_sqrt_s", "f8"),
+        ("iron", "f8"),  # deviations: of iron on the sensor at the start
+        ("iron_put_on", "f8"),  # of iron put on later, zero if none ever is
+        ("first_place", "f8"),  # of what the first place adds
+        ("beside_iron", "?"),  # whether that place is left at a reading that shows another
+        ("place", "f8"),  # of what any other place adds
+        ("white_sqrt_s", "f8"),  # of a reading's noise
         ("lag_s", "f8"),
-        ("freedom", "f8"),
-        ("outlier", "f8"),
-        ("hold_s", "f8"),
-    ]
+        ("first_stray", "f8"),  # of the first reading's stray, a fraction of the stray's
+    ],
+    align=True,
 )
-"""What all models share: see `xsens.fusion.heading`."""
+"""What a filter takes for granted."""
 
-KEPT = np.dtype(
+FILTER = np.dtype(
     [
         ("x", "f8", SIZE),
         ("p", "f8", (SIZE, SIZE)),
@@ -63,17 +57,39 @@ KEPT = np.dtype(
         ("begun", "?"),  # in this stretch
         ("ran", "?"),  # ever
         ("rested", "?"),  # in the last bin
+        ("beside", "?"),  # iron, since the start
         ("holding_s", "f8"),  # how long iron is still being put on
-        ("iron", "f8"),  # deviation of the iron at the start
-        ("iron_put_on", "f8"),  # of iron put on later, zero if none ever is
     ],
     align=True,
 )
-"""One model's filter."""
 
-FOUND = np.dtype([(name, "f8") for name in ("turn_rad", "variance", "evidence", "trust", "stray")])
+HEADING = np.dtype([(name, "f8") for name in ("turn_rad", "variance", "evidence", "doubt", "trust", "stray")])
 """Angle from the level axes to north at the end of a bin, and its variance; logarithm of the density of the
-reading, NaN without one; its weight, 0 to 1; deviation of the stray."""
+reading; of the odds that the first place was beside iron; the reading's weight, 0 to 1; the stray."""
+
+_LEAST_STRAY, _MOST_STRAY = 0.005, 0.3
+
+_STRAY_S, _ADAPTS_S = 2.0, 60.0
+"""How long a stray persists, a hand's length at a hand's speed; how fast its variance is followed."""
+
+_BIAS_S = 10.0
+"""How long what is left of the gyroscope's bias persists."""
+
+_WALK_SQRT_S = 0.0003
+"""The room's random walk: 1 % in twenty minutes."""
+
+_FREEDOM = 3.0
+"""Of Student's distribution of the readings' errors."""
+
+_OUTLIER = 25.0
+"""Squared misfit that shows iron put on or off, or left: one in 10^5 with normal errors."""
+
+_PUT_ON_S = 3.0
+"""How long putting iron on the sensor takes."""
+
+_DOUBT_S, _BESIDE_S = 1.0, 3.0
+"""Times of movement after which odds are less by e: of a field that is disbelieved to be the room's after
+all, and of a sensor that began beside iron to be still there: iron's field is uneven over a hand's length."""
 
 _ADAPTED = 1.5
 """Fisher's information on the logarithm of a variance that one vector gives."""
@@ -85,9 +101,9 @@ _LARGEST_SCORE, _LARGEST_CHANGE = 50.0, 0.5
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def find_headings(
     bins: Any,
-    room: Any,
-    kept: Any,
-    found: Any,
+    models: Any,
+    filters: Any,
+    headings: Any,
     states: FloatArray,
     covariances: FloatArray,
     transitions: FloatArray,
@@ -98,52 +114,30 @@ def find_headings(
     Parameters
     ----------
     bins : structured ndarray, shape (n,), of `BIN`
-    room : structured ndarray, shape (1,), of `ROOMS`
-    kept : structured ndarray, shape (1,), of `KEPT`
-        The filter, changed in place.
-    found : structured ndarray, shape (n,), of `FOUND`
+    models : structured ndarray, shape (1,), of `MODEL`
+    filters : structured ndarray, shape (1,), of `FILTER`
+        Changed in place.
+    headings : structured ndarray, shape (n,), of `HEADING`
         Filled.
     states, covariances, transitions, noises : ndarray, shapes (n, SIZE) and (n, SIZE, SIZE), or n = 0
         Filled: after each bin, and from the one before to it.
     """
-    s, r = kept[0], room[0]
-    rows, transition, noise = np.zeros((3, SIZE)), np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
+    s, m = filters[0], models[0]
+    rows, f, q = np.zeros((3, SIZE)), np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
     for k in range(bins.shape[0]):
-        b, out = bins[k], found[k]
-        out.evidence, out.trust, out.turn_rad, out.variance = math.nan, 0.0, 0.0, math.pi**2
-        out.stray = s.stray
+        b, out = bins[k], headings[k]
+        out.evidence, out.doubt, out.trust, out.turn_rad, out.variance = 0.0, 0.0, 0.0, 0.0, math.pi**2
         if not s.begun and b.seen:
-            _begin(s, b, r)
+            _begin(s, b, m)
+        out.stray = s.stray
         if not s.begun:
             continue
-        _predict(s, b, r, transition, noise)
+        _predict(s, b, m, f, q)
         if b.seen:
-            _correct(s, b, r, rows, noise, out)
-        for first in (ROOM, PLACE, STRAY):  # fields stay where they are as the level axes are corrected
-            s.x[first : first + 3] = b.correction @ s.x[first : first + 3]
-            _turn_rows(s.p, first, b.correction)
-            _turn_rows(s.p.T, first, b.correction)
+            _correct(s, b, m, rows, f, q, out)
         out.turn_rad, out.variance = turn_to_north(s.x, s.p)
         if states.shape[0] > 0:
-            states[k], covariances[k], transitions[k], noises[k] = s.x, s.p, transition, noise
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _turn_rows(p: FloatArray, first: int, turn: FloatArray) -> None:
-    """Turn three rows of a covariance as one vector."""
-    for j in range(SIZE):
-        x, y, z = p[first, j], p[first + 1, j], p[first + 2, j]
-        for i in range(3):
-            p[first + i, j] = turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _add_turn(p: FloatArray, rates: FloatArray, across: float, along: float) -> None:
-    """Add to the rows of the room's field what those of the bias turn it by."""
-    for j in range(SIZE):
-        angle = rates[0] * p[BIAS, j] + rates[1] * p[BIAS + 1, j] + rates[2] * p[BIAS + 2, j]
-        p[ROOM, j] -= along * angle
-        p[ROOM + 1, j] += across * angle
+            states[k], covariances[k], transitions[k], noises[k] = s.x, s.p, f, q
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -158,19 +152,18 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _begin(s: Any, b: Any, r: Any) -> None:
+def _begin(s: Any, b: Any, m: Any) -> None:
     """Begin with the bin's reading; after a pause with the iron and lag found so far."""
-    place = r.place if s.ran else r.first_place
     if not s.ran:
-        _forget(s, IRON, 3, s.iron)
-        _forget(s, LAG, 1, r.lag_s)
-        s.stray = r.stray
+        _forget(s, IRON, 3, m.iron)
+        _forget(s, LAG, 1, m.lag_s)
     _forget(s, ROOM, 3, 1.0)
     _forget(s, BIAS, 3, math.sqrt(b.bias_variance))
-    _forget(s, PLACE, 3, place)
-    _forget(s, STRAY, 3, r.first_stray * s.stray)
+    _forget(s, PLACE, 3, m.place if s.ran else m.first_place)
+    _forget(s, STRAY, 3, m.first_stray * s.stray)
     s.x[ROOM : ROOM + 3] = b.field - b.level @ s.x[IRON : IRON + 3]
-    s.begun, s.ran, s.rested, s.holding_s = True, True, b.resting, 0.0
+    s.holding_s, s.beside = 0.0, m.beside_iron and not s.ran
+    s.begun, s.ran, s.rested = True, True, b.resting
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -182,12 +175,14 @@ def _forget(s: Any, first: int, count: int, sd: float) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _predict(s: Any, b: Any, r: Any, f: FloatArray, q: FloatArray) -> None:
-    """Predict over a bin; fill its transition and noise."""
+def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
+    """Predict over a bin; fill its transition and noise.
+
+    Fields stay where they are as the level axes are corrected.
+    """
     span, across, along = b.span_s, s.x[ROOM], s.x[ROOM + 1]
-    moving = 0.0 if b.resting else 1.0
-    keep_bias, keep_stray = math.exp(-span / r.bias_s), math.exp(-moving * span / r.stray_s)
-    stays = 1.0 if b.resting == s.rested else 0.0
+    moving, moves_on = 0.0 if b.resting else 1.0, b.resting != s.rested
+    keep_bias, keep_stray = math.exp(-span / _BIAS_S), math.exp(-moving * span / _STRAY_S)
     s.rested = b.resting
     s.x[BIAS : BIAS + 3] -= b.bias_change
     f[:], q[:] = 0.0, 0.0
@@ -195,30 +190,29 @@ def _predict(s: Any, b: Any, r: Any, f: FloatArray, q: FloatArray) -> None:
     for i in range(3):
         turn = moving * span * keep_bias * b.level[2, i]
         f[ROOM, BIAS + i], f[ROOM + 1, BIAS + i] = -turn * along, turn * across
-        f[ROOM + i, ROOM + i] = f[IRON + i, IRON + i] = 1.0
-        f[BIAS + i, BIAS + i], f[PLACE + i, PLACE + i], f[STRAY + i, STRAY + i] = keep_bias, stays, keep_stray
-        q[ROOM + i, ROOM + i] = r.walk_sqrt_s**2 * span
+        f[IRON + i, IRON + i], f[BIAS + i, BIAS + i] = 1.0, keep_bias
+        for j in range(3):
+            f[ROOM + i, ROOM + j] = b.correction[i, j]
+            f[PLACE + i, PLACE + j] = 0.0 if moves_on and not s.beside else b.correction[i, j]
+            f[STRAY + i, STRAY + j] = keep_stray * b.correction[i, j]
+        q[ROOM + i, ROOM + i] = _WALK_SQRT_S**2 * span
         q[BIAS + i, BIAS + i] = (1.0 - keep_bias**2) * b.bias_variance
-        q[IRON + i, IRON + i] = s.iron_put_on**2 if s.holding_s > 0.0 else 0.0
-        q[PLACE + i, PLACE + i] = (1.0 - stays) * r.place**2
+        q[IRON + i, IRON + i] = m.iron_put_on**2 if s.holding_s > 0.0 else 0.0
+        q[PLACE + i, PLACE + i] = m.place**2 if moves_on else 0.0
         q[STRAY + i, STRAY + i] = (1.0 - keep_stray**2) * s.stray**2
     q[ROOM, ROOM] += b.slip_rad2 * along * along
     q[ROOM + 1, ROOM + 1] += b.slip_rad2 * across * across
     q[ROOM, ROOM + 1] = q[ROOM + 1, ROOM] = -b.slip_rad2 * across * along
     s.holding_s = max(s.holding_s - span, 0.0)
     s.x[:] = f @ s.x
-    for i in range(SIZE):
-        for j in range(SIZE):
-            s.p[i, j] *= f[i, i] * f[j, j]
-    rates = moving * span * b.level[2]
-    _add_turn(s.p, rates, across, along)
-    _add_turn(s.p.T, rates, across, along)
-    s.p += q
+    s.p[:] = f @ s.p @ f.T + q
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _correct(s: Any, b: Any, r: Any, rows: FloatArray, q: FloatArray, out: Any) -> None:
+def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatArray, out: Any) -> None:
     """Correct by a reading, the less the less likely it is: its errors have Student's distribution.
+
+    An outlier is left out: what disturbs it may last longer than a stray does.
 
     Of fields only that of the room is turned by errors of the heading: place and stray have random
     directions, and turned they are as likely; a linear filter would take their turns for knowledge of it.
@@ -227,33 +221,63 @@ def _correct(s: Any, b: Any, r: Any, rows: FloatArray, q: FloatArray, out: Any) 
         rows[i, ROOM + i] = rows[i, PLACE + i] = rows[i, STRAY + i] = 1.0
         rows[i, LAG] = b.field_rate[i]
         rows[i, IRON : IRON + 3] = b.level[i]
-    off = b.field - rows @ s.x
-    cross, total = _spread(s, b, r, rows)
+    off, cross, total = _innovation(s, b, m, rows)
     inverse, determinant = _inverse(total)
-    misfit = off @ (inverse @ off)
-    if misfit > r.outlier and s.iron_put_on > 0.0 and s.holding_s <= 0.0:
-        s.holding_s = r.hold_s
-        for i in range(IRON, IRON + 3):
-            s.p[i, i] += s.iron_put_on**2
-            q[i, i] += s.iron_put_on**2
-        cross, total = _spread(s, b, r, rows)
-        inverse, determinant = _inverse(total)
-        misfit = off @ (inverse @ off)
+    misfit = float(off @ (inverse @ off))
     if not b.resting:
-        _adapt(s, b, r, off, misfit, inverse)
-    v = r.freedom
-    density = math.lgamma(0.5 * (v + 3.0)) - math.lgamma(0.5 * v) - 1.5 * math.log(v)
-    out.evidence = density - 0.5 * math.log(determinant) - 0.5 * (v + 3.0) * math.log(1.0 + misfit / v)
+        _adapt(s, b, off, misfit, inverse)
+    if misfit > _OUTLIER and _changed(s, m, f, q, off, total):
+        off, cross, total = _innovation(s, b, m, rows)
+        inverse, determinant = _inverse(total)
+        misfit = float(off @ (inverse @ off))
+    v = _FREEDOM
+    out.evidence = -0.5 * math.log(determinant) - 0.5 * (v + 3.0) * math.log(1.0 + misfit / v)
     out.trust = min((v + 3.0) / (v + misfit), 1.0)
+    out.doubt = b.span_s * ((1.0 - out.trust) / _DOUBT_S + (1.0 / _BESIDE_S if s.beside else 0.0))
+    if misfit > _OUTLIER:
+        out.trust = 0.0
+        return
     if out.trust < 1.0:
         more = (1.0 / out.trust - 1.0) * (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0
-        for i in range(3):
-            total[i, i] += more
-        inverse, _ = _inverse(total)
+        inverse, _ = _inverse(total + more * np.eye(3))
     gain = cross @ inverse
     s.x[:] += gain @ off
     p = s.p - gain @ cross.T
     s.p[:] = 0.5 * (p + p.T)
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _changed(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, total: FloatArray) -> bool:
+    """Whether an outlier is iron put on the sensor, or iron beside it left behind; if so, foresee it."""
+    if m.iron_put_on > 0.0 and s.holding_s <= 0.0:
+        s.holding_s = _PUT_ON_S
+        for i in range(IRON, IRON + 3):
+            s.p[i, i] += m.iron_put_on**2
+            q[i, i] += m.iron_put_on**2
+        return True
+    wide, _ = _inverse(total + m.place**2 * np.eye(3))
+    if not s.beside or off @ (wide @ off) <= _OUTLIER:
+        return False
+    s.beside = False
+    _forget(s, PLACE, 3, m.place)
+    f[PLACE : PLACE + 3], q[PLACE : PLACE + 3] = 0.0, 0.0
+    for i in range(PLACE, PLACE + 3):
+        q[i, i] = m.place**2
+    return True
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The reading less what is expected, its covariance with the state, and its own.
+
+    The last holds its noise, and what the level axes' tilt makes of the field.
+    """
+    cross = s.p @ rows.T
+    total = rows @ cross
+    across, up = s.x[ROOM] ** 2 + s.x[ROOM + 1] ** 2, s.x[ROOM + 2] ** 2
+    for i in range(3):
+        total[i, i] += m.white_sqrt_s**2 / b.span_s + b.tilt_rad2 * (up if i < 2 else across)
+    return b.field - rows @ s.x, cross, total
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -270,27 +294,13 @@ def _inverse(m: FloatArray) -> tuple[FloatArray, float]:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _spread(s: Any, b: Any, r: Any, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Covariance of the state with the expected field, and that of the reading.
-
-    The reading's holds its noise, and what the level axes' tilt makes of the field.
-    """
-    cross = s.p @ rows.T
-    total = rows @ cross
-    across, up = s.x[ROOM] ** 2 + s.x[ROOM + 1] ** 2, s.x[ROOM + 2] ** 2
-    for i in range(3):
-        total[i, i] += r.white_sqrt_s**2 / b.span_s + b.tilt_rad2 * (up if i < 2 else across)
-    return cross, total
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _adapt(s: Any, b: Any, r: Any, off: FloatArray, misfit: float, inverse: FloatArray) -> None:
+def _adapt(s: Any, b: Any, off: FloatArray, misfit: float, inverse: FloatArray) -> None:
     """Follow the stray's variance by the slope of the reading's likelihood: the room may become another."""
     weighted = inverse @ off
     believed = min(1.0, _LARGEST_SCORE / misfit)
     score = 0.0
     for i in range(3):
         score += 0.5 * s.p[STRAY + i, STRAY + i] * (believed * weighted[i] ** 2 - inverse[i, i])
-    change = score * b.span_s / (_ADAPTED * r.adapts_s)
+    change = score * b.span_s / (_ADAPTED * _ADAPTS_S)
     s.stray *= math.exp(0.5 * min(max(change, -_LARGEST_CHANGE), _LARGEST_CHANGE))
-    s.stray = min(max(s.stray, r.least_stray), r.most_stray)
+    s.stray = min(max(s.stray, _LEAST_STRAY), _MOST_STRAY)

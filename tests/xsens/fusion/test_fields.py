@@ -13,9 +13,6 @@ WORSE = 1.15
 SIGMAS = 2.5
 """RMS error over RMS claimed sigma that is still honest: as of the worst of BROAD's trials."""
 
-FALLS_SHORT = {("start", ONLINE), ("start", OFFLINE), ("walk", OFFLINE)}
-"""Kinds in which a field is taken for north, or iron not found, at 3 to 8 claimed sigmas."""
-
 KINDS = [
     ("attached", 5.0),
     ("attached", 30.0),
@@ -45,14 +42,8 @@ def made(kind, amount):
 @pytest.mark.parametrize("methods", [ONLINE, OFFLINE], ids=["on-line", "off-line"])
 @pytest.mark.parametrize(("kind", "amount"), KINDS)
 def test_no_heading_is_confident_and_wrong(kind, amount, methods):
-    if (kind, amount, methods) == ("walk", 0.3, ONLINE):
-        # A walk from a place where the field is 20 degrees off: on line ours keeps to that start for too
-        # long, 18.8 degrees off claiming 7.4 where VQF is 9.4. A weaker field is told.
-        amount = 0.2
     one = made(kind, amount)
     theirs, ours = (estimate(one.log, method) for method in methods)
     peer, own = (errors_deg(each.wxyz, one.true_wxyz, one.moving)[1] for each in (theirs, ours))
     sigma = rms_deg(ours.sigma_rad[counting(one.true_wxyz, one.moving), 2])
-    if (kind, methods) in FALLS_SHORT and own > SIGMAS * sigma:
-        pytest.xfail(f"{own:.2f} degrees, claimed {sigma:.2f}, VQF {peer:.2f}")
     assert own <= max(SIGMAS * sigma, WORSE * peer), f"{own:.2f}, claimed {sigma:.2f}, VQF {peer:.2f}"
