@@ -29,6 +29,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.sweep import Tracker
+from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     PathLike,
     find_member,
@@ -41,7 +42,6 @@ from speckle3d.io.hdf5 import (
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.lazy import HDF5Slices
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Value
@@ -100,7 +100,8 @@ def open_scan(scan: Path, _: ImportSettings) -> Recording:
                 f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
             )
         n, height, width = node.shape
-        frames = HDF5Slices(scan, "frames", np.transpose, (n, width, height), node.dtype)
+        slices = HDF5Slices(scan.absolute(), "frames", np.transpose, n)
+        frames = FileFrames(scan, slices, (n, width, height), node.dtype)
     tracker, remarks = None, list[str]()
     source = _transforms_file(scan) or scan
     with reading(source), open_hdf5(source) as file:

@@ -1,4 +1,4 @@
-"""Frames that stay in another system's file and are read, and turned, one at a time."""
+"""Frames that stay in a file and are read, and turned, one at a time."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
-from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import require_finite
-from speckle3d.io.hdf5 import reading
+from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
 
 ReadFrame: TypeAlias = Callable[[int], npt.NDArray[Any]]
 """Reads frame i of an open file, shape (vector, sample)."""
+
+Turn: TypeAlias = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
+"""Makes a frame (vector, sample) of what the file holds of it; a top-level function, so that frames can be
+sent to another process."""
 
 
 class FileFrames:
@@ -109,7 +114,7 @@ class RawFile:
     step: int
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
-    turn: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
+    turn: Turn
 
     def __call__(self) -> ReadFrame:
         """Open nothing: the file is open only while a frame is read."""
@@ -123,12 +128,68 @@ class RawFile:
         FileError
             If the file ends before.
         """
-        expected = int(np.prod(self.shape)) * self.dtype.itemsize
-        with open_regular(self.path) as stream:
-            stream.seek(self.start + i * self.step)
-            content = stream.read(expected)
-        if len(content) != expected:
-            raise FileError(
-                f"{self.path}: frame {i}: expected {expected} bytes, got {len(content)}: truncated"
-            )
-        return self.turn(np.frombuffer(content, self.dtype).reshape(self.shape))
+        count = int(np.prod(self.shape))
+        values = np.fromfile(self.path, self.dtype, count, offset=self.start + i * self.step)
+        if values.size != count:
+            raise FileError(f"{self.path}: frame {i}: expected {count} samples, got {values.size}: truncated")
+        return self.turn(values.reshape(self.shape))
+
+
+@dataclass(frozen=True)
+class HDF5Slices:
+    """Opens frames that are slices of a data set along its first axis.
+
+    Attributes
+    ----------
+    count : int
+        Frames there must be.
+    grows : bool
+        Whether the data set may hold more, which are not looked at.
+    """
+
+    path: Path
+    name: str
+    turn: Turn
+    count: int
+    grows: bool = False
+
+    def __call__(self) -> ReadFrame:
+        """Open the file.
+
+        HDF5's handles are made once: h5py frees one in a callback, where Python drops a Ctrl-C, the one
+        pressed while a frame was read.
+
+        Raises
+        ------
+        InvalidInputError
+            If there are fewer frames than there must be, or more.
+        """
+        file = open_hdf5(self.path)
+        data = require_dataset(file, self.name)
+        count = data.shape[0] if data.ndim else 0
+        if count < self.count or (count > self.count and not self.grows):
+            raise InvalidInputError(f"/{self.name}: expected {self.count} frames, got shape {data.shape}")
+        shape, dtype = data.shape[1:], data.dtype.newbyteorder("=")
+        on_disk, in_memory = data.id.get_space(), h5py.h5s.create_simple(shape or (1,))
+        kind = h5py.h5t.py_create(dtype)
+        # As they lie in the file, twice as fast as by way of HDF5's cache of chunks.
+        is_plain = (
+            data.chunks == (1, *shape)
+            and not data.id.get_create_plist().get_nfilters()
+            and data.dtype == dtype
+        )
+
+        def read(i: int) -> npt.NDArray[Any]:
+            values, start = np.empty(shape, dtype), (i, *(0,) * len(shape))
+            if not is_plain:
+                on_disk.select_hyperslab(start, (1, *shape))
+                data.id.read(in_memory, on_disk, values, kind)
+            elif data.id.get_chunk_info_by_coord(start).byte_offset is None:
+                raise InvalidInputError(
+                    f"/{self.name}: expected samples in the file, got none: never written"
+                )
+            else:
+                data.id.read_direct_chunk(start, out=values.reshape(-1).view(np.uint8))
+            return self.turn(values)
+
+        return read

@@ -7,7 +7,6 @@ file before its time is, and a reading before its time: a reader takes as many o
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.geometry import rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
@@ -31,9 +30,6 @@ from speckle3d.io.sweeps import FORMAT, GROWING
 
 _ROWS_PER_CHUNK = 128
 """A chunk is written again with every value that is added to it."""
-
-_FLUSH_S = 0.2
-"""Longest time for which readings wait for the next frame."""
 
 
 class GrowingSweep:
@@ -137,11 +133,9 @@ class GrowingSweep:
         """
         self._clock.require_after(time_s)
         with self._writing():
-            self._write_readings()
             self._frames.append(frame, self._room)
             self._frames.flush()
-            self._clock.add(time_s)
-            self._clock.write()
+            self._clock.append(time_s)
 
     def append_pose(self, time_s: float, matrix: npt.ArrayLike, valid: bool = True) -> None:
         """Write a tracker's reading: world_from_sensor, shape (4, 4), mm; of an invalid one any numbers.
@@ -153,7 +147,8 @@ class GrowingSweep:
         """
         if valid:
             transforms_from_matrices(np.asarray(matrix)[None], f"{self.path}: /tracker at {time_s} s")
-        self._take(self._tracker, time_s, matrix, valid)
+        with self._writing():
+            self._tracker.append(matrix, valid, time_s)
 
     def append_orientation(self, time_s: float, quaternion_wxyz: npt.ArrayLike) -> None:
         """Write an orientation sensor's reading: world_from_sensor, scalar first.
@@ -165,16 +160,16 @@ class GrowingSweep:
         """
         where = f"{self.path}: /orientation at {time_s} s"
         rotations_from_quaternions(np.asarray(quaternion_wxyz)[None], where)
-        self._take(self._orientation, time_s, quaternion_wxyz)
+        with self._writing():
+            self._orientation.append(quaternion_wxyz, time_s)
 
     def close(self, complete: bool = True) -> None:
-        """Write what waits and end the file; closing twice does nothing."""
+        """End the file; closing twice does nothing."""
         file, self._file = self._file, None
         if file is None:
             return
         try:
             with self._writing():
-                self._write_readings()
                 file[GROWING][...] = not complete
         except FileError:
             if complete:
@@ -190,11 +185,11 @@ class GrowingSweep:
         if self._probe:
             file.attrs["probe"] = self._probe
         self._frames.create(file)
-        self._clock = _Stream(file, {"frame_time_s": ()})
+        self._clock = _Stream(file, self._room, {"frame_time_s": ()})
         tracker, orientation = (file.create_group(name) for name in ("tracker", "orientation"))
         # Times last: what has a time is whole.
-        self._tracker = _Stream(tracker, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
-        self._orientation = _Stream(orientation, {"quaternion_wxyz": (4,), "time_s": ()})
+        self._tracker = _Stream(tracker, self._room, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
+        self._orientation = _Stream(orientation, self._room, {"quaternion_wxyz": (4,), "time_s": ()})
         for group in (tracker, orientation):
             group.attrs["time_offset_s"] = self._offset_s
         if self._mounting is not None:
@@ -207,31 +202,18 @@ class GrowingSweep:
     def _writing(self) -> Iterator[None]:
         try:
             yield
-        except FileError:
+        except Speckle3DError:
             raise
         except (OSError, RuntimeError) as error:
             failure = error if isinstance(error, OSError) else OSError(str(error))
             raise cannot_write(self.path, failure) from error
 
-    def _take(self, stream: _Stream, time_s: float, *values: Any) -> None:
-        stream.require_after(time_s)
-        stream.add(*values, time_s)
-        if time.monotonic() - stream.waiting_since_s > _FLUSH_S:
-            with self._writing():
-                self._write_readings()
-
-    def _write_readings(self) -> None:
-        """Write readings that wait for the next frame."""
-        self._room.require(self._tracker.file_bytes)
-        for stream in (self._tracker, self._orientation):
-            stream.write()
-
 
 class _Stream:
-    """Data sets of a group that grow row by row; rows wait until they are written, the last data set last."""
+    """Data sets of a group that grow row by row, the last data set last."""
 
-    def __init__(self, group: h5py.Group, shapes: dict[str, tuple[int, ...]]) -> None:
-        self._where, self._shapes = f"{group.file.filename}: {group.name}", list(shapes.values())
+    def __init__(self, group: h5py.Group, room: Room, shapes: dict[str, tuple[int, ...]]) -> None:
+        self._where, self._room, self._file = f"{group.file.filename}: {group.name}", room, group.file.id
         self._nodes = [
             group.create_dataset(
                 name, (0, *shape), "?" if name == "valid" else "f8", maxshape=(None, *shape),
@@ -239,39 +221,24 @@ class _Stream:
             )
             for name, shape in shapes.items()
         ]  # fmt: skip
-        self._file = group.file.id
-        self._rows: list[tuple[npt.NDArray[Any], ...]] = []
         self._time_s = -np.inf
-        self.waiting_since_s = np.inf
-
-    @property
-    def file_bytes(self) -> int:
-        """Length of the file."""
-        return int(self._file.get_filesize())
 
     def require_after(self, time_s: float) -> None:
         """Raise unless a time is after that of the last row."""
         if not (np.isfinite(time_s) and time_s > self._time_s):
             raise InvalidInputError(f"{self._where}: expected a time after {self._time_s} s, got {time_s}")
 
-    def add(self, *values: Any) -> None:
-        """Take a row, its time last."""
-        row = tuple(np.asarray(value, dtype=float) for value in values)
-        for value, shape in zip(row, self._shapes, strict=True):
-            if value.shape != shape or not np.isfinite(value).all():
-                raise InvalidInputError(
-                    f"{self._where}: expected finite numbers of shape {shape}, got {value.tolist()}"
-                )
-        if not self._rows:
-            self.waiting_since_s = time.monotonic()
-        self._rows.append(row)
-        self._time_s = float(row[-1])
-
-    def write(self) -> None:
-        """Write the rows that wait, and hand them to the operating system."""
-        if self._rows:
-            for node, values in zip(self._nodes, zip(*self._rows, strict=True), strict=True):
-                node.resize(len(node) + len(values), axis=0)
-                node[-len(values) :] = np.array(values, dtype=node.dtype)
-                node.id.flush()
-            self._rows, self.waiting_since_s = [], np.inf
+    def append(self, *values: Any) -> None:
+        """Write a row, its time last, and hand it to the operating system."""
+        self.require_after(values[-1])
+        row = [np.asarray(value, dtype=float) for value in values]
+        for node, value in zip(self._nodes, row, strict=True):
+            if value.shape != node.shape[1:] or not np.isfinite(value).all():
+                expected = f"finite numbers of shape {node.shape[1:]}"
+                raise InvalidInputError(f"{self._where}: expected {expected}, got {value.tolist()}")
+        self._room.require(self._file.get_filesize())
+        for node, value in zip(self._nodes, row, strict=True):
+            node.resize(len(node) + 1, axis=0)
+            node[-1] = value.astype(node.dtype)
+            node.id.flush()
+        self._time_s = values[-1]

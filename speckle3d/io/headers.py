@@ -22,19 +22,22 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.pixels import Pixels, map_pixels, meta_pixels, nrrd_pixels
+from speckle3d.io.pixels import Pixels, map_pixels, number_type
 from speckle3d.io.text import numbers
 
-_FRAME_FIELD = re.compile(r"Seq_Frame(\d+)_(\w+)")
-_MOST_LINES = 10**8
+_FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,7})_(\w+)")
+_LONGEST_LINE = 2**24
 _MM_PER = {
-    "": 1.0, "?": 1.0, "none": 1.0, "mm": 1.0, "millimeter": 1.0, "millimeters": 1.0, "cm": 10.0,
-    "centimeter": 10.0, "centimeters": 10.0, "m": 1e3, "meter": 1e3, "meters": 1e3, "um": 1e-3, "µm": 1e-3,
-    "micrometer": 1e-3, "micrometers": 1e-3, "micron": 1e-3, "in": 25.4, "inch": 25.4,
+    "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "millimeters": 1.0,
+    "cm": 10.0, "centimeter": 10.0, "centimeters": 10.0, "m": 1e3, "meter": 1e3, "meters": 1e3, "um": 1e-3,
+    "µm": 1e-3, "micrometer": 1e-3, "micrometers": 1e-3, "micron": 1e-3, "in": 25.4, "inch": 25.4,
 }  # fmt: skip
-_S_PER = {"": 1.0, "?": 1.0, "none": 1.0, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3,
-          "msec": 1e-3, "us": 1e-6}  # fmt: skip
+_S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6}
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
+_PACKINGS = {
+    "raw": "raw", "gz": "deflate", "gzip": "deflate", "bz2": "bzip2", "bzip2": "bzip2",
+    "txt": "text", "text": "text", "ascii": "text",
+}  # fmt: skip
 
 NRRD_NAMES = {
     "ultrasound image orientation": "UltrasoundImageOrientation",
@@ -86,20 +89,16 @@ class SequenceHeader:
         return self.size[2] if len(self.size) > 2 else 1
 
     @property
-    def kinds(self) -> list[str]:
-        """What the axes are, fastest first, as domain or list; none where the header does not say."""
-        return (self.fields.get("Kinds") or self.fields.get("kinds", "")).lower().split()
-
-    @property
     def is_volume(self) -> bool:
-        """Whether the third axis is of space, as ``Kinds`` says and frames' fields do not contradict."""
-        in_space = len(self.kinds) == 3 and self.kinds[2] in ("domain", "space")
-        return in_space and self.frame_count > max(len(self.frames), 1)
+        """Whether all three axes are of space, as they say and frames' fields do not contradict."""
+        kinds = (self.fields.get("Kinds") or self.fields.get("kinds", "")).lower().split()
+        is_spatial = len(kinds) == 3 and kinds[2] in ("domain", "space")
+        return is_spatial and (not self.frames or self.frame_count > len(self.frames))
 
     @property
-    def file_format(self) -> str:
-        """``"NrrdImage"`` or ``"MetaImage"``."""
-        return "NrrdImage" if "sizes" in self.fields else "MetaImage"
+    def is_nrrd(self) -> bool:
+        """Whether the file is NRRD, else MetaImage."""
+        return "sizes" in self.fields
 
     @property
     def transforms(self) -> list[str]:
@@ -121,9 +120,9 @@ class SequenceHeader:
             if self.path in str(error):
                 raise
             raise FileError(f"{self.path}: expected its pixels in a file beside it: {error}") from error
-        axis = 0 if self.frame_axis is None else len(self.stored) - 1 - self.frame_axis
-        turned = values if self.frame_axis is None else np.moveaxis(values, axis, 0)
-        return turned.reshape(self.frame_count, self.size[1], self.size[0])
+        if self.frame_axis is not None:
+            values = np.moveaxis(values, len(self.stored) - 1 - self.frame_axis, 0)
+        return values.reshape(self.frame_count, self.size[1], self.size[0])
 
 
 def is_metaimage(start: bytes) -> bool:
@@ -151,73 +150,104 @@ def read_header(path: PathLike) -> SequenceHeader:
         start = stream.read(512)
         stream.seek(0)
         if is_nrrd(start):
-            return _nrrd_header(Path(path), dict(_nrrd_lines(path, stream)), stream.tell())
+            return _nrrd_header(Path(path), stream)
         if is_metaimage(start):
-            return _meta_header(Path(path), dict(_meta_lines(path, stream)), stream.tell())
+            return _meta_header(Path(path), stream)
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
 
 
-def _meta_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
+def mm_per(unit: str, where: str) -> float:
+    """Millimetres of a unit of length; what names none is in mm.
+
+    Raises
+    ------
+    InvalidInputError
+        If the unit is not known.
+    """
+    if unit.lower() not in _MM_PER:
+        raise InvalidInputError(f"{where}: expected a unit as mm, cm, m or um, got {unit}")
+    return _MM_PER[unit.lower()]
+
+
+def _lines(stream: BinaryIO) -> Iterator[str]:
+    while line := stream.readline(_LONGEST_LINE):
+        try:
+            yield line.decode("utf-8").rstrip("\r\n")
+        except UnicodeDecodeError:
+            yield line.decode("latin-1").rstrip("\r\n")
+
+
+def _meta_header(path: Path, stream: BinaryIO) -> SequenceHeader:
+    lines: dict[str, str] = {}
     for line in _lines(stream):
-        name, equals, value = line.partition("=")
-        if not equals:
-            break
-        yield name.strip(), value.strip()
+        name, _, value = line.partition("=")
+        lines[name.strip()] = value.strip()
         if name.strip() == "ElementDataFile":
-            return
-    raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
+            break
+    else:
+        raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
+    stored = _sizes(path, lines, "DimSize")
+    text, steps = lines.get("ElementSpacing") or lines.get("ElementSize"), None
+    if text:
+        factor = mm_per(lines.get("DistanceUnits", ""), f"{path}: DistanceUnits")
+        steps = [factor * step for step in numbers(text, len(stored), f"{path}: ElementSpacing")]
+    channels = int(lines.get("ElementNumberOfChannels", "1"))
+    count, name = math.prod(stored) * channels, lines["ElementDataFile"]
+    skipped = int(lines.get("HeaderSize", "0") or 0)
+    source, start = path, skipped if skipped < 0 else stream.tell()
+    if name.upper() != "LOCAL":
+        source, start = _beside(path, name, "ElementDataFile"), skipped
+    is_big = any(_is_set(lines, name) for name in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"))
+    word = lines.get("ElementType", "") if count else "MET_UCHAR"  # a tracker's recording may name no type
+    packing = "deflate" if _is_set(lines, "CompressedData") else "raw"
+    if not _is_set(lines, "BinaryData", "True"):
+        packing = "text"
+    pixels = Pixels(source, start, number_type(word, is_big, f"{path}: ElementType"), count, packing)
+    return _header(path, lines, stored, lines.get("Kinds", ""), steps, pixels, channels)
 
 
-def _nrrd_lines(path: PathLike, stream: BinaryIO) -> Iterator[tuple[str, str]]:
-    is_apart = False
+def _nrrd_header(path: Path, stream: BinaryIO) -> SequenceHeader:
+    lines: dict[str, str] = {}
+    is_whole = False
     for line in _lines(stream):
-        if not line.strip():
-            return
+        if is_whole := not line.strip():
+            break
         if line.startswith(("#", "NRRD")):
             continue
         if ":=" in line:
             name, _, value = line.partition(":=")
-            yield NRRD_NAMES.get(name.strip(), name.strip()), value.strip()
+            lines[NRRD_NAMES.get(name.strip(), name.strip())] = value.strip()
         else:
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
             name, _, value = line.partition(":")
-            name = name.strip().lower()
-            is_apart = is_apart or name in ("data file", "datafile")
-            yield name, value.strip()
-    if not is_apart:
+            lines[name.strip().lower()] = value.strip()
+    data = lines.get("data file", lines.get("datafile"))
+    if not (is_whole or data is not None):
         raise FileError(f"{path}: expected an NRRD header up to an empty line, got a truncated one")
-
-
-def _lines(stream: BinaryIO) -> Iterator[str]:
-    for _ in range(_MOST_LINES):
-        line = stream.readline(2**16)
-        if not line:
-            return
-        if b"\0" in line:
-            raise FileError(f"{stream.name}: expected text in the header, got a zero byte")
-        try:
-            text = line.decode("utf-8")
-        except UnicodeDecodeError:
-            text = line.decode("latin-1")
-        yield text.rstrip("\r\n")
-
-
-def _meta_header(path: Path, lines: dict[str, str], start: int) -> SequenceHeader:
-    stored = _sizes(path, lines, "DimSize")
-    text = lines.get("ElementSpacing") or lines.get("ElementSize")
-    factor = _factor(path, "DistanceUnits", lines.get("DistanceUnits", ""), _MM_PER)
-    steps = None
-    if text:
-        steps = [factor * step for step in numbers(text, len(stored), f"{path}: ElementSpacing")]
-    channels = int(lines.get("ElementNumberOfChannels", "1"))
-    pixels = meta_pixels(path, lines, math.prod(stored) * channels, start)
-    return _header(path, lines, stored, lines.get("Kinds", ""), steps, pixels, channels)
-
-
-def _nrrd_header(path: Path, lines: dict[str, str], start: int) -> SequenceHeader:
     stored = _sizes(path, lines, "sizes")
-    pixels = nrrd_pixels(path, lines, math.prod(stored), start)
-    return _header(path, lines, stored, lines.get("kinds", ""), _nrrd_steps(path, lines, len(stored)), pixels)
+    dtype = number_type(lines.get("type", ""), lines.get("endian", "").lower() == "big", f"{path}: type")
+    packing = lines.get("encoding", "").lower()
+    if packing not in _PACKINGS:
+        raise InvalidInputError(f"{path}: encoding: expected raw, gzip, bzip2 or text, got {packing!r}")
+    source, start = (path, stream.tell()) if data is None else (_beside(path, data, "data file"), 0)
+    lines_skipped, skipped = (
+        int(lines.get(f"{what} skip", lines.get(f"{what}skip", "0"))) for what in ("line", "byte")
+    )
+    pixels = Pixels(
+        source,
+        -1 if skipped < 0 else start + skipped,
+        dtype,
+        math.prod(stored),
+        _PACKINGS[packing],
+        lines_skipped,
+    )
+    axes = nrrd_axes_mm(path, lines, len(stored))
+    steps = None if axes is None else np.linalg.norm(axes, axis=1).tolist()
+    return _header(path, lines, stored, lines.get("kinds", ""), steps, pixels)
+
+
+def _is_set(lines: dict[str, str], name: str, default: str = "False") -> bool:
+    return lines.get(name, default)[:1] in ("T", "t", "1")
 
 
 def _header(
@@ -247,76 +277,68 @@ def _header(
             f"{path}: sizes: expected images on two axes and at most one of frames, got lengths "
             f"{' '.join(map(str, stored))} of kinds {' '.join(kinds)}"
         )
-    known = None if steps is None else [steps[i] for i in spatial]
+    spacing = None if steps is None else (steps[spatial[0]], steps[spatial[1]])
+    if spacing is not None and (not all(map(math.isfinite, spacing)) or spacing == (1.0, 1.0)):
+        spacing = None  # PLUS and ITK write 1 where nobody told them
     size = tuple(stored[i] for i in (*spatial, *(() if frame_axis is None else (frame_axis,))))
     fields, frames = _split(lines)
     if frame_axis is not None and len(frames) == stored[frame_axis] + 1 and not frames[0]:
         frames = frames[1:]  # of a writer that counts from 1
-    times = _nrrd_times(path, lines, frame_axis, stored)
     if frame_axis is not None and frame_axis == len(stored) - 1:
         pixels = replace(pixels, frames=max(stored[frame_axis], 1))
+    times = None if frame_axis is None else _nrrd_times(lines, frame_axis, stored)
     return SequenceHeader(
-        str(path), size, _spacing(known), fields, frames, pixels, stored, frame_axis, channels, times
+        str(path), size, spacing, fields, frames, pixels, stored, frame_axis, channels, times
     )
 
 
-def _nrrd_steps(path: Path, lines: dict[str, str], count: int) -> list[float] | None:
-    """Distance along each axis, mm; NaN of those that have none."""
+def nrrd_axes_mm(path: PathLike, lines: dict[str, str], count: int) -> FloatArray | None:
+    """Step along each axis of an NRRD file, shape (axis, coordinate of space); NaN of an axis that has none.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is another number of them than of axes, or a unit is not known.
+    """
     if "spacings" in lines:
         steps = [float(word) for word in lines["spacings"].split()]
-        units = _quoted(lines.get("units", ""), count)
+        for i, unit in enumerate(_quoted(lines.get("units", ""))[: len(steps)]):
+            steps[i] *= 1.0 if unit in _S_PER else mm_per(unit, f"{path}: units")
+        axes = np.diag(steps)
     elif "space directions" in lines:
-        vectors = re.findall(r"\([^)]*\)|none", lines["space directions"].lower())
-        where = f"{path}: space directions"
-        steps = [
-            math.nan
-            if text == "none"
-            else float(np.linalg.norm(numbers(re.sub("[(),]", " ", text), None, where)))
-            for text in vectors
+        rows = re.findall(r"\(([^)]*)\)|none", lines["space directions"].lower())
+        vectors = [
+            numbers(row.replace(",", " "), None, f"{path}: space directions") if row else () for row in rows
         ]
-        space = _quoted(lines.get("space units", lines.get("units", "")), count)
-        units = [next((unit for unit in space if unit in _MM_PER), "")] * count
+        units = _quoted(lines.get("space units", lines.get("units", "")))
+        factor = mm_per(next((unit for unit in units if unit not in _S_PER), ""), f"{path}: space units")
+        width = max(map(len, vectors), default=0)
+        axes = np.full((len(rows), width), np.nan)
+        for axis, vector in zip(axes, vectors, strict=True):
+            if vector:
+                axis[:] = np.multiply(vector, factor)
     else:
         return None
-    if len(steps) != count:
-        raise InvalidInputError(f"{path}: expected a spacing for each of {count} axes, got {len(steps)}")
-    return [
-        step if unit in _S_PER and unit not in _MM_PER else step * _factor(path, "units", unit, _MM_PER)
-        for step, unit in zip(steps, units, strict=True)
-    ]
+    if len(axes) != count:
+        raise InvalidInputError(f"{path}: expected a spacing for each of {count} axes, got {len(axes)}")
+    return axes
 
 
-def _nrrd_times(
-    path: Path, lines: dict[str, str], axis: int | None, stored: tuple[int, ...]
-) -> FloatArray | None:
+def _nrrd_times(lines: dict[str, str], axis: int, stored: tuple[int, ...]) -> FloatArray | None:
     """Times of frames by their axis: its index, as 3D Slicer writes it, or its spacing in a unit of time."""
-    if axis is None:
-        return None
-    units = _quoted(lines.get("units", ""), len(stored))
-    unit = units[axis] if axis < len(units) else ""
+    units = _quoted(lines.get("units", ""))
+    unit = units[axis] if len(units) == len(stored) else ""
     values = lines.get(f"axis {axis} index values", "").split()
-    if lines.get(f"axis {axis} index type", "numeric") == "numeric" and len(values) == stored[axis]:
-        try:
-            return np.array([float(word) for word in values]) * _factor(path, "units", unit, _S_PER)
-        except ValueError:
-            return None
     steps = lines.get("spacings", "").split()
-    if unit in _S_PER and unit not in _MM_PER and len(steps) == len(stored) and float(steps[axis]) > 0:
+    if lines.get(f"axis {axis} index type", "numeric") == "numeric" and len(values) == stored[axis]:
+        return np.array(values, dtype=float) * _S_PER.get(unit, 1.0)
+    if unit in _S_PER and len(steps) == len(stored) and float(steps[axis]) > 0:
         return np.arange(float(stored[axis])) * float(steps[axis]) * _S_PER[unit]
     return None
 
 
-def _quoted(text: str, count: int) -> list[str]:
-    words = [word.strip().lower() for word in re.findall(r'"([^"]*)"', text)]
-    return words if len(words) == count else [*words, *[""] * (count - len(words))][:count]
-
-
-def _factor(path: Path, field: str, unit: str, known: dict[str, float]) -> float:
-    if unit.lower() not in known:
-        raise InvalidInputError(
-            f"{path}: {field}: expected one of {', '.join(filter(None, known))}, got {unit}"
-        )
-    return known[unit.lower()]
+def _quoted(text: str) -> list[str]:
+    return [word.strip().lower() for word in re.findall(r'"([^"]*)"', text)]
 
 
 def _split(lines: dict[str, str]) -> tuple[dict[str, str], tuple[dict[str, str], ...]]:
@@ -328,15 +350,7 @@ def _split(lines: dict[str, str]) -> tuple[dict[str, str], tuple[dict[str, str],
             frames.setdefault(int(match[1]), {})[match[2]] = value
         else:
             fields[name] = value
-    count = min(max(frames, default=-1) + 1, 10**7)
-    return fields, tuple(frames.get(i, {}) for i in range(count))
-
-
-def _spacing(steps: list[float] | None) -> tuple[float, float] | None:
-    """Of the first two axes, but for the 1 that PLUS and ITK write where nobody told them."""
-    if steps is None or not all(map(math.isfinite, steps[:2])) or steps[:2] == [1.0, 1.0]:
-        return None
-    return steps[0], steps[1]
+    return fields, tuple(frames.get(i, {}) for i in range(max(frames, default=-1) + 1))
 
 
 def _sizes(path: Path, lines: dict[str, str], name: str) -> tuple[int, ...]:
@@ -344,3 +358,17 @@ def _sizes(path: Path, lines: dict[str, str], name: str) -> tuple[int, ...]:
     if any(length != int(length) or not 0 <= length < 2**40 for length in sizes):
         raise InvalidInputError(f"{path}: {name}: expected whole numbers from 0, got {lines[name]}")
     return tuple(map(int, sizes))
+
+
+def _beside(path: Path, name: str, field: str) -> Path:
+    """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
+    if name.split()[:1] == ["LIST"] or ("%" in name and len(name.split()) > 1):
+        raise InvalidInputError(
+            f"{path}: {field}: expected LOCAL or the name of one file, got a list of files ({name!r}), which "
+            "is not read: write the images into one file"
+        )
+    folder = path.parent.resolve()
+    data = (folder / name).resolve()
+    if not name or Path(name).is_absolute() or not data.is_relative_to(folder):
+        raise InvalidInputError(f"{path}: {field}: expected a file in the header's own folder, got {name!r}")
+    return data

@@ -422,7 +422,7 @@ class _Sequence:
         header, layout = self.header, self.layout
         spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
         rows = [
-            ("container", header.file_format, ""),
+            ("container", "NrrdImage" if header.is_nrrd else "MetaImage", ""),
             ("size", " x ".join(str(n) for n in header.size), ""),
             ("images", str(header.frame_count), ""),
             ("images not valid", str(np.count_nonzero(~self._valid())), ""),

@@ -34,7 +34,7 @@ from speckle3d.io.sweeps import (
     KNOWN,
     SAMPLE_TYPES,
     VERSION,
-    HDF5Frames,
+    SweepSlices,
     require_sample_type,
 )
 
@@ -81,8 +81,8 @@ class FrameSet:
 
     def create(self, file: h5py.File) -> None:
         """Make the data set, without frames."""
-        shape = (self._grid.vectors, self._grid.samples, *((2,) if self._in_pairs else ()))
-        is_packed = self._compression is not None
+        grid = self._grid
+        shape = (grid.vectors, grid.samples, *((2,) if self._in_pairs else ()))
         node = file.create_dataset(
             self.name,
             (0, *shape),
@@ -91,16 +91,13 @@ class FrameSet:
             chunks=(1, *shape),
             compression=self._compression,
             compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
-            shuffle=is_packed,
+            shuffle=self._compression is not None,
         )
-        signal = {name: value for name, value in vars(self._signal).items() if value is not None}
-        across, down = "vector_pitch_mm", "sample_spacing_mm"
+        sizes = {"vector_pitch_mm": grid.vector_pitch_mm}
         if isinstance(self._signal, BModeSettings):
-            across, down = "column_pitch_mm", "row_spacing_mm"
-            signal[down] = self._grid.sample_spacing_mm
-        node.attrs.update(signal)
-        node.attrs[across] = self._grid.vector_pitch_mm
-        node.attrs["first_sample_depth_mm"] = self._grid.first_sample_depth_mm
+            sizes = {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
+        values = {**vars(self._signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
+        node.attrs.update({name: value for name, value in values.items() if value is not None})
         # h5py frees a handle in a callback, where Python drops a Ctrl-C: none is freed from frame to frame.
         self._file, self._node, self._memory = file.id, node.id, h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
@@ -132,12 +129,12 @@ class FrameSet:
     def _stored(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """A frame as it is stored: contiguous, I/Q of int16 in pairs."""
         where, expected = f"{self._where}[{self.count}]", (self._grid.vectors, self._grid.samples)
-        if frame.shape != expected:
-            raise InvalidInputError(f"{where}: expected a frame of shape {expected}, got {frame.shape}")
         wanted: np.dtype[Any] = np.dtype(np.complex64) if self.name == "iq" else self._dtype
         is_of_kind = self.name != "iq" or frame.dtype.kind == "c"
-        if not (is_of_kind and np.can_cast(frame.dtype, wanted, "same_kind")):
-            raise InvalidInputError(f"{where}: expected samples of type {wanted}, got {frame.dtype}")
+        if frame.shape != expected or not (is_of_kind and np.can_cast(frame.dtype, wanted, "same_kind")):
+            raise InvalidInputError(
+                f"{where}: expected a frame of {wanted}, shape {expected}, got {frame.dtype}, {frame.shape}"
+            )
         if frame.dtype.kind in "fc":
             require_finite(frame, where)
         if self._in_pairs:
@@ -266,8 +263,8 @@ def write_sweep(
             writer.put(writer.file, "simulation", {name: plain})
         if hasattr(frames, "write_more"):
             frames.write_more(writer.file)
-        if type(frames) is HDF5Frames:
-            writer.copy_unknown(frames.path)
+        if isinstance(getattr(frames, "open_file", None), SweepSlices):
+            writer.copy_unknown(frames.open_file.path)
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
@@ -293,21 +290,19 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
 
 
 def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker, room: Room) -> None:
-    group = file.create_group("tracker" if isinstance(sensor, Tracker) else "orientation")
-    readings = sensor.readings
+    readings, mounting = sensor.readings, sensor.sensor_from_image
     values: dict[str, Any] = {"time_s": readings.time_s, "time_offset_s": sensor.time_offset_s}
-    mounting, turns = sensor.sensor_from_image, readings.world_from_sensor
     if isinstance(sensor, Tracker):
-        values |= {"world_from_sensor": turns, "valid": np.ones(len(readings), dtype=bool)}
-        if sensor.image_skew_rad:
-            values["image_skew_rad"] = sensor.image_skew_rad
+        values["world_from_sensor"] = readings.world_from_sensor
+        values["valid"] = np.ones(len(readings), dtype=bool)
+        values["image_skew_rad"] = sensor.image_skew_rad or None
     else:
-        values["quaternion"] = turns
+        values["quaternion"] = readings.world_from_sensor
         values |= {name: getattr(sensor, name) for name in INERTIAL}
-    for name, value in values.items():
-        put(group, name, value, room)
+    name = "tracker" if isinstance(sensor, Tracker) else "orientation"
+    put(file, name, values, room)
     if mounting is not None:
-        group.attrs.update(mounting_attribute(mounting))
+        file[name].attrs.update(mounting_attribute(mounting))
 
 
 def mounting_attribute(mounting: RigidTransform | Rotation) -> dict[str, Any]:

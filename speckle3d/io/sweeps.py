@@ -28,6 +28,7 @@ from speckle3d.core.sweep import (
     Sweep,
     Tracker,
 )
+from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     PathLike,
     find_group,
@@ -46,7 +47,6 @@ from speckle3d.io.hdf5 import (
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.lazy import HDF5Slices
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording
 from speckle3d.io.records import read_record
@@ -76,23 +76,18 @@ SIGNALS: dict[str, type[RFSettings] | type[BModeSettings]] = {
 """What tells how the samples of each kind were made."""
 
 
-class HDF5Frames(HDF5Slices):
-    """Frames of a sweep file, read one at a time; pairs of int16 (I/Q) as complex64."""
-
-    def __init__(
-        self, path: PathLike, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], grows: bool = False
-    ) -> None:
-        in_pairs = len(shape) == 4
-        n, vectors, samples = shape[:3]
-        turn = from_pairs if in_pairs else as_stored
-        kind = np.complex64 if in_pairs else dtype
-        super().__init__(path, name, turn, (n, vectors, samples), kind, grows)
-        self.stored_dtype = dtype
+class SweepSlices(HDF5Slices):
+    """Opens the frames of a sweep file."""
 
 
 def as_stored(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Frame as the file has it."""
     return values
+
+
+def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
+    """Complex samples of pairs of I and Q, the last axis."""
+    return pairs.astype(np.float32).view(np.complex64)[..., 0]
 
 
 def read_sweep(path: PathLike) -> Sweep:
@@ -129,11 +124,13 @@ def is_growing(file: h5py.File) -> bool:
     return file.swmr_mode or (has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_)))
 
 
-def _read_rows(group: h5py.Group, name: str, shape: tuple[int | str, ...]) -> npt.NDArray[Any]:
+def _read_rows(
+    group: h5py.Group, name: str, shape: tuple[int | str, ...], dtype: npt.DTypeLike = np.float64
+) -> npt.NDArray[Any]:
     """Read a data set; of one that grows the rows that are whole, as many as there are times before NaN."""
     if not is_growing(group.file):
-        return read_checked(group, name, shape)
-    values = read_checked(group, name, ("row", *shape[1:]))
+        return read_checked(group, name, shape, dtype)
+    values = read_checked(group, name, ("row", *shape[1:]), dtype)
     count = shape[0]
     if isinstance(count, str):
         unwritten = np.flatnonzero(np.isnan(values))
@@ -143,44 +140,36 @@ def _read_rows(group: h5py.Group, name: str, shape: tuple[int | str, ...]) -> np
     return values[:count]
 
 
-def _read_image(file: h5py.File, count: int) -> tuple[HDF5Frames, ImageGrid, RFSettings | BModeSettings]:
+def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:
     """Frames of a file, as many as it has times for."""
-    known = ("rf", "bmode") if read_attribute(file, "version") == VERSION else ("rf", "iq", "bmode")
-    names = [name for name in known if has_member(file, name)]
-    if not names or ("iq" in names and len(names) > 1):
-        raise InvalidInputError(
-            f"{locate(file)}: expected a data set {', '.join(known[:-1])} or {known[-1]}, got "
-            f"{' and '.join(names) or 'none of them'}"
-        )
-    name = names[0]
+    name = next((name for name in SIGNALS if has_member(file, name)), None)
+    if name is None:
+        raise InvalidInputError(f"{locate(file)}: expected a data set rf, iq or bmode, got none of them")
     node, where = require_dataset(file, name), locate(file, name)
     dtype, grows = node.dtype.newbyteorder("="), is_growing(file)
     require_sample_type(name, dtype, where)
-    pairs = (2,) if name == "iq" and dtype == np.int16 else ()
-    if node.ndim != 3 + len(pairs) or node.shape[3:] != pairs or 0 in node.shape:
-        expected = f"(frame, vector, sample{', 2' if pairs else ''})"
+    in_pairs = name == "iq" and dtype == np.int16
+    if node.ndim != 3 + in_pairs or (in_pairs and node.shape[3] != 2) or 0 in node.shape:
+        expected = f"(frame, vector, sample{', 2' if in_pairs else ''})"
         raise InvalidInputError(f"{where}: expected shape {expected}, got {node.shape}")
     if not (node.shape[0] == count or (grows and node.shape[0] > count)):
         raise InvalidInputError(f"{where}: expected {count} frames, one for each time, got {node.shape[0]}")
-    frames = HDF5Frames(file.filename, name, (count, *node.shape[1:]), dtype, grows)
+    _, vectors, samples = node.shape[:3]
+    turn = from_pairs if in_pairs else as_stored
+    slices = SweepSlices(Path(file.filename).absolute(), name, turn, count, grows)
+    frames = FileFrames(
+        file.filename, slices, (count, vectors, samples), np.complex64 if in_pairs else dtype, dtype
+    )
     with naming(where):
         if name == "iq":
             read_attribute(node, "demodulation_frequency_hz")
         signal: RFSettings | BModeSettings = read_record(node, SIGNALS[name])
         first_mm = read_attribute(node, "first_sample_depth_mm")
         if isinstance(signal, RFSettings):
-            pitch_mm, spacing_mm = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
+            sizes = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
         else:
-            pitch_mm, spacing_mm = (
-                read_attribute(node, each) for each in ("column_pitch_mm", "row_spacing_mm")
-            )
-        vectors, samples = node.shape[1:3]
-        return frames, ImageGrid(vectors, samples, pitch_mm, spacing_mm, first_mm), signal
-
-
-def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
-    """Complex samples of pairs of I and Q, the last axis."""
-    return pairs.astype(np.float32).view(np.complex64)[..., 0]
+            sizes = read_attribute(node, "column_pitch_mm"), read_attribute(node, "row_spacing_mm")
+        return frames, ImageGrid(vectors, samples, *sizes, first_mm), signal
 
 
 def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
@@ -227,13 +216,11 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
         return None
     valid = np.ones(time_s.size, dtype=bool)
     if has_member(group, "valid"):
-        valid = read_checked(group, "valid", ("sample",), np.bool_)
-        valid = valid[: time_s.size] if is_growing(file) else valid
-    if valid.size != time_s.size or (valid.size and not valid.any() and not has_member(file, GROWING)):
-        expected = f"shape ({time_s.size},) with a valid sample"
-        raise InvalidInputError(f"{locate(group, 'valid')}: expected {expected}, got {valid.shape}")
+        valid = _read_rows(group, "valid", (time_s.size,), np.bool_)
     if not valid.any():
-        return None
+        if has_member(file, GROWING):
+            return None
+        raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
     matrices = _read_rows(group, "world_from_sensor", (time_s.size, 4, 4))
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
@@ -242,9 +229,8 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
     if name in group.attrs:
         matrix = read_vector_attribute(group, name, 16).reshape(1, 4, 4)
         mounting = transforms_from_matrices(matrix, f"{locate(group)} attribute {name}")[0]
-    offset_s = read_attribute(group, "time_offset_s", default=0.0)
+    offset_s, skew_rad = (read_attribute(group, name, 0.0) for name in ("time_offset_s", "image_skew_rad"))
     with naming(locate(group)):
-        skew_rad = read_attribute(group, "image_skew_rad", default=0.0)
         return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
 
 
@@ -255,9 +241,9 @@ def unfinished_note(path: PathLike) -> str | None:
     with reading(path), open_hdf5(path) as file:
         if not has_format(file, FORMAT) or not is_growing(file):
             return None
-        times = _read_rows(file, "frame_time_s", ("frame",))
+        count = _read_rows(file, "frame_time_s", ("frame",)).size
     return (
-        f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far, of "
+        f"{path}: the recording goes on, or was ended without being closed: {count} frames so far, of "
         "which speckle3d convert makes a whole file"
     )
 

@@ -73,7 +73,7 @@ def elsewhere(file):
 
 WRONG = {
     "rf": [
-        (drop("rf"), "rf or bmode"),
+        (drop("rf"), "rf, iq or bmode"),
         *((drop(name), f"/{name}") for name in (
             "frame_time_s", "orientation/time_s", "tracker/world_from_sensor", "truth/world_from_image")),
         (replaced("rf", np.zeros((4, 6, 50))), "/rf.*int16"),

@@ -13,7 +13,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage
-from speckle3d.io.pixels import read_pixels
+from speckle3d.io.pixels import map_pixels
 from speckle3d.io.voxels.volumes import read_volume
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
@@ -36,7 +36,7 @@ def test_pixels_beside_the_header_are_read(tmp_path, name, suffix):
     path, pixels = detached(tmp_path, name, suffix)
     (tmp_path / "below").mkdir()
     (tmp_path / name).write_bytes(pixels)
-    np.testing.assert_array_equal(read_pixels(read_header(path).pixels), grey().ravel())
+    np.testing.assert_array_equal(map_pixels(read_header(path).pixels), grey().ravel())
 
 
 @pytest.mark.parametrize("suffix", [".mhd", ".nhdr"])
@@ -115,7 +115,7 @@ def test_packed_pixels_are_as_many_as_the_header_says(tmp_path, kind, size, cont
     pack = zlib.compress if kind == "mha" else gzip.compress
     path = packed_sequence(tmp_path / f"a.{kind}", size, pack(content), kind)
     with pytest.raises(Speckle3DError, match=rf"a\.{kind}: .*{message}"):
-        read_pixels(read_header(path).pixels)
+        map_pixels(read_header(path).pixels)
 
 
 def test_damaged_packed_pixels_are_a_file_error(tmp_path):
@@ -135,7 +135,7 @@ def test_numbers_of_either_byte_order_are_read(tmp_path, kind, big):
     if big:
         head, _, _ = path.read_bytes().partition(b"LOCAL\n")
         path.write_bytes(head + b"LOCAL\n" + values.byteswap().tobytes())
-    got = read_pixels(read_header(path).pixels)
+    got = map_pixels(read_header(path).pixels)
     assert got.dtype == values.dtype
     np.testing.assert_array_equal(got, values.ravel())
 
@@ -149,7 +149,7 @@ def test_pixels_of_others_are_what_the_image_library_finds(realdata, name):
     import SimpleITK
 
     expected = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(str(realdata / name)))
-    got = read_pixels(read_header(realdata / name).pixels)
+    got = map_pixels(read_header(realdata / name).pixels)
     assert got.dtype == expected.dtype
     np.testing.assert_array_equal(got, expected.ravel())
 

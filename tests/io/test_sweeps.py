@@ -15,8 +15,9 @@ import sweep_examples
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import BModeSettings, stored_dtype
 from speckle3d.io.describe import describe
+from speckle3d.io.frames import FileFrames
 from speckle3d.io.sweep_writer import SweepWriter, write_sweep
-from speckle3d.io.sweeps import HDF5Frames, read_sweep
+from speckle3d.io.sweeps import read_sweep
 
 
 @pytest.fixture
@@ -110,8 +111,6 @@ def replaced(data):
     ("change", "message"),
     [
         (lambda file: file.attrs.__setitem__("version", 3), r"version 1 or 2, got 3$"),
-        (lambda file: file.attrs.__setitem__("version", 1), r"data set rf or bmode, got none"),
-        (lambda file: file.create_dataset("rf", data=np.zeros((6, 5, 40), "i2")), r"got rf and iq"),
         (lambda file: file["iq"].attrs.__delitem__("demodulation_frequency_hz"), r"/iq .*demodulation_freq"),
         (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", 20e6), r"within half"),
         (replaced(np.zeros((6, 5, 40, 3), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40, 3\)"),
@@ -201,7 +200,7 @@ def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path, kind):
         file[kind][2, 1, 7] = np.nan
     sweep = read_sweep(tmp_path / "s.h5")
     sweep.frames[1], sweep.frames[3]
-    with pytest.raises(InvalidInputError, match=rf"/{kind}\[2\]\[\(1, 7\)\]"):
+    with pytest.raises(InvalidInputError, match=r"s\.h5: frame 2\[\(1, 7\)\]"):
         sweep.frames[2]
 
 
@@ -215,7 +214,7 @@ def test_reading_a_frame_touches_no_other(path):
     path.write_bytes(bytes(content))
     sweep = read_sweep(path)
     np.testing.assert_array_equal(sweep.frames[3], sweep_examples.rf_sweep().frames[3])
-    with pytest.raises(FileError, match=r"/rf\[2\]: cannot be read"):
+    with pytest.raises(FileError, match=r"frame 2: cannot be read"):
         sweep.frames[2]
 
 
@@ -234,7 +233,7 @@ def test_reading_frames_holds_no_more_than_a_few(tmp_path):
 
 def test_frames_may_be_closed_indexed_and_sent_elsewhere(path):
     frames = read_sweep(path).frames
-    assert isinstance(frames, HDF5Frames)
+    assert isinstance(frames, FileFrames)
     last = frames[-1]
     frames.close()
     frames.close()
@@ -345,7 +344,7 @@ def append_all(path, frames, times, **options):
         ([np.full((5, 40), np.nan)], [0], {"dtype": np.float32}, r"/rf\[0\]\[\(0, 0\)\]"),
         ([np.zeros((5, 40), np.int16)] * 2, [1, 1], {}, r"/frame_time_s\[1\]"),
         ([], [], {"dtype": np.complex64}, r"complex64"),
-        ([np.zeros((5, 40), np.complex64)], [0], {}, r"/rf\[0\].*int16, got complex64"),
+        ([np.zeros((5, 40), np.complex64)], [0], {}, r"/rf\[0\].*int16.*got complex64"),
     ],
 )
 def test_the_writer_refuses_what_the_reader_would(tmp_path, frames, times, options, message):

@@ -16,7 +16,6 @@ from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.describe import describe
-from speckle3d.io.voxels import volume_writer
 from speckle3d.io.voxels.volume_writer import SUFFIXES, VolumeWriter
 from speckle3d.io.voxels.volumes import read_volume, write_volume
 
@@ -100,10 +99,9 @@ def test_the_anatomical_orientation_of_a_metaimage_is_itks(tmp_path, rotation, l
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_slabs_and_byte_order_do_not_show_in_the_file(tmp_path, suffix, monkeypatch):
+def test_slabs_and_byte_order_do_not_show_in_the_file(tmp_path, suffix):
     volume = volume_of(3, "int16", (40, 30, 20))
     write_volume(tmp_path / f"whole{suffix}", volume)
-    monkeypatch.setattr(volume_writer, "_BATCH_BYTES", 2**14)
     place = volume.shape, volume.spacing_mm, volume.world_from_grid
     with VolumeWriter(tmp_path / f"slabs{suffix}", *place, "int16") as writer:
         for first, stop in itertools.pairwise((0, 1, 7, 20)):

@@ -1,4 +1,4 @@
-"""One socket to a peer, read and written by two threads, with bounded queues on either way."""
+"""One socket to a peer, read and written by two threads, and what client and server have in common."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import queue
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Self
 
 from speckle3d.io.igtl.messages import HEADER, MessageError, Received, decode, read_header
 
@@ -57,112 +59,139 @@ class LinkState:
     last_failure: str = ""
 
 
-class Inbox:
-    """Messages received and not yet taken, and counts of what has come."""
+class End:
+    """An end of connections: messages received and not yet taken, and counts of what has come.
+
+    A thread of its own makes connections; each has two more.
+    """
 
     def __init__(self) -> None:
-        self._queue: queue.Queue[Received] = queue.Queue(_MOST_RECEIVED)
-        self.messages = self.refused = 0
+        self._inbox: queue.Queue[Received] = queue.Queue(_MOST_RECEIVED)
+        self._links: list[Link] = []
+        self._lost: list[Link] = []
+        self._changed, self._over = threading.Condition(), threading.Event()
+        self._made = self._dropped = self.messages = self.refused = 0
         self.last_refused = self.last_failure = ""
         self.heard_s = time.monotonic()
+        self._thread = threading.Thread(target=self._run, daemon=True)
 
-    def put(self, message: Received, over: threading.Event) -> None:
-        """Append a message as soon as there is room; not at all if its connection is over before."""
-        while not over.is_set():
-            with suppress(queue.Full):
-                self._queue.put(message, timeout=_LOOK_S)
-                self.messages += 1
-                return
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
 
-    def take(self, timeout_s: float) -> list[Received]:
-        """Take all messages, waiting for the first one; none if none came in time."""
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End all connections; what was received and not taken can still be taken."""
+        self._over.set()
+        with self._changed:
+            self._changed.notify_all()
+        if self._thread.is_alive():
+            self._thread.join()
+        with self._changed:
+            self._lost, self._links = self._lost + self._links, []
+        self._close_lost()
+
+    def wait_connected(self, timeout_s: float) -> bool:
+        """Wait for a peer; whether there is one."""
+        with self._changed:
+            return self._changed.wait_for(lambda: bool(self._links), timeout_s)
+
+    def receive(self, timeout_s: float) -> list[Received]:
+        """Take all messages in the order in which they came, waiting for the first one.
+
+        Returns
+        -------
+        list
+            Empty if none came in time.
+        """
         taken: list[Received] = []
         with suppress(queue.Empty):
-            taken.append(self._queue.get(timeout=timeout_s) if timeout_s > 0 else self._queue.get_nowait())
+            taken.append(self._inbox.get(timeout_s > 0, timeout_s))
             while True:
-                taken.append(self._queue.get_nowait())
+                taken.append(self._inbox.get_nowait())
         return taken
+
+    def send(self, message: bytes) -> None:
+        """Send a packed message to all peers, without waiting for any: a slow one loses the oldest ones."""
+        for link in list(self._links):
+            link.send(message)
+
+    @property
+    def state(self) -> LinkState:
+        """What has happened so far."""
+        dropped = self._dropped + sum(link.dropped for link in list(self._links))
+        return LinkState(
+            bool(self._links), self.messages, self.refused, self.last_refused, max(self._made - 1, 0),
+            dropped, self._inbox.qsize(), time.monotonic() - self.heard_s, self.last_failure,
+        )  # fmt: skip
+
+    def put(self, message: Received, over: threading.Event) -> None:
+        """Take a message as soon as there is room; not at all if its connection is over before."""
+        while not over.is_set():
+            with suppress(queue.Full):
+                self._inbox.put(message, timeout=_LOOK_S)
+                self.messages += 1
+                return
 
     def refuse(self, error: MessageError) -> None:
         """Count a message that made no sense."""
         self.refused += 1
         self.last_refused = str(error)
 
-    def state(self, connected: bool, reconnections: int, dropped: int) -> LinkState:
-        """What has happened so far."""
-        return LinkState(
-            connected, self.messages, self.refused, self.last_refused, max(reconnections, 0), dropped,
-            self._queue.qsize(), time.monotonic() - self.heard_s, self.last_failure,
-        )  # fmt: skip
+    def lose(self, link: Link, reason: str) -> None:
+        """Give up a connection."""
+        with self._changed:
+            if link in self._links:
+                self._links.remove(link)
+                self._lost.append(link)
+                self._dropped += link.dropped
+                self.last_failure = reason
+                self._changed.notify_all()
 
+    def _add(self, connected: socket.socket) -> None:
+        link = Link(connected, self)
+        with self._changed:
+            self._links.append(link)
+            self._made += 1
+            self._changed.notify_all()
+        link.start()  # known before it can be lost
 
-class Outbox:
-    """Messages to a peer that are not yet sent; of too many the oldest are dropped."""
+    def _close_lost(self) -> None:
+        """End the threads of lost connections, which cannot do so themselves."""
+        with self._changed:
+            lost, self._lost = self._lost, []
+        for link in lost:
+            link.close()
 
-    def __init__(self) -> None:
-        self._queue: queue.Queue[bytes] = queue.Queue(_MOST_SENDING)
-        self.dropped = 0
-
-    def put(self, message: bytes) -> None:
-        """Append a message; never waits."""
-        while True:
-            try:
-                return self._queue.put_nowait(message)
-            except queue.Full:
-                self.clear(1)
-
-    def clear(self, most: int = _MOST_SENDING) -> None:
-        """Drop the oldest messages, as many at most."""
-        with suppress(queue.Empty):
-            for _ in range(most):
-                self._queue.get_nowait()
-                self._queue.task_done()
-                self.dropped += 1
-
-    def send_to(self, peer: socket.socket, over: threading.Event) -> None:
-        """Send messages as they come until the connection is over."""
-        while not over.is_set():
-            try:
-                left = memoryview(self._queue.get(timeout=_LOOK_S))
-            except queue.Empty:
-                continue
-            try:
-                while left and not over.is_set():
-                    with suppress(TimeoutError):
-                        left = left[peer.send(left) :]
-            finally:
-                self._queue.task_done()
-
-    @property
-    def waiting(self) -> int:
-        """Messages not yet handed to the system as a whole."""
-        return self._queue.unfinished_tasks
+    def _run(self) -> None:
+        """Make connections until `_over` is set."""
+        raise NotImplementedError
 
 
 class Link:
-    """A connected socket: what it brings goes into `inbox`, what is in `outbox` is sent.
+    """A connected socket: what it brings goes to its end, messages to send wait in a queue.
 
     A message whose body makes no sense is refused alone. Where there is no header of a message, or the peer
     stalls within one, the connection is given up.
-
-    Parameters
-    ----------
-    ended : callable
-        Called once with the reason when the peer is gone or makes no sense; not when closed from here.
     """
 
-    def __init__(
-        self, connected: socket.socket, inbox: Inbox, outbox: Outbox, ended: Callable[[str], None]
-    ) -> None:
-        self._socket, self._inbox, self._outbox, self._ended = connected, inbox, outbox, ended
-        self._over, self._ending = threading.Event(), threading.Lock()
+    def __init__(self, connected: socket.socket, end: End) -> None:
+        self._socket, self._end = connected, end
+        self._outbox: deque[bytes] = deque(maxlen=_MOST_SENDING)
+        self._changed, self._over, self._sends = threading.Condition(), threading.Event(), False
+        self.dropped = 0
         connected.settimeout(_LOOK_S)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self._threads = [
             threading.Thread(target=self._guarded, args=(work,), daemon=True)
-            for work in (self._read, lambda: outbox.send_to(connected, self._over))
+            for work in (self._read, self._write)
         ]
+
+    def start(self) -> None:
+        """Begin to read and to send."""
         for thread in self._threads:
             thread.start()
 
@@ -172,19 +201,38 @@ class Link:
         with suppress(OSError):  # the peer may be gone
             self._socket.shutdown(socket.SHUT_RDWR)
         for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join()
+            thread.join()
         self._socket.close()
+
+    def send(self, message: bytes) -> None:
+        """Append a message to those to send; never waits."""
+        with self._changed:
+            self.dropped += len(self._outbox) == self._outbox.maxlen
+            self._outbox.append(message)
+            self._changed.notify()
+
+    @property
+    def is_sending(self) -> bool:
+        """Whether there are messages not yet handed to the system as a whole."""
+        with self._changed:
+            return self._sends or bool(self._outbox)
 
     def _guarded(self, work: Callable[[], None]) -> None:
         try:
             work()
         except (OSError, MessageError) as error:
-            with self._ending:
-                if self._over.is_set():
-                    return
+            if not self._over.is_set():
                 self._over.set()
-            self._ended(str(error))
+                self._end.lose(self, str(error))
+
+    def _write(self) -> None:
+        while not self._over.is_set():
+            with self._changed:
+                self._sends = self._changed.wait_for(lambda: bool(self._outbox), _LOOK_S)
+                left = memoryview(self._outbox.popleft() if self._sends else b"")
+            while left and not self._over.is_set():
+                with suppress(TimeoutError):
+                    left = left[self._socket.send(left) :]
 
     def _read(self) -> None:
         while not self._over.is_set():
@@ -192,15 +240,13 @@ class Link:
             try:
                 header = read_header(start)
             except MessageError as error:
-                self._inbox.refuse(error)
+                self._end.refuse(error)
                 raise
             body = self._receive(header.body_bytes)
             try:
-                message = decode(header, body)
+                self._end.put(decode(header, body), self._over)
             except MessageError as error:
-                self._inbox.refuse(error)
-            else:
-                self._inbox.put(message, self._over)
+                self._end.refuse(error)
 
     def _receive(self, count: int, is_start: bool = False) -> bytes:
         """Receive so many bytes; a message may begin after any time, and then has no long pause."""
@@ -221,5 +267,5 @@ class Link:
             if not came:
                 raise ConnectionError(f"closed by the peer{' within a message' if is_within else ''}")
             left, begun_s = left[came:], time.monotonic()
-            self._inbox.heard_s = begun_s
+            self._end.heard_s = begun_s
         return bytes(content)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,9 @@ import numpy.typing as npt
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
+from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import one_line
+from speckle3d.io.headers import mm_per
 
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes: the length of the header of NIfTI-1 and NIfTI-2."""
@@ -27,7 +30,6 @@ _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _LABELS = "label"
 """Intent of an image of labels."""
 _OWN = "speckle3d"
-_MM = {"mm": 1.0, "unknown": 1.0, "meter": 1e3, "micron": 1e-3}
 
 
 def is_nifti(path: Path, start: bytes) -> bool:
@@ -35,35 +37,29 @@ def is_nifti(path: Path, start: bytes) -> bool:
     return start[:4] in _SIZES or (start.startswith(b"\x1f\x8b") and path.name.lower().endswith(".nii.gz"))
 
 
-def nifti_header(
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    world_from_index: FloatArray,
-    fields: Mapping[str, str],
-    is_labels: bool,
-) -> bytes:
-    """Header of a NIfTI-1 file up to its voxels; `world_from_index`, shape (4, 4), is of LPS, mm.
+def nifti_header(volume: Volume, fields: Mapping[str, str], is_labels: bool) -> bytes:
+    """Header of a NIfTI-1 file up to its voxels.
 
     Raises
     ------
     InvalidInputError
         If an axis is longer than the 32,767 voxels that the format counts.
     """
-    header = nibabel.Nifti1Header()
-    header.set_data_dtype(dtype.newbyteorder("<"))
-    if max(shape) >= 2**15:
+    if max(volume.shape) >= 2**15:
         raise InvalidInputError(
-            f"NIfTI: expected at most 32767 voxels along an axis, got {max(shape)}: take .nrrd"
+            f"NIfTI: expected at most 32767 voxels along an axis, got {max(volume.shape)}: take .nrrd"
         )
-    header.set_data_shape(shape)
+    header = nibabel.Nifti1Header()
+    header.set_data_dtype(volume.voxels.dtype.newbyteorder("<"))
+    header.set_data_shape(volume.shape)
     header.set_xyzt_units("mm")
-    header.set_sform(_RAS_FROM_LPS @ world_from_index, 1)
-    header.set_qform(_RAS_FROM_LPS @ world_from_index, 1)
+    header.set_sform(_RAS_FROM_LPS @ volume.world_from_index, 1)
+    header.set_qform(_RAS_FROM_LPS @ volume.world_from_index, 1)
     header.set_slope_inter(1, 0)
     if is_labels:
         header.set_intent(_LABELS)
-    told = printable("; ".join((_OWN, *(f"{name}: {value}" for name, value in fields.items()))))
-    header["descrip"] = told.encode("ascii", "replace")[:79]
+    words = printable("; ".join((_OWN, *(f"{name}: {value}" for name, value in fields.items()))))
+    header["descrip"] = words.encode("ascii", "replace")[:79]
     if fields:
         text = json.dumps({_OWN: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")
         header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", text))
@@ -92,8 +88,7 @@ def read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str]
     try:
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
-        unit = image.header.get_xyzt_units()[0]
-        factor = _MM[unit]
+        factor = mm_per(image.header.get_xyzt_units()[0], str(path))
         is_labels = image.header.get_intent()[0] == _LABELS
     # A damaged file shows in whatever nibabel happens to stumble over.
     except Exception as error:
@@ -101,15 +96,8 @@ def read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str]
     while voxels.ndim > 3 and voxels.shape[-1] == 1:
         voxels = voxels[..., 0]
     affine = np.diag([factor, factor, factor, 1.0]) @ _RAS_FROM_LPS @ image.affine
-    return voxels, affine, _own_fields(image.header.extensions), is_labels
-
-
-def _own_fields(extensions: Any) -> dict[str, str]:
-    """Fields in the first comment that is of this package; none where there is no such one."""
-    for extension in extensions:
-        try:
-            own = json.loads(bytes(extension.get_content()).rstrip(b"\0"))[_OWN]
-            return {str(name): str(value) for name, value in own.items()}
-        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):  # of somebody else
-            continue
-    return {}
+    fields: dict[str, str] = {}
+    for extension in image.header.extensions:
+        with suppress(ValueError, LookupError, TypeError, AttributeError):  # of somebody else
+            fields |= json.loads(bytes(extension.get_content()).rstrip(b"\0"))[_OWN]
+    return voxels, affine, fields, is_labels

@@ -11,7 +11,6 @@ References
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,13 +22,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.files import PathLike
-from speckle3d.core.labels import Segment, require_segments
+from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
-from speckle3d.core.volume import VOXEL_TYPES, require_spacing
+from speckle3d.core.volume import Volume
+from speckle3d.io.deflate import GZIP, ZLIB, packer
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.header_text import meta_start, put_packed_size
+from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
 from speckle3d.io.pixels import meta_type, nrrd_type
 from speckle3d.io.text import unescaped
 from speckle3d.io.voxels.nifti import nifti_header
@@ -44,9 +45,6 @@ PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
-_BATCH_BYTES = 2**24
-_GZIP, _ZLIB = 31, 15
-"""Windows of zlib, by which it tells how a stream begins and ends."""
 _SIDES = (("L", "R"), ("P", "A"), ("S", "I"))
 """Sides that an axis along a world axis leads to or comes from, by MetaImage's letters."""
 
@@ -107,24 +105,23 @@ class VolumeWriter:
         compress: bool = True,
         segments: Sequence[Segment] | None = None,
     ) -> None:
-        self._path, self._shape = Path(path), shape
-        self._dtype: np.dtype[Any] = np.dtype(dtype).newbyteorder("=")
+        self._path, self._fields = Path(path), dict(fields or {})
         self._suffix = require_suffix(self._path, segments is not None)
         self._packs = self._suffix == ".nii.gz" or (compress and self._suffix != ".nii")
         with naming(str(path)):
-            self._require_volume(spacing_mm, world_from_grid, fields or {})
-            plain: dict[str, str] = {}
-            if segments is not None:
-                require_segments(self._dtype, tuple(segments))
-                plain = segment_fields(segments, shape)
-            matrix = world_from_grid.as_matrix() @ np.diag([*spacing_mm, 1.0]) + 0.0  # no negative zeros
-            if self._suffix in (".nrrd", ".mha"):
-                texts = {f"{PREFIX}{name}": value for name, value in (fields or {}).items()} | plain
-                lines = self._nrrd(matrix, texts) if self._suffix == ".nrrd" else self._meta(matrix, texts)
-                self._header = "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
-            else:
-                texts = {**(fields or {}), **plain}
-                self._header = nifti_header(shape, self._dtype, matrix, texts, segments is not None)
+            # Checked by the container, whose voxels are all one here.
+            voxels = np.broadcast_to(np.zeros((), np.dtype(dtype).newbyteorder("=")), shape)
+            place = voxels, spacing_mm, world_from_grid, self._fields
+            volume = Volume(*place) if segments is None else LabelMap(*place, tuple(segments))
+            if not np.isfinite(volume.world_from_index).all():
+                raise InvalidInputError("world_from_grid: expected a finite pose, got another")
+            for name in self._fields:
+                if not _NAME.fullmatch(name):
+                    raise InvalidInputError(
+                        f"fields: expected names of letters, digits and '_.-' after a letter, got {name!r}"
+                    )
+            self._volume = volume
+            self._header = self._made_header(volume, segments)
         self._planes = 0
 
     def __enter__(self) -> Self:
@@ -132,11 +129,8 @@ class VolumeWriter:
             part = stack.enter_context(atomic_path(self._path))
             self._file = stack.enter_context(part.open("wb"))
             stack.push(self._finish_unless)
-            self._packer = _packer(_ZLIB if self._suffix == ".mha" else _GZIP) if self._packs else None
-            if self._suffix == ".nii.gz":
-                self._write(self._header)
-            else:
-                self._file.write(self._header)
+            self._packer = packer(ZLIB if self._suffix == ".mha" else GZIP) if self._packs else None
+            self._file.write(self._packed(self._header) if self._suffix == ".nii.gz" else self._header)
             self._stack = stack.pop_all()
         return self
 
@@ -160,70 +154,59 @@ class VolumeWriter:
         FileError
             If the file cannot be written.
         """
-        n_i, n_j, n_k = self._shape
+        (n_i, n_j, n_k), dtype = self._volume.shape, self._volume.voxels.dtype
         left = n_k - self._planes
         if planes.ndim != 3 or planes.shape[1:] != (n_j, n_i) or len(planes) > left:
             expected = f"at most {left} planes of {n_j} x {n_i} voxels (j x i)"
             raise MismatchError(f"{self._path}: expected {expected}, got shape {planes.shape}")
-        if planes.dtype.newbyteorder("=") != self._dtype:
-            raise MismatchError(f"{self._path}: expected voxels of type {self._dtype}, got {planes.dtype}")
-        step = max(1, _BATCH_BYTES // (n_i * n_j * self._dtype.itemsize))
-        for first in range(0, len(planes), step):
-            batch = np.ascontiguousarray(planes[first : first + step], self._dtype.newbyteorder("<"))
-            self._write(batch.data.cast("B"))
+        if planes.dtype.newbyteorder("=") != dtype:
+            raise MismatchError(f"{self._path}: expected voxels of type {dtype}, got {planes.dtype}")
+        for plane in planes:
+            content = np.ascontiguousarray(plane, dtype.newbyteorder("<"))
+            self._file.write(self._packed(content.data.cast("B")))
         self._planes += len(planes)
 
-    def _write(self, content: bytes | memoryview) -> None:
-        self._file.write(content if self._packer is None else self._packer.compress(content))
+    def _packed(self, content: bytes | memoryview) -> Any:
+        return content if self._packer is None else self._packer.compress(content)
 
     def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
         if error is not None:
             return
-        if self._planes != self._shape[2]:
-            raise MismatchError(f"{self._path}: expected {self._shape[2]} planes, got {self._planes}")
+        if self._planes != self._volume.shape[2]:
+            raise MismatchError(f"{self._path}: expected {self._volume.shape[2]} planes, got {self._planes}")
         if self._packer is not None:
             self._file.write(self._packer.flush())
             if self._suffix == ".mha":
                 put_packed_size(self._file, self._header, self._file.tell() - len(self._header))
 
-    def _require_volume(
-        self,
-        spacing_mm: tuple[float, float, float],
-        world_from_grid: RigidTransform,
-        fields: Mapping[str, str],
-    ) -> None:
-        if len(self._shape) != 3 or min(self._shape) < 1:
-            raise InvalidInputError(f"shape: expected three lengths above zero, got {self._shape}")
-        if self._dtype.name not in VOXEL_TYPES:
-            raise InvalidInputError(f"dtype: expected {', '.join(VOXEL_TYPES)}, got {self._dtype}")
-        require_spacing(spacing_mm)
-        if not world_from_grid.single or not np.isfinite(world_from_grid.as_matrix()).all():
-            raise InvalidInputError("world_from_grid: expected one finite pose, got another")
-        for name in fields:
-            if not _NAME.fullmatch(name):
-                raise InvalidInputError(
-                    f"fields: expected names of letters, digits and '_.-' after a letter, got {name!r}"
-                )
+    def _made_header(self, volume: Volume, segments: Sequence[Segment] | None) -> bytes:
+        plain = {} if segments is None else segment_fields(segments, volume.shape)
+        if ".nii" in self._suffix:
+            return nifti_header(volume, {**self._fields, **plain}, segments is not None)
+        fields = {f"{PREFIX}{name}": value for name, value in self._fields.items()} | plain
+        escaped = {name: _escaped(value) for name, value in fields.items()}
+        matrix = volume.world_from_index + 0.0  # no negative zeros
+        return header_bytes((self._nrrd if self._suffix == ".nrrd" else self._meta)(matrix, escaped))
 
-    def _nrrd(self, matrix: npt.NDArray[np.float64], fields: Mapping[str, str]) -> list[str]:
-        steps = [f"({_texts(column, ',')})" for column in matrix[:3].T]
+    def _nrrd(self, matrix: FloatArray, fields: Mapping[str, str]) -> list[str]:
+        *steps, origin = (f"({_texts(column, ',')})" for column in matrix[:3].T)
         return [
             "NRRD0005",
-            f"type: {nrrd_type(self._dtype)}",
+            f"type: {nrrd_type(self._volume.voxels.dtype)}",
             "dimension: 3",
             "space: left-posterior-superior",
-            f"sizes: {_texts(self._shape)}",
-            f"space directions: {' '.join(steps[:3])}",
+            f"sizes: {_texts(self._volume.shape)}",
+            f"space directions: {' '.join(steps)}",
             "kinds: domain domain domain",
             "endian: little",
             f"encoding: {'gzip' if self._packs else 'raw'}",
             'space units: "mm" "mm" "mm"',
-            f"space origin: {steps[3]}",
-            *(f"{name}:={_escaped(value)}" for name, value in fields.items()),
+            f"space origin: {origin}",
+            *(f"{name}:={value}" for name, value in fields.items()),
             "",
         ]
 
-    def _meta(self, matrix: npt.NDArray[np.float64], fields: Mapping[str, str]) -> list[str]:
+    def _meta(self, matrix: FloatArray, fields: Mapping[str, str]) -> list[str]:
         spacing = np.linalg.norm(matrix[:3, :3], axis=0)
         return [
             *meta_start(3, 0 if self._packs else None),
@@ -232,11 +215,11 @@ class VolumeWriter:
             "CenterOfRotation = 0 0 0",
             f"AnatomicalOrientation = {''.join(nibabel.aff2axcodes(matrix, _SIDES))}",
             f"ElementSpacing = {_texts(spacing)}",
-            f"DimSize = {_texts(self._shape)}",
+            f"DimSize = {_texts(self._volume.shape)}",
             # As PLUS tells a volume from a sequence of frames.
             "Kinds = domain domain domain",
-            *(f"{name} = {_escaped(value)}" for name, value in fields.items()),
-            f"ElementType = MET_{meta_type(self._dtype)}",
+            *(f"{name} = {value}" for name, value in fields.items()),
+            f"ElementType = MET_{meta_type(self._volume.voxels.dtype)}",
             "ElementDataFile = LOCAL",
         ]
 
@@ -280,11 +263,3 @@ def _escaped(text: str) -> str:
 
 def _texts(values: Iterable[float], between: str = " ") -> str:
     return between.join(str(value) if isinstance(value, int) else repr(float(value)) for value in values)
-
-
-def _packer(window: int) -> Any:
-    try:  # four times as fast as zlib
-        from isal import isal_zlib
-    except ImportError:
-        return zlib.compressobj(1, zlib.DEFLATED, window)
-    return isal_zlib.compressobj(1, isal_zlib.DEFLATED, window)

@@ -17,8 +17,8 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
-from speckle3d.io.pixels import read_pixels
+from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, mm_per, nrrd_axes_mm, read_header
+from speckle3d.io.pixels import map_pixels
 from speckle3d.io.text import numbers
 from speckle3d.io.voxels.nifti import is_nifti, read_nifti
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
@@ -28,16 +28,6 @@ _SNIFFED_BYTES = 4096
 
 _SAME_PLACE_MM = 1e-3
 """Two grids are one if they differ by less: NIfTI keeps places to single precision."""
-
-_TO_LPS = {
-    "left-anterior-superior": (1, -1, 1), "las": (1, -1, 1),
-    "right-anterior-superior": (-1, -1, 1), "ras": (-1, -1, 1),
-}  # fmt: skip
-"""Signs that turn a space of NRRD into the one of MetaImage and this package; others stay as they are."""
-
-_MM = {"": 1.0, "mm": 1.0, "millimeter": 1.0, "cm": 10.0, "m": 1e3, "meter": 1e3, "um": 1e-3, "\u00b5m": 1e-3,
-       "micron": 1e-3}  # fmt: skip
-"""Millimetres of the units of NRRD and MetaImage."""
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -85,8 +75,7 @@ def is_volume(path: PathLike) -> bool:
     """
     start = _start(path)
     if is_metaimage(start) or is_nrrd(start):
-        header = read_header(path)
-        return header.is_volume or (header.kinds == 3 * ["domain"] and not header.frames)
+        return read_header(path).is_volume
     return is_nifti(Path(path), start)
 
 
@@ -140,15 +129,12 @@ def read_volume(path: PathLike) -> Volume:
     elif is_metaimage(start) or is_nrrd(start):
         header = read_header(path)
         fields, own, is_labels = header.fields, own_fields(header.fields), is_segmentation(header.fields)
-        if fields.get("ElementNumberOfChannels", "1") != "1":
-            raise InvalidInputError(f"{path}: expected a grey image, got more than one value per pixel")
-        voxels = read_pixels(header.pixels)
-        if len(header.size) != 3 or voxels.size != np.prod(header.size, dtype=object):
-            got = f"{len(header.size)} axes {header.size} of {voxels.size} numbers"
+        if header.channels > 1 or len(header.size) != 3:
+            got = f"{len(header.size)} axes, {header.channels} number(s) a pixel"
             raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
-        # The first axis runs fastest in a file.
-        voxels = voxels.reshape(header.size[::-1]).T
-        matrix = _meta_matrix(header) if is_metaimage(start) else _nrrd_matrix(header)
+        # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
+        voxels = np.array(map_pixels(header.pixels)).reshape(header.size[::-1]).T
+        matrix = (_nrrd_matrix if header.is_nrrd else _meta_matrix)(header)
     else:
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
@@ -161,9 +147,8 @@ def read_volume(path: PathLike) -> Volume:
         voxels, spacing, pose = _placed(voxels, matrix)
         if is_labels:
             return LabelMap(_labels(voxels), spacing, pose, own, read_segments(fields, str(path)))
-        return Volume(
-            voxels if voxels.dtype.name in VOXEL_TYPES else voxels.astype(np.float32), spacing, pose, own
-        )
+        kept = voxels if voxels.dtype.name in VOXEL_TYPES else voxels.astype(np.float32)
+        return Volume(kept, spacing, pose, own)
 
 
 load_volume = read_volume
@@ -228,50 +213,35 @@ def _labels(voxels: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def _meta_matrix(header: SequenceHeader) -> FloatArray:
     """World (LPS, mm) from index of a MetaImage."""
-    spacing = _of_field(header, ("ElementSpacing", "ElementSize"), np.ones(3))
-    axes = _of_field(header, ("TransformMatrix", "Rotation", "Orientation"), np.eye(3).ravel())
+
+    def numbers_of(default: FloatArray, *names: str) -> FloatArray:
+        text = next((header.fields[name] for name in names if name in header.fields), None)
+        where = f"{header.path}: {names[0]}"
+        return default if text is None else np.array(numbers(text, default.size, where))
+
     matrix = np.eye(4)
-    matrix[:3, :3] = axes.reshape(3, 3).T * spacing
-    matrix[:3, 3] = _of_field(header, ("Offset", "Position", "Origin"), np.zeros(3))
-    matrix[:3] *= _mm_of(header, header.fields.get("DistanceUnits", ""))
+    axes = numbers_of(np.eye(3).ravel(), "TransformMatrix", "Rotation", "Orientation")
+    matrix[:3, :3] = axes.reshape(3, 3).T * numbers_of(np.ones(3), "ElementSpacing", "ElementSize")
+    matrix[:3, 3] = numbers_of(np.zeros(3), "Offset", "Position", "Origin")
+    matrix[:3] *= mm_per(header.fields.get("DistanceUnits", ""), f"{header.path}: DistanceUnits")
     return matrix
-
-
-def _of_field(header: SequenceHeader, names: tuple[str, ...], default: FloatArray) -> FloatArray:
-    name = next((name for name in names if name in header.fields), None)
-    if name is None:
-        return default
-    return np.array(numbers(header.fields[name], default.size, f"{header.path}: {name}"))
 
 
 def _nrrd_matrix(header: SequenceHeader) -> FloatArray:
     """World (LPS, mm) from index of an NRRD file."""
-    fields, where, matrix = header.fields, header.path, np.eye(4)
-    if "space directions" in fields:
-        matrix[:3, :3] = _vectors(fields["space directions"], 3, f"{where}: space directions").T
-        units = fields.get("space units", "")
-    else:
-        matrix[:3, :3] = np.diag(_of_field(header, ("spacings",), np.ones(3)))
-        units = fields.get("units", "")
+    fields, matrix = header.fields, np.eye(4)
+    axes = nrrd_axes_mm(header.path, fields, 3)
+    if axes is not None:
+        if axes.shape != (3, 3):
+            raise InvalidInputError(f"{header.path}: expected steps in three dimensions, got {axes.shape}")
+        matrix[:3, :3] = axes.T
     if "space origin" in fields:
-        matrix[:3, 3] = _vectors(fields["space origin"], 1, f"{where}: space origin")[0]
-    words = {word.strip().lower() for word in re.findall(r'"([^"]*)"', units)} or {""}
-    if len(words) > 1:
-        raise InvalidInputError(f"{where}: expected one unit for all axes, got {units}")
-    signs = _TO_LPS.get(fields.get("space", "").lower(), (1, 1, 1))
-    matrix[:3] *= np.array(signs)[:, None] * _mm_of(header, words.pop())
+        units = re.findall(r'"([^"]*)"', fields.get("space units", "")) or [""]
+        origin = numbers(re.sub("[(),]", " ", fields["space origin"]), 3, f"{header.path}: space origin")
+        matrix[:3, 3] = np.multiply(origin, mm_per(units[0], f"{header.path}: space units"))
+    space = fields.get("space", "").lower()
+    if space in ("right-anterior-superior", "ras"):
+        matrix[0] *= -1.0
+    if space in ("right-anterior-superior", "ras", "left-anterior-superior", "las"):
+        matrix[1] *= -1.0
     return matrix
-
-
-def _mm_of(header: SequenceHeader, unit: str) -> float:
-    if unit.lower() not in _MM:
-        known = ", ".join(word for word in _MM if word)
-        raise InvalidInputError(f"{header.path}: expected a unit among {known}, got {unit!r}")
-    return _MM[unit.lower()]
-
-
-def _vectors(text: str, count: int, where: str) -> FloatArray:
-    rows = [numbers(row.replace(",", " "), 3, where) for row in re.findall(r"\(([^)]*)\)", text)]
-    if len(rows) != count:
-        raise InvalidInputError(f"{where}: expected {count} vector(s) of three numbers, got {text[:40]!r}")
-    return np.array(rows)
