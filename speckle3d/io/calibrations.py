@@ -15,9 +15,7 @@ from dataclasses import replace
 
 import h5py
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.geometry import require_finite, rotations_from_quaternions
@@ -28,17 +26,20 @@ from speckle3d.io.hdf5 import (
     has_member,
     locate,
     opened,
-    plain_attribute,
     read_attribute,
     read_checked,
     read_texts,
     read_transforms,
+    read_vector_attribute,
     require_group,
     sha256_of,
 )
 from speckle3d.io.records import HDF5Writer, read_record
 
 FORMAT = "speckle3d.calibration"
+
+_WORDS, _NUMBERS = ("name", "unit"), ("value", "standard_error")
+"""Columns of /parameters."""
 
 
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
@@ -55,25 +56,20 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
     FileError
         If the file cannot be written.
     """
+    frames, rows = calibration.frames, calibration.parameters
     with HDF5Writer(path, FORMAT) as writer:
-        root, apart = writer.file, ("rotation", "translation_mm", "parameters", "frames")
-        writer.put_fields(root, calibration, skip=apart)
+        root = writer.file
+        writer.put_fields(root, calibration, skip=("rotation", "translation_mm", "parameters", "frames"))
         is_turn = calibration.translation_mm is None
-        writer.put(
-            root, "sensor_from_image", calibration.rotation if is_turn else calibration.sensor_from_image
-        )
-        rows = calibration.parameters
-        group = root.create_group("parameters")
-        for name in ("name", "unit"):
-            writer.put_text(group, name, [getattr(row, name) for row in rows])
-        for name in ("value", "standard_error"):
-            writer.put(group, name, np.array([getattr(row, name) for row in rows], dtype=float))
-        frames = calibration.frames
-        group = root.create_group("frames")
-        writer.put(group, "given", frames.given)
-        writer.put(group, "used", np.array(frames.used, dtype=np.int64))
-        writer.put(group, "dropped", np.array(list(frames.dropped), dtype=np.int64))
-        writer.put_text(group, "reason", list(frames.dropped.values()))
+        pose = calibration.rotation if is_turn else calibration.sensor_from_image
+        writer.put(root, "sensor_from_image", pose)
+        columns = {name: np.array([getattr(row, name) for row in rows], float) for name in _NUMBERS}
+        writer.put(root, "parameters", columns)
+        for name in _WORDS:
+            writer.put_text(root["parameters"], name, [getattr(row, name) for row in rows])
+        used, dropped = (np.array([*numbers], dtype=np.int64) for numbers in (frames.used, frames.dropped))
+        writer.put(root, "frames", {"given": frames.given, "used": used, "dropped": dropped})
+        writer.put_text(root["frames"], "reason", list(frames.dropped.values()))
 
 
 def read_calibration(path: PathLike) -> Calibration:
@@ -110,25 +106,27 @@ def read_calibration(path: PathLike) -> Calibration:
     [0.0, 0.0, 0.1]
     """
     with opened(path, FORMAT) as file, naming(str(path)):
-        rotation, translation = _read_pose(file)
-        condition = np.asarray(plain_attribute(file, "condition_number"))
-        # Infinite where the motion leaves something undetermined, unlike all other attributes.
-        if condition.dtype.kind not in "fiu" or condition.size != 1 or np.isnan(condition).any():
-            raise InvalidInputError("attribute condition_number: expected a number, got another value")
+        pose, quaternion = None, None
+        if has_member(file, "sensor_from_image"):
+            pose = read_transforms(file, "sensor_from_image")
+        else:
+            where = locate(file, "sensor_from_image_wxyz")
+            wxyz = read_checked(file, "sensor_from_image_wxyz", (4,))
+            quaternion = rotations_from_quaternions(wxyz[None], where)[0]
         calibration = read_record(
             file,
             Calibration,
-            rotation=rotation,
-            translation_mm=translation,
+            rotation=quaternion if pose is None else pose.rotation,
+            translation_mm=None if pose is None else np.asarray(pose.translation),
             pixel_mm=read_checked(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
             parameters=_read_parameters(require_group(file, "parameters")),
-            condition_number=float(condition.ravel()[0]),
+            # Infinite where the motion leaves something undetermined.
+            condition_number=float(read_vector_attribute(file, "condition_number", 1, finite=False)[0]),
             frames=_read_frames(require_group(file, "frames")),
         )
-        where = locate(file, "covariance")
-        _require_spread(np.diag(calibration.covariance), where)
-        if np.isnan(calibration.covariance).any():
-            raise InvalidInputError(f"{where}: expected numbers, got NaN")
+        if not (np.diag(calibration.covariance) >= 0).all() or np.isnan(calibration.covariance).any():
+            where = locate(file, "covariance")
+            raise InvalidInputError(f"{where}: expected variances of zero or more, and no NaN")
         return calibration
 
 
@@ -142,16 +140,18 @@ def apply_calibrations(sweep: Sweep, paths: Sequence[PathLike]) -> tuple[Sweep, 
     MismatchError
         If two are for one sensor, or the sweep has no such sensor.
     """
-    held: list[CalibrationFile] = []
+    files: dict[str, CalibrationFile] = {}
     for path in paths:
         calibration = read_calibration(path)
-        before = [one.path for one in held if one.sensor == calibration.sensor]
-        if before:
-            raise MismatchError(f"{path}: expected one calibration for a sensor, got {before[0]} for it too")
+        sensor = calibration.sensor
+        if sensor in files:
+            raise MismatchError(
+                f"{path}: expected one calibration for a sensor, got {files[sensor].path} for it too"
+            )
         with naming(str(path)):
             sweep = calibrated(sweep, calibration)
-        held.append(CalibrationFile(calibration.sensor, str(path), sha256_of(path)))
-    return sweep, tuple(held)
+        files[sensor] = CalibrationFile(sensor, str(path), sha256_of(path))
+    return sweep, tuple(files.values())
 
 
 def fitted_pixels(paths: Sequence[PathLike]) -> dict[str, float]:
@@ -179,41 +179,18 @@ def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
 
 
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
-    values = read_checked(group, "value", ("p",))
-    require_finite(values, locate(group, "value"))
-    errors = read_checked(group, "standard_error", (values.size,))
-    _require_spread(errors, locate(group, "standard_error"))
-    names, units = (read_texts(group, name, values.shape) for name in ("name", "unit"))
-    rows = zip(names, values.tolist(), errors.tolist(), units, strict=True)
-    return tuple(Parameter(*row) for row in rows)
+    value = read_checked(group, "value", ("p",))
+    require_finite(value, locate(group, "value"))
+    error = read_checked(group, "standard_error", value.shape)
+    name, unit = (read_texts(group, column, value.shape) for column in _WORDS)
+    return tuple(map(Parameter, name, value.tolist(), error.tolist(), unit))
 
 
 def _read_frames(group: h5py.Group) -> FramesUsed:
-    used = read_checked(group, "used", ("u",), np.int64)
-    dropped = read_checked(group, "dropped", ("d",), np.int64)
+    used, dropped = (read_checked(group, name, ("n",), np.int64) for name in ("used", "dropped"))
     reasons = read_texts(group, "reason", dropped.shape)
     given = int(read_attribute(group, "given"))
-    for name, numbers in (("used", used), ("dropped", dropped)):
-        bad = np.flatnonzero((numbers < 0) | (numbers >= given))
-        if bad.size:
-            where = f"{locate(group, name)}[{bad[0]}]"
-            raise InvalidInputError(f"{where}: expected a frame among {given}, got {numbers[bad[0]]}")
     return FramesUsed(given, tuple(used.tolist()), dict(zip(dropped.tolist(), reasons, strict=True)))
-
-
-def _read_pose(file: h5py.File) -> tuple[Rotation, FloatArray | None]:
-    if has_member(file, "sensor_from_image"):
-        pose = read_transforms(file, "sensor_from_image")
-        return pose.rotation, np.asarray(pose.translation)
-    quaternion = read_checked(file, "sensor_from_image_wxyz", (4,))
-    return rotations_from_quaternions(quaternion[None], locate(file, "sensor_from_image_wxyz"))[0], None
-
-
-def _require_spread(values: FloatArray, where: str) -> None:
-    """Refuse negative or NaN standard errors; an infinite one marks what the motion did not determine."""
-    bad = np.flatnonzero(~(values >= 0))
-    if bad.size:
-        raise InvalidInputError(f"{where}[{bad[0]}]: expected zero or a value above it, got {values[bad[0]]}")
 
 
 load_calibration = read_calibration

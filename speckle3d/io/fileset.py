@@ -64,14 +64,25 @@ class FileSet:
         for name in self.names if existed else ():
             require_target(folder / name)
         base, name = (folder, self.primary) if existed else (folder.parent, folder.name)
-        above = [each for each in (base, *base.parents) if not each.exists()]
+        above = [parent for parent in (base, *base.parents) if not parent.exists()]
         make_folder(base)
         part = _part(base, name)
         try:
-            with _held(part, given):
-                self._finish_killed(folder)
-                yield part
-                self._put_in_place(part, folder)
+            part.mkdir(exist_ok=True)
+            with _locked(part):
+                try:
+                    for left in part.iterdir():  # of a killed run
+                        shutil.rmtree(left) if left.is_dir() else left.unlink()
+                    self._finish_killed(folder)
+                    yield part
+                    self._put_in_place(part, folder)
+                except BaseException:
+                    shutil.rmtree(part, ignore_errors=True)
+                    raise
+        except BlockingIOError as error:
+            raise FileError(
+                f"{given}: expected a place that no other run is at work in, got one that is taken"
+            ) from error
         except Speckle3DError as error:
             if str(part) not in str(error):
                 raise
@@ -79,9 +90,9 @@ class FileSet:
         except OSError as error:
             raise cannot_write(given, error) from error
         finally:
-            for each in above:
+            for parent in above:
                 with suppress(OSError):  # it holds something by now
-                    each.rmdir()
+                    parent.rmdir()
 
     def _decided(self, folder: Path) -> Path:
         """Where the new files of a set are from the moment that they count."""
@@ -102,16 +113,12 @@ class FileSet:
         """Finish what a killed run had decided, and remove what it had not."""
         if not folder.is_dir():
             return
-        with suppress(FileNotFoundError):
-            # A run that is at it needs a moment more.
-            file = _locked(self._decided(folder), wait=True)
-            try:
-                self._move(folder)
-            finally:
-                _release(file)
-        if (beside := _part(folder.parent, folder.name)).is_dir():
-            with suppress(FileError), _held(beside, folder):  # of a run from before there was the folder
-                pass
+        # A run that is at it needs a moment more.
+        with suppress(FileNotFoundError), _locked(self._decided(folder), wait=True):
+            self._move(folder)
+        before = _part(folder.parent, folder.name)  # of a run from before there was the folder
+        with suppress(FileNotFoundError, BlockingIOError), _locked(before):
+            shutil.rmtree(before)
         for name in self.names:
             clear_parts(folder / name)
 
@@ -143,85 +150,28 @@ def _replace(new: Path, target: Path) -> None:
 
 
 @contextmanager
-def _held(part: Path, folder: Path) -> Iterator[None]:
-    """Make a hidden folder, or take over that of a killed run, for the block; it is removed afterwards.
-
-    The folder is its own lock, which the operating system releases when the process ends, however it ends.
+def _locked(folder: Path, wait: bool = False) -> Iterator[None]:
+    """Lock a folder for the block, where there are locks; the system releases it however the process ends.
 
     Raises
     ------
-    FileError
-        If a run at work holds it, or the system refuses to make it.
+    BlockingIOError
+        If another process holds it.
     """
-    file = _take(part, folder)
+    fcntl = locks()
+    file = None if fcntl is None else os.open(folder, os.O_RDONLY)
     try:
-        for left in part.iterdir():
-            shutil.rmtree(left) if left.is_dir() else left.unlink()
+        if file is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            except OSError as error:
+                if isinstance(error, BlockingIOError):
+                    raise  # else a file system without locks
         yield
     finally:
-        if file is None or _is_at(file, part):
-            shutil.rmtree(part, ignore_errors=True)
-        _release(file)
-
-
-def _take(part: Path, folder: Path) -> int | None:
-    """Make and lock a hidden folder; returns its open file, None where there are no locks."""
-    while True:
-        made = True
-        try:
-            part.mkdir()
-        except FileExistsError:
-            made = False
-        except OSError as error:
-            raise cannot_write(folder, error) from error
-        try:
-            file = _locked(part)
-        except FileNotFoundError:  # another run has just ended
-            continue
-        except BlockingIOError:
-            raise _taken(folder) from None
-        if file is None:
-            if made:
-                return None
-            raise _taken(folder, f" (if none is, remove {part})")
-        if _is_at(file, part):
-            return file
-        os.close(file)
-
-
-def _locked(folder: Path, wait: bool = False) -> int | None:
-    """Open and lock a folder; None where the system or the file system has no such locks."""
-    fcntl = locks()
-    if fcntl is None:
-        return None
-    file = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except OSError as error:
-        os.close(file)
-        if isinstance(error, BlockingIOError):
-            raise
-        return None
-    return file
-
-
-def _is_at(file: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def _release(file: int | None) -> None:
-    if file is not None:
-        os.close(file)
+        if file is not None:
+            os.close(file)
 
 
 def _part(base: Path, name: str) -> Path:
     return base / f".part-{name}"
-
-
-def _taken(folder: Path, advice: str = "") -> FileError:
-    return FileError(
-        f"{folder}: expected a place that no other run is at work in, got one that is taken{advice}"
-    )

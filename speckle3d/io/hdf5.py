@@ -360,11 +360,12 @@ def read_attribute(node: Node, name: str, default: float | None = None) -> float
     return float(read_vector_attribute(node, name, 1)[0])
 
 
-def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
-    """Read an attribute of `size` finite numbers as a flat array."""
+def read_vector_attribute(node: Node, name: str, size: int, finite: bool = True) -> FloatArray:
+    """Read an attribute of `size` numbers, finite ones by default, as a flat array."""
     raw = plain_attribute(node, name)
     value = np.asarray(raw)
-    if value.dtype.kind not in "fiu" or value.size != size or not np.isfinite(value).all():
+    is_right = value.dtype.kind in "fiu" and value.size == size
+    if not is_right or np.isnan(value).any() or (finite and np.isinf(value).any()):
         where = f"{locate(node)} attribute {name}"
         raise InvalidInputError(f"{where}: expected {size} finite number(s), got {_shown(raw)}")
     return value.astype(np.float64).ravel()

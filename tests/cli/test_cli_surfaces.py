@@ -112,8 +112,8 @@ def test_a_picture_of_other_poses_is_refused(run, refused, rec, tmp_path):
     [
         ((), "--point X,Y,Z two or more times"),
         (("--point", "5,5,1"), "at least 2 points"),
-        (("--point", "5,5", "--point", "5,5,3"), "--point: expected 3 numbers"),
-        (("--point", "5,5,1", "--point", "5,5,nan"), "--point: expected 3 numbers"),
+        (("--point", "5,5", "--point", "5,5,3"), "--point: expected 3 finite number"),
+        (("--point", "5,5,1", "--point", "5,5,nan"), "--point: expected 3 finite number"),
         (("--point", "5,5,1", "--point", "5,5,30"), "point 2 (5, 5, 30): expected a point in the sweep"),
         (("--point", "5,5,1", "--point", "5,5,2", "--mode", "pose"), "--mode: expected one of image, fused"),
         (("--point", "5,5,1", "--point", "5,5,2", "--pick-mm", "-1"), "--pick-mm"),

@@ -9,7 +9,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.io.text import text_lines
+from speckle3d.io.text import numbers, text_lines
 
 WORLD = ("x_mm", "y_mm", "z_mm")
 """Columns of points of the world."""
@@ -27,34 +27,20 @@ def read_places(path: PathLike, columns: Sequence[str] = WORLD) -> FloatArray:
     InvalidInputError
         Naming the line, if it is not as it must be.
     """
-    rows = [
-        (number, [cell.strip() for cell in text.split("#")[0].split(",")])
-        for number, text in text_lines(path)
-        if text.split("#")[0].strip()
-    ]
-    if not rows or any(name not in rows[0][1] for name in columns):
-        got = ",".join(rows[0][1]) if rows else "nothing"
-        raise InvalidInputError(f"{path}: expected columns {','.join(columns)}, got {got}")
-    at = [rows[0][1].index(name) for name in columns]
-    found = [
-        _place([cells[k] if k < len(cells) else "" for k in at], f"{path}:{number}")
-        for number, cells in rows[1:]
-    ]
-    return np.array(found, dtype=float).reshape(-1, len(columns))
+    lines = ((number, text.split("#")[0]) for number, text in text_lines(path))
+    rows = [(number, [cell.strip() for cell in text.split(",")]) for number, text in lines if text.strip()]
+    header = rows[0][1] if rows else ["nothing"]
+    if not {*columns} <= {*header}:
+        raise InvalidInputError(f"{path}: expected columns {','.join(columns)}, got {','.join(header)}")
+    places = []
+    for number, cells in rows[1:]:
+        row = dict(zip(header, cells, strict=False))
+        text = " ".join(row.get(name, "") for name in columns)
+        places.append(numbers(text, len(columns), f"{path}:{number}"))
+    return np.array(places, dtype=float).reshape(-1, len(columns))
 
 
 def parse_places(texts: Sequence[str], columns: Sequence[str] = WORLD, option: str = "--point") -> FloatArray:
     """Points given as ``X,Y,Z``, or ``X,Y``, each; shape (k, number of columns)."""
-    found = [_place(text.split(","), option, len(columns)) for text in texts]
-    return np.array(found, dtype=float).reshape(-1, len(columns))
-
-
-def _place(cells: Sequence[str], where: str, count: int | None = None) -> list[float]:
-    wanted = len(cells) if count is None else count
-    try:
-        values = [float(cell) for cell in cells]
-    except ValueError:
-        values = []
-    if len(values) != wanted or not np.isfinite(values).all():
-        raise InvalidInputError(f"{where}: expected {wanted} numbers in mm, got {','.join(cells)!r}")
-    return values
+    places = [numbers(text.replace(",", " "), len(columns), option) for text in texts]
+    return np.array(places, dtype=float).reshape(-1, len(columns))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -54,15 +52,14 @@ def write_surface(path: PathLike, surface: Surface) -> None:
     if not len(surface):
         raise InvalidInputError(f"{path}: expected a surface of at least one triangle, got none")
     meshio = extra_module("meshio", "surface", "a surface's file")
-
     points, triangles = surface.vertices_mm.astype(np.float32), surface.triangles.astype(np.int32)
     mesh = meshio.Mesh(points, [("triangle", triangles)])
-    if suffix == ".stl":
-        mesh.cell_data["facet_normals"] = [surface.normals.astype(np.float32)]
     with atomic_path(path) as part:
         if suffix == ".stl":
+            mesh.cell_data["facet_normals"] = [surface.normals.astype(np.float32)]
             meshio.stl.write(part, mesh, binary=True)
-            _say_in_stl(part)
+            content = part.read_bytes()[_STL_HEADER_BYTES:]
+            part.write_bytes(f"speckle3d surface. {SPACE}".encode().ljust(_STL_HEADER_BYTES) + content)
         elif suffix == ".ply":
             meshio.ply.write(part, mesh, binary=True)
             _replace_line(part, b"comment ", f"comment {SPACE}")
@@ -91,47 +88,25 @@ def read_surface(path: PathLike) -> Surface:
         If the suffix is not one of `SUFFIXES`, or the file holds no triangles.
     """
     suffix = require_suffix(path)
-    with reading(path), open(path, "rb"):
-        pass
+    meshio = extra_module("meshio", "surface", "a surface's file")
+    with reading(path):
+        content = Path(path).read_bytes()
     try:
-        mesh = _read(Path(path), suffix)
-        triangles = [block.data for block in mesh.cells if block.type == "triangle"]
+        if suffix == ".ply" and b"end_header" not in content:  # which meshio would search for ever
+            raise ValueError("its header has no end")
+        mesh = meshio.read(path)
     # A damaged file shows in whatever meshio happens to stumble over.
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise FileError(f"{path}: cannot be read as {suffix[1:].upper()}: {one_line(error)}") from error
-    if not triangles or any(each.dtype.kind not in "iu" for each in triangles):
+    triangles = [block.data for block in mesh.cells if block.type == "triangle"]
+    if not triangles or any(block.dtype.kind not in "iu" for block in triangles):
         raise InvalidInputError(f"{path}: expected triangles by numbers of their vertices, got none")
-    promised = _promised_cells(Path(path))
-    if promised is not None and promised != sum(len(block.data) for block in mesh.cells):
-        raise FileError(f"{path}: cannot be read: it ends before its {promised} triangles do")
+    count = re.search(rb"\nCELLS (\d+) ", content)  # of VTK; other readers find missing cells themselves
+    if count and int(count[1]) != sum(len(block.data) for block in mesh.cells):
+        raise FileError(f"{path}: cannot be read: it ends before its {int(count[1])} triangles do")
     # Not-a-numbers of a damaged file warn when they are cast; the surface refuses them.
     with naming(str(path)), np.errstate(invalid="ignore"):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
-
-
-def _read(path: Path, suffix: str) -> Any:
-    meshio = extra_module("meshio", "surface", "a surface's file")
-
-    if suffix == ".ply":
-        with _Lines(io.FileIO(path)) as stream:
-            return meshio.ply.read(stream)
-    return (meshio.stl if suffix == ".stl" else meshio.vtk).read(path)
-
-
-class _Lines(io.BufferedReader):
-    """A file whose end is an error to who asks for a line: meshio would ask for the next for ever."""
-
-    def readline(self, size: int | None = -1, /) -> bytes:
-        line = super().readline(-1 if size is None else size)
-        if not line:
-            raise EOFError("its header has no end")
-        return line
-
-
-def _promised_cells(path: Path) -> int | None:
-    """Number of cells that a VTK file says it has; the other readers find missing ones themselves."""
-    found = re.search(rb"\nCELLS (\d+) ", path.read_bytes()) if path.suffix.lower() == ".vtk" else None
-    return None if found is None else int(found[1])
 
 
 def require_suffix(path: PathLike) -> str:
@@ -140,12 +115,6 @@ def require_suffix(path: PathLike) -> str:
     if suffix not in SUFFIXES:
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}")
     return suffix
-
-
-def _say_in_stl(part: Path) -> None:
-    """Put the world's axes into the header, which must not begin as a text file does."""
-    with part.open("r+b") as file:
-        file.write(f"speckle3d surface. {SPACE}".encode().ljust(_STL_HEADER_BYTES))
 
 
 def _replace_line(part: Path, begins: bytes, line: str) -> None:
