@@ -97,20 +97,10 @@ def import_notes(path: PathLike, settings: ImportSettings | None = None) -> list
     return [] if find_reader(path) is None else open_recording(path, settings).notes
 
 
-def companion_files(path: PathLike) -> list[Path]:
-    """List other files that a sweep's content depends on; none of what no reader claims."""
-    reader, beside = find_reader(path), settings_file(path)
-    if reader is None:
-        return []
-    if beside is None or not reader.takes_settings:
-        return [*reader.companions(Path(path))]
-    config = settings_for(path).plus_config
-    return [*reader.companions(Path(path)), beside, *([] if config is None else [Path(config)])]
-
-
 def import_record(path: PathLike) -> ImportRecord | None:
     """Settings that a file beside a recording gives; None where there is none, or it would not be read."""
-    reader, beside = find_reader(path), settings_file(path)
+    beside = settings_file(path)
+    reader = None if beside is None else find_reader(path)
     if reader is None or beside is None or not reader.takes_settings:
         return None
     return ImportRecord(written_path(beside.name), settings_for(path).model_dump_json(exclude_defaults=True))
@@ -118,8 +108,15 @@ def import_record(path: PathLike) -> ImportRecord | None:
 
 def recording_files(path: PathLike) -> list[Path]:
     """List the files that a recording's content depends on: itself, unless it is a folder, and companions."""
-    place = Path(path)
-    return [*([] if place.is_dir() else [place]), *companion_files(place)]
+    place, reader = Path(path), find_reader(path)
+    files = [] if place.is_dir() else [place]
+    if reader is None:
+        return files
+    files += reader.companions(place)
+    if reader.takes_settings and (beside := settings_file(path)) is not None:
+        config = settings_for(path).plus_config
+        files += [beside, *([] if config is None else [Path(config)])]
+    return files
 
 
 def recording_sha256(path: PathLike) -> str:
@@ -148,8 +145,16 @@ def kind_of(path: PathLike) -> str:
     reader = find_reader(path)
     if reader is not None:
         return reader.format
-    if sniff(path) == IMAGE:
-        return IMAGE
+    known = ", ".join(reader.format for reader in readers())
+    if Path(path).is_dir():
+        raise FileError(f"{path}: expected a recording ({known}), got a folder that none of them is in")
+    require_file(path)
+    start = first_bytes(path)
+    if not start.startswith(SIGNATURE):
+        got = "something else" if start else "an empty file"
+        if start.startswith(_GZIP):
+            got = "a file packed by gzip: unpack it first"
+        raise InvalidInputError(f"{path}: expected a recording ({known}), got {got}")
     with reading(path), open_hdf5(path) as file:
         if "format" not in file.attrs:
             held = ", ".join(printable(str(name)) for name in file) or "nothing"
@@ -158,29 +163,3 @@ def kind_of(path: PathLike) -> str:
                 "`speckle3d convert` reads zea, USTB and MATLAB 7.3"
             )
         return file_format(file)
-
-
-def sniff(path: PathLike) -> str:
-    """Tell the container of a file from its first bytes: ``"hdf5"`` or ``"image"``.
-
-    Raises
-    ------
-    FileError
-        If there is no such file, or it cannot be read.
-    InvalidInputError
-        If it is neither.
-    """
-    if Path(path).is_dir():
-        known = ", ".join(reader.format for reader in readers())
-        raise FileError(f"{path}: expected a recording ({known}), got a folder that none of them is in")
-    require_file(path)
-    start = first_bytes(path)
-    if start.startswith(SIGNATURE):
-        return "hdf5"
-    if _IMAGES.claims(Path(path), start):
-        return IMAGE
-    got = "an empty file" if not start else "something else"
-    if start.startswith(_GZIP):
-        got = "a file packed by gzip: unpack it first"
-    known = ", ".join(reader.format for reader in readers())
-    raise InvalidInputError(f"{path}: expected a recording ({known}), got {got}")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -43,7 +42,7 @@ _SIZE_TOLERANCE = 0.1
 """How far the pixel of a header and that of its image calibration may differ; a nominal size and a measured
 one were seen to differ by 8 %."""
 _DEVICE = "the device set"
-_OWN = "as this package wrote it"
+_OWN, _NO_VALUES = "as this package wrote it", ("probe", "full_scale")
 _CARRIER = {1: "told by the phase", -1: "turned, as told by the phase", 0: "as stored, not told by the phase"}
 
 
@@ -134,23 +133,18 @@ class _Sequence:
         return cls(header, settings, device, own, Layout.of(header, device.image_orientation))
 
     def recording(self) -> Recording:
-        images, times = self._images()
+        header, images, times, rows = self.header, self._images(), self.times, self.rows()
         first_mm = self.settings.first_sample_depth_mm
         depth_mm = self.own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm
-        values = self._values()
-        frames = self._frames(images)
-        rows = self.rows()
+        values, frames = self._values(), self._frames(images, self.layout)
         if self.layout.is_complex:
             sign = self._sign_of_q(frames, values)
             rows.append(("sign of Q", _CARRIER[sign], ""))
             if sign == -1:
-                turned = SequenceFile(self.header, replace(self.layout, conjugated=True))
-                frames = FileFrames(
-                    self.header.path, turned, frames.shape, frames.dtype, None, images.tolist()
-                )
+                frames = self._frames(images, replace(self.layout, conjugated=True))
         tracker = self.tracker(depth_mm)
         return Recording(
-            Path(self.header.path),
+            Path(header.path),
             self.settings,
             frames,
             values,
@@ -162,24 +156,20 @@ class _Sequence:
             full_scale=self.own.get("full_scale", 255.0),
             assumptions=("parallel lines",) if self.layout.is_rf and not self.own else (),
             rows=tuple(rows),
-            remarks=tuple(self._remarks(images, times)),
+            remarks=tuple(self._remarks(images)),
         )
 
     @cached_property
     def poses(self) -> Poses | None:
-        given = self.settings
-        return tracked_poses(
-            self.header.path, self.header.frames, given.tracker_transform, given.reference_transform,
-            self.device.names,
-        )  # fmt: skip
+        asked, reference = self.settings.tracker_transform, self.settings.reference_transform
+        return tracked_poses(self.header.path, self.header.frames, asked, reference, self.device.names)
 
     @cached_property
     def stamps(self) -> FloatArray | None:
         """Time of every frame by its stamp or its axis, NaN where it has none."""
-        header = self.header
-        stamps = [_number(frame.get("Timestamp")) for frame in header.frames]
+        stamps = [_number(frame.get("Timestamp")) for frame in self.header.frames]
         if not np.isfinite(stamps).any():
-            return header.index_s
+            return self.header.index_s
         return np.array(stamps + [np.nan] * (self._count - len(stamps)))
 
     @property
@@ -193,8 +183,8 @@ class _Sequence:
         rate = self.settings.frame_rate_hz
         return self.stamps if rate is None else np.arange(self._count) / rate
 
-    def _images(self) -> tuple[IntArray, FloatArray | None]:
-        """Numbers of the frames that are images with a time, and the times of all."""
+    def _images(self) -> IntArray:
+        """Numbers of the frames that are images with a time."""
         header, size = self.header, self.header.size
         if 0 in size or max(size[:2]) == 1:
             what = ": the recording of a tracker, for --poses" if header.transforms else ""
@@ -204,38 +194,34 @@ class _Sequence:
         if header.is_volume and not self.settings.frame_rate_hz:
             raise InvalidInputError(
                 f"{header.path}: expected a sequence of images, got a volume, whose third axis is in space "
-                "by "
-                "its Kinds; if it is time, say so by --frame-rate-hz"
+                "by its Kinds; if it is time, say so by --frame-rate-hz"
             )
         self.layout.require_lines(header)
         if header.pixels.packing == "raw":
             header.images()  # maps them, and refuses a file that ends early
-        valid = self._valid()
+        images = np.flatnonzero(self._valid)
         if self.times is not None:
-            kept = np.flatnonzero(valid)
-            valid[:] = False
-            valid[kept[rising(self.times[kept])]] = True
-        images = np.flatnonzero(valid)
+            images = images[rising(self.times[images])]
         if not images.size:
             raise InvalidInputError(
                 f"{header.path}: ImageStatus: expected a valid frame with a time, got none"
             )
-        return images, self.times
+        return images
 
+    @property
     def _valid(self) -> BoolArray:
         """Frames whose image is valid; older files of PLUS say so in Status alone."""
-        count, frames = self.header.frame_count, self.header.frames[: self.header.frame_count]
-        statuses = [{f.get("ImageStatus", "OK"), f.get("Status", "OK")} == {"OK"} for f in frames]
-        return np.array(statuses + [True] * (count - len(statuses)), dtype=bool)
+        valid = np.ones(self.header.frame_count, dtype=bool)
+        for i, frame in enumerate(self.header.frames[: valid.size]):
+            valid[i] = {frame.get("ImageStatus", "OK"), frame.get("Status", "OK")} == {"OK"}
+        return valid
 
-    def _frames(self, images: IntArray) -> FileFrames:
+    def _frames(self, images: IntArray, layout: Layout) -> FileFrames:
         """Frames of the pixels' type; wider whole numbers as int16 where it holds them, else float32."""
-        header, layout = self.header, self.layout
-        dtype = header.pixels.dtype.newbyteorder("=")
-        stored: npt.DTypeLike | None = None
+        header = self.header
+        dtype, stored = header.pixels.dtype.newbyteorder("="), None
         if layout.is_complex:
-            stored = np.int16 if dtype == np.int16 else None
-            dtype = np.dtype(np.complex64)
+            dtype, stored = np.dtype(np.complex64), dtype if dtype == np.int16 else None
         elif layout.is_rf and dtype != np.int16:
             limits = np.iinfo(np.int16)
             fits = dtype.kind in "iu" and all(
@@ -247,59 +233,39 @@ class _Sequence:
 
     def _values(self) -> dict[str, Value]:
         """What a sweep of this kind needs, and where file or device set have it."""
-        values = {
-            name: Value(value, _OWN)
-            for name, value in self.own.items()
-            if name not in ("probe", "full_scale")
-        }
+        own = {name: Value(value, _OWN) for name, value in self.own.items() if name not in _NO_VALUES}
+        values, sizes, scan = {}, self._pixel_mm(), self.device.scan
         if self.stamps is not None and (rate := rate_of(self.stamps[np.isfinite(self.stamps)])):
             values["frame_rate_hz"] = Value(rate, "of its time stamps")
-        sizes = self._pixel_mm()
+        across, down = (replace(sizes, value=size) for size in sizes.value or (None, None))
         if not self.layout.is_rf:
-            if sizes.value is not None and "column_pitch_mm" not in values:
-                values["column_pitch_mm"] = replace(sizes, value=sizes.value[0])
-                values["row_spacing_mm"] = replace(sizes, value=sizes.value[1])
-            return values
-        if sizes.value is not None and "sampling_rate_hz" not in values:
-            own = values.get("speed_of_sound_m_s", Value(1540.0)).value
-            speed, step = self.settings.speed_of_sound_m_s or own, sizes.value[1]
-            source = f"of samples {step:.6g} mm apart, by {sizes.source}, at {speed:g} m/s"
-            values["sampling_rate_hz"] = Value(1e3 * speed / (2.0 * step), source, sizes.said_by)
-        if "vector_pitch_mm" not in values:
-            values["vector_pitch_mm"] = self._line_pitch(sizes)
-        return values
-
-    def _line_pitch(self, sizes: Value) -> Value:
-        scan = self.device.scan
-        if scan.is_curved and self.settings.vector_pitch_mm is None:
+            return values | {"column_pitch_mm": across, "row_spacing_mm": down} | own
+        if scan.is_curved and self.settings.vector_pitch_mm is None and "vector_pitch_mm" not in own:
             raise InvalidInputError(
                 f"{self.header.path}: expected lines of a linear transducer, got a {scan.geometry.lower()} "
-                "one, "
-                "whose lines spread, by the device set: give its scan-converted B-mode, or parallel lines "
-                "with "
-                "--vector-pitch-mm"
+                "one, whose lines spread, by the device set: give its scan-converted B-mode, or parallel "
+                "lines with --vector-pitch-mm"
             )
-        if sizes.value is not None:
-            return replace(sizes, value=sizes.value[0])
-        if scan.width_mm is None:
-            return Value()
-        vectors, _ = self.layout.shape(self.header.size)
-        return Value(scan.width_mm / vectors, "ScanConversion of the device set", _DEVICE)
+        if down.value is not None:
+            speed = self.settings.speed_of_sound_m_s or self.own.get("speed_of_sound_m_s", 1540.0)
+            source = f"of samples {down.value:.6g} mm apart, by {sizes.source}, at {speed:g} m/s"
+            rate = 1e3 * speed / (2.0 * down.value)
+            values["sampling_rate_hz"] = Value(rate, source, sizes.said_by)
+        elif scan.width_mm is not None:
+            vectors, _ = self.layout.shape(self.header.size)
+            across = Value(scan.width_mm / vectors, "ScanConversion of the device set", _DEVICE)
+        return values | {"vector_pitch_mm": across} | own
 
     def _pixel_mm(self) -> Value:
         """Lateral and axial distance of samples, mm: calibrated, spaced, or of the device set."""
-        spaced, calibrated = self._spaced_mm(), self._calibrated_mm()
-        if (
-            spaced.value is not None
-            and calibrated.value is not None
-            and not self.own
-            and self.settings.image_to_probe is None
-            and not np.allclose(spaced.value, calibrated.value, rtol=_SIZE_TOLERANCE, atol=0)
-        ):
-            given, got = (" x ".join(f"{size:g}" for size in one.value) for one in (spaced, calibrated))
+        spaced, calibrated, given = self._spaced_mm(), Value(), self.settings.image_to_probe
+        if (calibration := self.image_to_probe()) is not None:
+            calibrated = replace(calibration, value=pixel_axes(calibration.value, self._where(calibration)))
+        both = spaced.value is not None and calibrated.value is not None and not self.own and given is None
+        if both and not np.allclose(spaced.value, calibrated.value, rtol=_SIZE_TOLERANCE, atol=0):
             raise InvalidInputError(
-                f"{self.header.path}: expected an image calibration for pixels of {given} mm, as "
-                f"ElementSpacing says, got one for {got} mm"
+                f"{self.header.path}: expected an image calibration for pixels of {_shown(spaced.value)} mm, "
+                f"as ElementSpacing says, got one for {_shown(calibrated.value)} mm"
             )
         if self.layout.is_rf:  # whose sampling rate is known better than by a calibration
             return spaced
@@ -316,53 +282,47 @@ class _Sequence:
             )
         return Value(spacing[::-1] if self.layout.has_lines_in_rows else spacing, "ElementSpacing")
 
-    def _calibrated_mm(self) -> Value:
-        calibration = self.image_to_probe()
-        if calibration is None:
-            return Value()
-        matrix, where = calibration
-        name = where.rsplit(": ", 1)[-1]
-        said_by = name if where == name else "the file" if where.startswith(self.header.path) else _DEVICE
-        return Value(pixel_axes(matrix, where), name, said_by)
-
-    def image_to_probe(self) -> tuple[FloatArray, str] | None:
-        """Transform of this image's pixels to mm on the tracked tool, and where it is from."""
+    def image_to_probe(self) -> Value | None:
+        """Transform of this image's pixels to mm on the tracked tool."""
         path, names = self.header.path, self.device.names
         if self.settings.image_to_probe is not None:
-            return np.asarray(self.settings.image_to_probe, dtype=float), "image_to_probe"
+            given = np.asarray(self.settings.image_to_probe, dtype=float)
+            return Value(given, "image_to_probe", "image_to_probe")
         if self.poses is not None and self.poses.pixels is not None:
-            return self.poses.pixels, f"{path}: {self.poses.chain[0]}Transform"
+            return Value(self.poses.pixels, f"{self.poses.chain[0]}Transform")
         tool = names.probe if self.poses is None else self.poses.tool
         for name in (f"{names.image}To{tool}", "Calibration"):  # the second is of Ibis
             matrix = fixed_transform(path, self.header.fields, self.header.frames, name)
             if matrix is not None:
-                return matrix, f"{path}: {name}Transform"
+                return Value(matrix, f"{name}Transform")
         # The device set's is for the image that the machine shows, not for the lines it was made of.
         matrix = None if self.layout.is_rf else self.device.transform(names.image, tool)
-        return None if matrix is None else (matrix, f"{self.device.path}: {names.image}To{tool}")
+        return None if matrix is None else Value(matrix, f"{names.image}To{tool}", _DEVICE)
+
+    def _where(self, calibration: Value) -> str:
+        path = self.device.path if calibration.said_by == _DEVICE else self.header.path
+        return f"{path}: {calibration.source}"
 
     def _chain(self) -> list[str]:
         if self.poses is None:
             return []
-        calibration = (
-            [] if self.poses.pixels is not None else [f"{self.device.names.image}To{self.poses.tool}"]
-        )
-        return [*(calibration if self.image_to_probe() is not None else []), *self.poses.chain]
+        is_calibrated = self.poses.pixels is None and self.image_to_probe() is not None
+        return [
+            *([f"{self.device.names.image}To{self.poses.tool}"] if is_calibrated else []),
+            *self.poses.chain,
+        ]
 
     def tracker(self, first_sample_depth_mm: float) -> Tracker | None:
         """The tracker, with the image on it if that is known; None without a pose that has a time."""
-        poses = self.poses
-        if poses is None or self.times is None:
+        if self.poses is None or self.times is None or not (rows := self._posed(self.poses)).size:
             return None
-        rows = self._posed(poses)
-        if not rows.size:
-            return None
-        readings = TimedPoses(self.times[rows], poses.poses[rows])
+        readings = TimedPoses(self.times[rows], self.poses.poses[rows])
         calibration = self.image_to_probe()
         if calibration is None:
             return Tracker(readings)
-        mounting = sensor_from_image(calibration[0], first_sample_depth_mm, calibration[1])
-        return Tracker(readings, mounting, image_skew_rad=image_skew_rad(*calibration))
+        matrix, where = calibration.value, self._where(calibration)
+        mounting = sensor_from_image(matrix, first_sample_depth_mm, where)
+        return Tracker(readings, mounting, image_skew_rad=image_skew_rad(matrix, where))
 
     def _posed(self, poses: Poses) -> IntArray:
         assert self.times is not None
@@ -379,28 +339,26 @@ class _Sequence:
         mounting = None if matrix is None else sensor_from_image(matrix, 0.0, path).rotation
         return OrientationSensor(TimedRotations(self.times[rows], poses.poses[rows].rotation), mounting)
 
-    def _remarks(self, images: IntArray, times: FloatArray | None) -> list[str]:
+    def _remarks(self, images: IntArray) -> list[str]:
         """Tell what is left out, what contradicts, and which poses were not used."""
-        header, device, notes = self.header, self.device, []
-        counts = Counter({"not valid by their status": int(np.sum(~self._valid()))})
+        header, device, times, valid, notes = self.header, self.device, self.times, self._valid, []
+        count = header.frame_count
         if times is not None:
-            counts.update(_without_time(times, self._valid(), images))
-            notes += left_out("images", header.frame_count, counts, times[images])
+            counts = {"not valid by their status": int(np.sum(~valid))}
+            counts |= _without_time(times, valid, images)
+            notes += left_out("images", count, counts, times[images])
         if self.poses is not None and times is not None:
             rows = self._posed(self.poses)
-            reasons = Counter(self.poses.reasons)
-            reasons.update(_without_time(times, self.poses.valid, rows))
-            notes += left_out("poses", len(header.frames), reasons, times[rows])
+            counts = self.poses.reasons | _without_time(times, self.poses.valid, rows)
+            notes += left_out("poses", len(header.frames), counts, times[rows])
         if self.poses is None and header.transforms and self.settings.tracker_transform is None:
             notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
-        if len(header.frames) not in (0, header.frame_count):
-            notes.append(
-                f"the header has fields of {len(header.frames)} frames for {header.frame_count} images"
-            )
+        if len(header.frames) not in (0, count):
+            notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")
         if device.scan.is_curved:
-            notes.append(f"the device set calls the transducer {device.scan.geometry}: "
-                         + ("its lines spread and are taken for parallel" if self.layout.is_rf
-                            else "images are taken for scan-converted"))  # fmt: skip
+            lines = "its lines spread and are taken for parallel"
+            what = lines if self.layout.is_rf else "images are taken for scan-converted"
+            notes.append(f"the device set calls the transducer {device.scan.geometry}: {what}")
         if device.clip is not None and device.clip.is_part_of(header.size):
             notes.append(
                 f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
@@ -413,22 +371,26 @@ class _Sequence:
         if spaced is not None and given is not None:
             sizes = pixel_axes(np.asarray(given, dtype=float), "image_to_probe")
             if differs(sizes, spaced):
-                shown, own = (" x ".join(f"{size:g}" for size in pair) for pair in (sizes, spaced))
-                notes.append(f"pixels of {shown} mm, given by image_to_probe: the file says {own}")
+                notes.append(
+                    f"pixels of {_shown(sizes)} mm, given by image_to_probe: the file says {_shown(spaced)}"
+                )
         return notes
 
     def rows(self) -> list[Row]:
         """Facts of the header."""
         header, layout = self.header, self.layout
-        spacing = " x ".join(f"{s:g}" for s in header.spacing_mm or ()) or "unknown"
+        kinds = {"UltrasoundImageType": layout.kind, "UltrasoundImageOrientation": layout.orientation}
+        kind, orientation = (
+            used if name in header.fields else f"{used} (assumed)" for name, used in kinds.items()
+        )
         rows = [
             ("container", "NrrdImage" if header.is_nrrd else "MetaImage", ""),
-            ("size", " x ".join(str(n) for n in header.size), ""),
+            ("size", _shown(header.size), ""),
             ("images", str(header.frame_count), ""),
-            ("images not valid", str(np.count_nonzero(~self._valid())), ""),
-            ("spacing", spacing, "" if header.spacing_mm is None else "mm"),
-            ("image type", self._said("UltrasoundImageType", layout.kind), ""),
-            ("image orientation", self._said("UltrasoundImageOrientation", layout.orientation), ""),
+            ("images not valid", str(np.count_nonzero(~self._valid)), ""),
+            ("spacing", _shown(header.spacing_mm or ()) or "unknown", "mm" if header.spacing_mm else ""),
+            ("image type", kind, ""),
+            ("image orientation", orientation, ""),
             ("pixel type", header.pixels.dtype.name, ""),
             ("packing", header.pixels.packing, ""),
             ("transforms", ", ".join(header.transforms) or "none", ""),
@@ -436,17 +398,13 @@ class _Sequence:
         ]
         try:
             calibration = self.image_to_probe()
-            chain = " * ".join(self.poses.chain) if self.poses is not None else "none"
         except InvalidInputError as error:
             return [*rows, ("poses", f"none: {error}", "")]
-        rows.append(("tracker of", chain, ""))
-        rows.append(("image calibration", "none" if calibration is None else calibration[1], ""))
+        rows.append(("tracker of", " * ".join(self.poses.chain) if self.poses is not None else "none", ""))
+        rows.append(("image calibration", "none" if calibration is None else self._where(calibration), ""))
         if self.settings.plus_config is not None:
             rows.append(("device set", self.settings.plus_config, ""))
         return rows
-
-    def _said(self, name: str, used: str) -> str:
-        return used if name in self.header.fields else f"{used} (assumed)"
 
     def _sign_of_q(self, frames: FileFrames, values: dict[str, Value]) -> int:
         """Sign of Q as it is stored: 1, -1, or 0 where the phase does not tell, as of I/Q shifted down.
@@ -454,22 +412,28 @@ class _Sequence:
         In lines that are stored from the far end on, depth runs backwards and so does the phase, unless the
         writer thought of it.
         """
-        names = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
-        given = [getattr(self.settings, name) for name in names]
-        shift, centre, rate = (
-            values.get(name, Value()).value if own is None else own
-            for name, own in zip(names, given, strict=True)
-        )
-        return sign_of_q(frames, centre, rate) if shift == 0 and centre and rate else 0
+
+        def value(name: str) -> Any:
+            given = getattr(self.settings, name)
+            return values.get(name, Value()).value if given is None else given
+
+        centre, rate = value("centre_frequency_hz"), value("sampling_rate_hz")
+        is_analytic = value("demodulation_frequency_hz") == 0 and centre and rate
+        return sign_of_q(frames, centre, rate) if is_analytic else 0
 
 
-def _without_time(times: FloatArray, valid: BoolArray, kept: IntArray) -> dict[str, int]:
+def _shown(lengths: Sequence[float]) -> str:
+    return " x ".join(f"{length:g}" for length in lengths)
+
+
+def _without_time(times: FloatArray, valid: BoolArray, kept: IntArray) -> Counter[str]:
     """How many valid frames have no time, one that is repeated, or one out of order."""
     dropped = np.setdiff1d(np.flatnonzero(valid), kept)
     missing = int(np.sum(~np.isfinite(times[dropped])))
     repeated = int(np.isin(times[dropped], times[kept]).sum())
     late = dropped.size - missing - repeated
-    return {"without a time": missing, "with a repeated time": repeated, "with a time out of order": late}
+    reasons = {"without a time": missing, "with a repeated time": repeated, "with a time out of order": late}
+    return Counter(reasons)
 
 
 def _number(text: str | None) -> float:

@@ -54,9 +54,6 @@ _PAIR_ROWS: dict[str, tuple[int, ...]] = {
 }
 """Shape of a pair's row, -1 for the patches, in every data set of /pairs but ``patch_centre_mm``."""
 
-_SHARED = ("scale_sigma", "curves_sigma", "turn_sigma_per_mm")
-"""Attributes of the covariance of `image`, by the fields of `SharedErrors`."""
-
 _EARLIER = {"consistent-subset": "image+subset"}
 """Names of modes in older files."""
 
@@ -135,9 +132,8 @@ class ReconstructionWriter(HDF5Writer):
         for used in provenance.calibrations:
             self.put(file, f"calibrations/{used.sensor}", SourceFile(used.path, used.sha256))
         if provenance.imported is not None:
-            group = file.create_group("import")
-            self.put(group, "name", provenance.imported.name)
-            self.put_text(group, "settings_json", provenance.imported.settings_json)
+            self.put(file, "import", {"name": provenance.imported.name})
+            self.put_text(file["import"], "settings_json", provenance.imported.settings_json)
         self.put_text(file, "config_toml", config_toml)
         self._is_finished = True
 
@@ -199,9 +195,9 @@ def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
 
 def _read_provenance(file: h5py.File) -> Provenance:
     """Where a reconstruction came from; files of versions before 0.1 lack some groups."""
-    held = find_group(file, "calibrations") or {}
-    used = [read_record(require_group(held, sensor), CalibrationFile, sensor=sensor) for sensor in held]
-    imported, group = None, find_group(file, "import")
+    files, group = find_group(file, "calibrations") or {}, find_group(file, "import")
+    used = [read_record(require_group(files, sensor), CalibrationFile, sensor=sensor) for sensor in files]
+    imported = None
     if group is not None:
         imported = ImportRecord(read_text(group, "name"), read_texts(group, "settings_json", ()))
     return read_record(file, Provenance, calibrations=tuple(used), imported=imported)
@@ -220,24 +216,20 @@ def _read_trust(file: h5py.File, frames: int) -> Trust | None:
     if group is None or not has_member(file, "frame_flags"):
         return None
     covariances = {
-        mode: read_checked(group, mode, (frames, 6, 6))
-        for mode in MODES
-        if mode == "image" or has_member(group, mode)
+        mode: read_checked(group, mode, (frames, 6, 6)) for mode in MODES if has_member(group, mode)
     }
     for mode, values in covariances.items():
         require_finite(values, locate(group, mode))
     image, shared = require_dataset(group, "image"), None
-    if _SHARED[2] in image.attrs:
-        turn = read_vector_attribute(image, _SHARED[2], 2)
-        scale, curves = (read_attribute(image, name) for name in _SHARED[:2])
-        shared = SharedErrors(scale, curves, turn)
+    if "turn_sigma_per_mm" in image.attrs:
+        turn = read_vector_attribute(image, "turn_sigma_per_mm", 2)
+        shared = read_record(image, SharedErrors, turn_sigma_per_mm=turn)
+    covariance = covariances.pop("image")
     modes = {
         mode: ModeErrors(values, read_attribute(group[mode], "length_sigma"))
         for mode, values in covariances.items()
-        if mode != "image"
     }
-    flags = read_checked(file, "frame_flags", (frames,), np.int64)
-    return Trust(covariances["image"], flags, shared, modes)
+    return Trust(covariance, read_checked(file, "frame_flags", (frames,), np.int64), shared, modes)
 
 
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:

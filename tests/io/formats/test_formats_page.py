@@ -14,7 +14,7 @@ from speckle3d.core.sweep import ImageGrid, RFSettings
 from speckle3d.io import readers
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import companion_files, load_sweep
+from speckle3d.io.load import load_sweep, recording_files
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_a_reader_of_ones_own(tmp_path, installed, page):
     assert sweep.signal == RFSettings(40e6, 1540.0, 6e6, (4e6, 8e6))
     assert sweep.grid == ImageGrid(6, 40, 0.3, sweep.signal.sample_spacing_mm)
     np.testing.assert_array_equal(sweep.frame_time_s, said["time_s"])
-    assert companion_files(tmp_path / "arm.json") == [tmp_path / "arm.bin"]
+    assert recording_files(tmp_path / "arm.json")[1:] == [tmp_path / "arm.bin"]
     (tmp_path / "import.toml").write_text("bandwidth_hz = [4e6, 8e6]\n")
     rows = {name: value for name, value, _ in describe(tmp_path / "arm.json")}
     assert (rows["format"], rows["frames"]) == ("our rig", "4")
