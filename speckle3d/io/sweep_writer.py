@@ -263,8 +263,8 @@ def write_sweep(
             writer.put(writer.file, "simulation", {name: plain})
         if hasattr(frames, "write_more"):
             frames.write_more(writer.file)
-        if isinstance(getattr(frames, "open_file", None), SweepSlices):
-            writer.copy_unknown(frames.open_file.path)
+        if isinstance(source := getattr(frames, "open_file", None), SweepSlices):
+            writer.copy_unknown(source.path)
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:

@@ -9,7 +9,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.challenge import read_challenge_calibration, read_landmarks
 from speckle3d.io.describe import describe
-from speckle3d.io.load import companion_files, load_landmarks, load_sweep, open_recording
+from speckle3d.io.load import load_landmarks, load_sweep, open_recording, recording_files
 
 
 @pytest.fixture(params=["one file", "two files"])
@@ -49,7 +49,7 @@ def test_a_scan_is_described_and_its_companions_are_known(tmp_path):
     rows = {name: value for name, value, _ in describe(path)}
     assert rows["format"] == "TUS-REC scan"
     assert (rows["frames"], rows["landmarks"], rows["tracker covers"]) == ("12", "20", "12")
-    assert {each.name for each in companion_files(path)} == {
+    assert {each.name for each in recording_files(path)[1:]} == {
         f"{examples.SCAN}.h5",
         "calib_matrix.csv",
         "landmark_050.h5",
@@ -61,7 +61,7 @@ def test_a_test_scan_has_no_tracker_and_no_landmarks(tmp_path):
     (tmp_path / "transfs" / examples.SUBJECT / path.name).unlink()
     assert load_sweep(path).tracker is None
     assert read_landmarks(path) is None
-    assert [each.name for each in companion_files(path)] == ["calib_matrix.csv"]
+    assert [each.name for each in recording_files(path)[1:]] == ["calib_matrix.csv"]
 
 
 def test_a_scan_without_calibration_says_what_it_lacks(tmp_path):

@@ -61,15 +61,15 @@ def read_segments(fields: Mapping[str, str], where: str) -> tuple[Segment, ...]:
     for name, value in fields.items():
         if match := _FIELD.fullmatch(name):
             rows.setdefault(int(match[1]), {})[match[2]] = unescaped(value)
-    segments = []
+    segments: list[Segment] = []
     for i, row in sorted(rows.items()):
         place = f"{where}: Segment{i}"
         if row.get("Layer", "0") != "0":
             raise InvalidInputError(f"{place}_Layer: expected segments in layer 0, got {row['Layer']!r}")
-        (value,) = numbers(row.get("LabelValue", "1"), 1, f"{place}_LabelValue")
+        (label,) = numbers(row.get("LabelValue", "1"), 1, f"{place}_LabelValue")
         red, green, blue = numbers(row.get("Color", _UNNAMED_COLOUR), 3, f"{place}_Color")
-        if value != int(value):
-            raise InvalidInputError(f"{place}_LabelValue: expected a whole number, got {value}")
+        if label != int(label):
+            raise InvalidInputError(f"{place}_LabelValue: expected a whole number, got {label}")
         name = row.get("Name") or row.get("ID") or f"Segment {i}"
-        segments.append(Segment(int(value), name, (red, green, blue)))
+        segments.append(Segment(int(label), name, (red, green, blue)))
     return tuple(segments)
