@@ -7,6 +7,7 @@ import hashlib
 import os
 import re
 import struct
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -38,6 +39,7 @@ _READ_FAILURES = (
     MemoryError,
     ArithmeticError,
     EOFError,
+    zlib.error,
 )
 """What h5py, NumPy and zlib raise when the bytes of a file do not make sense."""
 
