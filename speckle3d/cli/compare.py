@@ -81,20 +81,17 @@ def compare(
             )
     write_report(out)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
-    _tell(study, copies=as_json or paper)
+    _tell(study)
 
 
-def _tell(study: Study, copies: bool) -> None:
+def _tell(study: Study) -> None:
     """Say on stderr what became of the sweeps; fail if all did."""
-    from speckle3d.study.results import copy_lines
-
     failed = [each for each in study.outcomes if each.status == "failed"]
     skipped = sum(each.skipped for each in study.outcomes)
     if skipped:
         note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
-    lines = copy_lines(study.copies) if copies else []
-    for line in lines + [f"{each.name}: failed: {each.reason}" for each in failed]:
-        note(line)
+    for each in failed:
+        note(f"{each.name}: failed: {each.reason}")
     out = study.directory
     note(f"results in {out}; the report is {out / 'report.html'}")
     if len(failed) == len(study.outcomes):

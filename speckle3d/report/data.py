@@ -63,15 +63,9 @@ class StudyData(BaseModel, frozen=True):
         return [entry for entry in self.sweeps if entry["status"] != "done"]
 
     @property
-    def copies(self) -> dict[str, str]:
-        """Sweeps whose bytes are those of an earlier one, and that one's name."""
-        return {entry["name"]: entry["copy_of"] for entry in self.done if entry.get("copy_of")}
-
-    @property
     def scored(self) -> list[dict[str, Any]]:
-        """Rows with an error of length, of all sweeps but copies."""
-        known = [row for row in self.rows if row.get("length_error_percent") is not None]
-        return [row for row in known if row["sweep"] not in self.copies]
+        """Rows with an error of length."""
+        return [row for row in self.rows if row.get("length_error_percent") is not None]
 
 
 @dataclass(frozen=True)

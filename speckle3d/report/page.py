@@ -118,7 +118,7 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
     keys = ("name", "path", "sha256", "key", "seconds")
     drifts = {key for row in study.drift for key, value in row.items() if value is not None}
     return environment.get_template("page.html").render(
-        shown=counted(len(study.done) - len(study.copies) or len(study.broken), "sweep"),
+        shown=counted(len(study.done) or len(study.broken), "sweep"),
         lead=tables.summary_lines(study),
         doubts=tables.records_table([_said(each) for each in study.doubts], (), anchors),
         broken=tables.records_table(study.broken, ("name", "status", "reason")),

@@ -19,7 +19,6 @@ from speckle3d.study.overall import (
     with_interval,
     words_of,
 )
-from speckle3d.study.results import copy_lines
 
 Table = Sequence[Sequence[str]]
 """Cells, the first line the heads; markup of our own is `Markup`."""
@@ -99,6 +98,5 @@ def summary_lines(study: StudyData) -> list[str]:
     references = {row["sweep"]: row["reference"] for row in study.scored}
     lines.append(reference_words({row["mode"] for row in study.scored}, references))
     if broken:
-        lines.append(f"{broken} of {done + broken} sweeps could not be reconstructed; the reasons are below")
-    lines += copy_lines(study.copies)
+        lines.append(f"{broken} of {done + broken} sweeps have no result; the reasons are below")
     return [f"{line[0].upper()}{line[1:]}." for line in lines if line]

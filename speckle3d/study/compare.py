@@ -140,16 +140,20 @@ def compare_sweeps(
     if curves is not None:
         read_curves(curves)
     settings = (config or Config()).to_toml()
-    plan = [
-        plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
-        for name, path in named(paths)
-    ]
-    outcomes = {each.name: each for each in plan if isinstance(each, SweepOutcome)}
-    jobs = [each for each in plan if isinstance(each, SweepJob)]
+    jobs: list[SweepJob] = []
+    outcomes: dict[str, SweepOutcome] = {}
+    first: dict[str, str] = {}
+    for name, path in named(paths):
+        plan = plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
+        if isinstance(plan, SweepJob) and (same := first.setdefault(plan.planned.sha256, name)) != name:
+            plan = plan.failed(f"the same recording as {same}, which counts once")
+        if isinstance(plan, SweepJob):
+            jobs.append(plan)
+        outcomes[name] = plan.planned if isinstance(plan, SweepJob) else plan
     if not jobs:
-        first = next(iter(outcomes.values()))
+        one = next(iter(outcomes.values()))
         raise InsufficientDataError(
-            f"expected a sweep that can be compared, got none of {len(plan)}; {first.name}: {first.reason}"
+            f"expected a sweep that can be compared, got none of {len(outcomes)}; {one.name}: {one.reason}"
         )
     # The longest first, so that no worker is left with it while the others have nothing to do.
     jobs.sort(key=lambda job: -job.planned.frames)
@@ -166,8 +170,7 @@ def compare_sweeps(
         for folder in (directory / "sweeps", directory):
             with suppress(OSError):  # it holds finished sweeps
                 folder.rmdir()
-    order = [each.name if isinstance(each, SweepOutcome) else each.planned.name for each in plan]
-    return write_study(directory, [outcomes[name] for name in order], settings)
+    return write_study(directory, list(outcomes.values()), settings)
 
 
 def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:

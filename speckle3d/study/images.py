@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.config import Config, stored_config
-from speckle3d.core.arrays import Float16Array, Float32Array, FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
+from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
@@ -214,7 +216,7 @@ class Strip:
 
     Attributes
     ----------
-    grid : ImageGrid
+    stack : ImageStack
         Of the strip's images.
     left_mm : float
         Where its first vector lies in the whole image.
@@ -223,29 +225,10 @@ class Strip:
     def __init__(self, sweep: Sweep, config: Config) -> None:
         grid = IntensityExtractor.for_sweep(sweep, config.intensity).grid
         width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
-        self._first = (grid.vectors - width) // 2
-        self._pool = max(1, round(PIXEL_MM / grid.sample_spacing_mm))
-        self.grid = ImageGrid(
-            width,
-            grid.samples // self._pool,
-            grid.vector_pitch_mm,
-            grid.sample_spacing_mm * self._pool,
-            grid.first_sample_depth_mm + (self._pool - 1) / 2 * grid.sample_spacing_mm,
-        )
-        self.left_mm = self._first * grid.vector_pitch_mm
-        self._images: dict[int, Float16Array] = {}
+        first = (grid.vectors - width) // 2
+        self._vectors, self.left_mm = slice(first, first + width), first * grid.vector_pitch_mm
+        self.stack = ImageStack(replace(grid, vectors=width), PIXEL_MM)
 
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep the strip of a frame."""
-        part = intensity[self._first : self._first + self.grid.vectors, : self.grid.samples * self._pool]
-        # NumPy's mean takes more than twice as long over so short an axis.
-        pooled = np.einsum("vsp->vs", part.reshape(self.grid.vectors, self.grid.samples, -1)) / self._pool
-        self._images[index] = _decibel(pooled).astype(np.float16)
-
-    def __getitem__(self, index: int) -> Float32Array:
-        return self._images[index].astype(np.float32)
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape (frame, vector, sample)."""
-        return len(self._images), self.grid.vectors, self.grid.samples
+        self.stack.keep(index, intensity[self._vectors])

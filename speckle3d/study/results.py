@@ -149,20 +149,13 @@ class SweepOutcome:
 
 @dataclass(frozen=True)
 class Study:
-    """What a study found, and where it is.
-
-    Attributes
-    ----------
-    copies : mapping of str to str
-        Sweeps whose bytes are those of an earlier one, and that one; statistics over sweeps leave them out.
-    """
+    """What a study found, and where it is."""
 
     directory: Path
     outcomes: Sequence[SweepOutcome]
     summaries: Sequence[Summary]
     drift: Sequence[Mapping[str, Any]]
     table: str
-    copies: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_summary(directory: Path, summary: Summary) -> list[Path]:
@@ -227,14 +220,12 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
     summaries = [read_summary(directory / each.folder, each.name) for each in done]
     rows = [record for each in summaries for record in each.records()]
     drift = [{"sweep": each.sweep, **row} for each in summaries for row in each.drift]
-    copies = copies_among(outcomes)
-    single = [[row for row in some if row["sweep"] not in copies] for some in (rows, drift)]
-    intervals, paired = over_sweeps(*single)
-    references = {each.sweep: each.reference for each in summaries if each.sweep not in copies}
-    remarks = [f"{each.name}  failed: {each.reason}" for each in failed] + copy_lines(copies)
+    intervals, paired = over_sweeps(rows, drift)
+    references = {each.sweep: each.reference for each in summaries}
+    remarks = [f"{each.name}  failed: {each.reason}" for each in failed]
     overall = overall_text(intervals, paired, references)
     table = summary_text(summaries, remarks) + (f"\n{overall}" if overall else "")
-    sweeps = [asdict(each) | {"copy_of": copies.get(each.name, "")} for each in outcomes]
+    sweeps = [asdict(each) for each in outcomes]
     for each in sweeps:
         del each["skipped"]
     contents = {
@@ -250,12 +241,12 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
         "paired": paired,
     }
     paths = {each.name: each.path for each in outcomes}
-    lines = [row | {"path": paths[row["sweep"]], "copy_of": copies.get(row["sweep"], "")} for row in rows]
+    lines = [row | {"path": paths[row["sweep"]]} for row in rows]
     lines += [{"sweep": each.name, "path": each.path, "reason": each.reason} for each in failed]
     texts = {"study.json": json_text(contents), "table.txt": table}
     with FILES.replaced(directory) as part:
-        write_texts(part, texts | {"table.csv": csv_text(lines, "path", "copy_of", "reason")})
-    return Study(directory, outcomes, summaries, drift, table, copies)
+        write_texts(part, texts | {"table.csv": csv_text(lines, "path", "reason")})
+    return Study(directory, outcomes, summaries, drift, table)
 
 
 def is_study(directory: Path) -> bool:
@@ -297,22 +288,6 @@ def json_text(value: Any) -> str:
         raise InvalidInputError(f"summary: expected what JSON can hold: {error}") from error
     plain = (c if c == "\n" or printable(c) == c else json.dumps(c)[1:-1] for c in text)
     return f"{text if text.isascii() else ''.join(plain)}\n"
-
-
-def copies_among(outcomes: Sequence[SweepOutcome]) -> dict[str, str]:
-    """Sweeps whose bytes are those of an earlier one, and that one's name."""
-    first: dict[str, str] = {}
-    done = [each for each in outcomes if each.status == "done"]
-    return {
-        each.name: original
-        for each in done
-        if (original := first.setdefault(each.sha256, each.name)) != each.name
-    }
-
-
-def copy_lines(copies: Mapping[str, str]) -> list[str]:
-    """Say which sweeps were left out of what is counted over sweeps."""
-    return [f"{name} is a copy of {first}: counted once" for name, first in copies.items()]
 
 
 def read_summary(folder: Path, name: str) -> Summary:

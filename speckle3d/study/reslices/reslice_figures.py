@@ -82,7 +82,8 @@ def draw_strip(
     shown, last = dict(poses), "image"
     if reference is not None and reference.covered.all():
         shown[reference.name], last = reference.world_from_image, reference.name
-    left, grid = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0]), strip.grid
+    left, grid = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0]), strip.stack.grid
+    kept = strip.stack.images(len(poses["image"]))
     placed = {mode: each * left for mode, each in shown.items()}
     planes = planes_from_first_frame(placed, lateral_line(grid, grid.width_mm / 2), PIXEL_MM, _LARGEST_MM)
     levels = []
@@ -90,7 +91,7 @@ def draw_strip(
         # A reach of two of the longest steps, so that no gaps show between frames.
         steps = np.diff((each[0].inv() * each).translation[:, 2])
         reach_mm = max(0.3, 2.0 * float(np.percentile(np.abs(steps), 99)))
-        levels.append(reslice_frames(strip, grid, each, planes[mode], reach_mm))
+        levels.append(reslice_frames(kept, grid, each, planes[mode], reach_mm))
     seen = np.concatenate([each[np.isfinite(each)] for each in levels])
     maximum = np.float32(np.percentile(seen, _BRIGHTEST_PERCENTILE)) if seen.size else np.float32(0.0)
     images = {mode: each - maximum for mode, each in zip(placed, levels, strict=True)}
