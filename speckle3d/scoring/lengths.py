@@ -87,6 +87,8 @@ class ModeError:
     reference_sigma_mm : float
         Standard deviation of the reference's length by its own jitter; 0 if it is exact. What a tracker's
         calibration adds is not in it.
+    sigma_mm : float
+        Standard deviation of `estimate_mm`: of mode `tracker` by its jitter, of others as they claim it.
     """
 
     part: str
@@ -100,6 +102,7 @@ class ModeError:
     yaw_error_deg: float
     roll_error_deg: float
     reference_sigma_mm: float = 0.0
+    sigma_mm: float = np.nan
 
     @classmethod
     def of_length(cls, part: str, mode: str, frames: int, length_mm: float) -> ModeError:
@@ -109,8 +112,11 @@ class ModeError:
 
     def of_reference(self, mode: str) -> ModeError:
         """Row of the reference itself under a mode's name: its length, errors NaN."""
-        row = ModeError.of_length(self.part, mode, self.frames, self.reference_mm)
-        return replace(row, reference_mm=self.reference_mm, reference_sigma_mm=self.reference_sigma_mm)
+        row, sigma_mm = (
+            ModeError.of_length(self.part, mode, self.frames, self.reference_mm),
+            self.reference_sigma_mm,
+        )
+        return replace(row, reference_mm=self.reference_mm, reference_sigma_mm=sigma_mm, sigma_mm=sigma_mm)
 
 
 def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> Accumulated:
@@ -224,11 +230,13 @@ def compare_modes(
     estimates = {mode: accumulated(each[used], centre_mm) for mode, each in poses.items()}
     rows = []
     for part in monotone_parts(true.length_mm):
-        true_changes = _changes(true, part, end_frames)
-        sigma_mm = jitter * _end_factor(part.last - part.first + 1, end_frames)
+        true_changes, size = _changes(true, part, end_frames), part.last - part.first + 1
         for mode, estimate in estimates.items():
-            changes = _changes(estimate, part, END_FRAMES if mode == TRACKER else end_frames)
-            rows.append(_mode_error(part, mode, changes, true_changes, sigma_mm))
+            ends = END_FRAMES if mode == TRACKER else end_frames
+            row = _mode_error(part, mode, _changes(estimate, part, ends), true_changes)
+            own_mm = jitter_mm(estimate.length_mm) * _end_factor(size, ends) if mode == TRACKER else np.nan
+            sigma_mm = jitter * _end_factor(size, end_frames)
+            rows.append(replace(row, reference_sigma_mm=sigma_mm, sigma_mm=own_mm))
     return rows
 
 
@@ -291,13 +299,13 @@ def _changes(motion: Accumulated, part: Part, end_frames: int) -> list[float]:
     return [read_end(each, end_frames) - read_end(each[::-1], end_frames) for each in inside]
 
 
-def _mode_error(part: Part, mode: str, changes: list[float], true: list[float], sigma_mm: float) -> ModeError:
+def _mode_error(part: Part, mode: str, changes: list[float], true: list[float]) -> ModeError:
     reference_mm, sign = abs(true[0]), -1.0 if true[0] < 0 else 1.0
     error_mm = sign * (changes[0] - true[0])
     percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
     tilt, yaw, roll = np.rad2deg(np.subtract(changes[1:], true[1:])).tolist()
     lengths = reference_mm, reference_mm + error_mm, error_mm, percent
-    return ModeError(part.name, mode, part.last - part.first + 1, *lengths, tilt, yaw, roll, sigma_mm)
+    return ModeError(part.name, mode, part.last - part.first + 1, *lengths, tilt, yaw, roll)
 
 
 def _turning_frames(length: FloatArray) -> list[int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import Float32Array
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
@@ -35,7 +35,7 @@ from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Tracked, track
 from speckle3d.scoring.displacements import score_row
-from speckle3d.scoring.lengths import TRACKER, compare_modes
+from speckle3d.scoring.lengths import TRACKER
 from speckle3d.scoring.references import Reference, error_rows, sweep_curves, tracker_alone
 from speckle3d.study.crossed import Companion
 from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
@@ -178,7 +178,10 @@ def run_job(
         lengths = {mode: float(np.abs(curve[0, -1])) for mode, curve in moved.modes.items()}
         claimed = {m: (lengths[m], lengths[m] * sigma) for m, sigma in claims.items() if m in lengths}
         doubts = (*tracked.doubts, *differing_lengths(claimed))
-        rows = error_rows(every, compared, centre)
+        rows = [
+            replace(row, sigma_mm=claims[row.mode] * abs(row.estimate_mm)) if row.mode in claims else row
+            for row in error_rows(every, compared, centre)
+        ]
         details = details_of(tracked, corrections, provenance)
         summary = Summary(
             sweep.name,
@@ -190,7 +193,7 @@ def run_job(
             doubts,
             doubted_modes(sweep, doubts, every),
             left_out,
-            claims | _own_claim(alone, centre),
+            claims,
             _drift(every, compared, sweep, source),
         )
         save_figure(figure_drift(moved, _title(summary)), part / PICTURES[0])
@@ -258,15 +261,6 @@ def _title(summary: Summary) -> str:
     """Name of the sweep and the modes in doubt, for figures."""
     doubted = [f"{mode} in doubt: {why}" for mode, why in summary.doubted.items()]
     return "; ".join([summary.sweep, *doubted, *(f"{mode} left out" for mode in summary.left_out)])
-
-
-def _own_claim(alone: RigidTransform | None, centre_mm: FloatArray) -> dict[str, float]:
-    """Relative standard deviation of the tracker's own length, by its jitter alone, in the longest part."""
-    if alone is None:
-        return {}
-    row = max(compare_modes({TRACKER: alone}, alone, centre_mm), key=lambda row: row.reference_mm)
-    share = row.reference_sigma_mm / max(row.reference_mm, 1e-9)
-    return {TRACKER: share} if np.isfinite(share) else {}
 
 
 def _drift(

@@ -24,7 +24,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.scoring.lengths import ModeError
+from speckle3d.scoring.lengths import TRACKER, ModeError
 from speckle3d.study.overall import FITTED_TO_TRACKER, number, over_sweeps, overall_text
 
 FORMAT = "speckle3d.study"
@@ -63,8 +63,7 @@ class Summary:
     left_out : mapping of str to str
         Modes that were asked for and refused, and why.
     claims : mapping of str to float
-        Relative standard deviation of the length that a mode claims, where it claims one; of `tracker` what
-        its jitter alone leaves.
+        Relative standard deviation of the length that a mode claims, where it claims one.
     details : dict
         Anything else worth keeping, by name: dataclasses, numbers, strings, arrays.
     """
@@ -108,27 +107,19 @@ class Summary:
         if self.reference != "truth":
             return []
         errors = {(row.part, row.mode): row.length_error_percent for row in self.rows}
-        jitter = 196 * self.claims.get("tracker", 0.0)
+        jitter = {row.part: 196 * row.sigma_mm / row.estimate_mm for row in self.rows if row.mode == TRACKER}
         return [
             f"part {part}: {mode} is farther from the truth ({error:+.1f} %) than image "
-            f"({errors[part, 'image']:+.1f} %); the tracker's jitter is +- {jitter:.1f} % of its length "
-            "(95 %)"
+            f"({errors[part, 'image']:+.1f} %); the tracker's jitter is +- {jitter[part]:.1f} % of its "
+            "length (95 %)"
             for (part, mode), error in errors.items()
-            if mode in FITTED_TO_TRACKER and jitter and abs(error) > abs(errors[part, "image"])
+            if mode in FITTED_TO_TRACKER and part in jitter and abs(error) > abs(errors[part, "image"])
         ]
 
     def records(self) -> list[dict[str, Any]]:
-        """Rows with what is known beside their errors: ``sweep``, ``reference``, ``sigma_mm``, ``remark``."""
-        return [
-            {
-                "sweep": self.sweep,
-                "reference": self.reference,
-                **asdict(row),
-                "sigma_mm": self.claims.get(row.mode, math.nan) * abs(row.estimate_mm),
-                "remark": self.remark(row),
-            }
-            for row in self.rows
-        ]
+        """Rows with what is known beside their errors: ``sweep``, ``reference`` and ``remark``."""
+        known = {"sweep": self.sweep, "reference": self.reference}
+        return [known | asdict(row) | {"remark": self.remark(row)} for row in self.rows]
 
 
 @dataclass(frozen=True)
@@ -197,7 +188,7 @@ def table_text(records: Sequence[Mapping[str, Any]]) -> str:
 
 def csv_text(records: Sequence[Mapping[str, Any]], *more: str) -> str:
     """`Summary.records` with full precision, and `more` columns behind."""
-    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "sigma_mm", "remark", *more]
+    columns = ["sweep", "reference", *(f.name for f in fields(ModeError)), "remark", *more]
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()

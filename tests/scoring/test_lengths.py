@@ -83,6 +83,9 @@ def test_the_references_length_is_its_own_whatever_is_compared_with_it():
     alone = error_rows({"tracker": tracker}, None, CENTRE_MM)
     assert [row.mode for row in every] == ["image", "tracker"]
     assert {row.estimate_mm for row in (every[1], *alone)} == {own} == {rows[0].reference_mm}
+    # And so is its error, which is of the jitter at its ends, whatever the length between them.
+    (beside,) = compare_modes({"tracker": tracker}, truth, CENTRE_MM, end_frames=1)
+    assert every[1].sigma_mm == beside.sigma_mm == rows[0].reference_sigma_mm > 0
     # Its curve begins where the line through its first readings does.
     drawn = sweep_curves({"tracker": tracker}, CENTRE_MM).modes["tracker"][0]
     assert abs(read_end(drawn)) == pytest.approx(own)
