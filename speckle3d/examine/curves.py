@@ -87,7 +87,7 @@ def doubt_curves(
 
     Size, depths and sums say so independently of each other: two of them at once refute the curves.
     """
-    gain = np.ones(patches.row_depth_mm.size) if rows is None else rows.gain
+    gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain, nan=1.0)
     kinds = doubt_size(seen, curves, patches, gain), doubt_bend(rows), doubt_sums(ratios)
     found = tuple(doubt for kind in kinds for doubt in kind)
     if sum(map(bool, kinds)) > 1:
@@ -141,7 +141,7 @@ def doubt_bend(rows: RowScales | None) -> tuple[Doubt, ...]:
     size = 0.0 if rows is None else bend(rows)
     if rows is None or size < BENT:
         return ()
-    ratio = np.exp(np.ptp(rows.logarithm))
+    ratio = np.exp(np.nanmax(rows.logarithm) - np.nanmin(rows.logarithm))
     return (
         Doubt(
             "curves",

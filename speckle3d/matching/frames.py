@@ -74,7 +74,7 @@ def match_sweep(
     def make(number: int) -> tuple[int, MadeReady]:
         made = maker.make(read_frame(sweep.frames, number))
         if number in chosen:
-            texture.keep(number, made.echo)
+            texture.keep(number, made.echo, made.features.usable)
         return number, made
 
     def pairs() -> Iterator[tuple[int, int, MatchedPair]]:
@@ -110,7 +110,7 @@ class FrameMaker:
         """Make one frame ready; `frame` as read, shape (vector, sample)."""
         echo = self._matcher.echo(frame)
         features = self._inspector.inspect(frame, echo.intensity)
-        return MadeReady(echo, self._matcher.prepare(echo), features)
+        return MadeReady(echo, self._matcher.prepare(echo, features.usable), features)
 
 
 class FrameByFrame:

@@ -7,14 +7,14 @@ maximum over lags biases the correlation upward and distances short.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import fft
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
@@ -89,6 +89,14 @@ class MatchedPair:
     correlation: FloatArray
     median: float
     motion: InPlaneMotion
+
+    def among(self, usable: BoolArray) -> MatchedPair:
+        """Keep the correlations of some patches."""
+        if usable.all():
+            return self
+        correlation = np.where(usable, self.correlation, np.nan)
+        known = correlation[np.isfinite(correlation)]
+        return replace(self, correlation=correlation, median=float(np.median(known)) if known.size else 0.0)
 
 
 class CoarseMatcher:

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
 from speckle3d.core.curves import CurveKey
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.inplane import (
@@ -51,6 +52,9 @@ class Echo:
 @dataclass(frozen=True)
 class ReadyFrame:
     """What is kept of a frame while pairs with it may still be measured."""
+
+    usable: BoolArray
+    """Patches that may be matched, shape (p,)."""
 
     image: Float32Array
     """Equalised intensity, shape (vector, sample)."""
@@ -114,10 +118,17 @@ class FrameMatcher:
         analytic = self.extractor.analytic(frame)
         return Echo(intensity_of(analytic), analytic)
 
-    def prepare(self, echo: Echo) -> ReadyFrame:
-        """Equalise an echo and transform it for the coarse search."""
+    def prepare(self, echo: Echo, usable: BoolArray | None = None) -> ReadyFrame:
+        """Equalise an echo and transform it for the coarse search.
+
+        Parameters
+        ----------
+        usable : ndarray of bool, shape (p,), optional
+            Patches that may be matched; by default all.
+        """
         image, parts = self.equalised(echo)
-        return ReadyFrame(image, self._coarse.spectrum(image), parts)
+        every = np.ones(len(self.patches), dtype=bool) if usable is None else usable
+        return ReadyFrame(every, image, self._coarse.spectrum(image), parts)
 
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array | None]:
         """Intensity and, where there is phase, echo over their local mean; see `ReadyFrame`."""
@@ -139,7 +150,7 @@ class FrameMatcher:
     ) -> list[MatchedPair]:
         """In-plane motion and correlation of a frame's pairs with some others, from a start for each."""
         theirs = [frame.echo for frame in fixed if frame.echo is not None]
-        return match_with_each(
+        matches = match_with_each(
             [frame.image for frame in fixed],
             moving.image,
             self.patches,
@@ -149,3 +160,5 @@ class FrameMatcher:
             None if moving.echo is None else (theirs, moving.echo),
             self._wavenumber,
         )
+        both = [frame.usable & moving.usable for frame in fixed]
+        return [match.among(usable) for match, usable in zip(matches, both, strict=True)]

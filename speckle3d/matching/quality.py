@@ -135,6 +135,9 @@ class FrameFeatures:
     """Share of patches with speckle in each row, shape (r,); columns all black do not count."""
     noise_share: float
     """Share of patches that vary as speckle does but have nothing in common from vector to vector."""
+    usable: BoolArray
+    """Patches that hold an echo which varies as speckle or structure does, shape (p,): no shadow, no noise
+    alone, none without contact or saturated."""
 
     @property
     def speckle_share(self) -> float:
@@ -187,9 +190,10 @@ class FrameInspector:
         with np.errstate(all="ignore"):  # Flat patches, and samples that are not finite, come out as NaN.
             statistics = self._statistics(intensity)
             mean = statistics[0]
-            speckle, noise, live = self._classify(statistics, floor)
+            speckle, noise, usable, live = self._classify(statistics, floor)
             # A sample that is not finite spoils its whole vector, and equalising then the others.
-            speckle &= np.isfinite(intensity.sum())
+            finite = np.isfinite(intensity.sum())
+            speckle &= finite
             near = intensity[:, : self._first[0, 1]]
             top = (self._first[0, 1] + self._size[1]) * samples.shape[1] // intensity.shape[1]
             below = some[:, top:].astype(np.float32)
@@ -201,6 +205,7 @@ class FrameInspector:
                 level_db=_decibel(mean[live].mean(axis=0)),
                 speckle=speckle[live].mean(axis=0),
                 noise_share=float(noise[live].mean()),
+                usable=(usable & finite).ravel(),
             )
 
     def _rails(self, samples: npt.NDArray[Any], counted: bool) -> tuple[float, float]:
@@ -230,8 +235,10 @@ class FrameInspector:
         patch_statistics(image, self._first, self._size, found)
         return np.moveaxis(found.reshape(self._columns, -1, 5), 2, 0)
 
-    def _classify(self, statistics: FloatArray, floor: float) -> tuple[BoolArray, BoolArray, BoolArray]:
-        """Patches with speckle and with noise, shape (column, row), and the columns that hold anything."""
+    def _classify(
+        self, statistics: FloatArray, floor: float
+    ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
+        """Patches with speckle, with noise and usable, shape (column, row), and columns that hold anything."""
         s = self.settings
         mean, contrast, alike, across, along = statistics
         echo = (mean > floor) & (contrast > s.least_contrast)
@@ -239,7 +246,7 @@ class FrameInspector:
         together = (alike > s.neighbour_correlation) | (self._pitch_mm > s.neighbour_pitch_mm)
         varies: BoolArray = contrast > _CONSTANT
         live = np.asarray(varies.any(axis=1) | ~varies.any())
-        return echo & together & fine, echo & ~together, live
+        return echo & together & fine, echo & ~together, echo & together, live
 
 
 def _digest(samples: npt.NDArray[Any]) -> int:

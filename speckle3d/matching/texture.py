@@ -46,11 +46,13 @@ class Texture:
         self._sizes: dict[int, FloatArray] = {}
         self._powers: dict[int, FloatArray] = {}
 
-    def keep(self, frame: int, echo: Echo) -> None:
-        """Measure the echo of one frame, on any thread."""
-        self._sizes[frame] = _sizes(echo.intensity, self._patches)
+    def keep(self, frame: int, echo: Echo, usable: BoolArray | None = None) -> None:
+        """Measure the usable patches of one frame, on any thread; by default all."""
+        kept = True if usable is None else usable
+        self._sizes[frame] = np.where(kept, _sizes(echo.intensity, self._patches), np.nan)
         if echo.analytic is not None:
-            self._powers[frame] = _patch_powers(echo.analytic, self._patches)
+            powers = _patch_powers(echo.analytic, self._patches)
+            self._powers[frame] = np.where(np.reshape(kept, (-1, 1)), powers, np.nan)
 
     def speckle_size(self, usable: BoolArray | None = None) -> SpeckleSize:
         """Lateral and axial size of speckle in each row of patches.
@@ -77,7 +79,12 @@ class Texture:
         """
         if not self._powers or not isinstance(self._signal, RFSettings):
             return None
-        power = self._patches.rows_of(np.mean(_some(self._powers, usable), axis=0).T).mean(axis=-1).T
+        by_row = self._patches.rows_of(np.moveaxis(_some(self._powers, usable), 1, 2))
+        by_row = by_row.transpose(2, 0, 3, 1).reshape(by_row.shape[2], -1, by_row.shape[1])
+        seen = np.isfinite(by_row).any(axis=(1, 2))
+        if not seen.any():
+            return None
+        power = np.nanmean(by_row[seen], axis=1)
         rate_hz = 1e3 * self._signal.speed_of_sound_m_s / (2.0 * self._patches.spacing_mm[1])
         low, high = self._signal.bandwidth_hz
         # The band's centre was shifted to zero.
@@ -85,7 +92,7 @@ class Texture:
         edge = self._edge_fraction * (high - low)
         rising = np.argsort(frequency)
         kept = rising[(frequency[rising] > low - edge) & (frequency[rising] < high + edge)]
-        return EchoSpectra(self._patches.row_depth_mm, frequency[kept], power[:, kept])
+        return EchoSpectra(self._patches.row_depth_mm[seen], frequency[kept], power[:, kept])
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:

@@ -47,6 +47,9 @@ counts: simulated tissue of two physics has 0.04 to 0.09, the scatter of 13 rows
 NO_STRUCTURE = 0.02
 """Mean share, over rows of patches, below which all speckle is taken as fully developed: simulated phantoms
 have 0.000 to 0.006, tissue 0.05 to 0.14."""
+LEAST_BINS = 4
+"""Distances at which a patch must have been seen to tell its own scale, gain and structure: as many as these
+and the structure's power are."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
 MOST_SHARE, MOST_POWER = {"echo": 0.5, "intensity": 0.95}, 0.9
@@ -176,6 +179,7 @@ class PatchCorrelations:
         variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, self.of_echo) + INTERPOLATION**2
         self._mean = (mean - floor) / (1 - floor)
         self._weight = (1 - floor) * np.sqrt(sums[0] / variance)
+        self.determined = (sums[0] > 0).sum(axis=1) >= LEAST_BINS
 
     def _speckle(self, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Amplitude of speckle at scaled distances, and its derivative by ln scale."""
@@ -231,9 +235,16 @@ class PatchCorrelations:
         return self._patches.row_depth_mm
 
     def row_medians(self, values: FloatArray) -> FloatArray:
-        """Medians of patches' values of shape (q,) over the row and the pieces, shape (r,)."""
-        by_piece = values.reshape(-1, len(self._patches))
-        return np.asarray(np.median([np.median(self._patches.rows_of(v), axis=-1) for v in by_piece], axis=0))
+        """Medians of patches' values of shape (q,) over the row and the pieces, shape (r,); NaN of none."""
+        by_piece = np.where(self.determined, values, np.nan).reshape(-1, len(self._patches))
+        by_row = np.moveaxis(self._patches.rows_of(by_piece), 1, 0)
+        return np.array([_median(row) for row in by_row])
+
+
+def _median(values: FloatArray) -> float:
+    """Median of the finite values; NaN of none."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else float("nan")
 
 
 def bounded_least_squares(
@@ -304,16 +315,20 @@ def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, floa
     RowScales
     """
     frozen = correlations.fit()
-    typical = float(np.mean(correlations.row_medians(frozen[:, 2])))
+    typical = float(np.nanmean(correlations.row_medians(frozen[:, 2])))
     if typical < NO_STRUCTURE:
         fits = [correlations.fit(most_share=0.0)]
     elif correlations.of_echo:
         fits = [correlations.fit(most_power=MOST_POWER)]
     else:
         fits = [frozen, correlations.fit(most_power=MOST_POWER)]
-    medians = [float(np.median(fit[:, 0])) for fit in fits]
+    medians = [_median(fit[correlations.determined, 0]) for fit in fits]
     log_scale, pieces = float(np.mean(medians)), correlations.centres.size
     share_gain = correlations.fit(log_scale, share_sigma=max(typical, LEAST_SHARE))[:, [2, 1]]
+    # Patches that tell nothing are taken for the sweep's typical ones.
+    share_gain[~correlations.determined] = [
+        _median(column) for column in share_gain[correlations.determined].T
+    ]
     share, gain = share_gain.T
     rows = RowScales(
         correlations.row_depth_mm,
@@ -322,12 +337,14 @@ def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, floa
         correlations.row_medians(share),
     )
     # Standard error of a median of rows, by their median absolute deviation from a line: tilt makes one.
-    line = theilslopes(rows.logarithm, rows.depth_mm)
-    spread = 1.4826 * float(np.median(np.abs(rows.logarithm - line.intercept - line.slope * rows.depth_mm)))
+    seen = np.isfinite(rows.logarithm)
+    logarithm, depth = rows.logarithm[seen], rows.depth_mm[seen]
+    line = theilslopes(logarithm, depth)
+    spread = 1.4826 * float(np.median(np.abs(logarithm - line.intercept - line.slope * depth)))
     if typical >= NO_STRUCTURE:
-        count = rows.logarithm.size
+        count = logarithm.size
         spread = np.sqrt((count * spread**2 + PRIOR_ROWS * ROW_SIGMA**2) / (count + PRIOR_ROWS))
-    errors = 1.2533 * spread / np.sqrt(rows.logarithm.size), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
+    errors = 1.2533 * spread / np.sqrt(logarithm.size), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
     return (
         Coherence(correlations.centres, share.reshape(pieces, -1), gain.reshape(pieces, -1), sigma),

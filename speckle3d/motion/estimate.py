@@ -141,10 +141,13 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
     if problem.curves.origin == "data sheet" and problem.adapt:
         # Tilt bends rows as a lens does: it is left out until the lens is known.
         tilt, problem = problem.curves.tilt, problem.with_curves(replace(problem.curves, tilt=None))
+        assert problem.curves.nominal is not None
+        focus_mm = problem.curves.nominal.focus_mm
         for _ in range(LENS_ROUNDS):
             motion = _in_turn(problem, table, sound, path)
             assert motion.rows is not None
-            problem, path = problem.with_curves(with_fitted_lens(problem.curves, motion.rows)), motion.path
+            curves = with_fitted_lens(problem.curves, motion.rows, focus_mm)
+            problem, path = problem.with_curves(curves), motion.path
         problem = problem.with_curves(replace(problem.curves, tilt=tilt))
     return _in_turn(problem, table, sound, path)
 

@@ -17,7 +17,7 @@ from speckle3d.core.sweep import RFSettings
 from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
 from speckle3d.motion.diffraction import Lens, Nominal, half_distance
 
-FOCUS_SIGMA = 0.15 / np.sqrt(3.0)
+FOCUS_SIGMA = 0.15
 """Standard deviation of the logarithm of the focal length about its data sheet's: 15 % either way."""
 LEAST_ROWS = 4
 F_NUMBER = 2.0
@@ -44,7 +44,9 @@ def _extended(at: FloatArray, grid: FloatArray, values: FloatArray) -> FloatArra
     return np.asarray(np.interp(at, grid, values) + slope * np.maximum(at - grid[-1], 0.0))
 
 
-def with_fitted_lens(curves: DecorrelationCurves, rows: RowScales) -> DecorrelationCurves:
+def with_fitted_lens(
+    curves: DecorrelationCurves, rows: RowScales, sheet_focus_mm: float
+) -> DecorrelationCurves:
     """Fit the focal length of a data sheet's probe to the scales that rows of patches ask for.
 
     All depths of one image move together, so that rows show how far curves are wrong against each other; a
@@ -56,6 +58,8 @@ def with_fitted_lens(curves: DecorrelationCurves, rows: RowScales) -> Decorrelat
         From a data sheet.
     rows : RowScales
         Of a sweep that was read with them.
+    sheet_focus_mm : float
+        Focal length that the data sheet has, about which the fitted one is to be.
 
     Returns
     -------
@@ -76,14 +80,16 @@ def with_fitted_lens(curves: DecorrelationCurves, rows: RowScales) -> Decorrelat
         other = replace(lens, focus_mm=lens.focus_mm * float(np.exp(focus)))
         return replace(nominal, lens=other).log_width(at) - before
 
+    moved = float(np.log(sheet.focus_mm / sheet_focus_mm))
+
     def misfit(values: FloatArray) -> FloatArray:
         left = (logarithm - values[1] - wider(values[0], depth, width)) / ROW_SIGMA
-        return np.append(left, values[0] / FOCUS_SIGMA)
+        # Rows may be wrong (the loss is SciPy's soft_l1), what the sheet says is not.
+        robust = np.sign(left) * np.sqrt(2.0 * (np.hypot(1.0, left) - 1.0))
+        return np.append(robust, (values[0] + moved) / FOCUS_SIGMA)
 
     start = np.array([0.0, np.median(logarithm)])
-    fit = least_squares(
-        misfit, start, loss="soft_l1", diff_step=[0.03, 0.03], x_scale=[0.1, 0.1], max_nfev=20
-    )
+    fit = least_squares(misfit, start, diff_step=[0.03, 0.03], x_scale=[0.1, 0.1], max_nfev=20)
     at = np.clip(curves.depth_mm, depth[0], depth[-1])
     factor = wider(float(fit.x[0]), at, nominal.log_width(at))
     fitted = replace(sheet, focus_mm=sheet.focus_mm * float(np.exp(fit.x[0])))
