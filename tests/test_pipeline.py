@@ -52,8 +52,8 @@ def test_two_runs_are_equal(sweep, curves):
 def test_few_frames_are_kept_however_long_the_sweep(sweep, curves, monkeypatch):
     made, most, plain = [], [], FrameMatcher.prepare
 
-    def prepare(matcher, echo):
-        ready = plain(matcher, echo)
+    def prepare(matcher, echo, usable):
+        ready = plain(matcher, echo, usable)
         made.append(weakref.ref(ready))
         return ready
 

@@ -73,10 +73,19 @@ class GyroscopeTurns:
             self.degrees - (turned[: -self.lag].inv() * turned[self.lag :]).as_rotvec(degrees=True)
         )
 
+    @property
+    def noise_deg(self) -> float:
+        """By how much turns and readings honestly differ."""
+        return LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
+
+    def agree(self, turned: Rotation) -> bool:
+        """Whether readings turn as the gyroscope, or neither turns, to their noise."""
+        return float(_spread(self.difference(turned)).max()) <= self.noise_deg
+
     def misfit(self, difference: FloatArray) -> float:
         """Negative log likelihood of a difference, but for a bias; overlapping turns count once."""
-        noise = LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
-        return float(len(self.degrees) / self.lag * np.log(_spread(difference) ** 2 + noise**2).sum())
+        variance = _spread(difference) ** 2 + self.noise_deg**2
+        return float(len(self.degrees) / self.lag * np.log(variance).sum())
 
     def gain(self, turned: Rotation, other: Rotation | None = None) -> float:
         """Log likelihood of `other` readings, or of none that turn, over that of `turned`."""
@@ -110,10 +119,11 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     ]
     gain, name = max(upright, default=(0.0, ""))
     still, bias = turns.gain(readings), turns.bias_deg_s(readings)
-    if gain > max(LEAST_GAIN, turns.gain_reversed(readings)):
+    contradicted = not turns.agree(readings)
+    if contradicted and gain > max(LEAST_GAIN, turns.gain_reversed(readings)):
         evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
-    elif still > LEAST_GAIN:
+    elif contradicted and still > LEAST_GAIN:
         evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
     elif bias > MOST_BIAS_DEG_S:

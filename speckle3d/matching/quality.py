@@ -238,7 +238,7 @@ class FrameInspector:
     def _classify(
         self, statistics: FloatArray, floor: float
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Patches with speckle, with noise and usable, shape (column, row), and columns that hold anything."""
+        """Patches with speckle, with noise, usable, shape (column, row); columns that hold anything."""
         s = self.settings
         mean, contrast, alike, across, along = statistics
         echo = (mean > floor) & (contrast > s.least_contrast)

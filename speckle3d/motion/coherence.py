@@ -47,6 +47,9 @@ counts: simulated tissue of two physics has 0.04 to 0.09, the scatter of 13 rows
 NO_STRUCTURE = 0.02
 """Mean share, over rows of patches, below which all speckle is taken as fully developed: simulated phantoms
 have 0.000 to 0.006, tissue 0.05 to 0.14."""
+LEAST_GAIN = 0.5
+"""Part of the correlation that noise leaves from which a patch counts for the scale: with less it is noise
+for the most part."""
 LEAST_BINS = 4
 """Distances at which a patch must have been seen to tell its own scale, gain and structure: as many as these
 and the structure's power are."""
@@ -179,7 +182,8 @@ class PatchCorrelations:
         variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, self.of_echo) + INTERPOLATION**2
         self._mean = (mean - floor) / (1 - floor)
         self._weight = (1 - floor) * np.sqrt(sums[0] / variance)
-        self.determined = (sums[0] > 0).sum(axis=1) >= LEAST_BINS
+        seen = (sums[0] > 0).sum(axis=1) >= LEAST_BINS
+        self.determined = seen if seen.any() else np.ones_like(seen)
 
     def _speckle(self, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Amplitude of speckle at scaled distances, and its derivative by ln scale."""
@@ -322,7 +326,9 @@ def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, floa
         fits = [correlations.fit(most_power=MOST_POWER)]
     else:
         fits = [frozen, correlations.fit(most_power=MOST_POWER)]
-    medians = [_median(fit[correlations.determined, 0]) for fit in fits]
+    # Where noise is most of the correlation, its course tells nothing of the scale.
+    clear = correlations.determined & (frozen[:, 1] >= LEAST_GAIN)
+    medians = [_median(fit[clear if clear.any() else correlations.determined, 0]) for fit in fits]
     log_scale, pieces = float(np.mean(medians)), correlations.centres.size
     share_gain = correlations.fit(log_scale, share_sigma=max(typical, LEAST_SHARE))[:, [2, 1]]
     # Patches that tell nothing are taken for the sweep's typical ones.
