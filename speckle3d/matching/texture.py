@@ -79,7 +79,7 @@ class Texture:
         """
         if not self._powers or not isinstance(self._signal, RFSettings):
             return None
-        by_row = self._patches.rows_of(np.moveaxis(_some(self._powers, usable), 1, 2))
+        by_row = self._patches.rows_of(np.moveaxis(np.stack(_some(self._powers, usable)), 1, 2))
         by_row = by_row.transpose(2, 0, 3, 1).reshape(by_row.shape[2], -1, by_row.shape[1])
         seen = np.isfinite(by_row).any(axis=(1, 2))
         if not seen.any():
