@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from speckle3d.core.errors import InsufficientDataError
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import INERTIAL, OrientationSensor
 from speckle3d.io.clarius import READER
 from speckle3d.io.clarius.imu import MEANING
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
+from speckle3d.io.sweep_writer import attach_orientation
 from xsens.logs.clocks import timeline_of_times
 from xsens.logs.faults import measured
 from xsens.logs.samples import Gap, ImuLog
@@ -68,6 +74,55 @@ def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
         source=source,
     )
     return measured(log)
+
+
+def with_orientation(log: ImuLog, rotations: TimedRotations) -> ImuLog:
+    """Replace the sensor's own orientation in a log."""
+    oriented = np.isin(log.time_s, rotations.time_s)
+    quaternions = np.tile([0.0, 0.0, 0.0, 1.0], (len(log), 1))
+    quaternions[oriented] = rotations.world_from_sensor.as_quat()
+    return replace(log, world_from_sensor=Rotation.from_quat(quaternions), oriented=oriented)
+
+
+def attach_log(
+    sweep_file: Path,
+    log: ImuLog,
+    rotations: TimedRotations,
+    mounting: Rotation | None,
+    time_offset_s: float,
+    replaces: bool,
+) -> str:
+    """Put a log with its orientation into a sweep file; returns how many frames it covers, in words.
+
+    Parameters
+    ----------
+    replaces : bool
+        Whether it may take the place of a stream, which may be why the sweep cannot be read.
+
+    Raises
+    ------
+    InvalidInputError
+        If the stream covers no frame.
+    """
+    kept = np.isin(log.time_s, rotations.time_s)
+    vectors = {}
+    for name in INERTIAL:
+        values = getattr(log, name)
+        whole = values is not None and bool(np.isfinite(values[kept]).all())
+        vectors[name] = values[kept] if whole and kept.sum() == len(rotations) else None
+    sensor = OrientationSensor(rotations, mounting, time_offset_s, **vectors)
+    words = ""
+    with suppress(InvalidInputError) if replaces else nullcontext():
+        times_s = load_sweep(sweep_file).frame_time_s
+        words = f": covers {int(sensor.covers(times_s).sum())} of {times_s.size} frames"
+    if words.startswith(": covers 0 "):
+        first, last = sensor.readings.time_s[[0, -1]] + sensor.time_offset_s
+        raise InvalidInputError(
+            f"{sweep_file}: expected a stream that covers frames of the sweep, {times_s[0]:.3f} to "
+            f"{times_s[-1]:.3f} s, got one from {first:.3f} to {last:.3f} s{words}"
+        )
+    attach_orientation(sweep_file, sensor)
+    return words
 
 
 def _pauses(gaps: Sequence[Gap]) -> tuple[Gap, ...]:

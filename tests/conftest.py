@@ -42,7 +42,7 @@ def shipped() -> Path:
 def back(tmp_path_factory) -> Path:
     """File of simulated tissue passed forward and back at 10 mm/s, 25 frames/s; nothing may change it."""
     from speckle3d.io.sweep_writer import write_sweep
-    from speckle3d.simulation import SimulationSettings, simulate
+    from speckle3d.simulation.presets import SimulationSettings, simulate
 
     settings = SimulationSettings(
         preset="reversal", vectors=26, samples=1200, seed=77, length_mm=10.0, frames=50

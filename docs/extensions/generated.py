@@ -60,13 +60,10 @@ def _cell(text: str | None) -> str:
 
 def command_pages() -> dict[str, str]:
     """One page for each command and group of commands, by name."""
-    import typer.main
-
     from speckle3d.cli import app
 
     pages: dict[str, str] = {}
-    root = typer.main.get_command(app)
-    for name, command in sorted(root.commands.items()):  # type: ignore[attr-defined]
+    for name, command in sorted(app.commands.items()):
         parts = [f"# `speckle3d {name}`", ""]
         if hasattr(command, "commands"):
             parts += [_text(command.help), ""]
@@ -79,28 +76,28 @@ def command_pages() -> dict[str, str]:
 
 
 def _command(command: Any) -> list[str]:
-    if hasattr(command, "describe"):
-        command.describe()
-    lines = [_text(command.help), ""]
-    rows = [_option(each) for each in command.params if not getattr(each, "hidden", False)]
-    panels: dict[str, list[str]] = {}
-    for panel, row in rows:
-        panels.setdefault(panel, []).append(row)
-    for panel, held in panels.items():
-        lines += [f"{panel}:", "", "| | |", "|---|---|", *held, ""]
+    lines = [
+        _text(command.help),
+        "",
+        "```console",
+        *(f"$ {line}" for line in command.words.examples),
+        "```",
+        "",
+    ]
+    for panel, held in command.panels(command.context_class(command)).items():
+        if held:
+            lines += [f"{panel}:", "", "| | |", "|---|---|", *map(_option, held), ""]
     return lines
 
 
-def _option(parameter: Any) -> tuple[str, str]:
-    argument = parameter.param_type_name == "argument"
-    panel = "Arguments" if argument else (getattr(parameter, "rich_help_panel", None) or "Options")
+def _option(parameter: Any) -> str:
     names = ", ".join([*parameter.opts, *parameter.secondary_opts])
-    if argument:
+    if parameter.param_type_name == "argument":
         names = str(parameter.metavar or parameter.name).strip("{}").upper()
     help_text = _cell(getattr(parameter, "help", "") or "")
     if not help_text:
         LOG.warning("%s: has no help", names)
-    return panel, f"| `{names}` | {_escaped(help_text)} |"
+    return f"| `{names}` | {_escaped(help_text)} |"
 
 
 def _text(text: str | None) -> str:

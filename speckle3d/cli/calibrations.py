@@ -1,12 +1,12 @@
-"""Calibration files: where they may be written, what was found, and putting them on a sweep's sensors."""
+"""What options say of a recording: settings and calibrations; where calibrations may be written."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from speckle3d.cli.common import emit, emit_json, note
+from speckle3d.cli.common import emit, emit_json, from_options, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from speckle3d.calibrating.written import Written
     from speckle3d.core.calibration import Calibration
     from speckle3d.core.sweep import Sweep
+    from speckle3d.io.import_settings import ImportSettings
 
 NOTED_SIZE = 0.01
 """Relative difference of pixel sizes that is reported: 0.4 mm over an image of 40 mm."""
@@ -23,6 +24,31 @@ NOTED_OFFSET_S = 0.001
 
 NOTED_DEG, NOTED_MM = 5.0, 10.0
 """Difference of mountings that is reported: calibrations of one mounting differ by less."""
+
+
+def given_settings(source: Path, imported: Mapping[str, Any], transform: str | None) -> ImportSettings:
+    """Settings of an import from options; `transform` is the tracker's.
+
+    Raises
+    ------
+    InvalidInputError
+        If an option is for another kind of recording, or the recording says the same itself.
+    """
+    from speckle3d.calibrating.recordings import require_sequence, require_unsaid
+    from speckle3d.io.import_settings import ImportSettings
+
+    require_sequence(source, transform, "--transform")
+    for name in ("reference_transform", "plus_config"):
+        require_sequence(source, imported.get(name), f"--{name.replace('_', '-')}")
+    named = {} if transform is None else {"tracker_transform": transform}
+    given = from_options(ImportSettings, {**imported, **named})
+    require_unsaid(source, given)
+    return given
+
+
+def files_of(imported: Mapping[str, Any], calibrations: Sequence[Path] | None) -> tuple[Path, ...]:
+    """Files that options name, which a command must not write over."""
+    return (*(calibrations or ()), *(Path(imported[name]) for name in ("plus_config",) if name in imported))
 
 
 def require_free(out: Path, *inputs: Path | None) -> None:
@@ -87,9 +113,9 @@ def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> Non
             " and stay so"
         )
     sensor = sweep.tracker if calibration.sensor == "tracker" else sweep.orientation
-    held_s, found_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
-    if held_s and found_s is not None and abs(found_s - held_s) > NOTED_OFFSET_S:
-        note(f"{path}: time offset {found_s:+.4f} s is used, not the sweep's {held_s:+.4f} s")
+    own_s, offset_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
+    if own_s and offset_s is not None and abs(offset_s - own_s) > NOTED_OFFSET_S:
+        note(f"{path}: time offset {offset_s:+.4f} s is used, not the sweep's {own_s:+.4f} s")
     turned_deg, moved_mm = mounting_difference(sweep, calibration)
     if turned_deg > NOTED_DEG or moved_mm > NOTED_MM:
         moved = f" and {moved_mm:.0f} mm" if calibration.sensor == "tracker" else ""

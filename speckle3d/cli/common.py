@@ -1,17 +1,18 @@
-"""What the commands share: the application, options, settings, progress, and output."""
+"""What the commands share: options, settings, and output."""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from speckle3d.cli.helping import App
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 
@@ -22,58 +23,41 @@ if TYPE_CHECKING:
 
     Model = TypeVar("Model", bound=BaseModel)
 
-app = App(
-    name="speckle3d",
-    help="Freehand 2-D ultrasound sweeps to measured 3-D.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+
+class Drift(StrEnum):
+    """A mode of a reconstruction beside `image`."""
+
+    ORIENTATION = "orientation"
+    POSE = "pose"
+    FUSED = "fused"
+    CROSSED = "crossed"
+    CONSISTENT_SUBSET = "consistent-subset"
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
-        from speckle3d import __version__
-
-        emit(f"speckle3d {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    """Freehand 2-D ultrasound sweeps to measured 3-D."""
-
-
-calibrate = App(help="Calibrate what a reconstruction needs.")
-app.add_typer(calibrate, name="calibrate")
-
+Reference = Literal["tracker", "truth"]
+Out = Annotated[Path, typer.Option("-o", "--output", writable=True)]
+OptionalOut = Annotated[Path | None, typer.Option("-o", "--output", writable=True)]
+OutArgument = Annotated[Path, typer.Argument(writable=True)]
+Written = Annotated[Path | None, typer.Option(writable=True)]
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable results on stdout.")]
 ConfigFile = Annotated[
-    Path | None, typer.Option("--config", help="TOML with settings to change; see `speckle3d config`.")
+    Path | None, typer.Option(help="TOML with settings to change; see `speckle3d config`.")
 ]
 CalibrationFiles = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--calibration", help="Calibration to use for its sensor in place of the file's; may be repeated."
-    ),
+    typer.Option(help="Calibration to use for its sensor in place of the file's; may be repeated."),
+]
+Curves = Annotated[
+    Path | None, typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside SWEEP.")
 ]
 Images = Annotated[
     Path,
     typer.Argument(metavar="IMAGES", help="Recording: a sweep file, an image sequence, a scanner's package."),
 ]
-CalibrationOut = Annotated[
-    Path, typer.Option("-o", "--output", help="Calibration file to write; .txt and .png beside it.")
-]
-Poses = Annotated[
-    Path | None, typer.Option("--poses", help="File with the sensor's readings, if not in IMAGES.")
-]
+Poses = Annotated[Path | None, typer.Option(help="File with the sensor's readings, if not in IMAGES.")]
 Transform = Annotated[
     str | None,
     typer.Option(
-        "--transform",
         metavar="NAME",
         help="Poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).",
     ),
@@ -82,13 +66,8 @@ PixelMm = Annotated[
     tuple[float, float] | None,
     typer.Option(help="Distance between columns and rows, mm, if IMAGES does not say."),
 ]
-Region = Annotated[
-    str | None, typer.Option(help='Polygon "column,row column,row ..." outside which nothing counts.')
-]
-
 ReconstructionFile = Annotated[
-    Path,
-    typer.Argument(metavar="RECONSTRUCTION", help="reconstruction.h5 of a results folder."),
+    Path, typer.Argument(metavar="RECONSTRUCTION", help="reconstruction.h5 of a results folder.")
 ]
 PosedFile = Annotated[
     Path,
@@ -98,14 +77,12 @@ PosedFile = Annotated[
     ),
 ]
 _MODE_HELP = (
-    "Which poses to use: image (default), orientation, pose, crossed, fused of a reconstruction; "
-    "tracker, truth of a recording."
+    "Which poses to use: image, orientation, pose, crossed, fused of a reconstruction (by default that which "
+    "claims the smallest error of length); tracker, truth of a recording."
 )
 Mode = Annotated[str | None, typer.Option(help=_MODE_HELP)]
-Modes = Annotated[list[str] | None, typer.Option("--mode", help=f"{_MODE_HELP} May be repeated.")]
-SweepFile = Annotated[
-    Path | None, typer.Option("--sweep", help="The sweep, if it moved since the reconstruction.")
-]
+Modes = Annotated[list[str] | None, typer.Option(help=f"{_MODE_HELP} May be repeated.")]
+SweepFile = Annotated[Path | None, typer.Option(help="The sweep, if it moved since the reconstruction.")]
 
 
 def note(text: str) -> None:
@@ -151,17 +128,22 @@ def load_settings(path: Path | None) -> Config:
     return load_config(path) if path else Config()
 
 
+def require_finite(option: str, *values: float | None) -> None:
+    """Refuse numbers that are NaN or infinite."""
+    if not all(value is None or math.isfinite(value) for value in values):
+        raise InvalidInputError(f"{option}: expected finite numbers, got {' '.join(map(str, values))}")
+
+
 def from_options(model: type[Model], options: Mapping[str, Any]) -> Model:
-    """Make settings from the options that were given; names that are no settings are ignored.
+    """Make settings from the options that were given.
 
     Raises
     ------
     InvalidInputError
         Naming the first option whose value is out of range.
     """
-    names = model.model_fields
     with naming_options():
-        return model(**{name: v for name, v in options.items() if name in names and v is not None})
+        return model(**options)
 
 
 @contextmanager

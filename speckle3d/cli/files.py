@@ -1,90 +1,76 @@
-"""Commands about files: what one holds, the configuration, conversion, simulation."""
+"""Commands about files: what one holds, the configuration, conversion."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.calibrations import mount
-from speckle3d.cli.common import CalibrationFiles, Json, SweepFile, Transform, app, emit, emit_rows, note
-from speckle3d.cli.importing import (
-    Importing,
-    Number,
-    PlusConfig,
-    ReferenceTransform,
-    files_of,
-    given_settings,
+from speckle3d.cli.calibrations import files_of, given_settings, mount
+from speckle3d.cli.commands import Fields
+from speckle3d.cli.common import (
+    CalibrationFiles,
+    Json,
+    Mode,
+    OutArgument,
+    SweepFile,
+    Transform,
+    emit,
+    emit_rows,
+    note,
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
 
-if TYPE_CHECKING:
-    pass
 
+def info(path: Path, as_json: Json = False) -> None:
+    """Tell what a file holds, after checking it.
 
-@app.command()
-def info(
-    path: Annotated[Path, typer.Argument(help="A file or folder that the package reads.")],
-    as_json: Json = False,
-) -> None:
-    """Tell what a file holds, after checking it."""
+    Parameters
+    ----------
+    path
+        A file or folder that the package reads.
+    as_json
+
+    Examples
+    --------
+    $ speckle3d info sweep.h5
+    """
     from speckle3d.io.describe import describe
 
     emit_rows(describe(path), as_json)
 
 
-@app.command()
 def config() -> None:
-    """Print every setting with what it is, its unit and its default, as TOML."""
+    """Print every setting with what it is, its unit and its default, as TOML.
+
+    Examples
+    --------
+    $ speckle3d config > settings.toml
+    """
     from speckle3d.config import Config
 
     emit(Config().to_toml(comments=True))
 
 
-@app.command(cls=Importing)
 def convert(
-    source: Annotated[
-        Path, typer.Argument(metavar="IN", help="Any recording that holds a sweep: a file, or a folder.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Argument(
-            metavar="OUT",
-            help="Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .mhd, .nrrd), to write; or -o OUT.",
+    source: Annotated[Path, typer.Argument(metavar="IN")],
+    out: OutArgument,
+    imported: Annotated[
+        dict[str, Any],
+        Fields(
+            "speckle3d.io.import_settings:ImportSettings",
+            without=("tracker_transform", "image_to_probe", "arrays"),
         ),
     ],
-    sampling_rate_hz: Number = None,
-    vector_pitch_mm: Number = None,
-    element_pitch_mm: Number = None,
-    speed_of_sound_m_s: Number = None,
-    centre_frequency_hz: Number = None,
-    bandwidth_hz: Annotated[tuple[float, float] | None, typer.Option()] = None,
-    demodulation_frequency_hz: Number = None,
-    first_sample_depth_mm: Number = None,
-    column_pitch_mm: Number = None,
-    row_spacing_mm: Number = None,
-    dynamic_range_db: Number = None,
-    frame_rate_hz: Number = None,
-    probe: Annotated[str | None, typer.Option(metavar="MODEL")] = None,
-    plus_config: PlusConfig = None,
     transform: Transform = None,
-    reference_transform: ReferenceTransform = None,
     calibration: CalibrationFiles = None,
     compression: Annotated[
-        str | None,
-        typer.Option(
-            "--compression",
-            "--compress",
-            help="gzip, some 0.65 of the size; lzf, faster and larger; or none: of a sweep file by default.",
-        ),
+        Literal["gzip", "lzf", "none"] | None, typer.Option("--compression", "--compress")
     ] = None,
-    mode: Annotated[
-        str | None,
-        typer.Option(help="IN a reconstruction: write its grey images with the poses of a mode (image)."),
-    ] = None,
+    mode: Mode = None,
     sweep_file: SweepFile = None,
 ) -> None:
     """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
@@ -94,68 +80,70 @@ def convert(
 
     A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
     unless options give it.
+
+    Parameters
+    ----------
+    source
+        Any recording that holds a sweep: a file, or a folder.
+    out
+        Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .mhd, .nrrd), to write; or -o OUT.
+    calibration, mode, sampling_rate_hz, vector_pitch_mm, plus_config
+
+    Other Parameters
+    ----------------
+    compression
+        gzip, some 0.65 of the size; lzf, faster and larger; or none: of a sweep file by default.
+
+    Examples
+    --------
+    $ speckle3d convert scan.mha sweep.h5 --calibration tracker.h5
     """
     from speckle3d.io.calibrations import fitted_pixels, resized
-    from speckle3d.io.load import open_recording
+    from speckle3d.io.load import kind_of, open_recording
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
+    from speckle3d.io.reconstructions import FORMAT
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
     from speckle3d.io.voxels.volume_writer import LABELS_ALONE
+    from speckle3d.study.posed import open_posed
+    from speckle3d.study.scenes.sequences import slicer_sequence
 
-    options = locals()
     suffix = out.suffix.lower()
-    if out.name.lower().endswith(LABELS_ALONE):
-        raise InvalidInputError(f"{out}: {LABELS_ALONE} is of labels: take a name ending in .seq.nrrd")
-    if suffix not in ("", ".h5", ".hdf5", *SUFFIXES):
-        known = ", ".join((".h5", ".hdf5", *SUFFIXES))
-        raise InvalidInputError(f"{out}: expected a name ending in {known}, got {suffix!r}")
-    named = files_of(plus_config, calibration)
-    require_own_place(out, "sequence" if suffix in SUFFIXES else "sweep", source, *named)
-    if _is_reconstruction(source):
-        _convert_posed(source, out, options)
+    is_made = source.is_file() and kind_of(source) == FORMAT
+    known = SUFFIXES if is_made else (".h5", ".hdf5", *SUFFIXES)
+    if out.name.lower().endswith(LABELS_ALONE) or suffix not in (*known, *([] if is_made else [""])):
+        raise InvalidInputError(f"{out}: expected a name ending in {', '.join(known)}, got {out.name!r}")
+    require_own_place(
+        out, "sequence" if suffix in SUFFIXES else "sweep", source, *files_of(imported, calibration)
+    )
+    packs = compression != "none"
+    if is_made:
+        options = {**imported, "transform": transform, "calibration": calibration}
+        range_db = options.pop("dynamic_range_db", 60.0)
+        _require_none(options, "recordings, got a reconstruction")
+        posed = open_posed(source, mode, sweep_file)
+        for line in posed.notes():
+            note(line)
+        with progress_bar(f"writing {out.name}") as progress:
+            sequence, poses = slicer_sequence(posed, range_db)
+            write_sequence(out, sequence, progress, packs, poses)
         return
-    for name, value in (("--mode", mode), ("--sweep", sweep_file)):
-        if value is not None:
-            raise InvalidInputError(f"{name} {value}: is of a reconstruction, got {source.name}")
-    if compression not in (None, *COMPRESSIONS):
-        raise InvalidInputError(f"--compression: expected {', '.join(COMPRESSIONS)}, got {compression!r}")
-    given = given_settings(source, options)
+    _require_none({"mode": mode, "sweep": sweep_file}, f"a reconstruction, got {source.name}")
+    given = given_settings(source, imported, transform)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
-    settings = given.model_copy(update=fitted)
-    recording = open_recording(source, settings)
+    recording = open_recording(source, given.model_copy(update=fitted))
     sweep = mount(resized(recording.sweep, fitted), calibration or ())
-    for each in recording.notes:
-        note(each)
+    for line in recording.notes:
+        note(line)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
             write_sweep(out, sweep, progress, COMPRESSIONS[compression or "none"])
             return
-        left_out = write_sequence(out, sweep, progress, compression != "none")
-    for each in left_out:
-        note(f"{out}: does not hold {each}")
+        left_out = write_sequence(out, sweep, progress, packs)
+    for part in left_out:
+        note(f"{out}: does not hold {part}")
 
 
-def _is_reconstruction(path: Path) -> bool:
-    from speckle3d.io.load import kind_of
-    from speckle3d.io.reconstructions import FORMAT
-
-    return path.is_file() and kind_of(path) == FORMAT
-
-
-def _convert_posed(source: Path, out: Path, options: dict[str, Any]) -> None:
-    """Write a reconstruction's images with its poses; other options than those of that have no effect."""
-    from speckle3d.io.import_settings import ImportSettings
-    from speckle3d.io.plus.write import SUFFIXES, write_sequence
-    from speckle3d.study.posed import open_posed
-    from speckle3d.study.scenes.sequences import slicer_sequence
-
-    if out.suffix.lower() not in SUFFIXES:
-        raise InvalidInputError(f"{out}: expected a name ending in {', '.join(SUFFIXES)} of a reconstruction")
-    of_recordings = {*ImportSettings.model_fields, "transform", "plus_config", "calibration"}
-    unused = [name for name in of_recordings - {"dynamic_range_db"} if options.get(name) is not None]
-    if unused:
-        raise InvalidInputError(f"--{unused[0].replace('_', '-')}: is of recordings, got a reconstruction")
-    posed = open_posed(source, options["mode"], options["sweep_file"])
-    range_db, packs = options["dynamic_range_db"] or 60.0, options["compression"] != "none"
-    with progress_bar(f"writing {out.name}") as progress:
-        sweep, poses = slicer_sequence(posed, range_db)
-        write_sequence(out, sweep, progress, packs, poses)
+def _require_none(options: dict[str, Any], whose: str) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise InvalidInputError(f"--{name.replace('_', '-')}: is of {whose}")

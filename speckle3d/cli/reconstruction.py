@@ -3,80 +3,96 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from speckle3d.cli.calibrations import mount
-from speckle3d.cli.common import CalibrationFiles, ConfigFile, Json, app, emit, load_settings, note
+from speckle3d.cli.common import (
+    CalibrationFiles,
+    ConfigFile,
+    Curves,
+    Drift,
+    Json,
+    Out,
+    Reference,
+    Written,
+    emit,
+    load_settings,
+    note,
+)
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from speckle3d.config import Config
     from speckle3d.core.sweep import Sweep
     from speckle3d.study.job import JobResult
 
 
-@app.command()
 def reconstruct(
-    sweep_file: Annotated[
-        Path,
-        typer.Argument(metavar="SWEEP", help="Sweep to reconstruct: a file or folder of any known format."),
-    ],
-    out: Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")],
-    curves_file: Annotated[
-        Path | None, typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside SWEEP.")
-    ] = None,
-    drift: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Correction mode: orientation, pose, fused, crossed or consistent-subset; may be repeated."
-        ),
-    ] = None,
-    crossing_file: Annotated[
-        Path | None,
-        typer.Option("--crossing", help="Second sweep over the same tissue, turned by 30 to 90 degrees."),
-    ] = None,
-    save_curves: Annotated[
-        Path | None, typer.Option(help="Write the curves as the crossing sweep corrects them.")
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(help="FIRST-LAST: reconstruct these frames of the recording only.")
-    ] = None,
-    crossing_frames: Annotated[
-        str | None,
-        typer.Option(help="FIRST-LAST: cross with these frames; of the same recording without --crossing."),
-    ] = None,
-    reference: Annotated[str | None, typer.Option(help="What to compare with: tracker or truth.")] = None,
+    sweep_file: Path,
+    out: Out,
+    curves_file: Curves = None,
+    drift: list[Drift] | None = None,
+    crossing_file: Path | None = None,
+    save_curves: Written = None,
+    frames: str | None = None,
+    crossing_frames: str | None = None,
+    reference: Reference | None = None,
     consistent_subset: Annotated[
-        bool | None,
-        typer.Option(help="In mode orientation, drop distances that the sensed orientation contradicts."),
+        bool | None, typer.Option("--consistent-subset/--no-consistent-subset")
     ] = None,
-    drift_curves: Annotated[
-        str | None, typer.Option(help="Correction cubic in time (published) or in distance (for reversals).")
-    ] = None,
-    volume: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write a volume, too (.nrrd, .mha, .nii.gz, .nii), as group `volume` of the settings says."
-        ),
-    ] = None,
-    volume_mode: Annotated[
-        str | None,
-        typer.Option(
-            help="Poses of the volume; by default the first there is of fused, crossed, pose, orientation, "
-            "image."
-        ),
-    ] = None,
+    drift_curves: Literal["published", "distance"] | None = None,
+    volume: Written = None,
+    volume_mode: str | None = None,
     calibration: CalibrationFiles = None,
     config_file: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
-    """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures."""
+    """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures.
+
+    Parameters
+    ----------
+    sweep_file
+        Sweep to reconstruct: a file or folder of any known format.
+    out
+        Folder for the results.
+    curves_file
+    drift
+        Mode beside image: orientation, pose (by those sensors), crossed (by a second sweep), fused (by all
+        there is), consistent-subset (images without patches that the sensed orientation contradicts); may be
+        repeated.
+    crossing_file
+        Second sweep over the same tissue, turned by 30 to 90 degrees.
+    calibration
+    volume
+        Write a volume, too (.nrrd, .mha, .nii.gz, .nii), as group `volume` of the settings says.
+    reference
+        What to compare with.
+    as_json
+
+    Other Parameters
+    ----------------
+    volume_mode
+        With --volume: its poses; by default those of the mode that claims the smallest error of length.
+    frames
+        FIRST-LAST: reconstruct these frames of the recording only.
+    crossing_frames
+        FIRST-LAST: cross with these frames; of the same recording without --crossing.
+    save_curves
+        With --crossing or --crossing-frames: write the curves as the crossing sweep corrects them.
+    consistent_subset
+        In mode orientation, drop distances that the sensed orientation contradicts.
+    drift_curves
+        Correction cubic in time (published) or in distance (for reversals).
+    config_file
+
+    Examples
+    --------
+    $ speckle3d reconstruct data/phantom.h5 -o out --drift orientation --drift pose
+    """
     from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
     from speckle3d.io.sweeps import unfinished_note
@@ -86,36 +102,36 @@ def reconstruct(
     settings = load_settings(config_file).with_choices(
         consistent_subset=consistent_subset, drift_curves=drift_curves
     )
-    modes = list(dict.fromkeys(drift or ()))
+    modes, calibrations = list[str](dict.fromkeys(drift or ())), calibration or ()
     sweep = load_sweep(sweep_file)
     if (unfinished := unfinished_note(sweep_file)) is not None:
         note(unfinished)
     used = _find_curves(curves_file, sweep_file)
     curves = read_curves(used)
-    mount(sweep, calibration or ())
-    crossing = _crossing(sweep, sweep_file, crossing_file, crossing_frames)
-    if crossing is not None and not {"crossed", "fused"}.intersection(modes):
-        modes.append("crossed")
+    mount(sweep, calibrations)
+    crossing = None
+    if crossing_file is not None or crossing_frames is not None:
+        whole = sweep if crossing_file is None else load_sweep(crossing_file)
+        crossing = _part(whole, crossing_frames, "--crossing-frames"), crossing_file or sweep_file
+        if not {"crossed", "fused"}.intersection(modes):
+            modes.append("crossed")
+    read = (sweep_file, crossing_file, config_file, used, *calibrations)
     if save_curves is not None:
-        if crossing is None:
-            raise InvalidInputError("--save-curves: expected a crossing sweep (--crossing SWEEP), got none")
-        read = (sweep_file, crossing[1], config_file, used, *(calibration or ()))
         require_own_place(save_curves, "curves", *read)
     if volume is not None:
         require_suffix(volume)
         # In a folder of results that is still to be made nothing can be in the way.
         if volume.parent.exists() or volume.parent != out:
-            require_own_place(volume, "volume", sweep_file, crossing_file, used, *(calibration or ()))
-        _require_mode(volume_mode, modes)
-    elif volume_mode is not None:
-        raise InvalidInputError("--volume-mode: expected --volume beside it, got none")
+            require_own_place(volume, "volume", *read)
+        if volume_mode not in (None, "image", *modes):
+            raise InvalidInputError(
+                f"--volume-mode: expected one of image, {', '.join(modes)}, got {volume_mode!r}"
+            )
     sweep = _part(sweep, frames, "--frames")
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
         result = run_job(
-            sweep, sweep_file, curves, out, modes, reference, settings, progress, calibration or (), crossing
+            sweep, sweep_file, curves, out, modes, reference, settings, progress, calibrations, crossing
         )
-    if save_curves is not None and result.curves is not None:
-        write_curves(save_curves, result.curves)
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
         for line in result.summary.doubt_lines:
@@ -124,45 +140,27 @@ def reconstruct(
         emit(result.table)
     _tell(result)
     note(f"{len(sweep)} frames in {result.seconds:.1f} s; results in {result.directory}")
+    if save_curves is not None and result.curves is not None:
+        write_curves(save_curves, result.curves)
+        note(f"curves corrected by the crossing sweep, for this probe: {save_curves}")
+    elif save_curves is not None:
+        note(f"{save_curves}: not written, since the sweeps could not be crossed")
     if volume is not None:
         _write_volume(result, sweep_file, volume, volume_mode, settings)
-    if save_curves is not None:
-        note(
-            f"curves corrected by the crossing sweep, for this probe: {save_curves}"
-            if result.curves is not None
-            else f"{save_curves}: not written, since the sweeps could not be crossed"
-        )
     for reason in result.summary.left_out.values():
         raise MismatchError(f"{reason}; the other modes' results are in {result.directory}")
-
-
-def _require_mode(wanted: str | None, modes: Sequence[str]) -> None:
-    if wanted is not None and wanted not in ("image", *modes):
-        there = ", ".join(("image", *modes))
-        raise InvalidInputError(f"--volume-mode: expected one of {there}, as --drift has it, got {wanted!r}")
 
 
 def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | None, settings: Config) -> None:
     """Compound the sweep at the poses just found."""
     from speckle3d.study.posed import open_posed
-    from speckle3d.study.scenes.voxels import VolumeRequest, best_mode, write_voxels
+    from speckle3d.study.scenes.voxels import VolumeRequest, write_voxels
 
-    made = result.directory / "reconstruction.h5"
-    posed = open_posed(made, mode or best_mode(made), sweep_file)
+    posed = open_posed(result.directory / "reconstruction.h5", mode, sweep_file)
+    for line in posed.notes():
+        note(line)
     with progress_bar(f"compounding {out.name}") as progress:
         note(write_voxels(posed, VolumeRequest(out, settings.volume), progress).line)
-
-
-def _crossing(
-    sweep: Sweep, sweep_file: Path, crossing_file: Path | None, frames: str | None
-) -> tuple[Sweep, Path] | None:
-    """The crossing sweep and its file: another recording, or a part of the same one; None without either."""
-    from speckle3d.io.load import load_sweep
-
-    if crossing_file is None and frames is None:
-        return None
-    whole = sweep if crossing_file is None else load_sweep(crossing_file)
-    return _part(whole, frames, "--crossing-frames"), crossing_file or sweep_file
 
 
 def _part(sweep: Sweep, frames: str | None, option: str) -> Sweep:
@@ -193,13 +191,10 @@ def _tell(result: JobResult) -> None:
 
 
 def _find_curves(given: Path | None, sweep_file: Path) -> Path:
+    from speckle3d.io.curves import curves_beside
+
     if given is not None:
         return given
-    beside = sweep_file.parent / "curves.h5"
-    if not beside.is_file():
-        raise InvalidInputError(
-            f"expected decorrelation curves: --curves CURVES.h5 or {beside}, got neither "
-            "(speckle3d calibrate curves makes them from a phantom sweep)"
-        )
+    beside = curves_beside(sweep_file)
     note(f"curves: {beside}")
     return beside

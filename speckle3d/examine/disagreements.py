@@ -84,10 +84,10 @@ def _compared(
         if size[worst] > JOINT_CLAIMS or (unit and axis == 2):
             factor, mm = (1.0, "mm") if axis < 3 else (float(np.degrees(1.0)), "degrees")
             images, other = (
-                f"{factor * float(path[worst, axis]):.3g} +- {factor * float(sigma[worst]):.2g} {mm}"
+                f"{factor * float(path[worst, axis]):.3g} +- {1.96 * factor * float(sigma[worst]):.2g} {mm}"
                 for path, sigma in ((by_images, own), (by_sensor, its))
             )
-            words = f"{name} {images} by the images, {other} by the {sensor.label}"
+            words = f"{name} {images} by the images, {other} by the {sensor.label} (95 %)"
             yield Doubt(about, unit and f"units: {unit} for millimetres", words, False)
             return
 
@@ -150,7 +150,8 @@ def differing_lengths(lengths: Mapping[str, tuple[float, float]]) -> tuple[Doubt
     for (one, (first, own)), (other, (second, its)) in combinations(lengths.items(), 2):
         if apart((first, second), (own, its)):
             words = (
-                f"length {first:.2f} +- {own:.2f} mm in mode {one}, {second:.2f} +- {its:.2f} mm in {other}"
+                f"length {first:.2f} +- {1.96 * own:.2f} mm in mode {one}, {second:.2f} +- "
+                f"{1.96 * its:.2f} mm in {other} (95 %)"
             )
             found.append(Doubt(f"modes {one} and {other}", "", words, False))
     return tuple(found)

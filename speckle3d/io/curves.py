@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
@@ -13,6 +15,23 @@ from speckle3d.io.records import HDF5Writer, read_record
 from speckle3d.io.sweeps import SIGNALS
 
 FORMAT = "speckle3d.curves"
+
+
+def curves_beside(sweep_file: Path) -> Path:
+    """Where the curves of a sweep's probe lie that nobody names: curves.h5 in its folder.
+
+    Raises
+    ------
+    InvalidInputError
+        If there are none.
+    """
+    beside = sweep_file.parent / "curves.h5"
+    if not beside.is_file():
+        raise InvalidInputError(
+            f"expected decorrelation curves: --curves CURVES.h5 or {beside}, got neither "
+            "(speckle3d calibrate curves makes them from a phantom sweep)"
+        )
+    return beside
 
 
 def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:

@@ -25,6 +25,7 @@ from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import FORMAT, read_reconstruction
 from speckle3d.io.tum import LengthUnit, read_tum
 from speckle3d.scoring.displacements import challenge_score, score_row
+from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.references import find_reference
 
 _ROUNDING_S = 0.5e-6
@@ -98,14 +99,14 @@ def kind_of(path: Path) -> str:
         return "text"
 
 
-def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | None = None) -> Trajectory:
+def load_estimate(path: Path, mode: str | None = None, length_unit: LengthUnit | None = None) -> Trajectory:
     """Read TUM text, or one mode of a reconstruction.
 
     Parameters
     ----------
     path : path
-    mode : str
-        Which poses of a reconstruction.
+    mode : str, optional
+        Which poses of a reconstruction; by default those that claim the smallest error of length.
     length_unit : {"m", "mm"}, optional
         Of text that does not say; else metres.
     """
@@ -115,8 +116,8 @@ def load_estimate(path: Path, mode: str = "image", length_unit: LengthUnit | Non
     return load_reconstructed(path, mode)
 
 
-def load_reconstructed(path: Path, mode: str) -> Trajectory:
-    """Read one mode of a reconstruction.
+def load_reconstructed(path: Path, mode: str | None = None) -> Trajectory:
+    """Read one mode of a reconstruction; by default that which claims the smallest error of length.
 
     Raises
     ------
@@ -124,6 +125,7 @@ def load_reconstructed(path: Path, mode: str) -> Trajectory:
         If the reconstruction has no such mode.
     """
     made = read_reconstruction(path, with_pairs=False)
+    mode = default_mode(made)[0] if mode is None else mode
     name, of = f"{path.name}, mode {mode}", made.provenance.input_sha256
     return Trajectory(name, made.frame_time_s, poses_of(made, mode), made.grid, sweep_sha256=of)
 
@@ -136,7 +138,7 @@ def poses_of(reconstruction: Reconstruction, mode: str) -> RigidTransform:
 
 
 def load_reference(
-    path: Path, wanted: str | None = None, mode: str = "image", length_unit: LengthUnit | None = None
+    path: Path, wanted: str | None = None, mode: str | None = None, length_unit: LengthUnit | None = None
 ) -> Trajectory:
     """Read TUM text, a reconstruction, or the truth or tracker of a sweep.
 

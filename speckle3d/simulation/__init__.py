@@ -3,8 +3,3 @@
 `SimulationSettings` validates what users choose; models of probe, hand, medium and sensors are plain
 dataclasses, since only presets make them.
 """
-
-from speckle3d.simulation.presets import simulate
-from speckle3d.simulation.settings import SimulatedSweep, SimulationSettings
-
-__all__ = ["SimulatedSweep", "SimulationSettings", "simulate"]

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.simulation.medium import TILE_MM, Layer, Scatterers, TiledMedium, tile_rng, tiles_near
-
-Reflector = Literal["wall", "bar"]
+from speckle3d.simulation.settings import Reflector
 
 _STEEPEST = np.cos(np.deg2rad(35.0))
 """Reverberations off virtual surfaces turned further than this miss the aperture."""

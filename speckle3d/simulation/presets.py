@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
 from speckle3d.simulation.bath import crossed_threads, water_bath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
@@ -29,7 +31,7 @@ from speckle3d.simulation.sensors import (
     simulate_orientation,
     simulate_tracker,
 )
-from speckle3d.simulation.settings import Preset, SimulatedSweep, SimulationSettings
+from speckle3d.simulation.settings import Preset, SimulationSettings
 
 __all__ = ["Preset", "SimulatedSweep", "SimulationSettings", "simulate"]
 
@@ -51,6 +53,35 @@ _MEDIA = {
     "crossed": tissue,
     "stepped": fully_developed,
 }
+
+
+@shown
+@dataclass(frozen=True)
+class SimulatedSweep:
+    """A sweep whose frames are computed as they are read, and the settings that determine it.
+
+    Parameters
+    ----------
+    sweep : Sweep
+    settings : SimulationSettings
+    tracker_from_image, orientation_from_image : RigidTransform, Rotation, optional
+        The true ``sensor_from_image`` of sensors that the sweep leaves uncalibrated.
+    """
+
+    sweep: Sweep
+    settings: SimulationSettings
+    tracker_from_image: RigidTransform | None = None
+    orientation_from_image: Rotation | None = None
+
+    def description(self) -> dict[str, Any]:
+        """Plain values for a file: the settings and, where it is for a calibration to find, the mounting."""
+        values = self.settings.model_dump(mode="json")
+        if self.tracker_from_image is not None:
+            values["tracker_sensor_from_image"] = self.tracker_from_image.as_matrix().tolist()
+        if self.orientation_from_image is not None:
+            wxyz = self.orientation_from_image.as_quat(scalar_first=True)
+            values["orientation_sensor_from_image_wxyz"] = wxyz.tolist()
+        return values
 
 
 def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:

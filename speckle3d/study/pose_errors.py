@@ -13,6 +13,7 @@ from speckle3d.core.reconstruction import Reconstruction, SharedErrors
 from speckle3d.imaging.measures.belonging import require_inside
 from speckle3d.imaging.measures.measure import Measurement, measured
 from speckle3d.motion.joint_errors import joint_errors, turn_factors
+from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.trajectories import poses_of
 
 PICKED = 0.5
@@ -20,7 +21,10 @@ PICKED = 0.5
 
 
 def measure(
-    reconstruction: Reconstruction, points_mm: FloatArray, mode: str = "image", pick_mm: float | None = None
+    reconstruction: Reconstruction,
+    points_mm: FloatArray,
+    mode: str | None = None,
+    pick_mm: float | None = None,
 ) -> list[Measurement]:
     """Say how long it is between points of a reconstructed sweep, and how sure that is.
 
@@ -30,8 +34,8 @@ def measure(
         Its pairs are not needed.
     points_mm : ndarray, shape (k, 3)
         In the world of the mode, in order.
-    mode : str
-        At whose poses the points were picked.
+    mode : str, optional
+        At whose poses the points were picked; by default those that claim the smallest error of length.
     pick_mm : float, optional
         Standard deviation of each point's place on each axis by picking; by default half the distance of the
         image's vectors.
@@ -46,10 +50,13 @@ def measure(
     ------
     InvalidInputError
         If there are fewer than two points, one lies outside the sweep, or there is no such mode.
+    MismatchError
+        If no mode is named, and modes differ by more than three joint claims.
     InsufficientDataError
         As `errors_of`.
     """
     points = np.asarray(points_mm, dtype=float).reshape(-1, 3)
+    mode = default_mode(reconstruction)[0] if mode is None else mode
     errors, grid = posed_errors_of(reconstruction, mode), reconstruction.grid
     near = require_inside(points, grid, errors.world_from_image)
     return measured(points, near, errors, PICKED * grid.vector_pitch_mm if pick_mm is None else pick_mm)

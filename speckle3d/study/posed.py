@@ -24,6 +24,7 @@ from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
 from speckle3d.io.reconstructions import FORMAT
 from speckle3d.matching.quality import describe
+from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
 from speckle3d.study.images import grey_images, open_reconstruction, usual_levels
@@ -52,6 +53,8 @@ class PosedSweep:
     range_is_known : bool
         Whether the recording says the dynamic range of its B-mode, or it is given; levels as stored need
         none.
+    chosen_for : str
+        Why this mode, where nobody chose it.
     """
 
     sweep: Sweep
@@ -60,6 +63,7 @@ class PosedSweep:
     mode: str
     reconstruction: Reconstruction | None = None
     range_is_known: bool = True
+    chosen_for: str = ""
 
     def images(
         self, dynamic_range_db: float = USUAL_RANGE_DB, progress: Callable[[int, int], None] | None = None
@@ -108,12 +112,13 @@ class PosedSweep:
         return 0.0 if tracker is None or self.mode != "tracker" else tracker.image_skew_rad
 
     def notes(self) -> list[str]:
-        """Tell which frames are left out, and which have poses that are guesses."""
+        """Tell why this mode was taken, which frames are left out, and which have poses that are guesses."""
         without = len(self.sweep) - len(self.frames)
         trust = None if self.reconstruction is None else self.reconstruction.trust
         flagged = [] if trust is None else describe(trust.flags)
         left_out = f"{without} of {len(self.sweep)} frames have no valid pose and are left out"
         return [
+            *filter(None, [self.chosen_for]),
             *([f"{self.sweep.name}: {left_out}"] if without else []),
             *(f"{line}: poses there are guesses" for line in flagged),
         ]
@@ -161,8 +166,8 @@ def open_posed(
     path : path
         Reconstruction, or recording with a calibrated tracker or true poses.
     mode : str, optional
-        A mode of the reconstruction (by default "image"); "tracker" or "truth" of a recording (by default
-        the truth if stored, else the tracker).
+        A mode of the reconstruction (by default that which claims the smallest error of length); "tracker" or
+        "truth" of a recording (by default the truth if stored, else the tracker).
     sweep_file : path, optional
         The reconstruction's sweep, if it moved.
     settings : ImportSettings, optional
@@ -177,6 +182,8 @@ def open_posed(
     ------
     InvalidInputError
         If there is no such mode.
+    MismatchError
+        If none is named, and modes differ by more than three joint claims.
     InsufficientDataError
         If the recording does not say where its frames are.
     """
@@ -186,10 +193,9 @@ def open_posed(
                 f"{path}: expected a recording with what it does not say, got a reconstruction"
             )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
-        chosen = mode or "image"
-        return PosedSweep(
-            sweep, np.arange(len(sweep)), poses_of(reconstruction, chosen), chosen, reconstruction
-        )
+        chosen, why = default_mode(reconstruction) if mode is None else (mode, "")
+        poses = poses_of(reconstruction, chosen)
+        return PosedSweep(sweep, np.arange(len(sweep)), poses, chosen, reconstruction, chosen_for=why)
     if sweep_file is not None:
         raise InvalidInputError(f"{path}: expected a reconstruction beside --sweep, got a recording")
     if mode is not None and mode not in REFERENCES:

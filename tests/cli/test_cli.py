@@ -14,17 +14,6 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volumes import read_volume
 
-RESULTS = {
-    "reconstruction.h5",
-    "summary.json",
-    "table.txt",
-    "table.csv",
-    "drift.png",
-    "reslice.png",
-    "enlarged.png",
-}
-PNG = b"\x89PNG\r\n\x1a\n"
-
 
 def test_info_tells_what_a_sweep_holds(run, bench):
     code, out, _ = run("info", bench / "sweep.h5", "--json")
@@ -36,29 +25,6 @@ def test_info_tells_what_a_sweep_holds(run, bench):
     code, out, _ = run("info", bench / "sweep.h5")
     assert code == 0
     assert "26 x 1800" in out
-
-
-@pytest.mark.slow
-def test_a_simulation_is_told_in_the_file_and_comes_again(run, bench, tmp_path):
-    again = tmp_path / "again.h5"
-    assert run("simulate", again, *SMALL, "--length-mm", "3", "--frames", "24")[0] == 0
-    first, second = load_sweep(bench / "sweep.h5"), load_sweep(again)
-    np.testing.assert_array_equal(first.frames[7], second.frames[7])
-    with h5py.File(again) as file:
-        assert file["simulation"].attrs["preset"] == "phantom"
-        assert file["simulation"].attrs["seed"] == 5
-
-
-def test_a_reconstruction_holds_every_mode_and_where_it_came_from(reconstructed, bench):
-    assert {path.name for path in reconstructed.iterdir()} == RESULTS
-    found = read_reconstruction(reconstructed / "reconstruction.h5")
-    assert set(found.poses) == {"image", "orientation", "pose"}
-    assert all(len(poses) == 24 for poses in found.poses.values())
-    np.testing.assert_allclose(found.poses["image"][0].as_matrix(), np.eye(4), atol=1e-12)
-    assert found.provenance.input_path == str(bench / "sweep.h5")
-    assert "[trajectory]" in found.config_toml
-    assert len(found.pairs) >= 23
-    assert all((reconstructed / name).read_bytes().startswith(PNG) for name in ("drift.png", "reslice.png"))
 
 
 def test_the_errors_against_truth_are_in_every_table(reconstructed):
@@ -74,16 +40,6 @@ def test_the_errors_against_truth_are_in_every_table(reconstructed):
     assert [line.split()[2] for line in (reconstructed / "table.txt").read_text().splitlines()[2:6]] == [
         *rows
     ]
-
-
-def test_json_is_the_summary_and_nothing_else(run, bench, reconstructed, tmp_path):
-    modes = ("--drift", "orientation", "--drift", "pose")
-    code, out, _ = run("reconstruct", bench / "sweep.h5", "-o", tmp_path, *modes, "--json")
-    got, before = (
-        json.loads(text)["sweeps"][0] for text in (out, (reconstructed / "summary.json").read_text())
-    )
-    assert code == 0
-    assert got["rows"] == before["rows"]
 
 
 def test_curves_as_json(run, bench, tmp_path):
@@ -112,16 +68,6 @@ def test_settings_are_used_and_saved(run, bench, tmp_path):
     assert json.loads(out)["sweeps"][0]["details"]["corrections"]["orientation"]["curves"] == "distance"
 
 
-def test_the_default_configuration_can_be_given_back(run, bench, tmp_path):
-    code, out, _ = run("config")
-    (tmp_path / "all.toml").write_text(out)
-    assert code == 0
-    code, _, err = run(
-        "reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", "--config", tmp_path / "all.toml"
-    )
-    assert code == 0, err
-
-
 def test_without_a_sensor_the_sign_is_said_to_be_assumed(run, changed, tmp_path):
     def forget(file):
         del file["tracker"], file["orientation"], file["truth"]
@@ -147,8 +93,8 @@ def test_of_a_tracker_that_the_images_contradict_both_lengths_are_told(run, chan
     assert {row["mode"] for row in summary["rows"]} == {"image", "orientation", "pose", "tracker"}
 
 
-@pytest.mark.parametrize("name", ["v.nrrd", "v.mha", "v.nii.gz"])
-def test_volume(run, reconstructed, tmp_path, name):
+def test_volume(run, reconstructed, tmp_path):
+    name = "v.nii.gz"
     options = ("--mode", "pose", "--voxel-mm", "0.5")
     code, _, err = run("volume", reconstructed / "reconstruction.h5", "-o", tmp_path / name, *options)
     assert code == 0, err
@@ -158,23 +104,17 @@ def test_volume(run, reconstructed, tmp_path, name):
     assert (voxels > 0).mean() > 0.3
 
 
-@pytest.mark.parametrize(("options", "packing"), [((), None), (("--compress", "gzip"), "gzip")])
-def test_convert_copies_a_sweep(run, bench, tmp_path, options, packing):
-    code, _, err = run("convert", bench / "sweep.h5", tmp_path / "copy.h5", *options)
+def test_convert_copies_a_sweep(run, bench, tmp_path):
+    code, _, err = run("convert", bench / "sweep.h5", tmp_path / "copy.h5", "--compress", "gzip")
     assert code == 0, err
     with h5py.File(tmp_path / "copy.h5") as file:
-        assert file["rf"].compression == packing
+        assert file["rf"].compression == "gzip"
     first, second = load_sweep(bench / "sweep.h5"), load_sweep(tmp_path / "copy.h5")
     np.testing.assert_array_equal(first.frames[3], second.frames[3])
     np.testing.assert_allclose(first.truth.as_matrix(), second.truth.as_matrix(), atol=1e-12)
 
 
-def test_an_unknown_compression_is_named(refused, bench, tmp_path):
-    said = refused("convert", bench / "sweep.h5", tmp_path / "copy.h5", "--compression", "zip")
-    assert "--compression: expected gzip, lzf, none, got 'zip'" in said
-
-
-@pytest.mark.parametrize("arguments", [(), ("--help",), ("reconstruct", "--help"), ("calibrate", "--help")])
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("reconstruct", "--help")])
 def test_help_is_no_error_and_needs_nothing_heavy(arguments):
     code = "import sys; from speckle3d.cli import main\ntry: main()\nexcept SystemExit: pass\n"
     code += "print(sorted({'numba', 'h5py', 'scipy', 'numpy', 'matplotlib'} & set(sys.modules)))"
@@ -190,16 +130,9 @@ def test_usage_errors_are_one_line(refused):
     assert "--preset" not in refused("simulate")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--preset", "phantm"), "--preset"),
-        (("--vectors", "0"), "--vectors"),
-        (("--length-mm", "-3"), "--length-mm"),
-    ],
-)
-def test_a_simulation_that_makes_no_sense(refused, tmp_path, options, message):
-    assert message in refused("simulate", tmp_path / "s.h5", *options)
+@pytest.mark.parametrize("option", [("--preset", "phantm"), ("--vectors", "0"), ("--vectors", "many")])
+def test_a_simulation_that_makes_no_sense(refused, tmp_path, option):
+    assert option[0] in refused("simulate", tmp_path / "s.h5", *option)
 
 
 def test_files_that_are_not_there_or_not_sweeps(refused, bench, tmp_path):
@@ -220,12 +153,6 @@ def test_curves_of_another_probe(refused, changed, bench, tmp_path):
     other = changed(lambda file: file.attrs.modify("vector_pitch_mm", 0.2), "curves.h5")
     message = refused("reconstruct", bench / "sweep.h5", "--curves", other, "-o", tmp_path / "o")
     assert re.search(r"vector_pitch_mm.*0\.2.*0\.3", message)
-
-
-def test_an_unknown_mode_or_reference(refused, bench, tmp_path):
-    sweep, out = bench / "sweep.h5", tmp_path / "o"
-    assert "got 'magic'" in refused("reconstruct", sweep, "-o", out, "--drift", "magic")
-    assert "got 'memory'" in refused("reconstruct", sweep, "-o", out, "--reference", "memory")
 
 
 def forgotten(file, mode):
@@ -250,18 +177,19 @@ def stopped_early(file, mode):
 SENSORS = {"orientation": ("orientation", "sensor_from_image_wxyz"), "pose": ("tracker", "sensor_from_image")}
 
 
-@pytest.mark.parametrize("mode", SENSORS)
 @pytest.mark.parametrize(
-    ("edit", "message"),
-    [(forgotten, "/{0}.*got none"), (uncalibrated, "not calibrated.*{1}|{1}.*not calibrated"),
-     (stopped_early, "got 1[12]")],
-)  # fmt: skip
+    ("mode", "edit", "message"),
+    [
+        ("orientation", forgotten, "/orientation.*got none"),
+        ("pose", uncalibrated, "not calibrated"),
+        ("orientation", stopped_early, "got 1[12]"),
+    ],
+)
 def test_a_mode_whose_sensor_is_missing_uncalibrated_or_covers_half(
     refused, changed, tmp_path, mode, edit, message
 ):
     sweep = changed(lambda file: edit(file, mode))
-    line = refused("reconstruct", sweep, "-o", tmp_path / "o", "--drift", mode)
-    assert re.search(message.format(*SENSORS[mode]), line)
+    assert re.search(message, refused("reconstruct", sweep, "-o", tmp_path / "o", "--drift", mode))
 
 
 def test_an_unknown_setting(refused, bench, tmp_path):

@@ -9,7 +9,6 @@ from io import StringIO
 import h5py
 import numpy as np
 import pytest
-import sweep_examples
 from calibration_files import made
 from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
@@ -19,7 +18,6 @@ from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.hdf5 import sha256_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import GreyImages
 
 FOUND = made().parameters
@@ -99,16 +97,6 @@ def calibrated_run(bench, sweep, uncalibrated):
     return bench / "calibrated", said.getvalue()
 
 
-def test_info_shows_a_calibration(run, saved):
-    code, out, _ = run("info", saved(made()))
-    assert code == 0
-    assert "4 of 9" in out
-    assert "44.220 deg" in out
-    code, out, _ = run("info", saved(made("orientation")), "--json")
-    rows = {row["description"]: row["value"] for row in json.loads(out)}
-    assert (rows["sensor"], rows["verdict"]) == ("orientation", "The motion was sufficient.")
-
-
 def test_calibrations_from_files_do_what_those_in_the_sweep_do(calibrated_run, reconstructed):
     got, before = (
         read_reconstruction(folder / "reconstruction.h5").poses
@@ -134,13 +122,6 @@ def test_the_files_are_told_in_the_reconstruction_the_summary_and_info(run, cali
         for r in json.loads(run("info", folder / "reconstruction.h5", "--json")[1])
     }
     assert rows["calibration of tracker"] == str(paths["tracker"])
-
-
-def test_volume_and_reslice_still_find_the_sweep(run, calibrated_run, tmp_path):
-    path = calibrated_run[0] / "reconstruction.h5"
-    options = ("--mode", "pose", "--voxel-mm", "0.5")
-    assert run("volume", path, "-o", tmp_path / "v.nrrd", *options)[0] == 0
-    assert run("reslice", path, "-o", tmp_path / "r.png", "--mode", "orientation")[0] == 0
 
 
 def test_another_clock_offset_is_said_but_the_same_pixels_are_not(calibrated_run, sweep):
@@ -202,8 +183,6 @@ def sequence(tmp_path):
     [
         ((), (0.137, 0.138)),
         (("--column-pitch-mm", "0.2"), (0.2, 0.138)),
-        (("--row-spacing-mm", "0.3"), (0.137, 0.3)),
-        (("--column-pitch-mm", "0.2", "--row-spacing-mm", "0.3"), (0.2, 0.3)),
     ],
 )
 def test_images_get_the_fitted_pixels_unless_given(run, sequence, saved, tmp_path, options, expected):
@@ -216,20 +195,6 @@ def test_images_get_the_fitted_pixels_unless_given(run, sequence, saved, tmp_pat
         got.tracker.sensor_from_image.as_matrix(), made().sensor_from_image.as_matrix(), atol=1e-12
     )
     assert ("found pixels of" in err) == bool(options)
-
-
-def test_fitted_pixels_go_before_those_of_a_sweep_file_of_images(run, saved, tmp_path):
-    source, out = tmp_path / "in.h5", tmp_path / "out.h5"
-    held = sweep_examples.bmode_sweep()
-    write_sweep(source, replace(held, grid=replace(held.grid, first_sample_depth_mm=0.9)))
-    code, _, err = run("convert", source, out, "--calibration", saved(made()))
-    assert (code, "found pixels" in err) == (0, False)
-    grid = load_sweep(out).grid
-    # Ten rows of 0.09 mm above the first stored one become ten rows of 0.138 mm.
-    assert (grid.vector_pitch_mm, grid.sample_spacing_mm) == (0.137, 0.138)
-    assert grid.first_sample_depth_mm == pytest.approx(1.38)
-    assert run("convert", source, out, "--calibration", saved(made("orientation")))[0] == 0
-    assert load_sweep(out).grid == load_sweep(source).grid
 
 
 def test_calibrations_that_do_not_fit_are_refused(refused, bench, saved, sequence, tmp_path):
@@ -257,12 +222,3 @@ def test_a_calibration_for_a_sensor_that_the_sweep_lacks(refused, changed, saved
     message = refused("reconstruct", changed(forget), "-o", tmp_path / "o", "--calibration", saved(made()))
     assert "cal.h5" in message
     assert "tracker" in message
-
-
-def test_in_python_it_is_two_calls(sweep, saved):
-    import speckle3d
-
-    calibration = speckle3d.load_calibration(saved(made()))
-    got = speckle3d.calibrated(replace(sweep, truth=None), calibration)
-    assert isinstance(calibration, speckle3d.Calibration)
-    assert got.tracker.time_offset_s == -0.0125

@@ -84,13 +84,6 @@ def test_a_calibration_of_another_sensor_is_refused(refused, back, tmp_path):
     assert "orientation" in line
 
 
-def test_a_pixel_size_beside_a_files_own_is_refused(refused, back):
-    for way in ("line", "images"):
-        line = refused("calibrate", "clock", back, "--by", way, "--pixel-mm", "0.1", "0.1")
-        assert line.startswith("speckle3d: --pixel-mm: ")
-        assert str(back) in line
-
-
 def test_frames_in_which_no_line_is_seen_are_counted(refused, noise):
     line = refused("calibrate", "clock", noise)
     assert "20 frames" in line
@@ -98,59 +91,9 @@ def test_frames_in_which_no_line_is_seen_are_counted(refused, noise):
     assert "--by images" in line
 
 
-def image_sequence(path, kind, sample, frames=4):
-    """A MetaImage whose header knows times and places but neither sizes nor rates."""
-    pose = " ".join(f"{value:g}" for value in np.eye(4).ravel())
-    lines = ["ObjectType = Image", "NDims = 3", f"DimSize = 16 16 {frames}", f"ElementType = {sample}"]
-    lines += [f"UltrasoundImageType = {kind}", "UltrasoundImageOrientation = MF"]
-    for number in range(frames):
-        lines += [
-            f"Seq_Frame{number:04d}_Timestamp = {0.04 * number}",
-            f"Seq_Frame{number:04d}_ProbeToTrackerTransform = {pose}",
-            f"Seq_Frame{number:04d}_ProbeToTrackerTransformStatus = OK",
-        ]
-    path.write_bytes(
-        "\n".join([*lines, "ElementDataFile = LOCAL\n"]).encode()
-        + bytes(512 * frames)[: 256 * frames * (1 + (sample == "MET_SHORT"))]
-    )
-    return path
-
-
-@pytest.mark.parametrize("way", ["line", "images"])
-def test_what_a_header_lacks_is_named_by_options_that_there_are(refused, tmp_path, way):
-    grey = image_sequence(tmp_path / "grey.mha", "BRIGHTNESS", "MET_UCHAR")
-    assert "--pixel-mm" in refused("calibrate", "clock", grey, "--by", way)
-    rf = image_sequence(tmp_path / "rf.mha", "RF_REAL", "MET_SHORT")
-    for options in ((), ("--pixel-mm", "0.1", "0.1")):
-        line = refused("calibrate", "clock", rf, "--by", way, *options)
-        assert "speckle3d convert rf.mha OUT.h5 --" in line
-        assert {"--sampling-rate-hz", "--centre-frequency-hz", "--bandwidth-hz"} <= {
-            *line.replace("`", " ").split()
-        }
-        assert "_hz" not in line
-
-
-def test_poses_of_another_name_are_listed_and_used_when_asked_for(refused, back, tmp_path):
-    grey = image_sequence(tmp_path / "grey.mha", "BRIGHTNESS", "MET_UCHAR")
-    grey.write_bytes(grey.read_bytes().replace(b"ProbeToTracker", b"ToolToTracker"))
-    command = ("calibrate", "clock", grey, "--pixel-mm", "0.1", "0.1")
-    assert "got ToolToTracker: name the sensor's with --transform" in refused(*command)
-    assert "expected a transform StylusToTracker, got ToolToTracker" in refused(
-        *command, "--transform", "StylusToTracker"
-    )
-    # With poses, what is lacking next is a line in the images.
-    assert "20 frames" in refused(*command, "--transform", "ToolToTracker")
-    assert "--transform" in refused("calibrate", "clock", back, "--transform", "ToolToTracker")
-
-
 def test_tissue_is_not_taken_for_a_plane(refused, back):
     # In 43 frames something like a line is seen; it once followed the sensor by 98 %, 95 ms off.
     assert " 8 numbers" in refused("calibrate", "clock", back)
-
-
-def test_help_says_how_the_sign_relates_to_that_of_plus(run):
-    _, text, _ = run("calibrate", "clock", "--help")
-    assert "LocalTimeOffsetSec" in text
 
 
 def test_what_is_printed_for_machines_is_json_even_if_numbers_are_not(run, back, monkeypatch):

@@ -1,10 +1,6 @@
 import json
-import re
 
 import pytest
-
-from speckle3d.cli.compare import _line
-from speckle3d.study.compare import StudyProgress
 
 
 @pytest.fixture(scope="module")
@@ -37,28 +33,12 @@ def test_a_study_of_broken_sweeps_alone_is_refused_with_the_first_reason(refused
     assert not (tmp_path / "study").exists()
 
 
-def test_curves_that_are_none_are_refused_before_any_work(refused, bench, tmp_path):
-    wrong = ("--curves", bench / "sweep.h5")
-    assert "sweep.h5" in refused("compare", bench / "sweep.h5", "-o", tmp_path / "study", *wrong)
-    assert not (tmp_path / "study").exists()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (("--scheduler", "tcp://a:1", "--workers", "2"), "--scheduler or --workers"),
         (("--workers", "0"), "--workers"),
-        (("--drift", "sideways"), "sideways"),
-        (("--reference", "guess"), "guess"),
-        (("--paper",), "sweeps"),
     ],
 )
 def test_a_wrong_option_is_one_line(refused, bench, tmp_path, options, message):
     assert message in refused("compare", bench / "sweep.h5", "-o", tmp_path / "study", *options)
-
-
-def test_the_line_of_progress_promises_nothing_before_the_first_sweep():
-    at = StudyProgress(sweeps=4, frames=400)
-    assert re.findall(r"\d+", _line(at)) == ["0", "4"]
-    at.done, at.failed, at.remaining_s = 2, 1, 83.0
-    assert re.findall(r"\d+", _line(at)) == ["2", "4", "1", "1", "23"]

@@ -8,7 +8,6 @@ import pytest
 import sweep_examples
 from image_examples import grey, tracked, write_mha
 
-from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
 
@@ -58,18 +57,6 @@ def test_what_a_sequence_does_not_hold_is_said(done, tmp_path):
     ]
 
 
-def test_every_setting_has_an_option_with_its_description(done, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "250")
-    text = " ".join(done("convert", "--help")[0].replace("│", " ").split())
-    named = {"tracker_transform": "--transform"}
-    not_numbers = {"image_to_probe", "arrays"}  # matrices and tables are for TOML
-    for name, field in ImportSettings.model_fields.items():
-        if name not in not_numbers:
-            assert named.get(name, f"--{name.replace('_', '-')}") in text
-        if name not in {*not_numbers, *named}:
-            assert " ".join(field.description.split()[:3]) in text
-
-
 def test_options_reach_the_sweep(done, tmp_path):
     pixels = np.random.default_rng(0).integers(-900, 900, (3, 4, 30)).astype(np.int16)
     path = write_mha(tmp_path / "rf.mha", pixels, frames=tracked(3)[2])
@@ -86,11 +73,11 @@ def test_options_reach_the_sweep(done, tmp_path):
 
 
 def test_places_that_are_taken_are_refused(refused, done, sequence, tmp_path):
-    assert ".seg.nrrd is of labels" in refused("convert", sequence, tmp_path / "s.seg.nrrd")
+    assert "s.seg.nrrd" in refused("convert", sequence, tmp_path / "s.seg.nrrd")
     assert "is an input" in refused("convert", sequence, sequence, *PIXELS)
     (tmp_path / "x.mha").write_bytes(b"something else")
     assert "another kind of file" in refused("convert", sequence, tmp_path / "x.mha", *PIXELS)
-    assert "'.nii'" in refused("convert", sequence, tmp_path / "x.nii", *PIXELS)
+    assert "x.nii" in refused("convert", sequence, tmp_path / "x.nii", *PIXELS)
     # Pixels beside a header are as much an output as the header.
     (tmp_path / "y.zraw").write_bytes(b"of another header")
     assert "y.zraw" in refused("convert", sequence, tmp_path / "y.mhd", *PIXELS)

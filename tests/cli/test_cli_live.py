@@ -9,11 +9,12 @@ import time
 
 import numpy as np
 import pytest
+from calibration_files import made
 from commands import command
 
 import speckle3d as s3
-from speckle3d.cli import _run
-from speckle3d.cli.stream.live import _require_possible, _trouble
+from speckle3d.cli.stream.live import _trouble
+from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.igtl.link import LinkState
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweeps import unfinished_note
@@ -120,19 +121,6 @@ def test_told_to_end_it_closes_the_recording_first(player, shipped, tmp_path):
     assert len(s3.load_sweep(out / "sweep.h5")) >= 10
 
 
-def test_an_error_that_a_signal_made_is_no_traceback(monkeypatch, capsys):
-    def failing(**_):
-        raise SystemError("compiled by halves")
-
-    monkeypatch.setattr("speckle3d.cli.app", failing)
-    with pytest.raises(SystemExit) as ended:
-        _run([signal.SIGTERM])
-    assert ended.value.code == 128 + signal.SIGTERM
-    assert capsys.readouterr().err == "speckle3d: stopped\n"
-    with pytest.raises(SystemError, match="halves"):
-        _run([])
-
-
 @pytest.mark.parametrize(
     ("state", "words"),
     [
@@ -150,28 +138,15 @@ def test_the_line_says_what_is_wrong_with_the_connection(state, words):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"drift": ["post"]}, "expected one of pose, orientation"),
-        ({"drift": ["pose"], "orientation": "P"}, "--drift pose: expected --transform beside it"),
-        ({"drift": ["crossed"]}, "--drift crossed: expected --crossing beside it"),
-        ({"drift": ["fused"]}, "expected --transform or --orientation or --crossing"),
-        ({"calibration": ["none.toml"]}, "none.toml"),
+        (("--drift", "pose", "--orientation", "P"), "--drift pose: expected --transform"),
+        (("--drift", "crossed"), "--drift crossed: expected --crossing"),
+        (("--calibration", "{calibration}"), "expected --transform"),
+        (("--compression", "lzf"), "--compression"),
     ],
 )
-def test_what_would_be_refused_at_the_end_is_refused_before(given, words):
-    options = dict.fromkeys(("drift", "calibration", "transform", "orientation", "crossing_file"))
-    with pytest.raises(s3.Speckle3DError, match=words):
-        _require_possible(options | given)
-    _require_possible(options | {"drift": ["pose", "fused"], "transform": "P"})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["nowhere", "-o", "out"], "HOST:PORT"),
-        (["localhost:18944", "-o", "out", "--compression", "lzf"], "none or gzip"),
-    ],
-)
-def test_a_wrong_option_is_one_line(refused, arguments, words, shipped, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert words in refused("live", *arguments, "--curves", shipped / "curves.h5")
+def test_what_would_be_refused_at_the_end_is_refused_before(refused, given, words, shipped, tmp_path):
+    write_calibration(tmp_path / "c.h5", made())
+    options = (word.format(calibration=tmp_path / "c.h5") for word in given)
+    live = ("live", "localhost:18944", "-o", tmp_path / "out", "--curves", shipped / "curves.h5")
+    assert words in refused(*live, *options)
     assert not (tmp_path / "out").exists()

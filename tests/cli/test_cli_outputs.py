@@ -55,19 +55,6 @@ def test_a_file_of_another_kind_stays_as_it_is(refused, calls, tmp_path, name):
     assert place.read_text(encoding="utf-8") == "precious, 1, 2\n"
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--voxel-mm", 1, "--spacing-mm", 1, 1, 1), "--voxel-mm: expected no --spacing-mm"),
-        (("--voxel-mm", 1, "--within-gb", 1), "--voxel-mm: expected no --within-gb"),
-        (("--rule", "maximum", "--backward-mm", 1), "--rule: expected no --backward-mm"),
-    ],
-)
-def test_options_that_would_say_nothing_are_refused(refused, reconstructed, tmp_path, options, words):
-    command = ("volume", reconstructed / "reconstruction.h5", "-o", tmp_path / "v.nrrd")
-    assert words in refused(*command, *options)
-
-
 def test_two_outputs_are_two_files(refused, reconstructed, tmp_path):
     place = tmp_path / "v.nrrd"
     command = ("volume", reconstructed / "reconstruction.h5", "-o", place, "--voxel-mm", 1)

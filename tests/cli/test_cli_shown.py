@@ -12,9 +12,7 @@ import pytest
 from calibration_files import made
 
 from speckle3d.cli import common
-from speckle3d.core.progress import bar_on_stderr
 from speckle3d.io.calibrations import write_calibration
-from speckle3d.study.compare import named
 
 HOSTILE = "a\x1b]0;gone\x07\x1b[31m\n\u202e[red]{0}$x^$<script>"
 SHOWN = "a\\x1b]0;gone\\x07\\x1b[31m\\n\\u202e[red]{0}$x^$<script>"
@@ -61,28 +59,9 @@ def test_a_sweep_of_any_name_is_reconstructed(run, tmp_path, small_sweeps):
     json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
 
 
-def test_a_bar_names_a_file_without_markup_or_template():
-    from rich.console import Console
-
-    with bar_on_stderr(f"reconstructing {HOSTILE}") as bar:
-        bar.add_task("", total=1)
-        out = io.StringIO()
-        Console(file=out, width=200, color_system=None).print(bar.get_renderable())
-    assert f"reconstructing {SHOWN}" in out.getvalue()
-
-
 def test_a_terminal_of_another_alphabet_shows_what_it_can(monkeypatch):
     out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", out)
     common.emit("3 µm \x1b[31m")
     out.flush()
     assert out.buffer.getvalue() == b"3 \\xb5m \\x1b[31m\n"
-
-
-def test_a_studys_folders_have_names_that_drive_nothing(tmp_path):
-    names = [
-        name for name, _ in named([tmp_path / f"{HOSTILE}.h5", tmp_path / "a%x1b.h5", tmp_path / "a\x1b.h5"])
-    ]
-    assert len(set(names)) == 3
-    assert all(name.isprintable() for name in names)
-    assert names[0] == SHOWN.replace("\\", "%")

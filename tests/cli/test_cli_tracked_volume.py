@@ -85,29 +85,6 @@ def test_other_levels_need_the_dynamic_range(run, refused, recording, tmp_path):
     assert 0 < np.nanmin(volume.voxels) < np.nanmax(volume.voxels) < 1
 
 
-def test_whole_grey_levels_are_kept_of_bytes_as_stored_alone(run, refused, recording, tmp_path):
-    out = tmp_path / "v.nrrd"
-    command = (
-        "volume",
-        recording[0],
-        "--plus-config",
-        tmp_path / "set.xml",
-        *GRID,
-        "--rule",
-        "plus",
-        "-o",
-        out,
-    )
-    told = refused(*command, "--voxel-type", "float32")
-    assert "rule plus: expected voxels of type uint8" in told
-    told = refused(*command, "--levels", "log", "--dynamic-range-db", 40)
-    assert "rule plus: expected images of type uint8, B-mode as stored, got float32" in told
-    assert not out.exists()
-    code, _, told = run(*command)
-    assert code == 0, told
-    assert read_volume(out).fields["rule"] == "plus"
-
-
 def test_a_cut_takes_the_same_options_and_shows_levels_where_decibels_are_not_known(run, recording, tmp_path):
     path, pixels = recording
     options = "--plus-config", tmp_path / "set.xml", "--frame", 2, "--pixel-mm", 0.5
@@ -122,4 +99,4 @@ def test_a_cut_takes_the_same_options_and_shows_levels_where_decibels_are_not_kn
     other = tmp_path / "c.nrrd", "--plus-config", tmp_path / "set.xml", "-o", tmp_path / "d.png"
     code, _, told = run("reslice", *other)
     assert code == 2
-    assert "--plus-config: expected a reconstruction or a recording with it, got a volume" in told
+    assert "--plus-config: expected a sweep" in told

@@ -4,7 +4,6 @@ import re
 import shlex
 
 import pytest
-import typer.main
 from pages import ROOT, shown_commands
 
 from speckle3d.cli import app
@@ -33,7 +32,7 @@ def commands_of(line):
 
 def parsed(words):
     """Follow the groups of commands to a command, and parse the rest with it; nothing is run."""
-    command, context = typer.main.get_command(app), None
+    command, context = app, None
     while hasattr(command, "commands"):
         assert words, "a group of commands alone"
         name, *words = words

@@ -7,9 +7,9 @@ from scipy.signal import hilbert
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.simulation import SimulationSettings, simulate
 from speckle3d.simulation.bath import Level, RoughSheet, water_bath
 from speckle3d.simulation.beam import tabulate_beam
+from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.scan import SimulatedFrames
 
 CENTRE_MM = (320.0, -150.0, -240.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.geometry import roll_yaw_tilt
-from speckle3d.simulation import SimulationSettings, simulate
+from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.receiver import received_as_bmode, received_as_iq
 
 

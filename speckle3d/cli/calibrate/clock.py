@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from speckle3d.cli.calibrations import require_free
-from speckle3d.cli.common import Images, Json, PixelMm, Poses, Region, Transform, calibrate, emit, note
+from speckle3d.cli.common import Images, Json, OptionalOut, PixelMm, Poses, Transform, emit, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 from speckle3d.core.progress import progress_bar
 
@@ -17,32 +17,48 @@ if TYPE_CHECKING:
     from speckle3d.core.calibration import Calibration
 
 
-@calibrate.command("clock")
-def calibrate_clock(
+def clock(
     images: Images,
     poses: Poses = None,
     transform: Transform = None,
     pixel_mm: PixelMm = None,
-    by: Annotated[
-        Literal["line", "images"],
-        typer.Option(
-            help="line: a plane's echo follows the sensor; images: a sweep forward and back over tissue."
-        ),
-    ] = "line",
-    sensor: Annotated[str, typer.Option(help="line: tracker or orientation.")] = "tracker",
-    region: Region = None,
-    search_s: Annotated[float, typer.Option(min=0.02, help="Delays to either side of the file's own.")] = 0.5,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="Calibration to start from (images), and to copy with the offset that was found."),
-    ] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--output", help="Where that copy goes.")] = None,
+    by: Literal["line", "images"] = "line",
+    sensor: Literal["tracker", "orientation"] = "tracker",
+    region: str | None = None,
+    search_s: Annotated[float, typer.Option(min=0.02)] = 0.5,
+    calibration: Path | None = None,
+    out: OptionalOut = None,
     as_json: Json = False,
 ) -> None:
     """Find a sensor's clock offset: a motion forward and back, or up and down (or rolling) over a plane.
 
     The offset is added to the sensor's times; PLUS's LocalTimeOffsetSec, of the image device, is the same
     with the other sign.
+
+    Parameters
+    ----------
+    images
+    by
+        line: a plane's echo follows the sensor; images: a sweep forward and back over tissue.
+    calibration
+        Calibration to start from (images), and to copy with the offset that was found.
+    out
+        Where that copy goes.
+    search_s
+        Delays to either side of the file's own.
+    poses, transform, as_json
+
+    Other Parameters
+    ----------------
+    pixel_mm
+    sensor
+        line: whose clock.
+    region
+        Polygon "column,row column,row ..." outside which nothing counts.
+
+    Examples
+    --------
+    $ speckle3d calibrate clock bath.h5 --calibration tracker.h5 -o timed.h5
     """
     from calibration.clock.images import delay_from_images
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
@@ -57,8 +73,8 @@ def calibrate_clock(
     known = _known(by, sensor, calibration, out)
     require_unsized(images, pixel_mm)
     if by == "images":
-        given_s = None if known is None else known.time_offset_s
-        tracked, mounting = open_tracked(images, poses, pixel_mm, given_s, transform)
+        offset_s = None if known is None else known.time_offset_s
+        tracked, mounting = open_tracked(images, poses, pixel_mm, offset_s, transform)
         mounting = mounting if known is None else known.sensor_from_image
         if mounting is None:
             raise InsufficientDataError(
@@ -66,12 +82,13 @@ def calibrate_clock(
                 "got none"
             )
         with progress_bar("trying delays") as progress, naming(str(images)):
-            found = delay_from_images(tracked, mounting, search_s, progress=progress)
-        frames = len(tracked.frame_time_s)
-        told = f"images of the two ways correlate by {found.followed:.2f}"
+            delay = delay_from_images(tracked, mounting, search_s, progress=progress)
+        frames, words = len(tracked.frame_time_s), f"images of the two ways correlate by {delay.followed:.2f}"
     else:
-        recording = open_recording(images, poses, pixel_mm, sensor, transform)
-        corners = region_of(region or "")
+        recording, corners = (
+            open_recording(images, poses, pixel_mm, sensor, transform),
+            region_of(region or ""),
+        )
         with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
             seen = detect_lines(recording.images, recording.pixel_mm, None, corners, progress)
         frames, times = len(seen), recording.frame_time_s
@@ -83,37 +100,35 @@ def calibrate_clock(
         with naming(str(images)):
             signal = line_signal(seen.pixels, recording.pixel_mm, (recording.images.shape[1] - 1) / 2)
             readings, around_s = recording.readings, recording.time_offset_s
-            found = delay_from_lines(signal, times[seen.frame], readings, around_s, search_s)
-        told = f"the sensor explains {100 * found.followed:.0f} % of the line's motion in {frames} frames"
+            delay = delay_from_lines(signal, times[seen.frame], readings, around_s, search_s)
+        words = f"the sensor explains {100 * delay.followed:.0f} % of the line's motion in {frames} frames"
     if known is not None and out is not None:
-        write_calibration(out, replace(known, time_offset_s=found.seconds))
+        write_calibration(out, replace(known, time_offset_s=delay.seconds))
         note(f"calibration with this offset in {out}")
+    error_s = delay.standard_error_s
     if as_json:
-        table = {
-            "time_offset_s": found.seconds,
-            "standard_error_s": found.standard_error_s,
-            "followed": found.followed,
-            "frames": frames,
-        }
-        emit(json_text(table))
+        offset = {"time_offset_s": delay.seconds, "standard_error_s": error_s}
+        emit(json_text({**offset, "followed": delay.followed, "frames": frames}))
         return
-    emit(f"sensor clock offset  {found.seconds:+.4f} +- {found.standard_error_s:.4f} s")
-    emit(told)
+    emit(f"sensor clock offset  {delay.seconds:+.4f} +- {1.96 * error_s:.4f} s (95 %)")
+    emit(words)
 
 
 def _known(by: str, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
     """Read the calibration, if one is given, after checking that the options fit each other and it."""
     from speckle3d.io.calibrations import read_calibration
 
-    if out is not None and calibration is None:
-        raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
-    if by == "line" and calibration is not None and out is None:
+    if by == "images" and sensor != "tracker":
+        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
+    if calibration is None:
+        if out is not None:
+            raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
+        return None
+    if by == "line" and out is None:
         raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
-    known = None if calibration is None else read_calibration(calibration)
-    if known is not None and known.sensor != sensor:
+    known = read_calibration(calibration)
+    if known.sensor != sensor:
         raise MismatchError(
             f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
         )
-    if by == "images" and sensor != "tracker":
-        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
     return known

@@ -2,91 +2,94 @@
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from speckle3d.cli.calibrations import report_written, require_free
-from speckle3d.cli.common import (
-    CalibrationOut,
-    Images,
-    Json,
-    calibrate,
-    emit,
-    emit_json,
-    from_options,
-    note,
-)
-from speckle3d.cli.helping import Command
+from speckle3d.cli.commands import Fields
+from speckle3d.cli.common import Images, Json, Out, emit, emit_json, from_options, note
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.calibrating.settings import ScanSettings
 
-METHODS = {
-    "plane": "Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom.",
-    "orientation": "Calibrate an orientation sensor with the floor of a water bath.",
-    "wires": "Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes.",
-}
+
+def plane(
+    images: Images,
+    out: Out,
+    settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:PlaneSettings")],
+    as_json: Json = False,
+) -> None:
+    """Calibrate a position sensor with the floor of a water bath, or the Cambridge phantom.
+
+    Parameters
+    ----------
+    images
+    out
+        Calibration file to write; .txt and .png beside it.
+    reflector, poses, transform, pixel_mm, time_offset_s, validation, as_json
+
+    Examples
+    --------
+    $ speckle3d calibrate plane bath.h5 -o tracker.h5 --reflector bar
+    """
+    from speckle3d.calibrating.settings import PlaneSettings
+
+    _calibrate(images, from_options(PlaneSettings, settings), out, as_json)
 
 
-class _OfSettings(Command):
-    """A command whose options are the fields of its settings, loaded when it is asked for them."""
+def orientation(
+    images: Images,
+    out: Out,
+    settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:OrientationSettings")],
+    as_json: Json = False,
+) -> None:
+    """Calibrate an orientation sensor with the floor of a water bath.
 
-    @property
-    def params(self) -> list[Any]:
-        """Of the command, as click has them."""
-        if "_params" not in vars(self):
-            alone = typer.Typer(add_completion=False)
-            alone.command()(_command_of(str(self.name)))
-            command = typer.main.get_command(alone)
-            self._params, self.callback = list(command.params), command.callback
-        return self._params
+    Parameters
+    ----------
+    images
+    out
+        Calibration file to write; .txt and .png beside it.
+    sensor, level, viewed_from, poses, time_offset_s, validation, as_json
 
-    @params.setter
-    def params(self, none: list[Any]) -> None:
-        """Ignore that its stand-in has none."""
+    Examples
+    --------
+    $ speckle3d calibrate orientation bath.h5 -o imu.h5
+    """
+    from speckle3d.calibrating.settings import OrientationSettings
 
-
-def _command_of(method: str) -> Any:
-    """The command of a method, with the fields of its settings as parameters."""
-    from speckle3d.calibrating.settings import model_of, written_as
-
-    def option(name: str, kind: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
-        only = inspect.Parameter.KEYWORD_ONLY
-        return inspect.Parameter(name, only, default=default, annotation=kind)
-
-    def command(images: Path, out: Path, as_json: bool, **options: Any) -> None:
-        _calibrate(images, from_options(model_of(method), options), out, as_json)
-
-    parameters = [option("images", Images), option("out", CalibrationOut)]
-    for name, field in model_of(method).model_fields.items():
-        kind, text, default = field.annotation, written_as(field), field.default
-        told: dict[str, Any] = {"help": field.description}
-        if text is not None:
-            kind, default, told["metavar"] = str | None, None, text.metavar
-        if name == "phantom":
-            default = inspect.Parameter.empty  # the command asks which one
-        flag = typer.Option(f"--{name.replace('_', '-')}", **told)
-        parameters.append(option(name, Annotated[kind, flag], default))
-    parameters.append(option("as_json", Json, False))
-    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    command.__annotations__ = {each.name: each.annotation for each in parameters}
-    return command
+    _calibrate(images, from_options(OrientationSettings, settings), out, as_json)
 
 
-def _add_command(method: str) -> None:
-    def stand_in() -> None: ...
+def wires(
+    images: Images,
+    out: Out,
+    phantom: Annotated[str, typer.Option()],
+    settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:WireSettings")],
+    as_json: Json = False,
+) -> None:
+    """Calibrate a position sensor with crossing wires, three orthogonal wires or N-shapes.
 
-    stand_in.__doc__ = METHODS[method]
-    calibrate.command(method, cls=_OfSettings)(stand_in)
+    Parameters
+    ----------
+    images
+    out
+        Calibration file to write; .txt, .png and .csv beside it.
+    phantom
+        cross, three, or a PLUS configuration of N-wires.
+    points, poses, transform, pixel_mm, time_offset_s, as_json
 
+    Examples
+    --------
+    $ speckle3d calibrate wires scan.mha -o tracker.h5 --phantom cross
+    """
+    from speckle3d.calibrating.settings import WireSettings
 
-for _method in METHODS:
-    _add_command(_method)
+    _calibrate(images, from_options(WireSettings, {**settings, "phantom": phantom}), out, as_json)
 
 
 def _calibrate(images: Path, settings: ScanSettings, out: Path, as_json: bool) -> None:
@@ -111,38 +114,45 @@ def _calibrate(images: Path, settings: ScanSettings, out: Path, as_json: bool) -
     report_written(written, notes, outcome.beam, as_json)
 
 
-@calibrate.command("repeatability")
-def calibrate_repeatability(
-    calibrations: Annotated[list[Path], typer.Argument(help="Calibration files of one mounting.")],
-    size_px: Annotated[
-        tuple[int, int] | None, typer.Option(help="Columns and rows of the image, for centre and corners.")
-    ] = None,
-    as_json: Json = False,
+def repeatability(
+    calibrations: list[Path], size_px: tuple[int, int] | None = None, as_json: Json = False
 ) -> None:
-    """Compare repeated calibrations: scatter of roll, yaw and tilt, and of the image's centre and corners."""
+    """Compare repeated calibrations: scatter of roll, yaw and tilt, and of the image's centre and corners.
+
+    Parameters
+    ----------
+    calibrations
+        Calibration files of one mounting.
+    size_px
+        Columns and rows of the image, for centre and corners.
+    as_json
+
+    Examples
+    --------
+    $ speckle3d calibrate repeatability first.h5 second.h5 third.h5
+    """
     import numpy as np
 
-    from calibration.repeatability import repeatability
+    from calibration.repeatability import repeatability as repeated
     from speckle3d.io.calibrations import read_calibration
 
-    found = repeatability([read_calibration(path) for path in calibrations], size_px)
-    roll, yaw, tilt = (float(angle) for angle in np.rad2deg(found.roll_yaw_tilt_sd_rad))
+    found = repeated([read_calibration(path) for path in calibrations], size_px)
+    angles = np.rad2deg(found.roll_yaw_tilt_sd_rad).tolist()
+    shifts = found.centre_shift_mm
     if as_json:
         table = {
             "trials": found.trials,
-            "roll_yaw_tilt_sd_deg": [roll, yaw, tilt],
+            "roll_yaw_tilt_sd_deg": angles,
             "centre_sd_mm": found.centre_sd_mm,
             "corner_sd_mm": found.corner_sd_mm,
-            "centre_shift_mm": None if found.centre_shift_mm is None else found.centre_shift_mm.tolist(),
+            "centre_shift_mm": None if shifts is None else shifts.tolist(),
         }
         emit_json(table)
         return
     emit(f"standard deviation over {found.trials} calibrations")
-    emit(f"  roll {roll:.3f}, yaw {yaw:.3f}, tilt {tilt:.3f} deg")
-    if found.centre_shift_mm is None:
-        if size_px is None:
-            note("with --size-px COLUMNS ROWS also the scatter of the image's centre and corners")
+    emit("  roll {:.3f}, yaw {:.3f}, tilt {:.3f} deg".format(*angles))
+    if shifts is None:
+        note("with --size-px COLUMNS ROWS also the scatter of the image's centre and corners")
         return
     emit(f"  centre {found.centre_sd_mm:.3f} mm, corners {found.corner_sd_mm:.3f} mm")
-    shifts = ", ".join(f"{shift:.2f}" for shift in found.centre_shift_mm)
-    emit(f"centre against the first calibration: {shifts} mm")
+    emit(f"centre against the first calibration: {', '.join(f'{shift:.2f}' for shift in shifts)} mm")

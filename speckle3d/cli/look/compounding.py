@@ -1,4 +1,4 @@
-"""Options of compounding that commands share, and the settings they make."""
+"""A sweep at poses, opened with what options say of it; settings of compounding."""
 
 from __future__ import annotations
 
@@ -8,58 +8,50 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
+from speckle3d.cli.calibrations import given_settings
+from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import from_options, load_settings, note
-from speckle3d.cli.importing import given_settings
 
 if TYPE_CHECKING:
     from speckle3d.imaging.voxels.settings import CompoundingSettings
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.study.posed import PosedSweep
 
-VoxelMm = Annotated[float | None, typer.Option(help="Side of a voxel (0.2).")]
-Splat = Annotated[
-    str | None, typer.Option(help="nearest: the voxel a sample lies in; linear: the eight around it.")
-]
-Rule = Annotated[
-    str | None,
-    typer.Option(
-        help="Of a voxel's samples: mean, maximum, latest, weighted; plus: mean kept in whole grey levels as "
-        "PLUS and 3D Slicer keep it, to compare with their volumes."
-    ),
-]
-FillRadius = Annotated[int | None, typer.Option(help="Voxels across which holes are filled (3); 0: none.")]
-LevelRange = Annotated[float | None, typer.Option(help="Range of log-compressed grey levels (60).")]
+    Statement = tuple[Path | None, ImportSettings, Sequence[Path], float | None]
+
+_IMPORTED = ("plus_config", "reference_transform", "column_pitch_mm", "row_spacing_mm", "frame_rate_hz")
+Imported = Annotated[dict[str, Any], Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)]
+"""Options of what a recording does not say; the range of its grey levels is that of the levels made."""
 
 
 def compounding_settings(config_file: Path | None, options: Mapping[str, Any]) -> CompoundingSettings:
-    """Group `volume` of a configuration, with the options of its names that were given in its place."""
+    """Group `volume` of a configuration, with the options that were given in its place."""
     from speckle3d.imaging.voxels.settings import CompoundingSettings
 
     base = load_settings(config_file).volume.model_dump()
-    given = {name: value for name, value in options.items() if value is not None}
-    if given.get("levels") == "linear" and base["voxel_type"] == "uint8":
-        given.setdefault("voxel_type", "float32")  # amplitudes may be less than one, or thousands
-    return from_options(CompoundingSettings, base | given)
+    if options.get("levels") == "linear" and base["voxel_type"] == "uint8":
+        base["voxel_type"] = "float32"  # amplitudes may be less than one, or thousands
+    return from_options(CompoundingSettings, base | dict(options))
 
 
-def open_sweep_at(modes: Sequence[str | None], source: Path, options: Mapping[str, Any]) -> list[PosedSweep]:
-    """Open a sweep at the poses of each mode, and say on stderr which frames have none.
+def statement(
+    source: Path,
+    sweep_file: Path | None,
+    imported: Mapping[str, Any],
+    transform: str | None,
+    calibration: Sequence[Path] | None,
+    dynamic_range_db: float | None,
+) -> Statement:
+    """What options say of a sweep, as `open_posed` takes it: file, settings, calibrations, range in dB."""
+    return sweep_file, given_settings(source, imported, transform), calibration or (), dynamic_range_db
 
-    Parameters
-    ----------
-    modes : sequence of str or None
-        At least one; None for the usual one.
-    source : path
-    options : mapping of str to object
-        All options of the command.
-    """
+
+def open_sweep_at(modes: Sequence[str | None], source: Path, stated: Statement) -> list[PosedSweep]:
+    """Open a sweep at the poses of each mode (None: the best), and say on stderr which frames have none."""
     from speckle3d.study.posed import open_posed
 
-    others = said_of(source, options)
-    opened = [open_posed(source, mode, *others) for mode in modes]
-    recorded = [] if opened[0].reconstruction is not None else recording_notes(source, others[1])
+    opened = [open_posed(source, mode, *stated) for mode in modes]
+    recorded = [] if opened[0].reconstruction is not None else recording_notes(source, stated[1])
     for line in (*recorded, *opened[0].notes()):
         note(line)
     return opened
@@ -78,21 +70,12 @@ def recording_notes(source: Path, settings: ImportSettings) -> list[str]:
     return []
 
 
-def clip_of(source: Path, options: Mapping[str, Any], posed: PosedSweep) -> str | None:
+def clip_of(source: Path, stated: Statement, posed: PosedSweep) -> str | None:
     """Region of the images that a device set of PLUS clips volumes to; None without one."""
     from speckle3d.io.import_settings import settings_for
     from speckle3d.io.plus.device_set import read_device_set
 
-    config = settings_for(source, said_of(source, options)[1]).plus_config
+    config = settings_for(source, stated[1]).plus_config
     clip = None if config is None else read_device_set(config).clip
     grid = replace(posed.sweep.grid, skew_rad=posed.skew_rad)
     return None if clip is None else clip.region_text(grid)
-
-
-def said_of(
-    source: Path, options: Mapping[str, Any]
-) -> tuple[Path | None, ImportSettings, Sequence[Path], float | None]:
-    """What options say of a sweep, as `open_posed` takes it: file, settings, calibrations, range in dB."""
-    # The range is that of the levels that are made, and of B-mode that says none of its own.
-    imported = given_settings(source, {**options, "dynamic_range_db": None})
-    return options["sweep_file"], imported, options["calibration"] or (), options["dynamic_range_db"]

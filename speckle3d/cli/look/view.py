@@ -3,131 +3,111 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.common import PixelMm, Poses, SweepFile, Transform, app, from_options, note
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.cli.common import (
+    PixelMm,
+    SweepFile,
+    Written,
+    from_options,
+    note,
+)
 from speckle3d.core.extras import require_extra
 
-if TYPE_CHECKING:
-    from speckle3d.app.page import Page
-    from speckle3d.io.import_settings import ImportSettings
 
-
-@app.command()
 def view(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE",
-            help="A recording, a reconstruction or its results folder, a log of an orientation sensor, or "
-            "the serial port of one, as /dev/ttyUSB0 or COM3.",
-        ),
-    ],
-    reconstruction: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Reconstruction of the recording, to see with it.")
-    ] = None,
-    sweep: SweepFile = None,
-    record: Annotated[
-        Path | None,
-        typer.Option(metavar="OUT", help="Of a sensor on a port: new file for its bytes; else none is kept."),
-    ] = None,
-    calibrate: Annotated[
-        Literal["plane", "orientation", "wires"] | None,
-        typer.Option(
-            help="FILE shows a phantom: tune what is found in it and calibrate, as the command would."
-        ),
-    ] = None,
-    phantom: Annotated[
-        str, typer.Option(help="Wires: cross, three, or a PLUS configuration of N-wires.")
-    ] = "cross",
-    points: Annotated[
-        Path | None, typer.Option(help="Wires: CSV of points picked by hand, to go on from.")
-    ] = None,
-    poses: Poses = None,
-    transform: Transform = None,
+    file: Path,
+    reconstruction: Path | None = None,
+    sweep_file: SweepFile = None,
+    record: Written = None,
+    calibrate: Literal["plane", "orientation", "wires"] | None = None,
+    phantom: str | None = None,
+    points: Path | None = None,
+    poses: Path | None = None,
+    transform: str | None = None,
     pixel_mm: PixelMm = None,
-    dynamic_range_db: Annotated[
-        float | None, typer.Option(help="Of a recording's grey levels, if it does not say.")
-    ] = None,
-    sensor: Annotated[
-        Literal["orientation", "tracker"], typer.Option(help="Orientation: which sensor's.")
-    ] = "orientation",
-    level: Annotated[bool, typer.Option("--level", help="Orientation: the plane is level.")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: any free one.")] = 0,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the browser, or only print the address.")
-    ] = True,
+    dynamic_range_db: float | None = None,
+    sensor: Literal["orientation", "tracker"] | None = None,
+    level: bool = False,
+    port: Annotated[int, typer.Option(min=0, max=65535)] = 0,
+    browser: bool = True,
 ) -> None:
-    """Look at a file in the browser, on this machine alone; ends ten minutes after the last viewer left."""
+    """Look at a file in the browser, on this machine alone; ends ten minutes after the last viewer left.
+
+    Parameters
+    ----------
+    file
+        A recording, a reconstruction or its results folder, a log of an orientation sensor, or the serial
+        port of one, as /dev/ttyUSB0 or COM3.
+    reconstruction
+        Reconstruction of the recording, to see with it.
+    calibrate
+        Not with --record or --reconstruction or --sweep: FILE shows a phantom: tune what is found in it and
+        calibrate, as the command would.
+    record
+        Of a sensor on a port: new file for its bytes; else none is kept.
+    port
+        Port on this machine; 0: any free one.
+    browser
+        Open the browser, or only print the address.
+
+    Other Parameters
+    ----------------
+    sweep_file
+    phantom
+        With --calibrate: of wires, cross (default), three, or a PLUS configuration of N-wires.
+    points
+        With --calibrate: of wires, CSV of points picked by hand, to go on from.
+    sensor
+        With --calibrate: of orientation, which sensor's (orientation).
+    level
+        With --calibrate: of orientation, the plane is level.
+    poses
+        With --calibrate: file with the sensor's readings, if not in FILE.
+    transform
+        With --calibrate: poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).
+    pixel_mm
+    dynamic_range_db
+        Of a recording's grey levels, if it does not say.
+
+    Examples
+    --------
+    $ speckle3d view out
+    $ speckle3d view bath.h5 --calibrate plane
+    """
     require_extra("app", "view", "panel")
     from speckle3d.app.opened import opened
+    from speckle3d.app.phantom.pages import phantom_pages
     from speckle3d.app.server import AppServer
+    from speckle3d.calibrating.settings import model_of
+    from speckle3d.io.import_settings import ImportSettings
 
+    scan: dict[str, Any] = {"phantom": phantom, "points": points, "poses": poses, "transform": transform,
+                            "sensor": sensor, "level": level or None}  # fmt: skip
     with ExitStack() as running:
         if calibrate is None:
-            _require_no_phantom(locals())
-            given = _settings(pixel_mm, dynamic_range_db)
+            column_mm, row_mm = pixel_mm or (None, None)
+            stated = {
+                "column_pitch_mm": column_mm,
+                "row_spacing_mm": row_mm,
+                "dynamic_range_db": dynamic_range_db,
+            }
+            settings = from_options(ImportSettings, {k: v for k, v in stated.items() if v is not None})
             pages = running.enter_context(
-                opened(file, record, reconstruction=reconstruction, sweep=sweep, settings=given)
+                opened(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
             )
         else:
-            _require_phantom_alone(record, reconstruction, sweep)
-            pages = _phantom(file, calibrate, locals())
+            model = model_of(calibrate)
+            scan["pixel_mm"] = pixel_mm
+            told = {n: v for n, v in scan.items() if n in model.model_fields and v is not None}
+            pages = phantom_pages(file, from_options(model, told))
         server = AppServer(pages, file.name, port)
         note(server.address)
         if browser:
             webbrowser.open(server.address_for_once())
         server.run()
     note(f"{file}: no viewer for ten minutes: ended")
-
-
-_OF_PHANTOMS = ("phantom", "points", "poses", "transform", "pixel_mm", "sensor", "level")
-_OF_RECORDINGS = ("pixel_mm",)
-"""Those that serve without a phantom, too."""
-
-
-def _settings(pixel_mm: tuple[float, float] | None, dynamic_range_db: float | None) -> ImportSettings:
-    """What a recording does not say, for looking at it."""
-    from speckle3d.io.import_settings import ImportSettings
-
-    column_mm, row_mm = pixel_mm or (None, None)
-    options = {
-        "column_pitch_mm": column_mm,
-        "row_spacing_mm": row_mm,
-        "dynamic_range_db": dynamic_range_db,
-    }
-    return from_options(ImportSettings, options)
-
-
-def _require_no_phantom(options: Mapping[str, Any]) -> None:
-    """Refuse options of phantoms without `--calibrate`, which they go with."""
-    plain = {"phantom": "cross", "sensor": "orientation", "level": False}
-    names = [name for name in _OF_PHANTOMS if name not in _OF_RECORDINGS]
-    given = [name for name in names if options[name] != plain.get(name)]
-    if given:
-        option = given[0].replace("_", "-")
-        raise InvalidInputError(
-            f"--{option}: expected --calibrate plane, orientation or wires with it, got none"
-        )
-
-
-def _require_phantom_alone(*others: Path | None) -> None:
-    """Refuse files that go with recordings and sensors beside `--calibrate`."""
-    for name, other in zip(("record", "reconstruction", "sweep"), others, strict=True):
-        if other is not None:
-            raise InvalidInputError(f"--{name}: expected none beside --calibrate, got {other}")
-
-
-def _phantom(file: Path, method: str, options: Mapping[str, Any]) -> Sequence[Page]:
-    from speckle3d.app.phantom.pages import phantom_pages
-    from speckle3d.calibrating.settings import model_of
-
-    model = model_of(method)
-    given = {name: options[name] for name in _OF_PHANTOMS if name in model.model_fields}
-    return phantom_pages(file, from_options(model, given))

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from speckle3d.cli.common import note
 
 if TYPE_CHECKING:
+    from speckle3d.core.streams import TimedRotations
+    from xsens.fusion.orient import Orientation
     from xsens.logs.samples import ImuLog
 
+World = Literal["ENU", "NWU", "NED"]
+Method = Literal["smoother", "filter", "vqf", "vqf-online", "sensor"]
 Log = Annotated[
     Path,
     typer.Argument(
@@ -23,24 +26,22 @@ Log = Annotated[
     ),
 ]
 RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs that do not say.")]
-
-
-class World(StrEnum):
-    """World that the sensor's own orientation is seen from: east, north, up and so on."""
-
-    ENU = "ENU"
-    NWU = "NWU"
-    NED = "NED"
-
-
 WorldOption = Annotated[
     World | None,
     typer.Option(
-        "--world",
         case_sensitive=False,
-        help="World of the sensor's own orientation; by default as its accelerometer and magnetometer show.",
+        help="World of the sensor's own orientation (east, north, up and so on); by default as its "
+        "accelerometer and magnetometer show.",
     ),
 ]
+MethodOption = Annotated[
+    Method,
+    typer.Option(
+        help="smoother: from all of the log; filter: as it would be live; vqf, vqf-online: the same by VQF "
+        "(Laidig and Seel 2023); sensor: the sensor's own."
+    ),
+]
+Magnetometer = Annotated[bool, typer.Option(help="Let the magnetic field tell the heading.")]
 
 
 def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> ImuLog:
@@ -65,3 +66,18 @@ def tell(log: ImuLog) -> None:
         longest = max(gap.duration_s for gap in log.gaps)
         lost = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
         note(f"{lost}, the longest of {longest:.3f} s; nothing filled in")
+
+
+def orientation_of(
+    log: ImuLog, method: Method, magnetometer: bool
+) -> tuple[TimedRotations, Orientation | None]:
+    """Find the orientation of a log; the second result is None for the sensor's own orientation."""
+    if method == "sensor":
+        return log.rotations(), None
+    from xsens.fusion.orient import orient
+    from xsens.fusion.settings import FusionSettings
+
+    found = orient(log, FusionSettings(use_magnetometer=magnetometer), method)
+    for text in found.notes:
+        note(text)
+    return found.rotations, found

@@ -146,7 +146,8 @@ def open_modes(
     is_reconstruction = kind_of(path) == FORMAT
     own = [mode for mode in modes if mode not in REFERENCES or not is_reconstruction]
     others = sweep_file, settings, calibrations, dynamic_range_db
-    first = open_posed(path, own[0] if own else None, *others)
+    # Beside a reference alone any mode will do.
+    first = open_posed(path, own[0] if own else ("image" if modes else None), *others)
     return at_modes(first, modes, reference)
 
 

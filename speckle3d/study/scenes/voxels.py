@@ -24,7 +24,6 @@ from speckle3d.imaging.region import Region
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, grid_like, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.volume import compound_onto
-from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volume_writer import VolumeWriter
 from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.pose_errors import posed_errors_of
@@ -176,12 +175,6 @@ class VolumeReport:
         named = ", ".join(f"{100 * share:.1f} % {word}" for word, share in self.shares.items())
         size = f"{self.size_bytes / 1e6:.3g} MB"
         return f"{self.path}: {size}, mode {self.mode}, {self.grid}: {named}; {self.seconds:.1f} s"
-
-
-def best_mode(reconstruction_file: Path) -> str:
-    """First of `BEST_FIRST` that a reconstruction holds."""
-    poses = read_reconstruction(reconstruction_file, with_pairs=False).poses
-    return next(mode for mode in BEST_FIRST if mode in poses)
 
 
 def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress | None = None) -> VolumeReport:

@@ -1,0 +1,284 @@
+"""Commands made of functions: an option for each parameter and each field of settings, help from docstrings.
+
+A command is a function with a numpydoc docstring. Options under *Parameters* are common and shown by
+``--help`` in that order, those under *Other Parameters* by ``--help-all``. A help that begins "With
+--frame:", "With --origin or --curve:" or "Not with --paper:" is a rule that is checked. A parameter annotated
+with `Fields` of a pydantic model becomes an option for each field, with the field's description as help; the
+function gets the values that were given as a dict.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
+from importlib import import_module
+from pathlib import Path
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    NamedTuple,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from speckle3d.core.errors import FileError, InvalidInputError
+
+if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
+
+Table = Mapping[str, "str | tuple[str, Table]"]
+"""Commands by name: where their functions are (``module:function``), or a group's help and its own table."""
+Command = Callable[..., None]
+
+_SETTINGS = {"help_option_names": ["-h", "--help"]}
+_SECTION = re.compile(r"^(Parameters|Other Parameters|Examples)\n-+\n", re.MULTILINE)
+_ENTRY = re.compile(r"^(\S.*)\n?((?:[ \t]+.*\n?|\n)*)", re.MULTILINE)
+_RULE = re.compile(r"(With|Not with) (--[^:]+):")
+_OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
+_FUSED = "`fused` takes any sensor there is, `crossed` a second sweep"
+_REMOVED = {
+    ("images", "--method"): "there is one optimiser, which finds what Nelder-Mead did",
+    ("reconstruct", "inertial"): _FUSED,
+    ("compare", "inertial"): _FUSED,
+}
+"""Words of commands that older versions took, and what replaces them."""
+
+
+class Fields(NamedTuple):
+    """Fields of a pydantic model as options: all, only some, or all but some."""
+
+    model: str
+    only: Sequence[str] = ()
+    without: Sequence[str] = ()
+
+    def chosen(self) -> dict[str, FieldInfo]:
+        """Fields by name; the model is loaded."""
+        known = _loaded(self.model).model_fields
+        return {n: f for n, f in known.items() if n in (self.only or known) and n not in self.without}
+
+
+def _loaded(place: str) -> Any:
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+class Words(NamedTuple):
+    """What a function's docstring says of its command: text, common options, all options' help, examples."""
+
+    text: str
+    common: Sequence[str]
+    options: Mapping[str, str]
+    examples: Sequence[str]
+
+    @classmethod
+    def of(cls, function: Command) -> Words:
+        """Parse the docstring."""
+        text, *parts = _SECTION.split(inspect.getdoc(function) or "")
+        sections = dict(zip(parts[::2], parts[1::2], strict=True))
+        common, others = (
+            {n: " ".join(body.split()) for names, body in _ENTRY.findall(part) for n in names.split(", ")}
+            for part in (sections.get("Parameters", ""), sections.get("Other Parameters", ""))
+        )
+        examples = re.findall(r"^\$ (.*)", sections.get("Examples", ""), re.MULTILINE)
+        return cls(text.strip(), tuple(common), common | others, examples)
+
+
+def command_of(name: str, function: Command) -> TyperCommand:
+    """Make the command of a function."""
+    words, hints = Words.of(function), get_type_hints(function, include_extras=True)
+    options: dict[str, inspect.Parameter] = {}
+    groups: dict[str, list[str]] = {}
+    for parameter in inspect.signature(function).parameters.values():
+        kind, info = hints[parameter.name], None
+        if get_origin(kind) is Annotated:
+            kind, info = kind.__origin__, copy(kind.__metadata__[0])
+        if isinstance(info, Fields):
+            chosen = {each: field for each, field in info.chosen().items() if each not in hints}
+            groups[parameter.name] = list(chosen)
+            options |= {each: _of_field(each, field, words) for each, field in chosen.items()}
+        else:
+            options[parameter.name] = _option(parameter.name, kind, parameter.default, info, words)
+    order = [*words.options, *options]
+    options = {each: options[each] for each in sorted(options, key=order.index)}
+
+    def run(**values: Any) -> None:
+        given = {_flag(n): o for n, o in options.items() if values[n] not in (None, False, o.default)}
+        for flag, option in given.items():
+            _require_fit(flag, option, values[option.name], given)
+        for group, names in groups.items():
+            picked = {name: values.pop(name) for name in names}
+            values[group] = {name: value for name, value in picked.items() if value is not None}
+        function(**values)
+
+    run.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in options.values()}
+    builder = typer.Typer(add_completion=False)
+    builder.command(name, cls=PlainCommand, help=words.text, context_settings=_SETTINGS)(run)
+    command = typer.main.get_command(builder)
+    assert isinstance(command, PlainCommand)
+    command.words = words
+    return command
+
+
+def _flag(name: str) -> str:
+    return f"--{name.removesuffix('_file').replace('_', '-')}"
+
+
+def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> None:
+    """Refuse an option against the rule that its help begins with, and an input that is not there."""
+    (info,) = option.annotation.__metadata__
+    if rule := _RULE.match(info.help or ""):
+        others = [other for other in rule[2].split(" or ") if other in flags]
+        if rule[1] == "With" and not others:
+            raise InvalidInputError(f"{flag}: expected {rule[2]} with it, got none")
+        if rule[1] == "Not with" and others:
+            raise InvalidInputError(f"{flag}: expected no {others[0]} beside it, got both")
+    for path in value if isinstance(value, list) else [value]:
+        if isinstance(path, Path) and not path.exists() and not info.writable:
+            where = f"{flag}: " if isinstance(info, typer.models.OptionInfo) else ""
+            raise FileError(f"{where}{path}: expected a file, got none")
+
+
+def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> inspect.Parameter:
+    """A parameter as typer takes it: an argument without a default, unless its annotation says otherwise."""
+    flag, only = _flag(name), inspect.Parameter.KEYWORD_ONLY
+    info = info or (typer.Argument() if default is inspect.Parameter.empty else typer.Option())
+    info.help = words.options.get(name) or info.help
+    if isinstance(info, typer.models.ArgumentInfo):
+        info.metavar = info.metavar or flag.strip("-").upper()
+    elif info.default is ... and not info.param_decls:
+        info.param_decls = (f"{flag}/--no-{flag[2:]}" if default is True else flag,)
+    return inspect.Parameter(name, only, default=default, annotation=Annotated[kind, info])
+
+
+def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
+    """An option of a field: of its type if that is a word of a command, else text that the model reads."""
+    kind: Any = field.annotation
+    default = field.default
+    if get_origin(kind) in (Union, UnionType):
+        members = [member for member in get_args(kind) if member is not type(None)]
+        choices = tuple(value for member in members for value in get_args(member))
+        kind = members[0] if len(members) == 1 else Literal[choices]
+    if field.metadata and any(hasattr(each, "write") for each in field.metadata):
+        kind = str
+    shown = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
+    info = typer.Option(help=f"{(field.description or '').removesuffix('.')}{shown}.")
+    if default is True:
+        info.param_decls = (f"{_flag(name)}/--no-{_flag(name)[2:]}",)
+    return _option(name, kind | None, None, info, words)
+
+
+class PlainCommand(TyperCommand):
+    """A command whose help is plain text: common options first, the others on request."""
+
+    words: Words
+    shows_all = False
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take `-o FILE` where the output is an argument, as everywhere else; answer for removed words."""
+        for word in args:
+            if text := _REMOVED.get((str(self.name), word.partition("=")[0])):
+                raise InvalidInputError(f"{word} was removed: {text}")
+        self.shows_all = "--help-all" in args
+        if any(param.name == "out" and param.param_type_name == "argument" for param in self.params):
+            args = _output_last(args)
+        return list(super().parse_args(ctx, ["--help"] if self.shows_all else args))
+
+    def panels(self, ctx: Any) -> dict[str, list[Any]]:
+        """Parameters by heading."""
+        held: dict[str, list[Any]] = {"Arguments": [], "Options": [], "Other options": []}
+        for param in self.get_params(ctx):
+            title = "Options" if param.name in (*self.words.common, "help") else "Other options"
+            held["Arguments" if param.param_type_name == "argument" else title].append(param)
+        return held
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print usage, what it does, examples, arguments and options."""
+        self.format_usage(ctx, formatter)
+        self.format_help_text(ctx, formatter)
+        formatter.write("".join(["\nExample:\n", *(f"  {line}\n" for line in self.words.examples)]))
+        panels = self.panels(ctx)
+        others = [] if self.shows_all else panels.pop("Other options")
+        for title, params in panels.items():
+            if params:
+                _write_list(formatter, title, [param.get_help_record(ctx) for param in params])
+        if others:
+            formatter.write(f"\n{len(others)} other options: {ctx.command_path} --help-all\n")
+
+
+def _write_list(formatter: Any, title: str, records: Sequence[Any]) -> None:
+    with formatter.section(title):
+        formatter.write_dl(records)
+
+
+def _output_last(args: list[str]) -> list[str]:
+    for i, word in enumerate(args):
+        if match := _OUTPUT.fullmatch(word):
+            value, after = ([match[1]], i + 1) if match[1] else (args[i + 1 : i + 2], i + 2)
+            return [*args[:i], *args[after:], *value]
+    return args
+
+
+class Commands(Mapping[str, Any]):
+    """Commands and groups by name, each loaded when it is first asked for."""
+
+    def __init__(self, table: Table) -> None:
+        self._table, self._made = table, dict[str, Any]()
+
+    def __getitem__(self, name: str) -> Any:
+        """The command or group of that name."""
+        if name not in self._made:
+            entry = self._table[name]
+            made = group(*entry) if isinstance(entry, tuple) else command_of(name, _function(entry))
+            self._made[name] = made
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._table)
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    def summaries(self) -> list[tuple[str, str]]:
+        """Names, and the first sentence of each one's help."""
+        texts = {
+            n: e[0] if isinstance(e, tuple) else inspect.getdoc(_function(e)) for n, e in self._table.items()
+        }
+        first = {name: (text or "").split("\n\n")[0] for name, text in texts.items()}
+        return [(n, re.split(r"[.;](?: |$)", " ".join(t.split()))[0] + ".") for n, t in first.items()]
+
+
+def _function(place: str) -> Command:
+    function: Command = _loaded(f"speckle3d.cli.{place}")
+    return function
+
+
+class Group(TyperGroup):
+    """A group of commands whose help is plain text, each with its first sentence whole."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print usage, what the group is for, its options and its commands."""
+        self.format_usage(ctx, formatter)
+        self.format_help_text(ctx, formatter)
+        _write_list(formatter, "Options", [param.get_help_record(ctx) for param in self.get_params(ctx)])
+        assert isinstance(self.commands, Commands)
+        _write_list(formatter, "Commands", self.commands.summaries())
+
+
+def group(text: str, table: Table, callback: Command = lambda: None) -> Any:
+    """Make a group of commands; its callback's parameters are options of its own."""
+    builder = typer.Typer(cls=Group, add_completion=False, no_args_is_help=True, context_settings=_SETTINGS)
+    builder.callback(help=text)(callback)
+    made: Any = typer.main.get_command(builder)
+    made.commands = Commands(table)
+    return made
