@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from speckle3d.app.folder import Folder
 from speckle3d.app.page import Page
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.io.hdf5 import SIGNATURE
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import kind_of, load_sweep
@@ -137,14 +137,17 @@ def _recorded(
 
 def _reconstructed(path: Path, sweep_file: Path | None, opened: Path) -> list[Page]:
     from speckle3d.app.reconstruction.page import ReconstructionPage
+    from speckle3d.scoring.modes import default_mode
     from speckle3d.study.details import recorded_doubts
     from speckle3d.study.images import open_reconstruction
-    from speckle3d.study.scenes.voxels import best_mode
 
     found, sweep = open_reconstruction(path, sweep_file)
     found = replace(found, pairs=read_reconstruction(path).pairs)
     pages = _recorded(sweep, opened, found, recorded_doubts(path, found.provenance))
-    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file, best_mode(path))
+    mode = "image"
+    with suppress(MismatchError):  # modes disagree: all can be looked at
+        mode = default_mode(found)[0]
+    viewer = ReconstructionPage(found, sweep, Folder(path), sweep_file, mode)
     # First what was asked for.
     return [viewer, *pages] if opened == path else [pages[0], viewer, *pages[1:]]
 

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.reconstruction import Provenance, SharedErrors, Trust
@@ -15,7 +14,9 @@ from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.shapes.surfaces import read_surface
 from speckle3d.io.voxels.volumes import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.reslices.cut_geometry import anchors_of, save_cuts
+from speckle3d.study.reslices.cut_geometry import anchors_of
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
+from speckle3d.study.reslices.reslice_figures import save_reslices
 
 GRID = ImageGrid(51, 51, 0.2, 0.2)
 N = 41
@@ -68,12 +69,14 @@ def test_a_distance_along_the_sweep_is_as_sure_as_its_scale(run, rec):
     assert "mode fused claims no errors of its own: those of the images are taken" in err
 
 
+def picture_of(path, mode, plane, anchors=None):
+    image = np.ones((51, 41), np.float32)
+    return save_reslices(CutPicture({mode: DrawnCut(image, plane)}, anchors={mode: anchors or {}}), path)
+
+
 def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
-    picture = tmp_path / "cut.png"
     turned = RigidTransform.from_matrix([[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 9], [0, 0, 0, 1.0]])
-    figure = Figure()
-    plane = ReslicePlane(turned, 8.0, 10.0, 0.2)
-    save_cuts(figure, picture, {"fused": plane}, {"fused": figure.add_subplot()})
+    picture = picture_of(tmp_path / "cut.png", "fused", ReslicePlane(turned, 8.0, 10.0, 0.2))
     code, out, err = run("measure", rec, "--on", picture, "--point", "0,5", "--point", "6,5", "--json")
     assert code == 0, err
     told = json.loads(out)
@@ -87,9 +90,7 @@ def test_a_picture_of_other_poses_is_refused(run, refused, rec, tmp_path):
     longer = RigidTransform.from_translation(1.01 * POSES.translation)
     plane = ReslicePlane(POSES[0], 8.0, 10.0, 0.2)
     for poses, name in ((POSES, "own.png"), (longer, "longer.png"), (POSES[:9], "shorter.png")):
-        figure = Figure()
-        panels = {"image": figure.add_subplot()}
-        save_cuts(figure, tmp_path / name, {"image": plane}, panels, anchors={"image": anchors_of(poses)})
+        picture_of(tmp_path / name, "image", plane, anchors_of(poses))
     code, _, err = run("measure", rec, "--on", tmp_path / "own.png", *picks)
     assert code == 0, err
     assert "frame 20 lies elsewhere" in refused("measure", rec, "--on", tmp_path / "longer.png", *picks)

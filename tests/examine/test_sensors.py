@@ -83,7 +83,7 @@ def test_lengths_of_modes_beyond_three_joint_claims_are_told_with_both_numbers()
     lengths = {"image": (12.0, 0.3), "pose": (10.0, 0.1), "fused": (11.5, 0.3)}
     told = differing_lengths(lengths)
     assert [doubt.about for doubt in told] == ["modes image and pose", "modes pose and fused"]
-    assert "12.00 +- 0.30 mm" in told[0].evidence
+    assert "12.00 +- 0.59 mm" in told[0].evidence
     assert "10.00 +- 0.10 mm" in told[0].evidence
 
 
