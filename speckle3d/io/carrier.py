@@ -32,20 +32,16 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     InvalidInputError
         If the carrier turns backwards: Q has the other sign.
     """
-    measured = carried_share(frames, frequency_hz, sampling_rate_hz)
-    if measured is None:
-        return None
-    if _REMOVED[0] <= measured <= _REMOVED[1]:
-        return frequency_hz
-    if _CARRIED[0] <= measured <= _CARRIED[1]:
-        return 0.0
-    if _REVERSED[0] <= measured <= _REVERSED[1]:
-        carried = _turn(frequency_hz, sampling_rate_hz)
+    share = _carried_share(frames, frequency_hz, sampling_rate_hz)
+    if share is not None and _REVERSED[0] <= share <= _REVERSED[1]:
+        turn = _turn(frequency_hz, sampling_rate_hz)
         raise InvalidInputError(
-            f"expected I/Q whose phase turns by {carried:.2f} rad a sample, or by none, got "
-            f"{measured * carried:.2f}: Q has the other sign"
+            f"expected I/Q whose phase turns by {turn:.2f} rad a sample, or by none, got {share * turn:.2f}: Q "
+            "has the other sign"
         )
-    return None
+    if share is not None and _CARRIED[0] <= share <= _CARRIED[1]:
+        return 0.0
+    return frequency_hz if share is not None and _REMOVED[0] <= share <= _REMOVED[1] else None
 
 
 def sign_of_q(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> int:
@@ -59,13 +55,12 @@ def sign_of_q(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> i
     int
         0 where the phase does not tell: noise, samples too far apart, or another carrier than `frequency_hz`.
     """
-    measured = carried_share(frames, frequency_hz, sampling_rate_hz)
-    if measured is None or not _CARRIED[0] <= abs(measured) <= _CARRIED[1]:
-        return 0
-    return 1 if measured > 0 else -1
+    share = _carried_share(frames, frequency_hz, sampling_rate_hz)
+    is_told = share is not None and _CARRIED[0] <= abs(share) <= _CARRIED[1]
+    return int(np.sign(share)) if is_told else 0
 
 
-def carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
+def _carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
     """Mean turn of the phase from sample to sample, over that of a carrier of `frequency_hz`.
 
     The phase between neighbouring samples is the mean turn of what they carry, the first moment of the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -34,7 +34,7 @@ from speckle3d.io.plus.transforms import (
     tracked_poses,
 )
 from speckle3d.io.plus.write import own_values
-from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.pose_paths import timed_poses, usable
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Row, Value, differs, rate_of
 
@@ -85,11 +85,14 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
     InvalidInputError
         If the header names no such transform, or no sample of it is valid.
     """
-    tracker = _Sequence.open(Path(path), settings or ImportSettings()).tracker(0.0)
+    sequence = _Sequence.open(Path(path), settings or ImportSettings())
+    tracker = sequence.tracker(0.0)
     if tracker is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
         )
+    for note in sequence.readings(sequence.poses)[1]:
+        warnings.warn(f"{path}: {note}", stacklevel=2)
     return tracker
 
 
@@ -109,10 +112,7 @@ def open_sequence(path: Path, settings: ImportSettings) -> Recording:
         If it, or the device set beside it, cannot be read or does not make sense.
     """
     sequence = _Sequence.open(path, settings)
-    try:
-        return sequence.recording()
-    except (InvalidInputError, FileError) as error:
-        return Recording(path, settings, rows=tuple(sequence.rows()), fault=error)
+    return Recording.of(path, settings, sequence.rows(), sequence.recording)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class _Sequence:
         return cls(header, settings, device, own, Layout.of(header, device.image_orientation))
 
     def recording(self) -> Recording:
-        header, images, times, rows = self.header, self._images(), self.times, self.rows()
+        header, images, times, rows = self.header, self._images(), self.times, list[Row]()
         first_mm = self.settings.first_sample_depth_mm
         depth_mm = self.own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm
         values, frames = self._values(), self._frames(images, self.layout)
@@ -156,7 +156,7 @@ class _Sequence:
             full_scale=self.own.get("full_scale", 255.0),
             assumptions=("parallel lines",) if self.layout.is_rf and not self.own else (),
             rows=tuple(rows),
-            remarks=tuple(self._remarks(images)),
+            remarks=tuple(self._remarks()),
         )
 
     @cached_property
@@ -166,9 +166,12 @@ class _Sequence:
 
     @cached_property
     def stamps(self) -> FloatArray | None:
-        """Time of every frame by its stamp or its axis, NaN where it has none."""
+        """Time of every frame by its stamp or its axis, NaN where it has none.
+
+        Stamps that are all the same are none.
+        """
         stamps = [_number(frame.get("Timestamp")) for frame in self.header.frames]
-        if not np.isfinite(stamps).any():
+        if len({*filter(np.isfinite, stamps)}) < min(2, self._count):
             return self.header.index_s
         return np.array(stamps + [np.nan] * (self._count - len(stamps)))
 
@@ -199,14 +202,20 @@ class _Sequence:
         self.layout.require_lines(header)
         if header.pixels.packing == "raw":
             header.images()  # maps them, and refuses a file that ends early
-        images = np.flatnonzero(self._valid)
-        if self.times is not None:
-            images = images[rising(self.times[images])]
+        images = self._chosen[0]
         if not images.size:
             raise InvalidInputError(
                 f"{header.path}: ImageStatus: expected a valid frame with a time, got none"
             )
         return images
+
+    @cached_property
+    def _chosen(self) -> tuple[IntArray, list[str]]:
+        """Numbers of the frames that are images with a time, and a line of those left out."""
+        if self.times is None:
+            return np.flatnonzero(self._valid), []
+        faults = np.where(self._valid, "", "not valid by their status").tolist()
+        return usable("images", self.times[: len(faults)], faults)
 
     @property
     def _valid(self) -> BoolArray:
@@ -314,9 +323,9 @@ class _Sequence:
 
     def tracker(self, first_sample_depth_mm: float) -> Tracker | None:
         """The tracker, with the image on it if that is known; None without a pose that has a time."""
-        if self.poses is None or self.times is None or not (rows := self._posed(self.poses)).size:
+        readings, _ = self.readings(self.poses)
+        if readings is None:
             return None
-        readings = TimedPoses(self.times[rows], self.poses.poses[rows])
         calibration = self.image_to_probe()
         if calibration is None:
             return Tracker(readings)
@@ -324,33 +333,27 @@ class _Sequence:
         mounting = sensor_from_image(matrix, first_sample_depth_mm, where)
         return Tracker(readings, mounting, image_skew_rad=image_skew_rad(matrix, where))
 
-    def _posed(self, poses: Poses) -> IntArray:
-        assert self.times is not None
-        rows = np.flatnonzero(poses.valid)
-        return np.asarray(rows[rising(self.times[rows])])
+    def readings(self, poses: Poses | None) -> tuple[TimedPoses | None, list[str]]:
+        """Poses that have a time, and a line of those left out."""
+        if poses is None or self.times is None:
+            return None, []
+        return timed_poses(self.times[: len(poses.faults)], poses.matrices, poses.faults)
 
     def _orientation(self) -> OrientationSensor | None:
         """The orientation sensor that this package wrote; None where there is none."""
         path, header = self.header.path, self.header
-        poses = tracked_orientation(path, header.frames)
-        if poses is None or self.times is None or not (rows := self._posed(poses)).size:
+        readings, _ = self.readings(tracked_orientation(path, header.frames))
+        if readings is None:
             return None
         matrix = fixed_transform(path, header.fields, header.frames, f"{IMAGE}To{ORIENTATION}")
         mounting = None if matrix is None else sensor_from_image(matrix, 0.0, path).rotation
-        return OrientationSensor(TimedRotations(self.times[rows], poses.poses[rows].rotation), mounting)
+        turned = TimedRotations(readings.time_s, readings.world_from_sensor.rotation)
+        return OrientationSensor(turned, mounting)
 
-    def _remarks(self, images: IntArray) -> list[str]:
+    def _remarks(self) -> list[str]:
         """Tell what is left out, what contradicts, and which poses were not used."""
-        header, device, times, valid, notes = self.header, self.device, self.times, self._valid, []
-        count = header.frame_count
-        if times is not None:
-            counts = {"not valid by their status": int(np.sum(~valid))}
-            counts |= _without_time(times, valid, images)
-            notes += left_out("images", count, counts, times[images])
-        if self.poses is not None and times is not None:
-            rows = self._posed(self.poses)
-            counts = self.poses.reasons | _without_time(times, self.poses.valid, rows)
-            notes += left_out("poses", len(header.frames), counts, times[rows])
+        header, device, count = self.header, self.device, self.header.frame_count
+        notes = [*self._chosen[1], *self.readings(self.poses)[1]]
         if self.poses is None and header.transforms and self.settings.tracker_transform is None:
             notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
         if len(header.frames) not in (0, count):
@@ -424,16 +427,6 @@ class _Sequence:
 
 def _shown(lengths: Sequence[float]) -> str:
     return " x ".join(f"{length:g}" for length in lengths)
-
-
-def _without_time(times: FloatArray, valid: BoolArray, kept: IntArray) -> Counter[str]:
-    """How many valid frames have no time, one that is repeated, or one out of order."""
-    dropped = np.setdiff1d(np.flatnonzero(valid), kept)
-    missing = int(np.sum(~np.isfinite(times[dropped])))
-    repeated = int(np.isin(times[dropped], times[kept]).sum())
-    late = dropped.size - missing - repeated
-    reasons = {"without a time": missing, "with a repeated time": repeated, "with a time out of order": late}
-    return Counter(reasons)
 
 
 def _number(text: str | None) -> float:

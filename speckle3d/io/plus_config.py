@@ -62,49 +62,37 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
     """
     root = read_xml(path)
     with naming(str(path)):
-        phantom = _phantom(root)
         segmentation = root.find(".//Segmentation")
-        if segmentation is None:
-            return WireConfig(phantom)
-        return WireConfig(phantom, _pixel_mm(segmentation), _clip_px(segmentation))
+        return WireConfig(_phantom(root), *(() if segmentation is None else _hints(segmentation)))
 
 
 def _phantom(root: Element) -> WirePhantom:
-    geometry = root.find(".//PhantomDefinition/Geometry")
-    if geometry is None:
-        raise InvalidInputError("expected an element PhantomDefinition/Geometry, got none")
     names: list[str] = []
     ends, patterns = [], []
-    for number, pattern in enumerate(geometry.findall("Pattern")):
-        wires = _pattern_wires(pattern, f"Pattern[{number}]")
+    for number, pattern in enumerate(root.iterfind(".//PhantomDefinition/Geometry/Pattern")):
+        kind, wires = pattern.get("Type", ""), pattern.findall("Wire")
+        wanted = _PATTERN_WIRES.get(kind) or len(wires) or "some"
+        if kind not in _PATTERN_WIRES or len(wires) != wanted:
+            raise InvalidInputError(
+                f"Pattern[{number}]: expected Type {' or '.join(_PATTERN_WIRES)} with {wanted} elements Wire, "
+                f"got {kind!r} with {len(wires)}"
+            )
         patterns.append(tuple(range(len(names), len(names) + len(wires))))
         for i, wire in enumerate(wires):
             names.append(wire.get("Name") or f"{number + 1}.{i + 1}")
             ends.append([vector(wire, f"EndPoint{end}", 3) for end in ("Front", "Back")])
     if not names:
-        raise InvalidInputError(
-            "PhantomDefinition/Geometry: expected an element Pattern with wires, got none"
-        )
+        raise InvalidInputError("PhantomDefinition/Geometry: expected elements Pattern with wires, got none")
     pose = _phantom_pose(root)
     return WirePhantom.from_ends(tuple(names), np.reshape(ends, (-1, 2, 3)), tuple(patterns), pose)
-
-
-def _pattern_wires(pattern: Element, where: str) -> list[Element]:
-    kind = pattern.get("Type", "")
-    if kind not in _PATTERN_WIRES:
-        raise InvalidInputError(f"{where}: expected Type {' or '.join(_PATTERN_WIRES)}, got {kind!r}")
-    wires, wanted = pattern.findall("Wire"), _PATTERN_WIRES[kind]
-    if not wires or (wanted is not None and len(wires) != wanted):
-        raise InvalidInputError(f"{where}: expected {wanted or 'some'} elements Wire, got {len(wires)}")
-    return wires
 
 
 def _phantom_pose(root: Element) -> RigidTransform | None:
     """Find the phantom in PLUS's reference frame, whichever way round the file has it."""
     algorithm = root.find(".//vtkPlusProbeCalibrationAlgo")
-    held = {} if algorithm is None else algorithm.attrib
-    phantom = held.get("PhantomCoordinateFrame", "Phantom")
-    reference = held.get("ReferenceCoordinateFrame", "Reference")
+    named = {} if algorithm is None else algorithm.attrib
+    phantom = named.get("PhantomCoordinateFrame", "Phantom")
+    reference = named.get("ReferenceCoordinateFrame", "Reference")
     for transform in root.iterfind(".//CoordinateDefinitions/Transform"):
         ends = (transform.get("From"), transform.get("To"))
         if set(ends) == {phantom, reference}:
@@ -114,24 +102,21 @@ def _phantom_pose(root: Element) -> RigidTransform | None:
     return None
 
 
-def _pixel_mm(segmentation: Element) -> float | None:
-    if "ApproximateSpacingMmPerPixel" not in segmentation.attrib:
-        return None
-    (spacing,) = vector(segmentation, "ApproximateSpacingMmPerPixel", 1)
-    if spacing <= 0:
-        raise InvalidInputError(
-            f"Segmentation: ApproximateSpacingMmPerPixel: expected above zero, got {spacing:g}"
-        )
-    return spacing
-
-
-def _clip_px(segmentation: Element) -> FloatArray | None:
-    if not {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
-        return None
-    left, top = map(int, vector(segmentation, "ClipRectangleOrigin", 2))
-    columns, rows = map(int, vector(segmentation, "ClipRectangleSize", 2))
-    if min(left, top) < 0 or min(columns, rows) < 1:
-        got = f"{columns} x {rows} from {left}, {top}"
-        raise InvalidInputError(f"Segmentation: clip: expected a rectangle inside an image, got {got}")
-    right, bottom = left + columns - 1, top + rows - 1
-    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=float)
+def _hints(segmentation: Element) -> tuple[float | None, FloatArray | None]:
+    """Size of a pixel and the part of images in which dots are looked for."""
+    spacing, clip = None, None
+    if "ApproximateSpacingMmPerPixel" in segmentation.attrib:
+        (spacing,) = vector(segmentation, "ApproximateSpacingMmPerPixel", 1)
+        if spacing <= 0:
+            raise InvalidInputError(
+                f"Segmentation: ApproximateSpacingMmPerPixel: expected above zero, got {spacing:g}"
+            )
+    if {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
+        left, top = map(int, vector(segmentation, "ClipRectangleOrigin", 2))
+        columns, rows = map(int, vector(segmentation, "ClipRectangleSize", 2))
+        if min(left, top) < 0 or min(columns, rows) < 1:
+            got = f"{columns} x {rows} from {left}, {top}"
+            raise InvalidInputError(f"Segmentation: clip: expected a rectangle inside an image, got {got}")
+        right, bottom = left + columns - 1, top + rows - 1
+        clip = np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=float)
+    return spacing, clip

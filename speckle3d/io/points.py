@@ -69,10 +69,9 @@ class PickedPoints:
         count, *size = shape
         if len(self) and int(self.frame.max()) >= count:
             raise MismatchError(f"expected frames from 0 to {count - 1}, got frame {int(self.frame.max())}")
-        half = 0.5
-        outside = ((self.pixels < -half) | (self.pixels > np.array(size) - half)).any(axis=1)
+        outside = ((self.pixels < -0.5) | (self.pixels > np.array(size) - 0.5)).any(axis=1)
         if outside.any():
-            first = int(np.flatnonzero(outside)[0])
+            first = int(np.argmax(outside))
             column, row = self.pixels[first]
             raise MismatchError(
                 f"expected points within images of {size[0]} columns and {size[1]} rows, got column "
@@ -96,18 +95,29 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
         Naming the line.
     """
     bare = ((number, line.partition("#")[0].strip()) for number, line in text_lines(path))
-    lines = ((number, text) for number, text in bare if text)
-    number, heading = next(lines, (1, ""))
-    columns = _columns(heading, f"{path}: line {number}")
+    lines = ((number, [word.strip() for word in text.split(",")]) for number, text in bare if text)
+    number, heading = next(lines, (1, []))
+    columns, known = [word.lower() for word in heading], (*_COLUMNS, _WIRE)
+    if not set(_COLUMNS) <= set(columns) <= set(known) or len(set(columns)) < len(columns):
+        raise InvalidInputError(
+            f"{path}: line {number}: expected the heading {','.join(_COLUMNS)}[,{_WIRE}], got "
+            f"{','.join(heading)[:60]!r}"
+        )
     rows: list[Row] = []
     lines_seen: dict[tuple[int, int], int] = {}
-    for number, text in lines:
+    for number, words in lines:
         where = f"{path}: line {number}"
-        frame, pixel, wire = _row(text, columns, wire_names, where)
-        rows.append((frame, pixel, wire))
-        seen = lines_seen.setdefault((frame, wire), number)
+        if len(words) != len(columns):
+            raise InvalidInputError(f"{where}: expected {len(columns)} values, got {len(words)}")
+        cell = dict(zip(columns, words, strict=True))
+        frame, column, row = (numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS)
+        if not 0 <= frame < _MOST_FRAMES or frame != int(frame):
+            raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
+        wire = _wire(cell[_WIRE], wire_names, f"{where}: wire") if _WIRE in cell else 0
+        rows.append((int(frame), (column, row), wire))
+        seen = lines_seen.setdefault((int(frame), wire), number)
         if seen != number and _WIRE in columns:
-            got = f"wire {wire} of frame {frame} as on line {seen}"
+            got = f"wire {wire} of frame {frame:g} as on line {seen}"
             raise InvalidInputError(f"{where}: expected a wire once in a frame, got {got}")
     if not rows:
         raise InvalidInputError(f"{path}: expected points below the heading, got none")
@@ -125,55 +135,28 @@ def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str]
     InvalidInputError
         If a name cannot be written, or a wire has none although names are given.
     """
-    names = [_writable(name) for name in wire_names]
-    heading = _COLUMNS if points.wire is None else (*_COLUMNS, _WIRE)
-    lines = [",".join(heading)]
+    for name in wire_names:
+        if name != name.strip() or not name or set(name) & set(",#\r\n"):
+            raise InvalidInputError(f"wire: expected a name without comma, hash or line break, got {name!r}")
+    lines = [",".join(_COLUMNS if points.wire is None else (*_COLUMNS, _WIRE))]
     for i, (frame, (column, row)) in enumerate(zip(points.frame, points.pixels, strict=True)):
-        line = f"{frame},{column:.3f},{row:.3f}"
-        lines.append(line if points.wire is None else f"{line},{_label(int(points.wire[i]), names)}")
+        words = [f"{frame}", f"{column:.3f}", f"{row:.3f}"]
+        if points.wire is not None:
+            wire = int(points.wire[i])
+            if wire_names and wire >= len(wire_names):
+                raise InvalidInputError(f"wire: expected one of {len(wire_names)} wires, got number {wire}")
+            words.append(wire_names[wire] if wire_names else str(wire))
+        lines.append(",".join(words))
     with atomic_path(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _columns(heading: str, where: str) -> list[str]:
-    columns = [word.strip().lower() for word in heading.split(",")]
-    known = (*_COLUMNS, _WIRE)
-    if not set(_COLUMNS) <= set(columns) <= set(known) or len(set(columns)) < len(columns):
-        shown = heading if len(heading) <= 60 else f"{heading[:57]}..."
-        raise InvalidInputError(
-            f"{where}: expected the heading {','.join(_COLUMNS)}[,{_WIRE}], got {shown!r}"
-        )
-    return columns
-
-
-def _row(text: str, columns: list[str], wire_names: Sequence[str], where: str) -> Row:
-    words = [word.strip() for word in text.split(",")]
-    if len(words) != len(columns):
-        raise InvalidInputError(f"{where}: expected {len(columns)} values, got {len(words)}")
-    cell = dict(zip(columns, words, strict=True))
-    frame, column, row = (numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS)
-    if not 0 <= frame < _MOST_FRAMES or frame != int(frame):
-        raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
-    wire = _wire(cell[_WIRE], wire_names, f"{where}: wire") if _WIRE in cell else 0
-    return int(frame), (column, row), wire
-
-
 def _wire(word: str, names: Sequence[str], where: str) -> int:
-    if word in names:
-        return list(names).index(word)
-    if word.isascii() and word.isdigit() and len(word) <= len(str(len(names))) and int(word) < len(names):
-        return int(word)
-    known = f"one of {', '.join(names)} or its number from 0" if names else "no wire, the phantom having none"
-    raise InvalidInputError(f"{where}: expected {known}, got {word!r}")
-
-
-def _writable(name: str) -> str:
-    if not name.strip() or name != name.strip() or any(c in name for c in ",#\r\n"):
-        raise InvalidInputError(f"wire: expected a name without comma, hash or line break, got {name!r}")
-    return name
-
-
-def _label(wire: int, names: list[str]) -> str:
-    if names and wire >= len(names):
-        raise InvalidInputError(f"wire: expected one of {len(names)} wires, got number {wire}")
-    return names[wire] if names else str(wire)
+    numbered = {str(number): number for number in range(len(names))}
+    wire = (numbered | {name: number for number, name in enumerate(names)}).get(word)
+    if wire is None:
+        known = (
+            f"one of {', '.join(names)} or its number from 0" if names else "no wire, the phantom having none"
+        )
+        raise InvalidInputError(f"{where}: expected {known}, got {word!r}")
+    return wire

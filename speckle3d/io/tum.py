@@ -7,7 +7,6 @@ otherwise; poses in memory are in mm.
 from __future__ import annotations
 
 import warnings
-from array import array
 from typing import Literal
 
 import numpy as np
@@ -17,7 +16,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path
-from speckle3d.io.pose_paths import left_out, rising
+from speckle3d.io.pose_paths import usable
 from speckle3d.io.text import numbers, text_lines
 
 LengthUnit = Literal["m", "mm"]
@@ -68,37 +67,35 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         If the file says another unit, or most lines are not eight finite numbers. Lines of no use, and poses
         whose time is not after the one before, are left out with a warning that counts them.
     """
-    values, said = array("d"), None
-    faults: list[InvalidInputError] = []
+    lines, faults, first, said = list[tuple[float, ...]](), list[str](), None, None
     # Line by line, so that an error names the line: 17 us each, where `np.loadtxt` takes 4.
     for n, text in text_lines(path):
-        if not _is_comment(text):
-            try:
-                values.extend(numbers(text, _COLUMNS, f"{path}: line {n}"))
-            except InvalidInputError as error:
-                faults.append(error)
-        elif not values:
-            said = said or _unit_of(text)
-    rows = np.frombuffer(values).reshape(-1, _COLUMNS)
-    if len(rows) <= len(faults):
-        raise faults[0] if faults else InvalidInputError(f"{path}: expected lines of eight numbers, got none")
+        if _is_comment(text):
+            said = said or (None if lines else _unit_of(text))
+            continue
+        try:
+            lines.append(numbers(text, _COLUMNS, f"{path}: line {n}"))
+            faults.append("")
+        except InvalidInputError as error:
+            first = first or error
+            lines.append((np.nan,) * _COLUMNS)
+            faults.append("that are not eight finite numbers")
+    rows = np.array(lines).reshape(-1, _COLUMNS)
+    if 2 * faults.count("") <= len(faults):
+        raise first or InvalidInputError(f"{path}: expected lines of eight numbers, got none")
     if length_unit is not None and said is not None and said != length_unit:
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
-    mm_per_unit = _mm_per(length_unit or said or "m")
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(rows[:, 4:], axis=1)
-        places_mm = rows[:, 1:4] * mm_per_unit
+        places_mm = rows[:, 1:4] * _mm_per(length_unit or said or "m")
     sound = (np.abs(norms - 1.0) <= _UNIT_TOLERANCE) & np.isfinite(places_mm).all(axis=1)
-    if not sound.any():
+    faults = [
+        fault or ("" if ok else "without a unit quaternion") for fault, ok in zip(faults, sound, strict=True)
+    ]
+    kept, notes = usable(f"{path}: poses", rows[:, 0], faults)
+    if not kept.size:
         raise InvalidInputError(f"{path}: pose 0: expected a unit quaternion, got norm {norms[0]:.4g}")
-    kept = np.flatnonzero(sound)
-    kept = kept[rising(rows[kept, 0])]
-    reasons = {
-        "that are not eight finite numbers": len(faults),
-        "without a unit quaternion": int(np.sum(~sound)),
-        "with a time that is not after the one before": int(np.sum(sound)) - kept.size,
-    }
-    for note in left_out(f"{path}: poses", len(rows) + len(faults), reasons, rows[kept, 0]):
+    for note in notes:
         warnings.warn(note, stacklevel=2)
     poses = RigidTransform.from_components(places_mm[kept], Rotation.from_quat(rows[kept, 4:]))
     return TimedPoses(rows[kept, 0].copy(), poses)
@@ -107,7 +104,7 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
 def is_tum(path: PathLike) -> bool:
     """Whether a file's first line that is no comment is eight numbers."""
     try:
-        number, first = next(each for each in text_lines(path) if not _is_comment(each[1]))
+        number, first = next(line for line in text_lines(path) if not _is_comment(line[1]))
         numbers(first, _COLUMNS, f"{path}: line {number}")
     except (FileError, InvalidInputError, StopIteration):
         return False
@@ -120,12 +117,10 @@ def _is_comment(line: str) -> bool:
 
 def _unit_of(comment: str) -> LengthUnit | None:
     """Return the length unit that a comment like the one of `write_tum` names."""
-    words = set(comment.split())
-    return next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in words), None)
+    return next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comment.split()), None)
 
 
-def _mm_per(length_unit: str) -> float:
-    for unit, mm in _MM_PER_UNIT.items():
-        if unit == length_unit:
-            return mm
-    raise InvalidInputError(f"length unit: expected m or mm, got {length_unit!r}")
+def _mm_per(length_unit: LengthUnit) -> float:
+    if length_unit not in _MM_PER_UNIT:
+        raise InvalidInputError(f"length unit: expected m or mm, got {length_unit!r}")
+    return _MM_PER_UNIT[length_unit]

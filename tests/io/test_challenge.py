@@ -7,7 +7,7 @@ import pytest
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
-from speckle3d.io.challenge import read_challenge_calibration, read_landmarks
+from speckle3d.io.challenge import read_challenge_calibration
 from speckle3d.io.describe import describe
 from speckle3d.io.load import load_landmarks, load_sweep, open_recording, recording_files
 
@@ -49,61 +49,50 @@ def test_a_scan_is_described_and_its_companions_are_known(tmp_path):
     rows = {name: value for name, value, _ in describe(path)}
     assert rows["format"] == "TUS-REC scan"
     assert (rows["frames"], rows["landmarks"], rows["tracker covers"]) == ("12", "20", "12")
-    assert {each.name for each in recording_files(path)[1:]} == {
-        f"{examples.SCAN}.h5",
-        "calib_matrix.csv",
-        "landmark_050.h5",
-    }
+    others = {f"{examples.SCAN}.h5", "calib_matrix.csv", "landmark_050.h5"}
+    assert {file.name for file in recording_files(path)[1:]} == others
 
 
-def test_a_test_scan_has_no_tracker_and_no_landmarks(tmp_path):
+def test_a_test_scan_has_no_tracker_and_no_landmarks_and_needs_a_calibration(tmp_path):
     path, *_ = examples.write_data_set(tmp_path, landmarks=False)
     (tmp_path / "transfs" / examples.SUBJECT / path.name).unlink()
     assert load_sweep(path).tracker is None
-    assert read_landmarks(path) is None
-    assert [each.name for each in recording_files(path)[1:]] == ["calib_matrix.csv"]
-
-
-def test_a_scan_without_calibration_says_what_it_lacks(tmp_path):
-    path, *_ = examples.write_data_set(tmp_path)
+    assert load_landmarks(path) is None
     (tmp_path / "calib_matrix.csv").unlink()
     with pytest.raises(InvalidInputError, match=r"calib_matrix\.csv"):
         load_sweep(path)
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    "content",
     [
-        ("words\n1,0,0,0\n", "got 1"),
-        ("\n".join(["1,0,0,0", "0,1,0,0", "0,0,1,0", "0,0,nan,1"] * 2), "line 4"),
-        ("\n".join(["1,0,0,0", "0,-1,0,0", "0,0,1,0", "0,0,0,1"] * 2), "expected a scaling"),
-        ("\n".join(["2,0,0,0", "0,2,0,0", "0,0,2,0", "0,0,0,1"] * 2), "image to tool.*rigid"),
+        "words\n1,0,0,0\n",
+        "\n".join(["1,0,0,0", "0,1,0,0", "0,0,1,0", "0,0,nan,1"] * 2),
+        "\n".join(["1,0,0,0", "0,-1,0,0", "0,0,1,0", "0,0,0,1"] * 2),
+        "\n".join(["2,0,0,0", "0,2,0,0", "0,0,2,0", "0,0,0,1"] * 2),
     ],
 )
-def test_a_wrong_calibration_is_named(tmp_path, content, message):
+def test_a_wrong_calibration_is_named(tmp_path, content):
     path = tmp_path / "calib_matrix.csv"
     path.write_text(content)
-    with pytest.raises(InvalidInputError, match=message):
-        read_challenge_calibration(path)
-    path.write_bytes(b"\xff\xfe\xff")
     with pytest.raises(InvalidInputError, match="calib_matrix"):
         read_challenge_calibration(path)
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "message"),
+    ("name", "values"),
     [
-        ("frames", np.zeros((12, 6, 8)), "/frames"),
-        ("frames", np.zeros((12, 8), dtype=np.uint8), "/frames"),
-        ("tforms", np.tile(np.eye(4), (11, 1, 1)), "/tforms"),
+        ("frames", np.zeros((12, 6, 8))),
+        ("frames", np.zeros((12, 8), dtype=np.uint8)),
+        ("tforms", np.tile(np.eye(4), (11, 1, 1))),
     ],
 )
-def test_a_wrong_scan_is_named(tmp_path, name, values, message):
+def test_a_wrong_scan_is_named(tmp_path, name, values):
     path, *_ = examples.write_data_set(tmp_path, split=False)
     with h5py.File(path, "r+") as file:
         del file[name]
         file[name] = values
-    with pytest.raises(InvalidInputError, match=message):
+    with pytest.raises(InvalidInputError, match=f"/{name}"):
         load_sweep(path)
 
 
@@ -125,4 +114,5 @@ def test_a_landmark_is_in_a_frame(tmp_path):
         del file[examples.SCAN]
         file[examples.SCAN] = np.array([[1.5, 2.0, 2.0]])
     with pytest.raises(InvalidInputError, match="landmark"):
-        read_landmarks(path)
+        load_landmarks(path)
+    assert len(load_sweep(path)) == 12

@@ -1,11 +1,7 @@
-import re
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.io.plus_config import read_wire_phantom
 
 N = """<Pattern Type="NWire">
@@ -40,88 +36,62 @@ def test_wires_patterns_and_hints_are_read(tmp_path):
     assert phantom.patterns == ((0, 1), (2, 3, 4))
     assert phantom.n_shapes == ((2, 3, 4),)
     np.testing.assert_array_equal(phantom.ends_mm[3], [[55, 0, 20], [35, 40, 20]])
-    assert phantom.world_from_phantom is None
     assert config.pixel_mm == 0.078
     # 766 columns from number 27 end with number 792.
     np.testing.assert_array_equal(config.clip_px, [[27, 28], [792, 28], [792, 589], [27, 589]])
-
-
-def test_a_file_without_segmentation_gives_no_hints(tmp_path):
-    config = read_wire_phantom(device_set(tmp_path))
-    assert config.pixel_mm is None
-    assert config.clip_px is None
+    plain = read_wire_phantom(device_set(tmp_path))
+    assert (plain.pixel_mm, plain.clip_px, plain.phantom.world_from_phantom) == (None, None, None)
 
 
 @pytest.mark.parametrize(
-    ("ends", "inverse"), [(("Phantom", "Reference"), False), (("Reference", "Phantom"), True)]
+    ("phantom", "reference", "inverse"),
+    [("Phantom", "Reference", False), ("Reference", "Phantom", True), ("Box", "Table", False)],
 )
-def test_the_phantoms_pose_is_read_either_way_round(tmp_path, ends, inverse):
-    phantom = read_wire_phantom(device_set(tmp_path, transforms=POSE.format(*ends))).phantom
-    pose = phantom.world_from_phantom.inv() if inverse else phantom.world_from_phantom
-    np.testing.assert_allclose(pose.apply([1.0, 2.0, 3.0]), [8.0, 21.0, 33.0])
-
-
-def test_frames_go_by_the_names_the_file_gives_them(tmp_path):
+def test_the_phantoms_pose_is_read_either_way_round_by_the_names_of_the_set(
+    tmp_path, phantom, reference, inverse
+):
     tail = '<vtkPlusProbeCalibrationAlgo PhantomCoordinateFrame="Box" ReferenceCoordinateFrame="Table" />'
-    text = POSE.format("Phantom", "Reference").replace("10", "99") + POSE.format("Box", "Table")
-    phantom = read_wire_phantom(device_set(tmp_path, transforms=text, tail=tail)).phantom
-    np.testing.assert_allclose(phantom.world_from_phantom.translation, [10.0, 20.0, 30.0])
+    own = tail if phantom == "Box" else ""
+    path = device_set(tmp_path, transforms=POSE.format(phantom, reference), tail=own)
+    pose = read_wire_phantom(path).phantom.world_from_phantom
+    np.testing.assert_allclose((pose.inv() if inverse else pose).apply([1.0, 2.0, 3.0]), [8.0, 21.0, 33.0])
 
 
 @pytest.mark.parametrize(
-    ("parts", "message"),
+    ("parts", "named"),
     [
         ({"patterns": ""}, "PhantomDefinition/Geometry"),
-        ({"patterns": N.replace("NWire", "Zigzag")}, r"Pattern\[0\].*'Zigzag'"),
-        ({"patterns": N + '<Pattern Type="NWire" />'}, r"Pattern\[1\].*3.*0"),
-        ({"patterns": N.replace('"30 0 20"', '"30 0"')}, "Wire a: EndPointFront.*3"),
-        ({"patterns": N.replace("35 40 20", "nan 40 20")}, "Wire b: EndPointBack.*3"),
-        ({"patterns": N.replace("EndPointBack", "Back")}, "Wire a: EndPointBack.*3"),
-        ({"patterns": N.replace('"b"', '"a"')}, "names.*'a'"),
-        (
-            {"transforms": POSE.format("Phantom", "Reference").replace("0 -1 0", "0 -2 0")},
-            r"Transform Phantom to Reference: Matrix\[0\]",
-        ),
-        ({"transforms": '<Transform From="Phantom" To="Reference" />'}, "Transform Phantom: Matrix.*16"),
-        ({"segmentation": SEGMENTATION.replace("0.078", "-1")}, "ApproximateSpacing.*-1"),
-        ({"segmentation": SEGMENTATION.replace("766", "0")}, "Segmentation: clip"),
+        ({"patterns": N.replace("NWire", "Zigzag")}, r"Pattern\[0\]"),
+        ({"patterns": N + '<Pattern Type="NWire" />'}, r"Pattern\[1\]"),
+        ({"patterns": N.replace('"30 0 20"', '"30 0"')}, "Wire a: EndPointFront"),
+        ({"patterns": N.replace("35 40 20", "nan 40 20")}, "Wire b: EndPointBack"),
+        ({"patterns": N.replace('"b"', '"a"')}, "names"),
+        ({"transforms": POSE.format("Phantom", "Reference").replace("0 -1 0", "0 -2 0")}, "Transform"),
+        ({"transforms": '<Transform From="Phantom" To="Reference" />'}, "Transform Phantom: Matrix"),
+        ({"segmentation": SEGMENTATION.replace("0.078", "-1")}, "ApproximateSpacing"),
+        ({"segmentation": SEGMENTATION.replace("766", "0")}, "clip"),
+        ({"tail": "<unclosed>"}, "XML"),
     ],
 )
-def test_what_is_missing_or_wrong_is_named_on_one_line(tmp_path, parts, message):
-    path = device_set(tmp_path, **parts)
-    with pytest.raises(InvalidInputError, match=f"^{re.escape(str(path))}: .*{message}") as caught:
-        read_wire_phantom(path)
+def test_what_is_missing_or_wrong_is_named_on_one_line(tmp_path, parts, named):
+    with pytest.raises(InvalidInputError, match=rf"set\.xml: .*{named}") as caught:
+        read_wire_phantom(device_set(tmp_path, **parts))
     assert "\n" not in str(caught.value)
+    with pytest.raises(FileError):
+        read_wire_phantom(tmp_path / "none.xml")
 
 
 ENTITIES = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]><a>&b;</a>'
 OUTSIDE = '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/hostname">]><a>&x;</a>'
 
 
-@pytest.mark.parametrize("text", [ENTITIES, OUTSIDE, '<!DOCTYPE a SYSTEM "http://localhost/a.dtd"><a/>'])
+@pytest.mark.parametrize("text", [ENTITIES, OUTSIDE])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
 def test_documents_that_declare_entities_are_refused(tmp_path, text, encoding):
     path = tmp_path / "hostile.xml"
     path.write_bytes(text.encode(encoding))
     with pytest.raises(InvalidInputError, match="document type declaration"):
         read_wire_phantom(path)
-
-
-@given(text=st.binary(max_size=60), cut=st.integers(0, 600))
-@settings(deadline=None, max_examples=60)
-def test_damaged_files_are_refused_and_nothing_else(tmp_path_factory, text, cut):
-    whole = device_set(tmp_path_factory.mktemp("set"))
-    content = whole.read_bytes()
-    whole.write_bytes(content[:cut] + text + content[cut + len(text) :])
-    try:
-        read_wire_phantom(whole)
-    except Speckle3DError as error:
-        assert "\n" not in str(error)  # noqa: PT017
-
-
-def test_a_missing_file_is_a_file_error(tmp_path):
-    with pytest.raises(FileError, match="cannot be read"):
-        read_wire_phantom(tmp_path / "none.xml")
 
 
 @pytest.mark.realdata
@@ -131,9 +101,3 @@ def test_the_published_device_set_is_read(realdata):
     assert config.phantom.names[4] == "5:H3_l3"
     np.testing.assert_array_equal(config.clip_px[[0, 2]], [[27, 27], [792, 588]])
     np.testing.assert_allclose(config.phantom.world_from_phantom.translation, [15.6642, -25.3628, -40.7799])
-
-
-@pytest.mark.realdata
-def test_a_device_set_without_phantom_is_refused(realdata):
-    with pytest.raises(InvalidInputError, match="PhantomDefinition/Geometry"):
-        read_wire_phantom(realdata / "plus" / "BoneUltrasound_L14_config.xml")

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 from drifting import hand_sweep
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.io.tum import is_tum, read_tum, write_tum
@@ -25,20 +24,11 @@ def test_columns_are_metres_and_a_quaternion_scalar_last(tmp_path):
     np.testing.assert_allclose(np.diag(matrices[1]), [-1.0, -1.0, 1.0, 1.0])
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "eight numbers"),
-        ("0 0 0 0 0 0 1\n", "line 1"),
-        ("1 nan 0 0 0 0 0 1\n", "line 1"),
-        ("0 0 0 0 0 0 0 2\n", "pose 0"),
-    ],
-)
-def test_a_wrong_file_is_named(tmp_path, text, words):
+@pytest.mark.parametrize("text", ["", "0 0 0 0 0 0 1\n", "1 nan 0 0 0 0 0 1\n", "0 0 0 0 0 0 0 2\n"])
+def test_a_wrong_file_is_named(tmp_path, text):
     (tmp_path / "a.tum").write_text(text)
-    with pytest.raises(InvalidInputError, match=words) as caught:
+    with pytest.raises(InvalidInputError, match=r"a\.tum"):
         read_tum(tmp_path / "a.tum")
-    assert "a.tum" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -63,30 +53,19 @@ def test_one_bad_line_is_left_out_and_counted(tmp_path, bad):
 
 
 def test_missing_files_units_and_times_that_do_not_fit(tmp_path):
+    poses = hand_sweep(np.random.default_rng(3), 5)
     with pytest.raises(FileError, match=r"none\.tum"):
         read_tum(tmp_path / "none.tum")
-    poses = hand_sweep(np.random.default_rng(3), 5)
-    with pytest.raises(MismatchError, match="times"):
+    with pytest.raises(MismatchError):
         write_tum(tmp_path / "a.tum", np.arange(4), poses)
-    with pytest.raises(InvalidInputError, match="m or mm"):
+    with pytest.raises(InvalidInputError):
         write_tum(tmp_path / "a.tum", np.arange(5), poses, "cm")
 
 
 def test_a_file_says_its_own_unit_and_is_not_overruled(tmp_path):
-    poses = RigidTransform.from_translation([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
-    write_tum(tmp_path / "mm.tum", [0.0, 1.0], poses, "mm")
-    back = read_tum(tmp_path / "mm.tum").world_from_sensor
-    np.testing.assert_array_equal(back.translation, poses.translation)
-    with pytest.raises(InvalidInputError, match=r"lengths in m.*mm"):
-        read_tum(tmp_path / "mm.tum", "m")
-
-
-def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
-    path = tmp_path / "windows.tum"
-    path.write_bytes(
-        b"\xef\xbb\xbf# time_s x_mm y_mm z_mm qx qy qz qw\r\n0 1 0 0 0 0 0 1\r\n1 2 0 0 0 0 0 1\r\n"
-    )
+    path, head = tmp_path / "windows.tum", b"# time_s x_mm y_mm z_mm qx qy qz qw\r\n"
+    path.write_bytes(b"\xef\xbb\xbf" + head + b"0 1 0 0 0 0 0 1\r\n1 2 0 0 0 0 0 1\r\n")
     assert is_tum(path)
     np.testing.assert_array_equal(read_tum(path).world_from_sensor.translation[:, 0], [1.0, 2.0])
-    path.write_bytes(b"\xef\xbb\xbf0 1 0 0 0 0 0 1\n")
-    assert is_tum(path)
+    with pytest.raises(InvalidInputError, match=r"lengths in m.*mm"):
+        read_tum(path, "m")

@@ -10,7 +10,6 @@ References
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 from xml.etree.ElementTree import Element
 
@@ -62,21 +61,17 @@ class Clip:
 
     def is_part_of(self, size: tuple[int, ...]) -> bool:
         """Whether something of images of a size (x, y) is left out."""
-        sides = zip((self.columns, self.rows), size, strict=False)
-        return self.fan is not None or any(
-            side is not None and (side[0] > 0 or side[1] < length - 1) for side, length in sides
-        )
+        sides = [side for side in zip((self.columns, self.rows), size, strict=False) if side[0] is not None]
+        return self.fan is not None or any(first > 0 or last < length - 1 for (first, last), length in sides)
 
     def region_text(self, grid: ImageGrid) -> str | None:
         """The part as a region of images in mm; None where it is all of them."""
-        parts = []
+        outlines = []
         if not self.is_part_of((grid.vectors, grid.samples)):
             return None
         if self.columns is not None and self.rows is not None:
-            (left, right), (top, bottom) = self.columns, self.rows
-            corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
-            outward = _HAIR * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-            parts.append(_polygon(grid, np.asarray(corners) + outward))
+            (left, right), (top, bottom) = np.add([self.columns, self.rows], [-_HAIR, _HAIR])
+            outlines.append(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
         if self.fan is not None:
             x, y, inner, outer, first, stop = self.fan
             angles = np.deg2rad(np.linspace(first, stop, _ARC_POINTS))
@@ -84,14 +79,12 @@ class Clip:
             outline = np.concatenate([outer * arc, inner * arc[::-1]])
             # PLUS moves both halves a pixel towards the middle (vtkIGSIOPasteSliceIntoVolume).
             outline[:, 0] -= (1 - _HAIR) * np.sign(outline[:, 0])
-            parts.append(_polygon(grid, outline + np.array([x, y])))
+            outlines.append(np.add(outline, [x, y]))
+        parts = []
+        for pixels in outlines:
+            places = np.column_stack([pixels, np.ones(len(pixels))]) @ grid.image_from_sample[:2].T
+            parts.append("polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in places))
         return " and ".join(parts)
-
-
-def _polygon(grid: ImageGrid, pixels: FloatArray) -> str:
-    """A polygon whose corners are given in pixels, in mm of the image."""
-    places = np.column_stack([pixels, np.ones(len(pixels))]) @ grid.image_from_sample[:2].T
-    return "polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in places)
 
 
 @dataclass(frozen=True)
@@ -156,23 +149,23 @@ class DeviceSet:
         InvalidInputError
             If a transform on the way that is needed the other way round has no inverse.
         """
-        reached: dict[str, FloatArray] = {start: np.eye(4)}
-        waiting = deque([start])
-        while waiting and end not in reached:
-            place = waiting.popleft()
+        reached, waiting = {start: np.eye(4)}, [start]
+        for place in waiting:
             for (a, b), matrix in self.transforms.items():
-                for source, target, inverted in ((a, b, False), (b, a, True)):
-                    if source == place and target not in reached:
-                        step = _inverse(matrix, f"{self.path}: Transform {a} to {b}") if inverted else matrix
-                        reached[target] = step @ reached[place]
-                        waiting.append(target)
+                target = b if a == place else a
+                if place not in (a, b) or target in reached:
+                    continue
+                if b == place and not np.linalg.det(matrix):
+                    where = f"{self.path}: Transform {a} to {b}"
+                    raise InvalidInputError(f"{where}: expected a matrix with an inverse, got a singular one")
+                reached[target] = (matrix if a == place else np.linalg.inv(matrix)) @ reached[place]
+                waiting.append(target)
         return reached.get(end)
 
     def pixel_mm(self, size: tuple[float, ...] | None) -> tuple[float, float] | None:
         """Distances of columns and rows of the image, whose size is (x, y), mm; None if unknown."""
         for end in (self.names.probe, self.origin_frame):
-            matrix = self.transform(self.names.image, end)
-            if matrix is not None:
+            if (matrix := self.transform(self.names.image, end)) is not None:
                 return pixel_axes(matrix, f"{self.path}: {self.names.image} to {end}")
         made = self.scan.output_size
         is_of_size = made is None or (size is not None and tuple(size[:2]) == made)
@@ -196,8 +189,7 @@ def read_device_set(path: PathLike) -> DeviceSet:
             f"got {root.tag}"
         )
     with naming(str(path)):
-        usual = Names()
-        named: dict[str, str] = {}
+        usual, named = Names(), dict[str, str]()
         for place in _ALGORITHMS:
             for element in root.iterfind(place):
                 named |= element.attrib
@@ -219,37 +211,39 @@ def read_device_set(path: PathLike) -> DeviceSet:
 def _transforms(root: Element) -> dict[tuple[str, str], FloatArray]:
     """Transforms by their ends; what is said twice, or both ways round, must be said alike."""
     transforms: dict[tuple[str, str], FloatArray] = {}
-    for place in _PLACES:
-        for element in root.iterfind(place):
-            a, b = element.get("From", ""), element.get("To", "")
-            matrix = np.reshape(vector(element, "Matrix", 16), (4, 4))
-            same, back = transforms.get((a, b), matrix), transforms.get((b, a))
-            is_inverse = back is None or np.allclose(back @ matrix, np.eye(4), 0, _INVERSE_TOLERANCE)
-            if not np.array_equal(same, matrix) or not is_inverse:
-                expected = "one, or the same again" if is_inverse else f"the inverse of From={b} To={a}"
-                other = same if is_inverse or back is None else back
-                raise InvalidInputError(
-                    f"Transform From={a} To={b}: expected {expected}, got another: {_text(other)} and "
-                    f"{_text(matrix)}"
-                )
-            transforms[a, b] = matrix
+    for element in (one for place in _PLACES for one in root.iterfind(place)):
+        a, b = element.get("From", ""), element.get("To", "")
+        matrix = np.reshape(vector(element, "Matrix", 16), (4, 4))
+        same, back = transforms.get((a, b), matrix), transforms.get((b, a))
+        is_inverse = back is None or np.allclose(back @ matrix, np.eye(4), 0, _INVERSE_TOLERANCE)
+        if not np.array_equal(same, matrix) or not is_inverse:
+            expected = f"the inverse of From={b} To={a}, " if is_inverse is False else ""
+            other = same if is_inverse or back is None else back
+            raise InvalidInputError(
+                f"Transform From={a} To={b}: expected {expected}what is said of it before, {_text(other)}, "
+                f"got {_text(matrix)}"
+            )
+        transforms[a, b] = matrix
     return transforms
 
 
 def _text(matrix: FloatArray) -> str:
-    return "[" + " ".join(f"{value:g}" for value in matrix.ravel()) + "]"
+    return " ".join(f"{value:g}" for value in matrix.ravel())
 
 
 def _scan_conversion(element: Element | None) -> ScanConversion:
     if element is None:
         return ScanConversion()
-    width = _positive(element, "TransducerWidthMm", 1)
-    spacing = _positive(element, "OutputImageSpacingMmPerPixel", 2)
+    width = _values(element, 1, "TransducerWidthMm")
+    spacing = _values(element, 2, "OutputImageSpacingMmPerPixel")
+    size = _values(element, 2, "OutputImageSizePixel")
+    if min((*(width or ()), *(spacing or ()), *(size or ())), default=1.0) <= 0:
+        raise InvalidInputError("ScanConversion: width, spacing and size: expected above zero, got others")
     return ScanConversion(
         element.get("TransducerName", ""),
         element.get("TransducerGeometry", "").upper(),
         None if width is None else width[0],
-        _positive(element, "OutputImageSizePixel", 2),
+        size,
         None if spacing is None else (spacing[0], spacing[1]),
     )
 
@@ -258,41 +252,27 @@ def _clip(element: Element | None) -> Clip | None:
     """Clip and fan of a volume reconstruction; names without a unit are those of older versions [1]_."""
     if element is None:
         return None
-
-    def values(count: int, *names: str) -> tuple[float, ...] | None:
-        return next((vector(element, name, count) for name in names if name in element.attrib), None)
-
-    origin, size = values(2, "ClipRectangleOrigin"), values(2, "ClipRectangleSize")
+    origin, size = _values(element, 2, "ClipRectangleOrigin"), _values(element, 2, "ClipRectangleSize")
     columns = rows = None
     if origin is not None and size is not None and min(size) > 0:
         # PLUS counts the pixel behind the rectangle, too (vtkIGSIOPasteSliceIntoVolume).
         columns, rows = ((first, first + count) for first, count in zip(origin, size, strict=True))
-    angles, apex = values(2, "FanAnglesDeg", "FanAngles"), values(2, "FanOriginPixel", "FanOrigin")
-    outer = values(1, "FanRadiusStopPixel", "FanDepth")
-    inner = values(1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
+    angles = _values(element, 2, "FanAnglesDeg", "FanAngles")
+    apex = _values(element, 2, "FanOriginPixel", "FanOrigin")
+    outer = _values(element, 1, "FanRadiusStopPixel", "FanDepth")
+    inner = _values(element, 1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
     fan = None
     if angles is not None and apex is not None and outer is not None and angles[0] != angles[1]:
         fan = (apex[0], apex[1], inner[0], outer[0], min(angles), max(angles))
     return None if columns is None and fan is None else Clip(columns, rows, fan)
 
 
-def _positive(element: Element, attribute: str, count: int) -> tuple[float, ...] | None:
-    if attribute not in element.attrib:
-        return None
-    values = vector(element, attribute, count)
-    if min(values) <= 0:
-        raise InvalidInputError(f"ScanConversion: {attribute}: expected above zero, got {values}")
-    return values
+def _values(element: Element, count: int, *names: str) -> tuple[float, ...] | None:
+    """Numbers of the first of some attributes that there is."""
+    return next((vector(element, name, count) for name in names if name in element.attrib), None)
 
 
 def _attribute(root: Element, name: str) -> str | None:
     """Value of an attribute that all elements with it share; None where none has it, or they differ."""
     values = {element.get(name) for element in root.iter() if name in element.attrib}
     return values.pop() if len(values) == 1 else None
-
-
-def _inverse(matrix: FloatArray, where: str) -> FloatArray:
-    try:
-        return np.asarray(np.linalg.inv(matrix))
-    except np.linalg.LinAlgError as error:
-        raise InvalidInputError(f"{where}: expected a matrix with an inverse, got a singular one") from error

@@ -22,30 +22,27 @@ def _device_rows(path: Path, root: Element) -> list[Row]:
         for element in root.iterfind(".//Device")
     ]
     wires = len(root.findall(".//PhantomDefinition/Geometry/Pattern/Wire"))
-    option = "--plus-config of convert" + (", --phantom of calibrate wires" if wires else "")
     return [
         ("devices", ", ".join(devices) or "none", ""),
         *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
-        ("pixel", *(("unknown", "") if pixel is None else (" x ".join(f"{mm:.5f}" for mm in pixel), "mm"))),
+        ("pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""),
         ("image orientation", device.image_orientation or "not said", ""),
-        ("transducer", " ".join((device.scan.probe, device.scan.geometry)).strip() or "not said", ""),
+        ("transducer", f"{device.scan.probe} {device.scan.geometry}".strip() or "not said", ""),
         ("clip of volumes", "none" if device.clip is None else str(device.clip), ""),
         ("wires of a phantom", str(wires), ""),
-        ("for", option, ""),
+        ("for", "--plus-config of convert" + (", --phantom of calibrate wires" if wires else ""), ""),
     ]
 
 
 def _lag_rows(_: Path, root: Element) -> list[Row]:
     """Rows of a delay, whose sign PLUS has the other way round: a tracker that lags is there negative."""
     (lag_s,) = vector(root, "TrackerLagSec", 1)
-    return [
-        ("time offset of the tracker", f"{-lag_s:+.4f}", "s"),
-        ("for", "--time-offset-s of calibrate", ""),
-    ]
+    option = "--time-offset-s of calibrate"
+    return [("time offset of the tracker", f"{-lag_s:+.4f}", "s"), ("for", option, "")]
 
 
 def _line_rows(_: Path, root: Element) -> list[Row]:
-    count = sum(element.get("SegmentationStatus") == "OK" for element in root.iterfind("Frame"))
+    count = len(root.findall("Frame[@SegmentationStatus='OK']"))
     return [("lines found", str(count), "frames"), ("for", "comparison alone, as lines are found anew", "")]
 
 
@@ -58,8 +55,9 @@ _KINDS: dict[str, tuple[str, Callable[[Path, Element], list[Row]]]] = {
 
 
 def _claims(_: Path, start: bytes) -> bool:
-    text = start.lstrip(b"\xef\xbb\xbf \t\r\n")
-    return text.startswith(b"<") and any(f"<{name}".encode() in text for name in _KINDS)
+    return start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") and any(
+        f"<{name}".encode() in start for name in _KINDS
+    )
 
 
 def _open(path: Path, settings: ImportSettings) -> Recording:

@@ -49,9 +49,8 @@ class Layout:
         PLUS stores B-mode as MF and RF as FM. A machine's orientation, from a device set, replaces that for
         the kind of image whose lines run so.
         """
-        kind = header.fields.get("UltrasoundImageType")
-        if kind is None:
-            kind = "BRIGHTNESS" if header.pixels.dtype == np.uint8 else "RF_REAL"
+        by_pixels = "BRIGHTNESS" if header.pixels.dtype == np.uint8 else "RF_REAL"
+        kind = header.fields.get("UltrasoundImageType", by_pixels)
         usual = "FM" if kind in RF_TYPES else "MF"
         if machine is not None and (machine[:1].upper() in "FN") == (usual == "FM"):
             usual = machine
@@ -97,34 +96,30 @@ class Layout:
     def frame(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Turn pixels, shape (y, x), into samples, shape (vector, sample): marked and far sides last."""
         if self.is_complex:
-            pairs = pixels if self._pair_axis == 0 else pixels.T
+            pairs = np.moveaxis(pixels, self._pair_axis, 0)
             joined = pairs[0::2].astype(np.complex64)
             joined.imag = -pairs[1::2].astype(np.float32) if self.conjugated else pairs[1::2]
-            pixels = joined if self._pair_axis == 0 else joined.T
+            pixels = np.moveaxis(joined, 0, self._pair_axis)
         return self._flipped(pixels if self.has_lines_in_rows else pixels.T)
 
     def pixels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Turn samples, shape (vector, sample), into pixels, shape (y, x): what `frame` undoes."""
         turned = self._flipped(frame) if self.has_lines_in_rows else self._flipped(frame).T
         if self.is_complex:
-            pairs = turned if self._pair_axis == 0 else turned.T
-            parted = np.empty((2 * pairs.shape[0], pairs.shape[1]), dtype=np.float32)
-            parted[0::2], parted[1::2] = pairs.real, pairs.imag
-            turned = parted if self._pair_axis == 0 else parted.T
+            pairs = np.moveaxis(turned, self._pair_axis, 0)
+            parted = np.stack([pairs.real, pairs.imag], axis=1).reshape(-1, *pairs.shape[1:])
+            turned = np.moveaxis(parted, 0, self._pair_axis)
         return np.ascontiguousarray(turned)
 
     def shape(self, size: tuple[int, ...]) -> tuple[int, int]:
         """Vectors and samples of an image of a size (x, y)."""
-        yx = [size[1], size[0]]
-        if self.is_complex:
-            yx[self._pair_axis] //= 2
-        return (yx[0], yx[1]) if self.has_lines_in_rows else (yx[1], yx[0])
+        y, x = (size[1 - axis] // (1 + (self.is_complex and axis == self._pair_axis)) for axis in (0, 1))
+        return (y, x) if self.has_lines_in_rows else (x, y)
 
     @property
     def _pair_axis(self) -> int:
         """Axis of (y, x) along which I and Q alternate."""
-        depth = 1 if self.has_lines_in_rows else 0
-        return depth if self.kind == "RF_IQ_LINE" else 1 - depth
+        return int(self.has_lines_in_rows == (self.kind == "RF_IQ_LINE"))
 
     def _flipped(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Turn lines round, and their order; shape (vector, sample) in and out."""

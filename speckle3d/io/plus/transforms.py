@@ -6,29 +6,25 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
+from speckle3d.io.pose_paths import ROUNDING_TOLERANCE, rigid
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
 """How far the axes of a measured image calibration may be from square, as the cosine of their angle. PLUS's
 published calibrations reach 0.05, an error of the calibration and not of the image."""
 
-ROUNDING_TOLERANCE = 2e-3
-"""How far R^T R of a pose in a header may be from the identity before it is made rigid. An electromagnetic
-tracker that rounds its own output was measured at 4.6e-4; six written digits alone give 2e-6."""
-
-_INVERSE_TOLERANCE_MM = 1.0
-"""How far poses and their inverses, both in a header, may be apart: rotations rounded by up to
-`ROUNDING_TOLERANCE` move a place 1,000 mm off by so much."""
+_INVERSE_TOLERANCE = 1.0
+"""How far the product of a pose and its inverse may be from the identity, mm in the last column: rotations
+rounded by up to `ROUNDING_TOLERANCE` move a place 1,000 mm off by so much."""
 
 _FIXED_TOLERANCE = 1e-4
 """How far entries of a transform that all frames share may differ: six written digits of tens of mm."""
@@ -51,20 +47,18 @@ class Poses:
         Name of its frame.
     chain : tuple of str
         Transforms from the tool to the world, in the order in which they are applied.
-    poses : RigidTransform, length n
-        The identity where not valid.
-    valid : ndarray of bool, shape (n,)
-    reasons : Counter
-        How many are not valid, by why.
+    matrices : ndarray, shape (n, 4, 4)
+        Rigid; the identity where there is no valid one.
+    faults : list of str
+        Why there is none; empty where there is.
     pixels : ndarray, shape (4, 4), optional
         Where the tool is the image itself, whose transforms take pixels to mm: pixels to mm in the image.
     """
 
     tool: str
     chain: tuple[str, ...]
-    poses: RigidTransform
-    valid: BoolArray
-    reasons: Counter[str]
+    matrices: FloatArray
+    faults: list[str]
     pixels: FloatArray | None = None
 
 
@@ -82,7 +76,8 @@ def tracked_poses(
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
 
-    The tool may be the image itself, as in ``ImageToReference``: poses are then the nearest rigid ones.
+    The tool may be the image itself, as in ``ImageToReference``: poses are then the nearest rigid ones. A
+    pose that is held both ways round, as two matrices that are not each other's inverses, is not valid.
 
     Parameters
     ----------
@@ -105,42 +100,39 @@ def tracked_poses(
     if name is None or name == "none":
         return None
     tool, world = ends(name)
-    held = [_held(path, there, name, is_asked=asked is not None)]
     # A reference counts if both are tracked in the same world.
     fixed = f"ReferenceTo{world}" if reference is None else reference.removesuffix("Transform")
-    if tool == "Reference" and reference is None:
+    if reference is None and (tool == "Reference" or not {fixed, _back(fixed)} & {*there}):
         fixed = "none"
-    if fixed != "none" and (reference is not None or _either(there, fixed)):
-        held.append(_held(path, there, fixed, is_asked=reference is not None))
-    columns = [_Column.read(path, frames, each) for each in held if each is not None]
-    if not columns:
-        return None
+    for one in {name, fixed} - {"none"}:
+        if one not in there and _back(one) not in there:
+            raise InvalidInputError(f"{path}: expected a transform {one}, got {', '.join(there) or 'none'}")
+    matrices, faults = _column(path, frames, name)
     pixels = None
     if tool == names.image:
-        first, pixels = _poses_of_pixels(path, name, columns[0])
+        matrices, own, pixels = _poses_of_pixels(path, name, matrices, faults)
     else:
-        first = columns[0].rigid()
-        _require_inverse(path, frames, there, name)
-    columns = [first, *(column.rigid() for column in columns[1:])]
-    valid = np.logical_and.reduce([column.valid for column in columns])
-    reasons: Counter[str] = Counter()
-    for i in np.flatnonzero(~valid):
-        reasons[next(column.reasons[i] for column in columns if not column.valid[i])] += 1
-    matrices = columns[0].matrices
+        matrices, own = rigid(matrices)
+        if {name, _back(name)} <= {*there}:
+            back, _ = rigid(_column(path, frames, _back(name))[0])
+            off = np.abs(back @ matrices - np.eye(4)).max(axis=(1, 2))
+            own = [fault or ("" if ok else "that its inverse contradicts") for fault, ok in
+                   zip(own, off < _INVERSE_TOLERANCE, strict=True)]  # fmt: skip
     chain = [name]
-    if len(columns) > 1:
-        matrices = np.asarray(np.linalg.inv(columns[1].matrices) @ matrices)
-        chain.append("To".join(reversed(ends(fixed))))
-    poses = RigidTransform.from_matrix(np.where(valid[:, None, None], matrices, np.eye(4)))
-    return Poses(tool, tuple(chain), poses, valid, reasons, pixels)
+    if fixed != "none":
+        world_from_reference, others = _column(path, frames, fixed)
+        world_from_reference, odd = rigid(world_from_reference)
+        matrices = np.asarray(np.linalg.inv(world_from_reference) @ matrices)
+        own = _first(own, others, odd)
+        chain.append(_back(fixed))
+    return Poses(tool, tuple(chain), matrices, _first(faults, own), pixels)
 
 
 def tracked_orientation(path: str, frames: Sequence[Fields]) -> Poses | None:
     """Read the orientation sensor's stream that this package writes; None where there is none."""
     name = f"{ORIENTATION}ToWorld"
-    if name not in names_of(frames):
-        return None
-    return tracked_poses(path, frames, name, "none", Names())
+    there = name in names_of(frames)
+    return tracked_poses(path, frames, name, "none", Names()) if there else None
 
 
 def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: str) -> FloatArray | None:
@@ -154,14 +146,14 @@ def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: s
     key = f"{name}Transform"
     if key in fields:
         return np.reshape(numbers(fields[key], 16, f"{path}: {key}"), (4, 4))
-    column = _Column.read(path, frames, (name, False))
-    if not column.valid.any():
+    matrices, faults = _column(path, frames, name)
+    matrices = matrices[[not fault for fault in faults]]
+    if not len(matrices):
         return None
-    matrices = column.matrices[column.valid]
     off = np.abs(matrices - np.median(matrices, axis=0)).max(axis=(1, 2))
     if off.max() > _FIXED_TOLERANCE * max(1.0, np.abs(matrices).max()):
-        i = int(np.flatnonzero(column.valid)[np.argmax(off)])
-        raise InvalidInputError(f"{path}: {key}[{i}]: expected that of the other frames, got another")
+        where = f"{path}: {key}[{int(np.argmax(off))}]"
+        raise InvalidInputError(f"{where}: expected that of the other frames, got one {off.max():.3g} off")
     first: FloatArray = matrices[0]
     return first
 
@@ -196,9 +188,8 @@ def sensor_from_image(matrix: FloatArray, first_sample_depth_mm: float, where: s
     cosine = float(axes[:, 0] @ axes[:, 1])
     if abs(cosine) > SKEW_TOLERANCE:
         raise InvalidInputError(f"{where}: expected square axes, got cosine {cosine:.3f}")
-    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     # PLUS writes z = x cross y as the third column (vtkPlusProbeCalibrationAlgo); zeros say nothing.
-    volume = float(np.linalg.det(matrix[:3, :3] / lengths)) if lengths[2] else 1.0
+    volume = float(np.linalg.det(matrix[:3, :3]))
     if volume < 0:
         raise InvalidInputError(
             f"{where}: expected right-handed axes (x to the marked side, y away from the probe, z = x cross "
@@ -251,122 +242,66 @@ def names_of(frames: Sequence[Fields]) -> list[str]:
     return sorted(name.removesuffix("Transform") for name in names)
 
 
+def _back(name: str) -> str:
+    return "To".join(reversed(ends(name)))
+
+
 def _usual(there: Sequence[str], names: Names) -> str | None:
     """The probe's pose, else the image's, in the tracker, or in the only frame where it is tracked."""
-    if _either(there, f"{names.probe}To{names.tracker}"):
-        return f"{names.probe}To{names.tracker}"
     for tool in (names.probe, names.image):
         worlds = {b if a == tool else a for a, b in map(ends, there) if tool in (a, b)}
         worlds -= {names.probe, names.image, "TransducerOrigin", "TransducerOriginPixel", ""}
-        if names.tracker in worlds:
-            return f"{tool}To{names.tracker}"
-        if "Reference" in worlds or len(worlds) == 1:
-            return f"{tool}To{'Reference' if 'Reference' in worlds else worlds.pop()}"
+        for world in (names.tracker, "Reference", *(worlds if len(worlds) == 1 else ())):
+            if world in worlds:
+                return f"{tool}To{world}"
     return None
 
 
-def _either(there: Sequence[str], name: str) -> bool:
-    return name in there or "To".join(reversed(ends(name))) in there
+def _first(*faults: list[str]) -> list[str]:
+    """The first fault of each frame."""
+    return [next(filter(None, column), "") for column in zip(*faults, strict=True)]
 
 
-def _held(path: str, there: Sequence[str], name: str, is_asked: bool) -> tuple[str, bool] | None:
-    """The transform that the frames hold, ``XToY`` or its inverse ``YToX``, and whether it is that."""
-    back = "To".join(reversed(ends(name)))
-    if name in there:
-        return name, False
-    if back in there:
-        return back, True
-    if is_asked:
-        raise InvalidInputError(f"{path}: expected a transform {name}, got {', '.join(there) or 'none'}")
-    return None
+def _column(path: str, frames: Sequence[Fields], name: str) -> tuple[FloatArray, list[str]]:
+    """One transform by frame, or the inverse of what is held; the identity where not valid, and why."""
+    is_back = not any(f"{name}Transform" in frame for frame in frames)
+    key = f"{_back(name) if is_back else name}Transform"
+    matrices, faults = np.tile(np.eye(4), (len(frames), 1, 1)), [""] * len(frames)
+    for i, frame in enumerate(frames):
+        if key not in frame or frame.get(f"{key}Status", "OK") != "OK":
+            faults[i] = "without a valid pose"
+            continue
+        try:
+            matrix = np.reshape(numbers(frame[key], 16, path), (4, 4))
+            matrices[i] = np.linalg.inv(matrix) if is_back else matrix
+        except (InvalidInputError, np.linalg.LinAlgError):
+            faults[i] = "whose pose is not 16 finite numbers, or has no inverse"
+    return matrices, faults
 
 
-def _require_inverse(path: str, frames: Sequence[Fields], there: Sequence[str], name: str) -> None:
-    """Refuse poses that a header holds both ways round, where the two are not each other's inverses."""
-    back = "To".join(reversed(ends(name)))
-    if name not in there or back not in there:
-        return
-    one, other = (_Column.read(path, frames, (held, False)).rigid() for held in (name, back))
-    valid = one.valid & other.valid
-    if not valid.any():
-        return
-    product = RigidTransform.from_matrix((one.matrices @ other.matrices)[valid])
-    far = (product.rotation.magnitude() > ROUNDING_TOLERANCE) | (
-        np.linalg.norm(product.translation, axis=-1) > _INVERSE_TOLERANCE_MM
-    )
-    if far.any():
-        i = int(np.flatnonzero(valid)[np.argmax(far)])
-        raise InvalidInputError(
-            f"{path}: {back}Transform[{i}]: expected the inverse of {name}Transform, got another: "
-            "one of the two is wrong"
-        )
-
-
-@dataclass(frozen=True)
-class _Column:
-    """One transform by frame: matrices, the identity where not valid, and why those are not."""
-
-    matrices: FloatArray
-    valid: BoolArray
-    reasons: list[str]
-
-    @classmethod
-    def read(cls, path: str, frames: Sequence[Fields], held: tuple[str, bool]) -> _Column:
-        """Read a transform, or the inverse of the one that is held."""
-        name, is_inverse = held
-        matrices = np.tile(np.eye(4), (len(frames), 1, 1))
-        reasons = [""] * len(frames)
-        for i, frame in enumerate(frames):
-            text = frame.get(f"{name}Transform")
-            if text is None or frame.get(f"{name}TransformStatus", "OK") != "OK":
-                reasons[i] = "without a valid pose"
-                continue
-            try:
-                matrices[i] = np.reshape(numbers(text, 16, path), (4, 4))
-            except InvalidInputError:
-                reasons[i] = "whose pose is not 16 finite numbers"
-        if is_inverse:
-            for i in np.flatnonzero(~(np.abs(np.linalg.det(matrices)) > 0)).tolist():
-                matrices[i], reasons[i] = np.eye(4), "whose pose has no inverse"
-            matrices = np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-        return cls(matrices, np.array([not reason for reason in reasons], dtype=bool), reasons)
-
-    def rigid(self) -> _Column:
-        """Make rounded rotations exact; a matrix farther off is not valid."""
-        r = self.matrices[:, :3, :3]
-        with np.errstate(over="ignore", invalid="ignore"):
-            near = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) < ROUNDING_TOLERANCE
-            near &= np.abs(self.matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) < ROUNDING_TOLERANCE
-        near[near] = np.linalg.det(r[near]) > 0
-        matrices = np.tile(np.eye(4), (len(r), 1, 1))
-        matrices[near, :3, 3] = self.matrices[near, :3, 3]
-        matrices[near, :3, :3] = nearest_rotation(r[near])
-        reasons = [reason or ("" if ok else "whose pose is not rigid") for reason, ok in
-                   zip(self.reasons, near, strict=True)]  # fmt: skip
-        return _Column(matrices, self.valid & near, reasons)
-
-
-def _poses_of_pixels(path: str, name: str, column: _Column) -> tuple[_Column, FloatArray | None]:
+def _poses_of_pixels(
+    path: str, name: str, matrices: FloatArray, missing: list[str]
+) -> tuple[FloatArray, list[str], FloatArray | None]:
     """Split transforms of pixels to mm into the image's poses and its pixels, the same in all frames."""
-    matrices, valid, reasons = column.matrices, column.valid.copy(), list(column.reasons)
-    rigid = np.tile(np.eye(4), (len(matrices), 1, 1))
-    sizes = np.ones((len(matrices), 3))
-    fault: InvalidInputError | None = None
-    for i in np.flatnonzero(valid).tolist():
+    poses, sizes = np.tile(np.eye(4), (len(matrices), 1, 1)), np.full((len(matrices), 3), np.nan)
+    faults, first = [""] * len(matrices), None
+    for i, matrix in enumerate(matrices):
+        if missing[i]:
+            continue
         where = f"{path}: {name}Transform[{i}]"
         try:
-            rigid[i] = sensor_from_image(matrices[i], 0.0, where).as_matrix()
-            sizes[i] = *pixel_axes(matrices[i], where), 1.0 + image_skew_rad(matrices[i], where)
+            poses[i] = sensor_from_image(matrix, 0.0, where).as_matrix()
+            sizes[i] = *pixel_axes(matrix, where), 1.0 + image_skew_rad(matrix, where)
         except InvalidInputError as error:
-            fault, valid[i], reasons[i] = fault or error, False, "whose pixels make no sense"
-    if not valid.any():
-        if fault is not None:
-            raise fault
-        return _Column(rigid, valid, reasons), None
-    middle = np.median(sizes[valid], axis=0)
-    other = valid & (np.abs(sizes / middle - 1.0) > ROUNDING_TOLERANCE).any(axis=1)
-    for i in np.flatnonzero(other).tolist():
-        valid[i], reasons[i] = False, f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
-    column_mm, row_mm, leaning = sizes[valid].mean(axis=0).tolist()
-    pixels = image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning - 1.0)
-    return _Column(rigid, valid, reasons), pixels
+            faults[i], first = "whose pixels make no sense", first or error
+    held = np.isfinite(sizes).all(axis=1)
+    if not held.any():
+        if first is not None:
+            raise first
+        return poses, faults, None
+    middle = np.median(sizes[held], axis=0)
+    held &= (np.abs(sizes / middle - 1.0) <= ROUNDING_TOLERANCE).all(axis=1)
+    other = f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
+    faults = [fault or ("" if same else other) for fault, same in zip(faults, held, strict=True)]
+    column_mm, row_mm, leaning = sizes[held].mean(axis=0).tolist()
+    return poses, faults, image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning - 1.0)

@@ -10,21 +10,21 @@ References
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike
 from speckle3d.core.parts import cannot_write
 from speckle3d.core.progress import Progress
-from speckle3d.core.sweep import RFSettings, Sweep, stored_dtype
+from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
@@ -141,7 +141,8 @@ def write_sequence(
     for name, matrices in (transforms or {}).items():
         rows.add(name, matrices)
         rows.fields["ElementSpacing"] = "1 1 1"
-    images = _Images.of(sweep, rows, progress)
+    layout = Layout(rows.fields["UltrasoundImageType"], rows.fields["UltrasoundImageOrientation"])
+    images = _Images(sweep, layout, progress)
     if suffix == ".mhd":
         _write_two_files(target, images, rows, compressed)
         return omitted
@@ -192,42 +193,35 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
 
 def _rows_of(sweep: Sweep) -> tuple[_Rows, list[str]]:
     """Fields of a sweep's sequence, and what a sequence does not hold of it."""
-    times, grid, tracker, sensor = sweep.frame_time_s, sweep.grid, sweep.tracker, sweep.orientation
-    rows = _Rows.of_times(times)
-    omitted = []
+    times, grid, count = sweep.frame_time_s, sweep.grid, len(sweep)
+    rows, omitted = _Rows.of_times(times), list[str]()
     for frame in rows.frames:
         frame["ImageStatus"] = "OK"
     sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
-    count = len(sweep)
-    if tracker is not None:
-        at = times - tracker.time_offset_s
-        covered = tracker.readings.covers(at)
-        matrices = np.tile(np.eye(4), (count, 1, 1))
-        if covered.any():
-            matrices[covered] = tracker.readings.at(at[covered]).as_matrix()
-        rows.add("ProbeToTracker", matrices, covered)
-        if not np.array_equal(tracker.readings.time_s, at[covered]):
-            omitted.append(
-                f"the tracker's {len(tracker.readings)} readings, of which {np.count_nonzero(covered)} "
-                f"interpolated ones are at the times of {count} frames"
-            )
-        if tracker.sensor_from_image is not None:
-            matrix = image_matrix(tracker.sensor_from_image, *sizes, tracker.image_skew_rad)
-            rows.add(f"{IMAGE}ToProbe", np.tile(matrix, (count, 1, 1)))
-    if sensor is not None:
+    sensors: tuple[tuple[Tracker | OrientationSensor | None, str, str], ...] = (
+        (sweep.tracker, "Probe", "Tracker"), (sweep.orientation, ORIENTATION, "World")
+    )  # fmt: skip
+    for sensor, own, world in sensors:
+        if sensor is None:
+            continue
         at = times - sensor.time_offset_s
         covered = sensor.readings.covers(at)
         matrices = np.tile(np.eye(4), (count, 1, 1))
         if covered.any():
-            matrices[covered, :3, :3] = sensor.readings.at(at[covered]).as_matrix()
-        rows.add(f"{ORIENTATION}ToWorld", matrices, covered)
-        if sensor.sensor_from_image is not None:
-            matrix = image_matrix(RigidTransform.from_rotation(sensor.sensor_from_image), *sizes)
-            rows.add(f"{IMAGE}To{ORIENTATION}", np.tile(matrix, (count, 1, 1)))
-        omitted.append(
-            f"the orientation sensor's {len(sensor.readings)} readings with what else it measured, of which "
-            f"{np.count_nonzero(covered)} interpolated rotations are at the times of {count} frames"
-        )
+            posed = sensor.readings.at(at[covered]).as_matrix()
+            size = range(posed.shape[-1])  # 3 of rotations
+            matrices[np.ix_(covered, size, size)] = posed
+        rows.add(f"{own}To{world}", matrices, covered)
+        if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[covered]):
+            omitted.append(
+                f"the {sensor.label}'s {len(sensor.readings)} readings with all that it measured: "
+                f"{np.count_nonzero(covered)} interpolated ones are at the times of {count} frames"
+            )
+        if (mounting := sensor.sensor_from_image) is not None:
+            if isinstance(mounting, Rotation):
+                mounting = RigidTransform.from_rotation(mounting)
+            skew_rad = sensor.image_skew_rad if isinstance(sensor, Tracker) else 0.0
+            rows.add(f"{IMAGE}To{own}", np.tile(image_matrix(mounting, *sizes, skew_rad), (count, 1, 1)))
     if sweep.truth is not None:
         omitted.append("the true poses")
     rows.fields.update(_standard_fields(sweep))
@@ -244,18 +238,17 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
     kind = "BRIGHTNESS" if not is_rf else "RF_IQ_LINE" if sweep.frames.dtype.kind == "c" else "RF_REAL"
     sizes = (grid.vector_pitch_mm, grid.sample_spacing_mm)
     calibrated = sweep.tracker is not None and sweep.tracker.sensor_from_image is not None
-    spacing = (1.0, 1.0, 1.0) if calibrated else (*(sizes[::-1] if is_rf else sizes), 1.0)
-    own: dict[str, Any] = {name: value for name, value in vars(signal).items() if value is not None}
-    own["first_sample_depth_mm"] = grid.first_sample_depth_mm
+    spacing = (1.0, 1.0) if calibrated else sizes[::-1] if is_rf else sizes
     names = ("vector_pitch_mm",) if is_rf else ("column_pitch_mm", "row_spacing_mm")
-    own.update(zip(names, sizes, strict=False))
+    own: dict[str, Any] = {name: value for name, value in vars(signal).items() if value is not None}
+    own |= {"first_sample_depth_mm": grid.first_sample_depth_mm, **dict(zip(names, sizes, strict=False))}
     texts = {name: " ".join(map(_text, np.ravel(value))) for name, value in own.items()}
     if sweep.probe:
         texts["probe"] = " ".join(sweep.probe.split())
     return {
         "UltrasoundImageOrientation": "FM" if is_rf else "MF",
         "UltrasoundImageType": kind,
-        "ElementSpacing": " ".join(map(_text, spacing)),
+        "ElementSpacing": " ".join(map(_text, (*spacing, 1.0))),
         "Offset": "0 0 0",
         "TransformMatrix": "1 0 0 0 1 0 0 0 1",
         "CenterOfRotation": "0 0 0",
@@ -275,38 +268,33 @@ class _Images:
 
     sweep: Sweep
     layout: Layout
-    dtype: np.dtype[Any]
-    shape: tuple[int, int]
     progress: Progress | None
 
-    @classmethod
-    def of(cls, sweep: Sweep, rows: _Rows, progress: Progress | None) -> _Images:
-        layout = Layout(rows.fields["UltrasoundImageType"], rows.fields["UltrasoundImageOrientation"])
-        dtype = sweep.frames.dtype
-        if dtype.kind == "c":
-            dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
-        y, x = layout.pixels(sweep.frames[0]).shape
-        return cls(sweep, layout, dtype, (y, x), progress)
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the numbers, of I and Q each."""
+        dtype = self.sweep.frames.dtype
+        if dtype.kind != "c":
+            return dtype
+        return np.dtype(np.int16 if stored_dtype(self.sweep.frames) == np.int16 else np.float32)
 
-    def __iter__(self) -> Iterator[npt.NDArray[Any]]:
-        for i in range(len(self.sweep)):
-            yield self.layout.pixels(self.sweep.frames[i])
-            if self.progress is not None:
-                self.progress(i + 1, len(self.sweep))
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """Lengths of the axes, fastest first."""
+        y, x = self.layout.pixels(self.sweep.frames[0]).shape
+        return x, y, len(self.sweep)
 
     def write(self, file: BinaryIO, window: int | None) -> int:
         """Write all images, packed if there is a window, and return how many bytes that took."""
         packer = None if window is None else _packer(window)
         size = 0
-        for image in self:
+        for i in range(len(self.sweep)):
+            image = self.layout.pixels(self.sweep.frames[i])
             raw = image.astype(self.dtype.newbyteorder("<"), order="C").data.cast("B")
             size += file.write(raw if packer is None else packer.compress(raw))
+            if self.progress is not None:
+                self.progress(i + 1, len(self.sweep))
         return size if packer is None else size + file.write(packer.flush())
-
-    @property
-    def lengths(self) -> str:
-        """Lengths of the axes, fastest first."""
-        return f"{self.shape[1]} {self.shape[0]} {len(self.sweep)}"
 
 
 def _packer(window: int) -> Any:
@@ -346,7 +334,7 @@ def _meta_header(images: _Images, rows: _Rows, data: str, packed: int | None) ->
     fields = dict(rows.fields)
     lines = [
         *meta_start(3, packed),
-        f"DimSize = {images.lengths}",
+        f"DimSize = {_spaced(images.shape)}",
         "Kinds = domain domain list",
         f"ElementSpacing = {fields.pop('ElementSpacing')}",
         f"ElementType = MET_{meta_type(images.dtype)}",
@@ -363,7 +351,7 @@ def _nrrd_header(images: _Images, rows: _Rows, encoding: str, is_slicers: bool) 
     lines = [
         "NRRD0004",
         f"type: {nrrd_type(images.dtype)}",
-        *(_slicers_axes if is_slicers else _axes)(images, x, y),
+        *(_slicers_axes if is_slicers else _axes)(images.shape, x, y),
         "endian: little",
         f"encoding: {encoding}",
         *(f"{_NRRD_NAMES.get(name, name)}:={value}" for name, value in fields.items()),
@@ -375,30 +363,34 @@ def _nrrd_header(images: _Images, rows: _Rows, encoding: str, is_slicers: bool) 
     return header_bytes(lines)
 
 
-def _axes(images: _Images, x: str, y: str) -> list[str]:
+def _axes(shape: tuple[int, int, int], x: str, y: str) -> list[str]:
     """Axes of an image, and one of frames, in a plane: as PLUS writes them."""
     return [
         "dimension: 3",
         "space dimension: 2",
-        f"sizes: {images.lengths}",
+        f"sizes: {_spaced(shape)}",
         f"space directions: ({x},0) (0,{y}) none",
         "kinds: domain domain list",
         "space origin: (0,0)",
     ]
 
 
-def _slicers_axes(images: _Images, x: str, y: str) -> list[str]:
+def _slicers_axes(shape: tuple[int, int, int], x: str, y: str) -> list[str]:
     """Axes of images one pixel thick in space, and one of frames; transforms count pixels from its origin."""
     return [
         "dimension: 4",
         "space: right-anterior-superior",
-        f"sizes: {images.shape[1]} {images.shape[0]} 1 {len(images.sweep)}",
+        f"sizes: {shape[0]} {shape[1]} 1 {shape[2]}",
         f"space directions: ({x},0,0) (0,{y},0) (0,0,1) none",
         "kinds: domain domain domain list",
         'labels: "" "" "" "time"',
         'units: "" "" "" "s"',
         "space origin: (0,0,0)",
     ]
+
+
+def _spaced(values: Iterable[object]) -> str:
+    return " ".join(map(str, values))
 
 
 def _slicers_index(rows: _Rows) -> Iterator[str]:

@@ -6,10 +6,9 @@ from igsio_twin import Clip
 from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.region import Region
-from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, recording_files
 from speckle3d.io.plus.device_set import read_device_set
@@ -21,6 +20,12 @@ def matrix(columns=(0.1, 0.2, 0.15), place=(10.0, 20.0, 30.0)):
     found = np.eye(4)
     found[:3, :3], found[:3, 3] = TURN * columns, place
     return found
+
+
+SINGLE = (
+    '<PlusConfiguration><CoordinateDefinitions><Transform From="{}" To="{}" Matrix="{}"/>'
+    "</CoordinateDefinitions></PlusConfiguration>"
+)
 
 
 def text(values):
@@ -162,45 +167,37 @@ def test_a_settings_file_names_a_set_of_its_folder(tmp_path, sequence):
     (folder / "import.toml").write_text('plus_config = "set.xml"\ndynamic_range_db = 60.0\n')
     assert load_sweep(moved).tracker.sensor_from_image is not None
     assert {path.name for path in recording_files(moved)} == {"a.mha", "import.toml", "set.xml"}
-    assert ("image calibration", f"{folder / 'set.xml'}: ImageToProbe", "") in describe(moved)
     written(tmp_path / "set.xml", ("Image", "Probe", matrix()))
     (folder / "link.xml").symlink_to(tmp_path / "set.xml")
     for name in ("../set.xml", str(folder / "set.xml"), "link.xml"):
         (folder / "import.toml").write_text(f'plus_config = "{name}"\n')
-        with pytest.raises(InvalidInputError, match=r"import\.toml: plus_config: .*the same folder"):
+        with pytest.raises(InvalidInputError, match=r"import\.toml: plus_config"):
             load_sweep(moved)
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "named"),
     [
-        ("<PlusConfiguration", "well-formed XML"),
+        ("<PlusConfiguration", "XML"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><PlusConfiguration/>', "declaration"),
-        ("<Other/>", "PlusConfiguration.*got Other"),
-        ('<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" Matrix="1 2"/>'
-         "</CoordinateDefinitions></PlusConfiguration>", r"Transform Image: Matrix: expected 16"),
+        ("<Other/>", "Other"),
         ('<PlusConfiguration><ScanConversion TransducerWidthMm="-1"/></PlusConfiguration>', "above zero"),
-        ('<PlusConfiguration><CoordinateDefinitions><Transform From="Probe" To="Image" Matrix="'
-         + "0 " * 16 + '"/></CoordinateDefinitions></PlusConfiguration>', "Probe to Image.*singular"),
-        ('<PlusConfiguration><CoordinateDefinitions><Transform From="Image" To="Probe" Matrix="'
-         + "0 " * 16 + '"/></CoordinateDefinitions></PlusConfiguration>', "axes of some length"),
+        (SINGLE.format("Image", "Probe", "1 2"), "Transform Image: Matrix"),
+        (SINGLE.format("Probe", "Image", "0 " * 16), "Probe to Image.*singular"),
+        (SINGLE.format("Image", "Probe", "0 " * 16), "axes of some length"),
     ],
-)  # fmt: skip
-def test_what_is_wrong_is_named(tmp_path, sequence, content, message):
+)
+def test_what_is_wrong_is_named(tmp_path, sequence, content, named):
     (tmp_path / "set.xml").write_text(content)
-    with pytest.raises(InvalidInputError, match=message) as caught:
+    with pytest.raises(InvalidInputError, match=rf"set\.xml.*{named}") as caught:
         load_sweep(sequence, given(str(tmp_path / "set.xml")))
-    assert "set.xml" in str(caught.value)
-    assert len(str(caught.value).splitlines()) == 1
-    with pytest.raises(FileError, match=r"none\.xml"):
-        read_device_set(tmp_path / "none.xml")
+    assert "\n" not in str(caught.value)
 
 
 def test_a_transform_said_twice_is_said_alike(tmp_path):
     image, back = ("Image", "Probe", matrix()), ("Probe", "Image", np.linalg.inv(matrix()))
     assert len(read_device_set(written(tmp_path / "set.xml", image, image, back)).transforms) == 2
-    other = matrix(place=(10.0, 20.0, 31.0))
-    with pytest.raises(InvalidInputError, match=r"set\.xml: Transform From=Image To=Probe.* 30 .* 31 "):
-        read_device_set(written(tmp_path / "set.xml", image, ("Image", "Probe", other)))
-    with pytest.raises(InvalidInputError, match=r"From=Image To=Probe: expected the inverse of From=Probe"):
-        read_device_set(written(tmp_path / "set.xml", back, ("Image", "Probe", other)))
+    other = ("Image", "Probe", matrix(place=(10.0, 20.0, 31.0)))
+    for first in (image, back):
+        with pytest.raises(InvalidInputError, match=r"set\.xml: Transform From=Image To=Probe.* 31 "):
+            read_device_set(written(tmp_path / "set.xml", first, other))

@@ -20,7 +20,7 @@ from speckle3d.io.load import kind_of, load_sweep
             '\ufeff<?xml version="1.0"?>\n<!-- x -->\n<ProbeCalibrationResult><CalibrationResults><Transform '
             'From="Image" To="Probe" Matrix="0.1 0 0 1 0 0.2 0 2 0 0 1 3 0 0 0 1"/></CalibrationResults>'
             "</ProbeCalibrationResult>",
-            {"content": "the result of a probe calibration", "pixel": "0.10000 x 0.20000"},
+            {"content": "the result of a probe calibration", "pixel": "0.10000 mm x 0.20000 mm"},
             "--plus-config",
         ),
         (

@@ -25,8 +25,10 @@ RF = ImportSettings(
 
 
 @pytest.mark.parametrize("make", [sweep_examples.bmode_sweep, sweep_examples.rf_sweep])
-@pytest.mark.parametrize("suffix", [".mha", ".mhd", ".nrrd", ".seq.nrrd"])
-@pytest.mark.parametrize("compressed", [True, False])
+@pytest.mark.parametrize(
+    ("suffix", "compressed"),
+    [(".mha", True), (".mha", False), (".mhd", True), (".mhd", False), (".nrrd", True), (".seq.nrrd", False)],
+)
 def test_a_sweep_with_sensors_is_interpolated_at_its_frames(tmp_path, make, suffix, compressed):
     sweep = make()
     omitted = write_sequence(tmp_path / f"out{suffix}", sweep, compressed=compressed)
@@ -128,9 +130,6 @@ def test_itk_reads_the_same_pixels(tmp_path, compressed):
         write_sequence(tmp_path / name, sweep, compressed=compressed)
         image = SimpleITK.ReadImage(str(tmp_path / name))
         np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
-    write_sequence(tmp_path / "a.nrrd", sweep, compressed=compressed)
-    image = SimpleITK.ReadImage(str(tmp_path / "a.nrrd"))
-    assert image.GetNumberOfComponentsPerPixel() == len(sweep)  # for ITK a list is one of components
 
 
 def test_names_of_other_files_are_refused(tmp_path):
