@@ -36,8 +36,8 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     if share is not None and _REVERSED[0] <= share <= _REVERSED[1]:
         turn = _turn(frequency_hz, sampling_rate_hz)
         raise InvalidInputError(
-            f"expected I/Q whose phase turns by {turn:.2f} rad a sample, or by none, got {share * turn:.2f}: Q "
-            "has the other sign"
+            f"expected I/Q whose phase turns by {turn:.2f} rad a sample, or by none, got {share * turn:.2f}: "
+            "Q has the other sign"
         )
     if share is not None and _CARRIED[0] <= share <= _CARRIED[1]:
         return 0.0
@@ -55,9 +55,8 @@ def sign_of_q(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> i
     int
         0 where the phase does not tell: noise, samples too far apart, or another carrier than `frequency_hz`.
     """
-    share = _carried_share(frames, frequency_hz, sampling_rate_hz)
-    is_told = share is not None and _CARRIED[0] <= abs(share) <= _CARRIED[1]
-    return int(np.sign(share)) if is_told else 0
+    share = _carried_share(frames, frequency_hz, sampling_rate_hz) or 0.0
+    return int(np.sign(share)) if _CARRIED[0] <= abs(share) <= _CARRIED[1] else 0
 
 
 def _carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:

@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
-import h5py
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
 from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
-from speckle3d.core.reconstruction import ImportRecord
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
+from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.hdf5 import (
-    PathLike,
-    find_member,
-    open_hdf5,
-    plain_attribute,
-    reading,
-    require_dataset,
-    require_group,
-)
 from speckle3d.io.load import kind_of, open_recording
-from speckle3d.io.readers import Row
 from speckle3d.io.reconstructions import read_reconstruction
+from speckle3d.io.recordings import Row, number_row
 from speckle3d.io.voxels.volumes import is_volume, read_volume
-
-_UNIT_NAMES = {"mm": "mm", "hz": "Hz", "db": "dB", "m_s": "m/s"}
 
 
 def describe(path: PathLike) -> list[Row]:
@@ -65,103 +55,71 @@ def describe(path: PathLike) -> list[Row]:
 
 def sweep_rows(sweep: Sweep) -> list[Row]:
     """Tell what a sweep holds."""
-    grid = sweep.grid
+    grid, signal, stored = sweep.grid, sweep.signal, stored_dtype(sweep.frames)
+    kind = "B-mode"
+    if isinstance(signal, RFSettings):
+        is_shifted = bool(signal.demodulation_frequency_hz)
+        complex_kind = "I/Q" if is_shifted else "I/Q, not demodulated (the analytic signal)"
+        kind = complex_kind if signal.are_complex else "RF"
+    narrow = "" if sweep.frames.dtype == stored else f", stored as pairs of {stored}"
+    skew_rad = 0.0 if sweep.tracker is None else sweep.tracker.image_skew_rad
     return [
         ("frames", str(len(sweep)), ""),
         *_rate_rows("", sweep.frame_time_s, "frames/s"),
         ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
-        ("sample type", _sample_type(sweep), ""),
+        ("sample type", f"{sweep.frames.dtype}{narrow}", ""),
         ("vector pitch", f"{grid.vector_pitch_mm:.4g}", "mm"),
         ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
         ("width", f"{grid.width_mm:.2f}", "mm"),
         ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
-        *_signal_rows(sweep.signal),
-        *_sensor_rows(sweep),
+        ("signal", kind, ""),
+        *(number_row(name, value) for name, value in vars(signal).items() if value and name != "full_scale"),
+        *_sensor_rows("orientation sensor", sweep.orientation, sweep),
+        *_sensor_rows("tracker", sweep.tracker, sweep),
+        *([("image axes off square", f"{np.rad2deg(skew_rad):.3g}", "deg")] if skew_rad else []),
+        ("truth", "no" if sweep.truth is None else "yes", ""),
     ]
 
 
 def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
-    span = float(times[-1] - times[0])
-    rows = [(f"{name} duration".strip(), f"{span:.3f}", "s")]
-    if times.size > 1:
-        rows.append((f"{name} rate".strip(), f"{(times.size - 1) / span:.2f}", unit))
-    return rows
+    span = float(np.ptp(times)) if times.size else 0.0
+    rows = [(f"{name} duration".strip(), f"{span:.3f}", "s"), (f"{name} rate".strip(), "", unit)]
+    return [*rows[:1], (rows[1][0], f"{(times.size - 1) / span:.2f}", unit)] if span else rows[: times.size]
 
 
-def _signal_rows(signal: RFSettings | BModeSettings) -> list[Row]:
-    if not isinstance(signal, RFSettings):
-        return [("signal", "B-mode", ""), ("dynamic range", f"{signal.dynamic_range_db:g}", "dB")]
-    low, high = (f"{edge / 1e6:g}" for edge in signal.bandwidth_hz)
+def _sensor_rows(name: str, sensor: OrientationSensor | Tracker | None, sweep: Sweep) -> list[Row]:
+    if sensor is None:
+        return [(name, "none", "")]
     return [
-        *_kind_rows(signal.demodulation_frequency_hz),
-        ("sampling rate", f"{signal.sampling_rate_hz / 1e6:g}", "MHz"),
-        ("centre frequency", f"{signal.centre_frequency_hz / 1e6:g}", "MHz"),
-        ("band", f"{low} to {high}", "MHz"),
-        ("speed of sound", f"{signal.speed_of_sound_m_s:g}", "m/s"),
+        (name, str(len(sensor.readings)), "samples"),
+        *_rate_rows(name, sensor.readings.time_s, "samples/s"),
+        (f"{name} covers", str(np.count_nonzero(sensor.covers(sweep.frame_time_s))), "frames"),
+        (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
+        (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
     ]
-
-
-def _kind_rows(demodulation_frequency_hz: float | None) -> list[Row]:
-    if demodulation_frequency_hz is None:
-        return [("signal", "RF", "")]
-    if demodulation_frequency_hz == 0:
-        return [("signal", "I/Q, not demodulated (the analytic signal)", "")]
-    return [
-        ("signal", "I/Q", ""),
-        ("demodulation frequency", f"{demodulation_frequency_hz / 1e6:g}", "MHz"),
-    ]
-
-
-def _sample_type(sweep: Sweep) -> str:
-    stored = stored_dtype(sweep.frames)
-    if sweep.frames.dtype == stored:
-        return str(stored)
-    return f"{sweep.frames.dtype}, stored as pairs of {stored}"
-
-
-def _sensor_rows(sweep: Sweep) -> list[Row]:
-    rows: list[Row] = []
-    for name, sensor in (("orientation sensor", sweep.orientation), ("tracker", sweep.tracker)):
-        if sensor is None:
-            rows.append((name, "none", ""))
-            continue
-        covered = int(np.count_nonzero(sensor.covers(sweep.frame_time_s)))
-        rows += [
-            (name, str(len(sensor.readings)), "samples"),
-            *_rate_rows(name, sensor.readings.time_s, "samples/s"),
-            (f"{name} covers", str(covered), "frames"),
-            (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
-            (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
-        ]
-    if sweep.tracker is not None and sweep.tracker.image_skew_rad:
-        rows.append(("image axes off square", f"{np.rad2deg(sweep.tracker.image_skew_rad):.3g}", "deg"))
-    return [*rows, ("truth", "no" if sweep.truth is None else "yes", "")]
 
 
 def _describe_reconstruction(path: PathLike) -> list[Row]:
     result = read_reconstruction(path)
-    rows = [("frames", str(result.frame_time_s.size), "")]
-    rows += _rate_rows("", result.frame_time_s, "frames/s") if result.frame_time_s.size else []
-    for mode, poses in result.poses.items() if result.frame_time_s.size else ():
+    made, pairs, times = result.provenance, result.pairs, result.frame_time_s
+    rows = [("frames", str(times.size), ""), *_rate_rows("", times, "frames/s")]
+    for mode, poses in result.poses.items() if times.size else ():
         length_mm = abs(elevational_steps(poses, result.grid.centre_mm).sum())
         rows.append((f"length, mode {mode}", f"{length_mm:.2f}", "mm"))
-    pairs = result.pairs
-    return [
-        *rows,
+    rows += [
         ("frame pairs", str(0 if pairs is None else len(pairs)), ""),
         ("patches", str(0 if pairs is None else len(pairs.patch_centre_mm)), ""),
-        ("input", result.provenance.input_path, ""),
-        ("input SHA-256", result.provenance.input_sha256, ""),
-        ("package version", result.provenance.package_version, ""),
-        *((f"calibration of {one.sensor}", one.path, "") for one in result.provenance.calibrations),
-        *_import_rows(result.provenance.imported),
+        *_source_rows(made),
+        *((f"calibration of {one.sensor}", one.path, "") for one in made.calibrations),
     ]
+    if made.imported is not None:
+        rows.append((f"import settings of {made.imported.name}", made.imported.settings_json, ""))
+    return rows
 
 
-def _import_rows(imported: ImportRecord | None) -> list[Row]:
-    if imported is None:
-        return []
-    return [("import settings of", imported.name, ""), ("import settings", imported.settings_json, "")]
+def _source_rows(source: Any) -> list[Row]:
+    names = {"input_path": "input", "input_sha256": "input SHA-256", "package_version": "package version"}
+    return [(words, getattr(source, name), "") for name, words in names.items()]
 
 
 def _describe_calibration(path: PathLike) -> list[Row]:
@@ -178,9 +136,7 @@ def _describe_calibration(path: PathLike) -> list[Row]:
         ("frames used", f"{len(held.frames.used)} of {held.frames.given}", ""),
         *((f"dropped: {reason}", str(n), "frames") for reason, n in held.frames.reasons().items()),
         ("verdict", held.verdict, ""),
-        ("input", held.source.input_path, ""),
-        ("input SHA-256", held.source.input_sha256, ""),
-        ("package version", held.source.package_version, ""),
+        *_source_rows(held.source),
     ]
 
 
@@ -226,33 +182,25 @@ def _describe_volume(path: PathLike) -> list[Row]:
     return rows
 
 
-def _describe_curves(path: PathLike) -> list[Row]:
-    """Attributes, but for the format, and lengths of data sets as they are."""
+def _record_rows(record: object, inside: str = "") -> list[Row]:
+    """Fields of a dataclass: lengths of arrays, and other values as they are."""
     rows: list[Row] = []
-    curves.read_curves(path)
-    with reading(path), open_hdf5(path) as file:
-        for name in file.attrs:
-            if name != "format":
-                spoken, unit = _spoken(name)
-                rows.append((spoken, str(plain_attribute(file, name)), unit))
-        names = {name for name in file if isinstance(name, str)}
-        groups = {name for name in names if isinstance(find_member(file, name), h5py.Group)}
-        below = {f"{name}/{inner}" for name in groups for inner in require_group(file, name)}
-        for name in sorted((names | below) - groups):
-            shape = " x ".join(str(n) for n in require_dataset(file, name).shape)
-            rows.append((_spoken(name)[0], shape, "values"))
+    for name, value in vars(record).items():
+        words, _, unit = name.rpartition("_") if name.endswith(("_mm", "_hz")) else (name, "", "")
+        unit = unit.replace("hz", "Hz")
+        words = inside + words.replace("_", " ")
+        if is_dataclass(value):
+            rows += [(words, type(value).__name__, "")]
+            rows += _record_rows(value, "" if name in ("key", "signal") else f"{words}, ")
+        elif isinstance(value, np.ndarray):
+            rows.append((words, " x ".join(map(str, value.shape)), "values"))
+        elif value is not None:
+            rows.append((words, str(value), unit))
     return rows
-
-
-def _spoken(name: str) -> tuple[str, str]:
-    """Name in words, and unit, of an attribute or data set."""
-    found = next((unit for unit in _UNIT_NAMES if name.endswith(f"_{unit}")), None)
-    words = name.removesuffix(f"_{found}").replace("_", " ").replace("/", ", ")
-    return words, "" if found is None else _UNIT_NAMES[found]
 
 
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
     reconstructions.FORMAT: _describe_reconstruction,
-    curves.FORMAT: _describe_curves,
+    curves.FORMAT: lambda path: _record_rows(curves.read_curves(path)),
     calibrations.FORMAT: _describe_calibration,
 }

@@ -74,8 +74,8 @@ def _phantom(root: Element) -> WirePhantom:
         wanted = _PATTERN_WIRES.get(kind) or len(wires) or "some"
         if kind not in _PATTERN_WIRES or len(wires) != wanted:
             raise InvalidInputError(
-                f"Pattern[{number}]: expected Type {' or '.join(_PATTERN_WIRES)} with {wanted} elements Wire, "
-                f"got {kind!r} with {len(wires)}"
+                f"Pattern[{number}]: expected Type {' or '.join(_PATTERN_WIRES)} with {wanted} elements "
+                f"Wire, got {kind!r} with {len(wires)}"
             )
         patterns.append(tuple(range(len(names), len(names) + len(wires))))
         for i, wire in enumerate(wires):

@@ -34,7 +34,8 @@ CONTRADICTION = 0.01
 """Difference, as a share, above which a number that is given contradicts what a file says."""
 
 _RATES = ("sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
-_UNITS = {"hz": "Hz", "mm": "mm", "db": "dB", "s": "m/s"}
+_UNITS = {"hz": (1e6, "MHz"), "frame": (1.0, "Hz"), "mm": (1.0, "mm"), "db": (1.0, "dB"), "s": (1.0, "m/s")}
+"""What numbers are divided by where they are shown, and the unit then."""
 _ASSUMED = "assumed"
 
 
@@ -144,7 +145,7 @@ class Recording:
     def notes(self) -> list[str]:
         """What a user should know of how the sweep was made."""
         assumed = [
-            f"{_words(name)[0]} {_shown(one.value, _words(name)[1])} {_words(name)[1]}"
+            " ".join(number_row(name, one.value))
             for name, one in self.needed.items()
             if one.is_assumed and getattr(self.settings, name) is None
         ]
@@ -167,12 +168,9 @@ class Recording:
             given = getattr(self.settings, name)
             if given is None or one.value is None or one.is_assumed or not differs(given, one.value):
                 continue
-            words, unit = _words(name)
             source = f" ({one.source})" if one.source else ""
-            notes.append(
-                f"{words} {_shown(given, unit)} {unit}, {self._giver(name)}: {one.said_by} says "
-                f"{_shown(one.value, unit)}{source}"
-            )
+            says = f"{one.said_by} says {number_row(name, one.value)[1]}{source}"
+            notes.append(f"{' '.join(number_row(name, given))}, {self._giver(name)}: {says}")
         return notes
 
     @cached_property
@@ -263,15 +261,14 @@ class Recording:
         return "given" if file is None or own != getattr(self.settings, name) else f"given by {file.name}"
 
     def _row(self, name: str, one: Value) -> Row:
-        words, unit = _words(name)
         given = getattr(self.settings, name)
-        own = None if one.value is None else _shown(one.value, unit)
+        words, own, unit = number_row(name, () if one.value is None else one.value)
         if given is not None:
-            shown = _shown(given, unit)
-            is_other = not one.is_assumed and own not in (None, shown)
+            shown = number_row(name, given)[1]
+            is_other = not one.is_assumed and own not in ("", shown)
             against = f", {one.said_by} says {own}" if is_other else ""
             return words, f"{shown} ({self._giver(name)}{against})", unit
-        if own is None:
+        if not own:
             return words, f"missing: --{self.asked.get(name, name).replace('_', '-')}", ""
         return words, f"{own} ({one.source})" if one.source else own, unit
 
@@ -317,14 +314,9 @@ def step_of(axis: FloatArray, where: str) -> float:
     return step
 
 
-def _words(name: str) -> tuple[str, str]:
-    """Words and unit of a setting, as they are shown."""
+def number_row(name: str, value: Any) -> Row:
+    """A number, or a low and a high one, by the name of its setting, in words and the unit that is shown."""
     *words, unit = name.split("_")
-    if unit == "s":
-        words = words[:-1]
-    is_mega = unit == "hz" and words[0] != "frame"
-    return " ".join(words), "MHz" if is_mega else _UNITS[unit]
-
-
-def _shown(value: Any, unit: str) -> str:
-    return " to ".join(f"{number / (1e6 if unit == 'MHz' else 1.0):.7g}" for number in np.ravel(value))
+    scale, shown = _UNITS[unit if words[0] != "frame" else "frame"]
+    numbers = " to ".join(f"{number / scale:.7g}" for number in np.ravel(value))
+    return " ".join(words[:-1] if unit == "s" else words), numbers, shown

@@ -54,7 +54,7 @@ def test_a_sweep_is_described(tmp_path):
     assert rows["vectors x samples"] == ("5 x 40", "")
     assert rows["vector pitch"] == ("0.3", "mm")
     assert rows["depth"] == ("2.00 to 2.75", "mm")  # 39 steps of 19.25 um below 2 mm
-    assert rows["band"] == ("4 to 8", "MHz")
+    assert rows["bandwidth"] == ("4 to 8", "MHz")
     assert rows["orientation sensor"] == ("18", "samples")
     assert rows["orientation sensor rate"] == ("100.00", "samples/s")
     # Readings at 10.015 to 10.185 s of image time miss the frames at 10.00 and 10.20 s.
@@ -88,9 +88,8 @@ def test_curves_are_listed_member_by_member(tmp_path):
     write_curves(tmp_path / "c.h5", replace(speckle.curves(), key=key))
     rows = values(tmp_path / "c.h5")
     assert rows["format"] == ("speckle3d.curves", "")
-    assert rows["version"] == ("1", "")
     assert rows["patch width"] == ("5.0", "mm")
-    assert rows["signal"] == ("rf", "")
+    assert rows["signal"] == ("RFSettings", "")
     assert rows["depth"][1] == "values"
     assert rows["centre frequency"][1] == "Hz"
 

@@ -482,3 +482,10 @@ def test_tracker_recordings_without_images(realdata, tmp_path):
         tmp_path / "a.mha", np.zeros((3, 0, 0), np.uint8), {"ElementType": "MET_OTHER"}, path_of(3)[1]
     )
     assert len(read_poses(empty).readings) == 3
+
+
+def test_stamps_that_are_all_the_same_are_none(tmp_path):
+    _, frames = path_of(4)
+    with pytest.raises(MissingSettingsError) as caught:
+        _ = opened(tmp_path, [frame | {"Timestamp": "0"} for frame in frames]).sweep
+    assert caught.value.settings == ("frame_rate_hz",)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import FileError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.images import ImageFrames, Images
 from speckle3d.io.hdf5 import one_line, reading
@@ -44,7 +44,11 @@ class PictureFolder:
 
         with reading(self._paths[index]), Image.open(self._paths[index]) as picture:
             grey = picture.mode in ("L", "I;16", "I")
-            return np.asarray(picture if grey else picture.convert("RGB"))
+            image = np.asarray(picture if grey else picture.convert("RGB"))
+        if index and image.shape != self.shape[1:]:
+            got = f"{image.shape}, and {self.shape[1:]} before"
+            raise InvalidInputError(f"{self._paths[index]}: expected pictures of one size, got {got}")
+        return image
 
 
 class Video:

@@ -42,8 +42,6 @@ FORMAT = "zea"
 _READ = ("beamformed_data", "envelope_data", "image", "image_sc")
 _NOT_BEAMFORMED = ("raw_data", "aligned_data")
 _POSES = "metadata/probe_pose"
-_FRAMES_CHECKED = 8
-"""Whose pixels must lie where the first frame's do."""
 _TOLERANCE_MM = 1e-3
 """Of a pixel's place: single precision in metres keeps 1e-5 mm of a depth of 150 mm."""
 _TIP_FROM_IMAGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -57,41 +55,27 @@ class _Array:
 
     Attributes
     ----------
-    name : str
-        Data set, from the root.
+    group : str
+        Data set, from the root; since 0.0.12 a group of ``values``, ``coordinates`` and ``timestamps``.
     home : str
         What stands before ``data`` and ``scan``: nothing at the root, or a track.
     kind : str
         One of `_READ`.
-    is_placed : bool
-        Whether ``coordinates`` beside the values say where pixels lie.
+    values : str
+        Data set of the values.
     """
 
-    name: str
+    group: str
     home: str
     kind: str
-    is_placed: bool = False
-
-    @property
-    def group(self) -> str:
-        """What holds the values, their coordinates and their times."""
-        return self.name.removesuffix("/values")
-
-
-@dataclass(frozen=True)
-class _Pixels:
-    """Lateral positions and depths of pixels, and whether the file's first axis of an image is lateral."""
-
-    x_mm: FloatArray
-    z_mm: FloatArray
-    x_first: bool
+    values: str
 
 
 def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
     names = (*_READ, *_NOT_BEAMFORMED)
     return "format" not in file.attrs and any(
-        find_member(file, f"{home}data/{name}") is not None for home in _homes(file) for name in names
+        has_member(file, f"{home}data/{name}") for home in _homes(file) for name in names
     )
 
 
@@ -106,41 +90,49 @@ def open_zea(path: Path, settings: ImportSettings) -> Recording:
 
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
     array = _chosen(file, path, settings)
-    rows.append(("read", array.name, ""))
-    node = dataset(file, array.name)
-    count, first, second, channels = _shape(node, array)
-    pixels = _pixels(dataset(file, f"{array.group}/coordinates"), node.shape[:3]) if array.is_placed else None
-    x_first = pixels is not None and pixels.x_first
-    shape = (count, first, second) if x_first else (count, second, first)
+    rows.append(("read", array.values, ""))
+    node, values = dataset(file, array.values), _scan(file, array)
+    is_beamformed = array.kind == "beamformed_data"
+    channels = node.shape[3] if is_beamformed and node.ndim == 4 else 1
+    is_number = node.dtype.kind == "f" or (array.kind.startswith("image") and node.dtype == np.uint8)
+    if not is_number or node.ndim not in (3, 3 + is_beamformed) or channels not in (1, 2):
+        raise InvalidInputError(
+            f"{locate(node)}: expected echoes of shape (frame, z, x), of beamformed_data (frame, z, x, 1 or "
+            f"2), got {node.shape} {node.dtype}"
+        )
+    count, first, second = node.shape[:3]
+    places = f"{array.group}/coordinates"
+    x_mm = z_mm = spacing = None
+    x_first = False
+    if array.values != array.group and has_member(file, places):
+        x_mm, z_mm, x_first = _pixels(dataset(file, places), (count, first, second))
+        spacing, source_text = step_of(z_mm, f"{locate(file, places)} z"), "of the coordinates"
+        pitch = Value(step_of(x_mm, f"{locate(file, places)} x"), source_text)
+        values |= {
+            "vector_pitch_mm": pitch,
+            "column_pitch_mm": pitch,
+            "row_spacing_mm": Value(spacing, source_text),
+            "first_sample_depth_mm": Value(float(z_mm[0]), source_text),
+        }
     trailing = node.shape[3:] if channels == 1 else ()
     grid = Grid((first, second, *trailing), (0, 1) if x_first else (1, 0), channels == 2)
-    source, values = HDF5File(path, (array.name,), 0, grid), _scan(file, array)
-    if array.kind == "beamformed_data" or node.dtype == np.uint8:
+    shape = (count, first, second) if x_first else (count, second, first)
+    source = HDF5File(path, (array.values,), 0, grid)
+    if is_beamformed or node.dtype == np.uint8:
         dtype = np.complex64 if channels == 2 else np.uint8 if node.dtype == np.uint8 else np.float32
         frames = source.frames(shape, dtype)
     else:
         decibels, given = array.kind != "envelope_data", settings.dynamic_range_db
         frames, top, span = source.grey_frames(shape, grid, decibels, given)
         values["dynamic_range_db"] = Value(span, f"of grey levels made here below {top:g}")
-    spacing = None
-    if pixels is not None:
-        where, source_text = locate(file, f"{array.group}/coordinates"), "of the coordinates"
-        pitch = Value(step_of(pixels.x_mm, f"{where} x"), source_text)
-        spacing = step_of(pixels.z_mm, f"{where} z")
-        values |= {
-            "vector_pitch_mm": pitch,
-            "column_pitch_mm": pitch,
-            "row_spacing_mm": Value(spacing, source_text),
-            "first_sample_depth_mm": Value(float(pixels.z_mm[0]), source_text),
-        }
-        shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
-        shift_hz = shifts.pop() if len(shifts) == 1 else None
-        if channels == 2 and shift_hz and settings.demodulation_frequency_hz is None:
-            with naming(str(path)):
-                by_phase = demodulation_of(frames, shift_hz, 1e3 * speed_of(settings, values) / (2 * spacing))
-            source_text = "of scan/demodulation_frequency and the phase of the data"
-            values["demodulation_frequency_hz"] = Value(by_phase, source_text)
-    tracker, remarks = _tracker(file, pixels)
+    shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
+    shift_hz = shifts.pop() if len(shifts) == 1 else None
+    if channels == 2 and shift_hz and spacing and settings.demodulation_frequency_hz is None:
+        with naming(str(path)):
+            by_phase = demodulation_of(frames, shift_hz, 1e3 * speed_of(settings, values) / (2 * spacing))
+        told_by = "of scan/demodulation_frequency and the phase of the data"
+        values["demodulation_frequency_hz"] = Value(by_phase, told_by)
+    tracker, remarks = _tracker(file, None if x_mm is None else float(x_mm[0]))
     return Recording(
         path,
         settings,
@@ -151,7 +143,7 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         tracker=tracker,
         chain=_POSES,
         probe=settings.probe or text_attribute(file, "probe_name") or text_attribute(file, "probe"),
-        assumptions=() if pixels is not None else ("parallel lines",),
+        assumptions=("parallel lines",) if spacing is None else (),
         remarks=tuple(remarks),
     )
 
@@ -160,88 +152,68 @@ def _homes(file: h5py.File) -> list[str]:
     """What stands before ``data``: nothing at the root, or tracks with a slash at the end."""
     tracks = find_member(file, "tracks")
     names = sorted(map(str, tracks)) if isinstance(tracks, h5py.Group) else []
-    homes = ["", *(f"tracks/{name}/" for name in names)]
-    homes = [home for home in homes if isinstance(find_member(file, f"{home}data"), h5py.Group)]
-    return homes[:1] if homes[:1] == [""] else homes
-
-
-def _arrays(file: h5py.File) -> list[_Array]:
-    """All that could be read."""
-    arrays = []
-    for home in _homes(file):
-        for kind in _READ:
-            name = f"{home}data/{kind}"
-            if isinstance(find_member(file, name), h5py.Dataset):
-                arrays.append(_Array(name, home, kind))
-            elif has_member(file, f"{name}/values"):
-                is_placed = has_member(file, f"{name}/coordinates")
-                arrays.append(_Array(f"{name}/values", home, kind, is_placed))
-    return arrays
+    homes = [""] if has_member(file, "data") else [f"tracks/{name}/" for name in names]
+    return [home for home in homes if isinstance(find_member(file, f"{home}data"), h5py.Group)]
 
 
 def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> _Array:
     """What to read: the earliest product, where not given by name."""
-    arrays = _arrays(file)
+    arrays = []
+    for home in _homes(file):
+        for kind in _READ:
+            group = f"{home}data/{kind}"
+            if isinstance(find_member(file, group), h5py.Dataset):
+                arrays.append(_Array(group, home, kind, group))
+            elif has_member(file, f"{group}/values"):
+                arrays.append(_Array(group, home, kind, f"{group}/values"))
     asked = settings.arrays.get("data")
     if asked is not None:
-        arrays = [one for one in arrays if asked.strip("/") in (one.name, one.group)]
-    elif not any(one.is_placed for one in arrays):
+        arrays = [one for one in arrays if asked.strip("/") in (one.values, one.group)]
+    elif all(one.group == one.values for one in arrays):
         # What came before scan conversion may be polar, and says nothing of it.
         arrays = [one for one in arrays if one.kind == "image_sc"] or arrays
+    arrays = [one for one in arrays if one.kind == min((other.kind for other in arrays), key=_READ.index)]
     if not arrays:
         raise InvalidInputError(f"{path}: expected {' or '.join(_READ[:3])}, got {_contents(file)}")
-    first = min((one.kind for one in arrays), key=_READ.index)
-    names = [one.name for one in arrays if one.kind == first]
-    if len(names) > 1:
+    if len(arrays) > 1:
         raise InvalidInputError(
-            f"{path}: expected one track, got {', '.join(names)}: say which by arrays = "
-            f'{{ data = "{names[0]}" }} in {path.name}.toml beside it'
+            f"{path}: expected one track, got {', '.join(one.values for one in arrays)}: say which by arrays "
+            f'= {{ data = "{arrays[0].values}" }} in {path.name}.toml beside it'
         )
-    return next(one for one in arrays if one.kind == first)
+    return arrays[0]
 
 
 def _contents(file: h5py.File) -> str:
     names = [f"{home}data/{printable(str(name))}" for home in _homes(file) for name in file[f"{home}data"]]
-    text = ", ".join(names) or "nothing"
+    advice = ""
     if any(name.endswith(_NOT_BEAMFORMED) for name in names):
-        return f"{text}: channel data need beamforming, by zea's Pipeline, and its result written"
-    if any(find_member(file, f"{name}/pixels") is not None for name in names):
-        return f"{text}: pixels with an extent, whose axes are not certain: write it by zea 0.0.12 or later"
-    return text
+        advice = ": channel data need beamforming, by zea's Pipeline, and its result written"
+    elif any(has_member(file, f"{name}/pixels") for name in names):
+        advice = ": pixels with an extent, whose axes are not certain: write it by zea 0.0.12 or later"
+    return (", ".join(names) or "nothing") + advice
 
 
-def _shape(node: h5py.Dataset, array: _Array) -> tuple[int, int, int, int]:
-    """Frames, the two axes of the image, and channels."""
-    is_beamformed = array.kind == "beamformed_data"
-    is_number = node.dtype.kind == "f" or (array.kind.startswith("image") and node.dtype == np.uint8)
-    channels = node.shape[3] if is_beamformed and node.ndim == 4 else 1
-    if not is_number or node.ndim != 3 + (is_beamformed and node.ndim == 4) or channels not in (1, 2):
-        expected = "(frame, z, x, 1 or 2)" if is_beamformed else "(frame, z, x)"
-        raise InvalidInputError(
-            f"{locate(node)}: expected echoes of shape {expected}, got {node.shape} {node.dtype}"
-        )
-    return *node.shape[:3], channels
+def _pixels(node: h5py.Dataset, shape: tuple[int, int, int]) -> tuple[FloatArray, FloatArray, bool]:
+    """Lateral positions and depths of a Cartesian grid, mm, and whether the first axis is lateral.
 
-
-def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> _Pixels:
-    """Axes of the pixels, whose positions must be those of a Cartesian grid, the same in all frames."""
-    where = locate(node)
+    It must be the same in all frames.
+    """
     if node.shape != (*shape, 3) or node.dtype.kind != "f" or not shape[0]:
-        raise InvalidInputError(f"{where}: expected shape {(*shape, 3)}, got {node.shape} {node.dtype}")
-    start = np.asarray(node[0], dtype=np.float64)
-    for i in np.unique(np.linspace(0, shape[0] - 1, _FRAMES_CHECKED).astype(int)).tolist():
-        if not np.abs(node[i] - start).max() <= _TOLERANCE_MM / 1e3:
-            raise InvalidInputError(f"{where}[{i}]: expected pixels where the first frame's are, got others")
-    x, y, z = 1e3 * start.transpose(2, 0, 1)
+        raise InvalidInputError(
+            f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape} {node.dtype}"
+        )
+    start = 1e3 * np.asarray(node[0], dtype=np.float64)
+    apart = [np.abs(1e3 * node[i] - start).max() for i in {shape[0] // 2, shape[0] - 1}]
+    x, y, z = start.transpose(2, 0, 1)
     for x_first in (False, True):
         columns, depths = (x.T, z.T) if x_first else (x, z)
-        pixels = _Pixels(columns[0], depths[:, 0], x_first)
-        off = max(np.abs(columns - pixels.x_mm).max(), np.abs(depths.T - pixels.z_mm).max(), np.ptp(y))
-        if off <= _TOLERANCE_MM and np.ptp(pixels.x_mm) > 0 and np.ptp(pixels.z_mm) > 0:
-            return pixels
+        x_mm, z_mm = columns[0], depths[:, 0]
+        off = max(np.abs(columns - x_mm).max(), np.abs(depths.T - z_mm).max(), np.ptp(y), *apart)
+        if off <= _TOLERANCE_MM and np.ptp(x_mm) > 0 and np.ptp(z_mm) > 0:
+            return x_mm, z_mm, x_first
     raise InvalidInputError(
-        f"{where}: expected pixels on a Cartesian grid in one plane, got others, as of a polar image: "
-        "beamform onto zea's cartesian_pixel_grid, or scan-convert and write that"
+        f"{locate(node)}: expected pixels on a Cartesian grid in one plane, the same in all frames, got "
+        "others, as of a polar image: beamform onto zea's cartesian_pixel_grid, or scan-convert and write that"
     )
 
 
@@ -265,7 +237,7 @@ def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:
     Where one of a frame's is not known, the next frame has no time, and later ones count the median for it.
     """
     group, name = array.group, f"{array.home}scan/time_to_next_transmit"
-    if array.name != group and has_member(file, f"{group}/timestamps"):
+    if array.values != group and has_member(file, f"{group}/timestamps"):
         stamps = np.asarray(dataset(file, f"{group}/timestamps")[()], dtype=np.float64)
         if stamps.shape == (count,):
             return stamps + (single(file, f"{group}/start_time_offset") or 0.0)
@@ -284,13 +256,13 @@ def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:
     return times
 
 
-def _tracker(file: h5py.File, pixels: _Pixels | None) -> tuple[Tracker | None, list[str]]:
+def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, list[str]]:
     """The probe's poses, with the image on the probe where the file says where its pixels lie."""
     node = find_member(file, _POSES)
     if node is None:
         return None, []
-    name = f"{_POSES}/rotation_representation"
-    kind = text_of(file[name][()]) if isinstance(find_member(file, name), h5py.Dataset) else ""
+    kind_node = find_member(node, "rotation_representation")
+    kind = text_of(kind_node[()]) if isinstance(kind_node, h5py.Dataset) else ""
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
     places, turns = (np.asarray(dataset(node, name)[()], float) for name in ("translation", "rotation"))
@@ -315,9 +287,8 @@ def _tracker(file: h5py.File, pixels: _Pixels | None) -> tuple[Tracker | None, l
     if readings is None:
         return None, [*notes, f"{_POSES}: no pose is of use"]
     mounting = None
-    if pixels is not None:
-        place = [float(pixels.x_mm[0]), 0.0, 0.0]
-        mounting = RigidTransform.from_components(place, Rotation.from_matrix(_TIP_FROM_IMAGE))
+    if left_mm is not None:
+        mounting = RigidTransform.from_components([left_mm, 0.0, 0.0], Rotation.from_matrix(_TIP_FROM_IMAGE))
     return Tracker(readings, mounting), [*notes, *remarks]
 
 

@@ -61,8 +61,10 @@ class Clip:
 
     def is_part_of(self, size: tuple[int, ...]) -> bool:
         """Whether something of images of a size (x, y) is left out."""
-        sides = [side for side in zip((self.columns, self.rows), size, strict=False) if side[0] is not None]
-        return self.fan is not None or any(first > 0 or last < length - 1 for (first, last), length in sides)
+        sides = zip((self.columns, self.rows), size, strict=False)
+        return self.fan is not None or any(
+            side is not None and (side[0] > 0 or side[1] < length - 1) for side, length in sides
+        )
 
     def region_text(self, grid: ImageGrid) -> str | None:
         """The part as a region of images in mm; None where it is all of them."""

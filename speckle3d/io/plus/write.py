@@ -209,8 +209,8 @@ def _rows_of(sweep: Sweep) -> tuple[_Rows, list[str]]:
         matrices = np.tile(np.eye(4), (count, 1, 1))
         if covered.any():
             posed = sensor.readings.at(at[covered]).as_matrix()
-            size = range(posed.shape[-1])  # 3 of rotations
-            matrices[np.ix_(covered, size, size)] = posed
+            size = posed.shape[-1]  # 3 of rotations
+            matrices[np.flatnonzero(covered), :size, :size] = posed
         rows.add(f"{own}To{world}", matrices, covered)
         if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[covered]):
             omitted.append(
