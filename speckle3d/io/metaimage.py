@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker

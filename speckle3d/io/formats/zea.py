@@ -213,7 +213,7 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, int, int]) -> tuple[FloatArray
             return x_mm, z_mm, x_first
     raise InvalidInputError(
         f"{locate(node)}: expected pixels on a Cartesian grid in one plane, the same in all frames, got "
-        "others, as of a polar image: beamform onto zea's cartesian_pixel_grid, or scan-convert and write that"
+        "others, as of a polar image: beamform onto zea's cartesian_pixel_grid, or scan-convert it"
     )
 
 
