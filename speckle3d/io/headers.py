@@ -25,7 +25,7 @@ from speckle3d.io.hdf5 import reading
 from speckle3d.io.pixels import Pixels, map_pixels, number_type
 from speckle3d.io.text import numbers
 
-_FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,7})_(\w+)")
+_FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
 _LONGEST_LINE = 2**24
 _MM_PER = {
     "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "millimeters": 1.0,

@@ -489,3 +489,14 @@ def test_stamps_that_are_all_the_same_are_none(tmp_path):
     with pytest.raises(MissingSettingsError) as caught:
         _ = opened(tmp_path, [frame | {"Timestamp": "0"} for frame in frames]).sweep
     assert caught.value.settings == ("frame_rate_hz",)
+
+
+def test_frames_may_be_numbered_with_more_digits(tmp_path):
+    """As Ibis numbers them."""
+    true, frames = path_of(4)
+    opened(tmp_path, frames)
+    path = tmp_path / "a.mha"
+    path.write_bytes(path.read_bytes().replace(b"Seq_Frame", b"Seq_Frame000000"))
+    np.testing.assert_allclose(
+        read_poses(path).readings.world_from_sensor.as_matrix(), true.as_matrix(), atol=1e-9
+    )
