@@ -95,28 +95,21 @@ def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
 
 def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(tmp_path):
     left_out = {"pose": "s: drift mode pose: tracker: ..."}
-    doubts = [METRES, SPIKES]
-    of = Summary(
-        "s", "truth", 100, 1.0, [row(sigma_mm=1.0)], {}, doubts, {"image": "x"}, left_out, {"image": 0.1}
-    )
+    doubts, details = [METRES, SPIKES], {"provenance": Provenance("s.h5", "ab12", "1.0")}
+    rows = [row(sigma_mm=1.0)]
+    of = Summary("s", "truth", 9, 1.0, rows, details, doubts, {"image": "x"}, left_out, {"image": 0.1})
     write_summary(tmp_path, of)
+    made = Provenance("s.h5", "ab12", "1.0")
+    assert recorded_doubts(tmp_path / "reconstruction.h5", made) == (METRES, SPIKES)
+    assert recorded_doubts(tmp_path / "reconstruction.h5", replace(made, input_sha256="cd34")) is None
     table = (tmp_path / "table.txt").read_text()
     assert "s: tracker: expected 23 mm, got 0.023 (suspect: units); refused" in table
     assert "s: mode pose is left out" in table
-    assert replace(read_summary(tmp_path, "s"), drift=()) == of
+    assert replace(read_summary(tmp_path, "s"), drift=(), details=details) == of
     study = write_study(tmp_path, [SweepOutcome("s", tmp_path, "done", folder=".")], "")
     doubts = json.loads((tmp_path / "study.json").read_text())["doubts"]
     assert [(each["sweep"], each["suspect"]) for each in doubts] == [("s", "units"), ("s", "spikes")]
     assert "mode pose is left out" in study.table
-
-
-def test_doubts_are_found_again_beside_the_reconstruction_they_belong_to(tmp_path):
-    made = Provenance("s.h5", "ab12", "1.0")
-    path = tmp_path / "reconstruction.h5"
-    assert recorded_doubts(path, made) is None
-    write_summary(tmp_path, Summary("s", "none", 9, 0.0, [], {"provenance": made}, [METRES, SPIKES]))
-    assert recorded_doubts(path, made) == (METRES, SPIKES)
-    assert recorded_doubts(path, Provenance("s.h5", "cd34", "1.0")) is None
 
 
 def test_a_study_takes_the_place_of_the_one_before_with_all_that_was_made_from_it(tmp_path, monkeypatch):

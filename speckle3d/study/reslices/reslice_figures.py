@@ -219,14 +219,13 @@ def save_outlines(opened: OpenedModes, path: Path) -> Path:
 
 def busiest_rows(image: Float32Array, count: int) -> int:
     """First of `count` rows in which structures along the sweep stand out most from speckle."""
-    seen = image[np.isfinite(image)]
-    if not seen.size:
+    if len(image) <= count or not np.isfinite(image).any():
         return 0
-    spread = uniform_filter1d(np.nan_to_num(image, nan=float(np.median(seen))), 15, axis=1).var(axis=1)
+    filled = np.nan_to_num(image, nan=float(np.nanmedian(image)))
+    sums = np.convolve(uniform_filter1d(filled, 15, axis=1).var(axis=1), np.ones(count), mode="valid")
     # Near the face the probe's own echo would win.
-    first = min(count // 3, max(len(spread) - count, 0))
-    sums = np.convolve(spread, np.ones(min(count, len(spread))), mode="valid")
-    return first + int(np.argmax(sums[first:])) if len(sums) > first else 0
+    first = min(count // 3, len(sums) - 1)
+    return first + int(np.argmax(sums[first:]))
 
 
 def _draw_rows(axes: Axes, picture: CutPicture) -> None:

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import SimpleITK
 import slicerio
-from disks import FULL, limited
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError, NoSpaceError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.headers import read_header
@@ -128,11 +127,3 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     require_scene_place(tmp_path)
     with pytest.raises(InvalidInputError):
         require_scene_place(tmp_path, tmp_path / "notes.txt")
-
-
-def test_on_a_full_disk_there_is_no_folder(tmp_path):
-    with limited(2500), pytest.raises(NoSpaceError, match=FULL) as caught:
-        write_scene(tmp_path / "s", [posed_sweep()], REQUEST)
-    assert str(tmp_path / "s") in str(caught.value)
-    assert ".part" not in str(caught.value)
-    assert list(tmp_path.iterdir()) == []
