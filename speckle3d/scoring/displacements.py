@@ -65,33 +65,33 @@ MEANINGS = {
 CHALLENGE_ERRORS = ("GPE_mm", "GLE_mm", "LPE_mm", "LLE_mm")
 
 
-def pixel_errors(
-    world_from_image: RigidTransform, reference: RigidTransform, grid: ImageGrid
-) -> tuple[float, float]:
-    """GPE and LPE, mm: displacement errors over every pixel of the images."""
-    whole, steps = _differences(world_from_image, reference)
-    return _mean_over_pixels(whole, grid), _mean_over_pixels(steps, grid)
+def point_errors(
+    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None = None
+) -> dict[str, Any]:
+    """Displacement errors over every pixel of the images and at landmarks, `CHALLENGE_ERRORS`.
 
-
-def landmark_errors(
-    world_from_image: RigidTransform, reference: RigidTransform, landmarks: Landmarks
-) -> tuple[float, float]:
-    """GLE and LLE, mm: displacement errors of landmarks, from frame 1 on: the first frame has no error.
+    Parameters
+    ----------
+    poses, true : RigidTransform, length n
+        Estimate and reference.
+    grid, landmarks : optional
+        Without, their errors are None. Landmarks lie in frame 1 and later: the first frame has no error.
 
     Raises
     ------
     InvalidInputError
         If there are no landmarks, or one is in no frame that has an error.
     """
-    at, points, last = landmarks.frame, landmarks.points_mm, len(reference) - 1
-    if not at.size:
-        raise InvalidInputError("landmarks: expected at least one, got none")
-    if (wrong := np.flatnonzero((at < 1) | (at > last))).size:
-        raise InvalidInputError(f"landmark {wrong[0]}: expected a frame from 1 to {last}, got {at[wrong[0]]}")
-    whole, steps = (each[at - 1] for each in _differences(world_from_image, reference))
-    shifts = (each[:, :, 3] + np.einsum("pij,pj->pi", each[:, :, :3], points) for each in (whole, steps))
-    global_mm, local_mm = (float(np.linalg.norm(each, axis=1).mean()) for each in shifts)
-    return global_mm, local_mm
+    _require_comparable(poses, true)
+    relative = [(each[0].inv() * each[1:], relative_poses(each)) for each in (poses, true)]
+    errors: dict[str, Any] = dict.fromkeys(CHALLENGE_ERRORS)
+    for letter, estimated, exact in zip("GL", *relative, strict=True):
+        differences = estimated.as_matrix()[:, :3] - exact.as_matrix()[:, :3]
+        if grid is not None:
+            errors[f"{letter}PE_mm"] = _mean_over_pixels(differences, grid)
+        if landmarks is not None:
+            errors[f"{letter}LE_mm"] = _mean_over_landmarks(differences, landmarks)
+    return errors
 
 
 def drift_rates(
@@ -152,7 +152,7 @@ def score_row(
         Without, the errors at landmarks are None.
     """
     rates = drift_rates(poses, true, np.zeros(3) if grid is None else grid.centre_mm)
-    return {**rates, **_point_row(poses, true, grid, landmarks)}
+    return {**rates, **point_errors(poses, true, grid, landmarks)}
 
 
 def challenge_score(
@@ -177,30 +177,22 @@ def challenge_score(
     ----------
     .. [1] TUS-REC challenge 2025, assessment criteria, ranking method.
     """
-    resting = _point_row(RigidTransform.identity(len(true)), true, grid, landmarks)
+    resting = point_errors(RigidTransform.identity(len(true)), true, grid, landmarks)
     for key in CHALLENGE_ERRORS:
         if not resting[key] > 0:
             raise InsufficientDataError(f"{key}: expected a reference that moves, got one that rests")
     return float(np.mean([1 - errors[key] / resting[key] for key in CHALLENGE_ERRORS]))
 
 
-def _point_row(
-    poses: RigidTransform, true: RigidTransform, grid: ImageGrid | None, landmarks: Landmarks | None
-) -> dict[str, Any]:
-    pixels = (None, None) if grid is None else pixel_errors(poses, true, grid)
-    marks = (None, None) if landmarks is None else landmark_errors(poses, true, landmarks)
-    return dict(zip(CHALLENGE_ERRORS, (pixels[0], marks[0], pixels[1], marks[1]), strict=True))
-
-
-def _differences(
-    world_from_image: RigidTransform, reference: RigidTransform
-) -> tuple[FloatArray, FloatArray]:
-    """Matrices of ``T^_i - T_i`` and of ``t^_i - t_i``, shape (n - 1, 3, 4) each."""
-    _require_comparable(world_from_image, reference)
-    both = (world_from_image, reference)
-    whole = [(each[0].inv() * each[1:]).as_matrix()[:, :3] for each in both]
-    steps = [relative_poses(each).as_matrix()[:, :3] for each in both]
-    return whole[0] - whole[1], steps[0] - steps[1]
+def _mean_over_landmarks(differences: FloatArray, landmarks: Landmarks) -> float:
+    at, points, last = landmarks.frame, landmarks.points_mm, len(differences)
+    if not at.size:
+        raise InvalidInputError("landmarks: expected at least one, got none")
+    if (wrong := np.flatnonzero((at < 1) | (at > last))).size:
+        raise InvalidInputError(f"landmark {wrong[0]}: expected a frame from 1 to {last}, got {at[wrong[0]]}")
+    there = differences[at - 1]
+    shifts = there[:, :, 3] + np.einsum("pij,pj->pi", there[:, :, :3], points)
+    return float(np.linalg.norm(shifts, axis=1).mean())
 
 
 def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:

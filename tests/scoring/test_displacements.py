@@ -7,14 +7,12 @@ from drifting import CENTRE_MM, drifted
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep
 from speckle3d.scoring.displacements import (
     challenge_score,
     drift_rates,
-    landmark_errors,
-    pixel_errors,
+    point_errors,
     score_row,
 )
 from speckle3d.scoring.references import find_reference
@@ -65,8 +63,8 @@ def test_what_has_no_error_is_refused():
     for frames in ([], [51]):
         marks = Landmarks(np.array(frames, dtype=int), np.zeros((len(frames), 3)))
         with pytest.raises(InvalidInputError):
-            landmark_errors(sliding(1.0), sliding(1.0), marks)
+            point_errors(sliding(1.0), sliding(1.0), None, marks)
     with pytest.raises(InsufficientDataError):
         drift_rates(sliding(1.0), RigidTransform.identity(51), CENTRE_MM)
     with pytest.raises(MismatchError):
-        pixel_errors(sliding(1.0), sliding(1.0)[1:], ImageGrid(1, 1, 1.0, 1.0))
+        point_errors(sliding(1.0), sliding(1.0)[1:], None)
