@@ -10,6 +10,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
@@ -23,6 +24,7 @@ from speckle3d.io.plus.write import write_sequence, write_transforms
 from speckle3d.io.shapes.polylines import write_polylines
 from speckle3d.io.shapes.transforms import write_transform
 from speckle3d.scoring.references import REFERENCES
+from speckle3d.study.figures import colour_of
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scenes.sequences import slicer_sequence
 from speckle3d.study.scenes.voxels import (
@@ -36,9 +38,6 @@ from speckle3d.study.scenes.voxels import (
 SCENE = "scene.mrml"
 
 _TEMPLATE = Path(__file__).with_name(SCENE)
-_COLOURS = ("0.2 0.6 1", "1 0.5 0.1", "0.3 0.8 0.3", "0.9 0.3 0.3", "0.6 0.4 0.9", "0.6 0.5 0.3")
-"""Of the outlines of one mode after the other: red, green and blue."""
-
 _NAMES = {
     "volume": "volume-{}.nrrd",
     "state": "state-{}.seg.nrrd",
@@ -172,14 +171,14 @@ def _write_mode(
 def _scene_text(posed: Sequence[PosedSweep], request: SceneRequest) -> str:
     """Scene as XML; everything that comes from outside is escaped."""
     modes: list[dict[str, Any]] = []
-    for i, each in enumerate(posed):
+    for each in posed:
         seconds = max(float(np.ptp(each.sweep.frame_time_s[each.frames])), 1e-3)
         modes.append(
             {
                 "name": printable(f"{each.sweep.name}, {each.mode}"),
                 "files": request.files(each.mode),
                 "is_bytes": request.settings.voxel_type == "uint8",
-                "colour": _COLOURS[i % len(_COLOURS)],
+                "colour": " ".join(f"{part:.3g}" for part in to_rgb(colour_of(each.mode))),
                 "frames_per_s": f"{len(each.frames) / seconds:g}",
             }
         )
