@@ -10,7 +10,8 @@ import numpy as np
 from speckle3d.core.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
-from speckle3d.kernels.field import line_field, two_way_field
+from speckle3d.core.threads import in_parallel
+from speckle3d.kernels.diffraction import lens_fields
 
 _NEPER_PER_DB = np.log(10.0) / 20.0
 
@@ -199,36 +200,46 @@ def _sum_sources(probe: Probe, lateral: FloatArray, wavenumbers: FloatArray) -> 
     depth, step = _DEPTH_MM, probe.pitch_mm / PER_PITCH
     widest = int(max(probe.transmit_elements, probe.receive_elements)) | 1
     element = (np.arange(widest) - widest // 2) * probe.pitch_mm
-    source = (element[:, None] + (np.arange(PER_PITCH) - (PER_PITCH - 1) / 2.0) * step).ravel()
-    distance = (np.arange(round((source[-1] + lateral[-1]) / step) + 1) + 0.5) * step
-    # All elements share the field of one elevational line source, shifted along the array.
-    strip = (np.arange(_STRIPS) + 0.5) / _STRIPS * probe.elevation_aperture_mm
-    strip = strip - probe.elevation_aperture_mm / 2.0
-    lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
-    line = np.empty((depth.size, distance.size, _ELEVATION_MM.size, wavenumbers.size), dtype=complex)
-    line_field(depth, distance, _ELEVATION_MM, strip, lens, wavenumbers, line)
     across = np.repeat(element, PER_PITCH)
     half = np.full(depth.size, probe.transmit_elements * probe.pitch_mm / 2.0)
-    focus = np.full(depth.size, probe.transmit_focus_mm)
-    transmit = _focused(probe, across, half, focus, wavenumbers)
+    transmit = _focused(probe, across, half, np.full(depth.size, probe.transmit_focus_mm), wavenumbers)
     # The dynamic receive aperture has at least four elements.
     widest_mm = probe.receive_elements * probe.pitch_mm
     half = np.clip(depth / probe.receive_f_number, 4 * probe.pitch_mm, widest_mm) / 2.0
     receive = _focused(probe, across, half, depth, wavenumbers)
+    # Sources lie half a step off the lateral grid: from each of its places two are each distance away.
+    place, away = np.arange(lateral.size)[:, None], np.arange(lateral.size + across.size // 2)
+    sources = place + across.size // 2 + away.size + np.stack([away, -1 - away])[:, None]
+    ways = [np.pad(way, ((0, 0), (0, 0), (away.size, away.size))) for way in (transmit, receive)]
+    # All elements share the field of one elevational line of strips behind the lens, shifted along the array.
+    strip = ((np.arange(_STRIPS) + 0.5) / _STRIPS - 0.5) * probe.elevation_aperture_mm
+    lens = probe.elevation_focus_mm - np.hypot(probe.elevation_focus_mm, strip)
     out = np.empty((depth.size, lateral.size, _ELEVATION_MM.size, wavenumbers.size), dtype=complex)
-    two_way_field(line, source, step, transmit, receive, out)
+
+    def sum_depths(first: int, stop: int) -> None:
+        line = np.empty((away.size, wavenumbers.size, _ELEVATION_MM.size, 2))
+        for iy in range(first, stop):
+            distance = np.hypot(depth[iy], (away + 0.5) * step)
+            # Obliquity depth / r and spreading 1 / r of a source in a pressure-release plane.
+            weight = np.full(away.size, depth[iy])
+            lens_fields(distance, _ELEVATION_MM, strip, lens, wavenumbers, weight, 2, 0, away.size, line)
+            field = line.view(complex)[..., 0].swapaxes(0, 1)
+            sent, heard = (way[iy][:, sources].sum(axis=1) @ field for way in ways)
+            out[iy] = np.moveaxis(sent * heard, 0, -1)
+
+    in_parallel(sum_depths, depth.size)
     return out
 
 
 def _focused(
     probe: Probe, element: FloatArray, half_width: FloatArray, focus: FloatArray, wavenumbers: FloatArray
 ) -> ComplexArray:
-    """Weights and focusing phases of the sources, shape (depth, source, node)."""
+    """Weights and focusing phases of the sources, shape (depth, node, source)."""
     across = element / half_width[:, None]
     raised = probe.edge_weight + (1.0 - probe.edge_weight) * np.cos(np.pi / 2.0 * across) ** 2
     weight = np.where(np.abs(across) <= 1.0, raised, 0.0)
     path = focus[:, None] - np.hypot(focus[:, None], element)
-    return np.asarray(weight[..., None] * np.exp(-1j * path[..., None] * wavenumbers))
+    return np.asarray(weight[:, None] * np.exp(-1j * path[:, None] * wavenumbers[:, None]))
 
 
 def _parabola(profile: ComplexArray, across: FloatArray, wavenumber: float) -> float:

@@ -14,7 +14,7 @@ from speckle3d.io.sweep_writer import SweepWriter, write_sweep
 from speckle3d.simulation.presets import SimulationSettings, simulate
 
 DEFAULT = Path(__file__).resolve().parents[2] / ".cache" / "sweeps"
-_SIMULATOR = ("simulation/*.py", "kernels/scatter.py", "kernels/field.py", "core/geometry.py")
+_SIMULATOR = ("simulation/*.py", "kernels/scatter.py", "kernels/diffraction.py", "core/geometry.py")
 
 
 def simulated(settings: SimulationSettings, folder: Path = DEFAULT) -> Path:
