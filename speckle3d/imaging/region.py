@@ -71,15 +71,11 @@ class Fan:
     radii_mm: Pair
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.apex_mm).all():
-            raise InvalidInputError(f"fan: expected a finite apex, got {self.apex_mm} mm")
-        if not -90 <= self.angles_deg[0] < self.angles_deg[1] <= 90:
+        (left, right), (near, far) = self.angles_deg, self.radii_mm
+        if not (np.isfinite(self.apex_mm).all() and -90 <= left < right <= 90 and 0 <= near < far < np.inf):
             raise InvalidInputError(
-                f"fan: expected two angles of -90 to 90 degrees, smaller first, got {self.angles_deg}"
-            )
-        if not 0 <= self.radii_mm[0] < self.radii_mm[1] < np.inf:
-            raise InvalidInputError(
-                f"fan: expected two radii of zero or more, smaller first, got {self.radii_mm} mm"
+                "fan: expected a finite apex, two angles of -90 to 90 degrees and two radii of zero or more, "
+                f"the smaller first, got {self.apex_mm} {self.angles_deg} {self.radii_mm}"
             )
 
     def mask(self, grid: ImageGrid) -> BoolArray:
@@ -206,25 +202,21 @@ def _hair_mm(grid: ImageGrid) -> float:
 
 def _shape(part: str, text: str) -> Shape:
     kind, *words = part.split() or [""]
-    pairs = [pair for word in words if (pair := _pair(word))]
-    make, fits = _MAKERS.get(kind, (None, range(0)))
-    if make is None or len(words) not in fits or len(pairs) != len(words):
-        raise InvalidInputError(f"region: expected {REGION_HELP}, joined by ' and ', got {text!r}")
-    return make(*pairs)
-
-
-_MAKERS: dict[str, tuple[Callable[..., Shape], range]] = {
-    "rectangle": (Rectangle, range(2, 3)),
-    "fan": (Fan, range(3, 4)),
-    "polygon": (lambda *corners: Polygon(corners), range(3, 1000)),
-}
-"""Shapes by their names, and how many pairs of numbers each takes."""
-
-
-def _pair(word: str) -> Pair | None:
-    """Two numbers with a comma between; None if the word is something else."""
     try:
-        first, second = (float(number) for number in word.split(","))
-    except ValueError:
-        return None
-    return first, second
+        return _MAKERS[kind](*map(_pair, words))
+    except InvalidInputError:
+        raise
+    except (KeyError, TypeError, ValueError):
+        raise InvalidInputError(f"region: expected {REGION_HELP}, joined by ' and ', got {text!r}") from None
+
+
+_MAKERS: dict[str, Callable[..., Shape]] = {
+    "rectangle": Rectangle,
+    "fan": Fan,
+    "polygon": lambda *corners: Polygon(corners),
+}
+
+
+def _pair(word: str) -> Pair:
+    first, second = word.split(",")
+    return float(first), float(second)

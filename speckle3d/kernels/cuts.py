@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.kernels.slicing import bilinear
 
@@ -128,26 +128,24 @@ def blend_nearest(
             levels[line, point] = level
 
 
-@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
-def _neighbours(at, last, stride):  # type: ignore[no-untyped-def]
-    """Where the lower neighbour along an axis is, weight of the upper one, and how far it is on, if asked."""
-    at = min(max(at, 0.0), last)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _neighbours(at: float, last: int) -> tuple[int, int, float]:
+    """Lower and upper neighbour along an axis, and weight of the upper one."""
+    at = min(max(at, 0.0), float(last))
     lower = int(at)
     share = at - lower
     # On a voxel but for rounding, its neighbours do not count: they may be outside, or hold nothing.
     if share < EDGE_TOLERANCE:
-        share = 0.0
-    elif share > 1.0 - EDGE_TOLERANCE:
-        lower, share = lower + 1, 0.0
-    return lower * stride, share, stride if share > 0.0 else 0
+        return lower, lower, 0.0
+    if share > 1.0 - EDGE_TOLERANCE:
+        return lower + 1, lower + 1, 0.0
+    return lower, lower + 1, share
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def cut_voxels(
     voxels: npt.NDArray[np.generic],
     state: ByteArray,
-    strides: IntArray,
-    sides: IntArray,
     index_from_world: FloatArray,
     lines: FloatArray,
     out: Float32Array,
@@ -156,84 +154,48 @@ def cut_voxels(
 
     Parameters
     ----------
-    voxels : ndarray, shape (n_i * n_j * n_k,)
+    voxels : ndarray, shape (n_i, n_j, n_k)
         In any order in memory.
-    state : ndarray, shape (n_i * n_j * n_k,) or (0,)
+    state : ndarray, shape (n_i, n_j, n_k) or (0, 0, 0)
         `EMPTY` where a voxel holds nothing; without it, those hold nothing that are NaN.
-    strides, sides : ndarray, shape (3,)
-        Distance in `voxels` between neighbours along i, j and k, and number of them.
     index_from_world : ndarray, shape (3, 4)
     lines : ndarray, shape (n, 2, 3)
         Of each line the first point and the step to the next one, mm in the world.
     out : ndarray, shape (n, points), filled
     """
-    points = out.shape[1]
-    stated = state.shape[0] > 0
-    last_i, last_j, last_k = sides[0] - 1.0, sides[1] - 1.0, sides[2] - 1.0
+    stated = state.size > 0
+    last_i, last_j, last_k = voxels.shape[0] - 1, voxels.shape[1] - 1, voxels.shape[2] - 1
     for line in range(lines.shape[0]):
         u, du = _mapped(index_from_world, 0, lines[line])
         v, dv = _mapped(index_from_world, 1, lines[line])
         w, dw = _mapped(index_from_world, 2, lines[line])
-        begin, end = _clip(0.0, points - 1.0, u, du, -EDGE_TOLERANCE, last_i + EDGE_TOLERANCE)
+        begin, end = _clip(0.0, out.shape[1] - 1.0, u, du, -EDGE_TOLERANCE, last_i + EDGE_TOLERANCE)
         begin, end = _clip(begin, end, v, dv, -EDGE_TOLERANCE, last_j + EDGE_TOLERANCE)
         begin, end = _clip(begin, end, w, dw, -EDGE_TOLERANCE, last_k + EDGE_TOLERANCE)
         out[line] = np.nan
         if begin > end:
             continue
-        first, stop = math.ceil(begin), int(end) + 1
-        for point in range(first, stop):
-            i, a, step_i = _neighbours(u + du * point, last_i, strides[0])
-            j, b, step_j = _neighbours(v + dv * point, last_j, strides[1])
-            k, c, step_k = _neighbours(w + dw * point, last_k, strides[2])
-            at = i + j + k
-            if stated:
-                level = _counted(voxels, state, at, step_i, step_j, step_k, a, b, c)
-            else:
-                level = _plane_of(voxels, at, step_i, step_j, a, b)
-                level += c * (_plane_of(voxels, at + step_k, step_i, step_j, a, b) - level)
-                if math.isnan(level):
-                    level = _counted(voxels, state, at, step_i, step_j, step_k, a, b, c)
-            out[line, point] = level
-
-
-@njit(cache=True, inline="always", error_model="numpy", fastmath=False)
-def _plane_of(voxels, at, step_i, step_j, a, b):  # type: ignore[no-untyped-def]
-    """Level between four voxels."""
-    near, far = float(voxels[at]), float(voxels[at + step_j])
-    near += a * (float(voxels[at + step_i]) - near)
-    far += a * (float(voxels[at + step_i + step_j]) - far)
-    return near + b * (far - near)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _counted(
-    voxels: npt.NDArray[np.generic],
-    state: ByteArray,
-    at: int,
-    step_i: int,
-    step_j: int,
-    step_k: int,
-    a: float,
-    b: float,
-    c: float,
-) -> float:
-    """Mean of those of eight voxels that hold something, by their weights; NaN if these are under a half."""
-    total = 0.0
-    weights = 0.0
-    for corner in range(8):
-        weight = a if corner & 1 else 1.0 - a
-        weight *= b if corner & 2 else 1.0 - b
-        weight *= c if corner & 4 else 1.0 - c
-        place = at
-        if corner & 1:
-            place += step_i
-        if corner & 2:
-            place += step_j
-        if corner & 4:
-            place += step_k
-        level = float(voxels[place])
-        if math.isnan(level) or (state.shape[0] > 0 and state[place] == EMPTY):
-            continue
-        total += weight * level
-        weights += weight
-    return total / weights if weights >= 0.5 - EDGE_TOLERANCE else math.nan
+        for point in range(math.ceil(begin), int(end) + 1):
+            i, far_i, a = _neighbours(u + du * point, last_i)
+            j, far_j, b = _neighbours(v + dv * point, last_j)
+            k, far_k, c = _neighbours(w + dw * point, last_k)
+            if not stated:
+                near = (1.0 - a) * voxels[i, j, k] + a * voxels[far_i, j, k]
+                near += b * ((1.0 - a) * voxels[i, far_j, k] + a * voxels[far_i, far_j, k] - near)
+                far = (1.0 - a) * voxels[i, j, far_k] + a * voxels[far_i, j, far_k]
+                far += b * ((1.0 - a) * voxels[i, far_j, far_k] + a * voxels[far_i, far_j, far_k] - far)
+                out[line, point] = near + c * (far - near)
+                if not math.isnan(out[line, point]):
+                    continue
+            total, weights = 0.0, 0.0
+            for corner in range(8):
+                weight = a if corner & 1 else 1.0 - a
+                weight *= b if corner & 2 else 1.0 - b
+                weight *= c if corner & 4 else 1.0 - c
+                place = far_i if corner & 1 else i, far_j if corner & 2 else j, far_k if corner & 4 else k
+                level = float(voxels[place])
+                if not math.isnan(level) and not (stated and state[place] == EMPTY):
+                    total += weight * level
+                    weights += weight
+            if weights >= 0.5 - EDGE_TOLERANCE:
+                out[line, point] = total / weights

@@ -92,21 +92,21 @@ def curved_sheet(
     .. [1] A. Kanitsar et al., "CPR - curved planar reformation", IEEE Visualization, 2002.
     """
     points, axis = np.asarray(points_mm, dtype=float), np.asarray(down, dtype=float)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise InvalidInputError(f"curve: expected finite points of x, y, z in mm, got shape {points.shape}")
     length = float(np.linalg.norm(axis))
-    if not (np.isfinite(length) and length > 0):
-        raise InvalidInputError(f"curve: expected a direction of its columns, got {axis.tolist()}")
-    axis = axis / length
-    flat = points - ((points - points[0]) @ axis)[:, None] * axis
-    apart = np.linalg.norm(np.diff(flat, axis=0), axis=1)
-    # A point picked twice is one.
-    flat = flat[np.concatenate([[True], apart > 1e-9])]
-    if len(flat) < 2:
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all() or not 0 < length < np.inf:
         raise InvalidInputError(
-            "curve: expected at least two points apart from each other across the direction of its columns, "
-            f"got {len(flat)}"
+            "curve: expected finite points of x, y, z in mm and a direction of its columns, got shape "
+            f"{points.shape} and {axis.tolist()}"
         )
+    axis = axis / length
+    flat = points - ((points - points[:1]) @ axis)[:, None] * axis
+    # A point picked twice is one.
+    apart = np.linalg.norm(np.diff(flat, axis=0), axis=1) > 1e-9
+    if not apart.any():
+        raise InvalidInputError(
+            "curve: expected at least two points apart from each other across the direction of its columns"
+        )
+    flat = flat[np.append(True, apart)]
     top, bottom = height_mm
     along = float(np.linalg.norm(np.diff(flat, axis=0), axis=1).sum())
     require_pixels(along, bottom - top, pixel_mm)
@@ -116,14 +116,16 @@ def curved_sheet(
 
 def _even_steps(points_mm: FloatArray, step_mm: float, smooth: bool) -> FloatArray:
     """Points of a curve in equal steps of its arc length, shape (n, 3); a shorter rest is left out."""
-    chord = np.concatenate([[0.0], np.linalg.norm(np.diff(points_mm, axis=0), axis=1).cumsum()])
+    chord = _arc(points_mm)
     dense = np.linspace(0.0, chord[-1], max(2, int(np.ceil(_DENSITY * chord[-1] / step_mm)) + 1))
     # With the points' own places among them, straight lines keep their corners.
     dense = np.union1d(dense, chord)
-    if smooth and len(points_mm) > 2:
-        curve = make_interp_spline(chord, points_mm, k=min(3, len(points_mm) - 1))(dense)
-    else:
-        curve = np.column_stack([np.interp(dense, chord, values) for values in points_mm.T])
-    arc = np.concatenate([[0.0], np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum()])
+    curve = make_interp_spline(chord, points_mm, k=min(3, len(points_mm) - 1) if smooth else 1)(dense)
+    arc = _arc(curve)
     at = np.arange(int(arc[-1] / step_mm + 1e-9) + 1) * step_mm
     return np.column_stack([np.interp(at, arc, values) for values in curve.T])
+
+
+def _arc(points_mm: FloatArray) -> FloatArray:
+    """Length of a line through points up to each of them."""
+    return np.append(0.0, np.linalg.norm(np.diff(points_mm, axis=0), axis=1).cumsum())

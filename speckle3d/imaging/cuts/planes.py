@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,13 +134,13 @@ class ReslicePlane(Cut):
 
 def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
     """Raise `InvalidInputError` unless sizes are positive and there are at most `MAX_PIXELS` pixels."""
-    for name, value in (("width_mm", width_mm), ("height_mm", height_mm), ("pixel_mm", pixel_mm)):
-        if not (np.isfinite(value) and value > 0):
-            raise InvalidInputError(f"{name}: expected a value above zero, got {value}")
+    sizes = width_mm, height_mm, pixel_mm
+    if not 0 < min(sizes) <= max(sizes) < np.inf:
+        raise InvalidInputError(f"width, height and pixel: expected values above zero, got {sizes} mm")
     if (width_mm / pixel_mm + 1) * (height_mm / pixel_mm + 1) > MAX_PIXELS:
         raise InvalidInputError(
-            f"reslice of {width_mm:g} x {height_mm:g} mm: expected at most {MAX_PIXELS} "
-            f"pixels, got more with pixels of {pixel_mm:g} mm"
+            f"reslice of {width_mm:g} x {height_mm:g} mm: expected at most {MAX_PIXELS} pixels, got "
+            f"more with pixels of {pixel_mm:g} mm"
         )
 
 
@@ -154,14 +154,24 @@ def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: flo
 
 def lateral_line(grid: ImageGrid, lateral_mm: float) -> FloatArray:
     """Line of an image down its depth at one lateral position, shape (2, 3), mm."""
-    _require_inside("lateral_mm", lateral_mm, 0.0, grid.width_mm)
-    return np.array([[lateral_mm, grid.first_sample_depth_mm, 0.0], [lateral_mm, grid.depth_mm, 0.0]])
+    ends = np.array([[0.0, grid.first_sample_depth_mm, 0.0], [grid.width_mm, grid.depth_mm, 0.0]])
+    return _line(ends, 0, "lateral_mm", lateral_mm)
 
 
 def depth_line(grid: ImageGrid, depth_mm: float) -> FloatArray:
     """Line of an image across its width at one depth, shape (2, 3), mm."""
-    _require_inside("depth_mm", depth_mm, grid.first_sample_depth_mm, grid.depth_mm)
-    return np.array([[0.0, depth_mm, 0.0], [grid.width_mm, depth_mm, 0.0]])
+    ends = np.array([[0.0, grid.first_sample_depth_mm, 0.0], [grid.width_mm, grid.depth_mm, 0.0]])
+    return _line(ends, 1, "depth_mm", depth_mm)
+
+
+def _line(ends: FloatArray, axis: int, name: str, value: float) -> FloatArray:
+    low, high = ends[:, axis]
+    if not low <= value <= high:
+        raise InvalidInputError(
+            f"{name}: expected a value inside the image, {low:g} to {high:g}, got {value:g}"
+        )
+    ends[:, axis] = value
+    return ends
 
 
 def planes_from_first_frame(
@@ -192,32 +202,26 @@ def planes_from_first_frame(
         If the poses have no common elevational direction, or none along the line.
     """
     placed = {mode: _travelled(each, line_mm) for mode, each in poses.items()}
-    low = reduce(np.minimum, [ends.min(axis=0) for _, ends in placed.values()])
-    high = reduce(np.maximum, [ends.max(axis=0) for _, ends in placed.values()])
-    low, high = np.maximum(low, -np.array(largest_mm)), np.minimum(high, largest_mm)
-    size = np.clip(high - low, pixel_mm, largest_mm)
-    return {mode: _plane_part(axes, low, size, pixel_mm, line_mm) for mode, (axes, _) in placed.items()}
+    ends = np.concatenate([each for _, each in placed.values()])
+    low = np.maximum(ends.min(axis=0), np.negative(largest_mm))
+    high = np.min([ends.max(axis=0), largest_mm, low + largest_mm], axis=0)
+    # Depth counts from the probe, lateral from the first vector.
+    begin = line_mm[0] @ (line_mm[1] != line_mm[0])
+    return {mode: _part(axes, low, high, pixel_mm, begin) for mode, (axes, _) in placed.items()}
 
 
 def plane_around(placed: RigidTransform, points_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
     """Smallest rectangle of a placed plane that holds points of it, shape (n, 2), mm."""
-    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
-    return _plane_part(placed, low, np.maximum(high - low, pixel_mm), pixel_mm)
+    return _part(placed, points_mm.min(axis=0), points_mm.max(axis=0), pixel_mm, 0.0)
 
 
-def _plane_part(
-    placed: RigidTransform,
-    low: FloatArray,
-    size: FloatArray,
-    pixel_mm: float,
-    line_mm: FloatArray | None = None,
+def _part(
+    placed: RigidTransform, low: FloatArray, high: FloatArray, pixel_mm: float, begin_mm: float
 ) -> ReslicePlane:
-    """Rectangle of a placed plane, whose axes count from its origin, or go on from a line of the image."""
+    """Rectangle of a placed plane, whose axes count from its origin, y with `begin_mm` there."""
     start = RigidTransform.from_translation([*low, 0.0])
-    # Depth counts from the probe, lateral from the first vector.
-    begin = 0.0 if line_mm is None else line_mm[0] @ (line_mm[1] != line_mm[0])
-    first = (float(low[0]), float(low[1] + begin))
-    return ReslicePlane(placed * start, float(size[0]), float(size[1]), pixel_mm, first)
+    width, height = np.maximum(high - low, pixel_mm).tolist()
+    return ReslicePlane(placed * start, width, height, pixel_mm, (float(low[0]), float(low[1] + begin_mm)))
 
 
 def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[RigidTransform, FloatArray]:
@@ -234,31 +238,26 @@ def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[R
     ends = np.stack([world_from_image.apply(point) for point in line_mm])
     along = ends[1] - ends[0]
     down = _unit(along.mean(axis=0), "the line to show")
-    travel = _mean_travel(ends.mean(axis=0), world_from_image)
+    normals = world_from_image.rotation.apply([0.0, 0.0, 1.0])
+    travel = _mean_travel(ends.mean(axis=0), _unit(normals.mean(axis=0), "elevational"))
     normal = np.cross(_unit(travel - (travel @ down) * down, "travel"), down)
-    beside = np.cross(
-        world_from_image[0].rotation.apply([0.0, 0.0, 1.0]), along[0] / np.linalg.norm(along[0])
-    )
+    beside = np.cross(normals[0], along[0] / np.linalg.norm(along[0]))
     # A frame that hardly crosses the plane has its line projected there instead.
     beside = beside if abs(beside @ normal) > _LEAST_CROSSING else normal
-    down = _unit(along[0] - (along[0] @ normal) / (beside @ normal) * beside, "the first frame's line")
+    beside = beside / (beside @ normal)
+    down = _unit(along[0] - (along[0] @ normal) * beside, "the first frame's line")
     axes = Rotation.from_matrix(np.column_stack([np.cross(down, normal), down, normal]))
-    away = (ends.reshape(-1, 3).mean(axis=0) - ends[0, 0]) @ normal
-    origin = ends[0, 0] + beside * away / (beside @ normal)
+    origin = ends[0, 0] + beside * ((ends.mean(axis=(0, 1)) - ends[0, 0]) @ normal)
     placed = RigidTransform.from_components(origin, axes)
     return placed, placed.inv().apply(ends.reshape(-1, 3))[:, :2]
 
 
-def _mean_travel(points_mm: FloatArray, world_from_image: RigidTransform) -> FloatArray:
-    """Mean travel per mm forward, by regressing position on elevational position; order does not matter."""
-    normal = world_from_image.rotation.apply([0.0, 0.0, 1.0]).mean(axis=0)
-    forward = _unit(normal, "elevational")
+def _mean_travel(points_mm: FloatArray, forward: FloatArray) -> FloatArray:
+    """Mean travel per mm forward, by regressing position on it; order does not matter."""
     moved = points_mm - points_mm.mean(axis=0)
-    elevation = moved @ forward
-    spread = float(elevation @ elevation)
-    if spread <= 1e-6 * len(points_mm):  # a micrometre rms is no travel to take a direction from
-        return forward
-    return np.asarray(elevation @ moved / spread)
+    ahead = moved @ forward
+    # A micrometre rms is no travel to take a direction from.
+    return ahead @ moved / (ahead @ ahead) if ahead @ ahead > 1e-6 * len(moved) else forward
 
 
 def _unit(vector: FloatArray, what: str) -> FloatArray:
@@ -266,10 +265,3 @@ def _unit(vector: FloatArray, what: str) -> FloatArray:
     if length < 1e-6:
         raise InsufficientDataError(f"the poses have no common direction of {what}: expected one sweep")
     return np.asarray(vector / length)
-
-
-def _require_inside(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise InvalidInputError(
-            f"{name}: expected a value inside the image, {low:g} to {high:g}, got {value:g}"
-        )

@@ -7,10 +7,8 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import ByteArray, Float32Array
@@ -125,23 +123,14 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
 
     if state is not None and state.shape != volume.shape:
         raise MismatchError(f"state: expected shape {volume.shape}, got {state.shape}")
-    order: Literal["C", "F"] = "C" if volume.voxels.flags.c_contiguous else "F"
-    n_i, n_j, n_k = volume.shape
-    strides = np.array([n_j * n_k, n_k, 1] if order == "C" else [1, n_i, n_i * n_j])
-    flat = _flat(volume.voxels, order)
-    held = np.empty(0, np.uint8) if state is None else _flat(state.astype(np.uint8, copy=False), order)
-    index_from_world = np.array(np.linalg.inv(volume.world_from_index)[:3], dtype=float)
-    lines, sides = cut.lines(), np.array(volume.shape)
+    held = np.empty((0, 0, 0), np.uint8) if state is None else state.astype(np.uint8, copy=False)
+    index_from_world = np.linalg.inv(volume.world_from_index)[:3]
+    lines = cut.lines()
     out = np.empty((len(lines), cut.shape[0]), np.float32)
 
     def fill(first: int, stop: int) -> None:
         band = slice(first, stop)
-        cut_voxels(flat, held, strides, sides, index_from_world, lines[band], out[band])
+        cut_voxels(volume.voxels, held, index_from_world, lines[band], out[band])
 
     in_parallel(fill, len(lines), _GRAIN)
     return np.ascontiguousarray(out.T)
-
-
-def _flat(values: npt.NDArray[Any], order: Literal["C", "F"]) -> npt.NDArray[Any]:
-    """Values as they follow in memory, without a copy where that is the order already."""
-    return np.asarray(values, order=order).ravel(order)

@@ -83,7 +83,7 @@ def grid_around(
         If a value is not what it must be, there are no poses, both `shape` and `size_mm` are given, or the
         grid would end before its origin.
     """
-    i, j, k = _three(np.broadcast_to(spacing_mm, 3) if np.ndim(spacing_mm) == 0 else spacing_mm, "spacing_mm")
+    i, j, k = _three([spacing_mm] * 3 if np.ndim(spacing_mm) == 0 else spacing_mm, "spacing_mm")
     spacing, axes = (i, j, k), world_from_axes or Rotation.identity()
     low, high = _bounds(grid, world_from_image, axes)
     if origin_mm is not None:
@@ -97,7 +97,7 @@ def grid_around(
         counts = _counts(low, high, spacing) if shape is None else np.array(_three(shape, "shape"))
     if (counts < 1).any():
         raise InvalidInputError("origin_mm: expected an origin before the images' end, got one beyond it")
-    n_i, n_j, n_k = (int(count) for count in counts)
+    n_i, n_j, n_k = counts.astype(int).tolist()
     origin = axes.apply(low) if origin_mm is None else np.asarray(origin_mm, dtype=float)
     return VoxelGrid((n_i, n_j, n_k), spacing, RigidTransform.from_components(origin, axes))
 
@@ -170,7 +170,6 @@ def _counts(low: FloatArray, high: FloatArray, spacing: float | Triple) -> Float
 
 def _three(values: npt.ArrayLike, name: str, above: float = 0.0) -> list[float]:
     numbers = np.asarray(values, dtype=float)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all() or (numbers <= above).any():
-        limit = " above zero" if above == 0.0 else ""
-        raise InvalidInputError(f"{name}: expected three finite values{limit}, got {numbers.tolist()}")
+    if numbers.shape != (3,) or not (np.isfinite(numbers) & (numbers > above)).all():
+        raise InvalidInputError(f"{name}: expected three values above {above:g}, got {numbers.tolist()}")
     return [float(number) for number in numbers]
