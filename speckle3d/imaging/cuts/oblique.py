@@ -25,7 +25,7 @@ def three_point_plane(points_mm: npt.ArrayLike) -> RigidTransform:
         If they are not three, or lie on one line.
     """
     points = np.asarray(points_mm, dtype=float)
-    if points.shape != (3, 3) or not np.isfinite(points).all():
+    if points.shape != (3, 3):
         raise InvalidInputError(f"points: expected three of x, y, z in mm, got shape {points.shape}")
     first, second, third = points
     return spanned_plane(first, second - first, third - first, "three points that are not on one line")
@@ -44,30 +44,22 @@ def spanned_plane(
     InvalidInputError
         If a direction has no length, both are along one line, or the origin is not finite.
     """
-    if not np.isfinite(origin_mm).all():
-        raise InvalidInputError(f"plane: expected a finite origin, got {vector_words(np.asarray(origin_mm))}")
-    x, y = np.asarray(right, dtype=float), np.asarray(down, dtype=float)
-    sizes = np.linalg.norm([x, y], axis=1)
-    x, y = np.divide([x, y], np.where(sizes > 0, sizes, 1.0)[:, None])
-    across = y - (y @ x) * x
-    if not (np.isfinite(sizes).all() and np.linalg.norm(across) >= _LEAST_SINE and sizes[0] > 0):
-        got = f"directions {vector_words(np.asarray(right))} and {vector_words(np.asarray(down))}"
-        raise InvalidInputError(f"plane: expected {expected}, got {got}")
-    y = across / np.linalg.norm(across)
-    turned = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)]))
-    return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), turned)
+    ways = np.array([right, down], dtype=float)
+    with np.errstate(invalid="ignore"):
+        x, y = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    normal = np.cross(x, y)
+    sine = np.linalg.norm(normal)
+    if not (sine >= _LEAST_SINE and np.isfinite(origin_mm).all()):
+        got = " and ".join(vector_words(np.asarray(each)) for each in (origin_mm, right, down))
+        raise InvalidInputError(f"plane: expected a finite origin and {expected}, got {got}")
+    axes = Rotation.from_matrix(np.column_stack([x, np.cross(normal / sine, x), normal / sine]))
+    return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), axes)
 
 
 def turned_frame_plane(
     world_from_image: RigidTransform, lateral_mm: float, angle_deg: float
 ) -> RigidTransform:
-    """Place a plane in one frame's depth line, turned about it: at 90 degrees along the sweep.
-
-    Raises
-    ------
-    InvalidInputError
-        If the angle is not finite.
-    """
+    """Place a plane in one frame's depth line, turned about it: at 90 degrees along the sweep."""
     if not np.isfinite(angle_deg):
         raise InvalidInputError(f"angle_deg: expected a finite angle, got {angle_deg}")
     line = RigidTransform.from_translation([lateral_mm, 0.0, 0.0])

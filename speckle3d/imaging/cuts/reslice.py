@@ -124,7 +124,7 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
     if state is not None and state.shape != volume.shape:
         raise MismatchError(f"state: expected shape {volume.shape}, got {state.shape}")
     held = np.empty((0, 0, 0), np.uint8) if state is None else state.astype(np.uint8, copy=False)
-    index_from_world = np.linalg.inv(volume.world_from_index)[:3]
+    index_from_world = np.asarray(np.linalg.inv(volume.world_from_index)[:3], dtype=float)
     lines = cut.lines()
     out = np.empty((len(lines), cut.shape[0]), np.float32)
 

@@ -31,14 +31,13 @@ def belonging_of(points_mm: FloatArray, grid: ImageGrid, world_from_image: Rigid
     world_from_image : RigidTransform, length n
     """
     points = np.asarray(points_mm, dtype=float).reshape(-1, 3)
-    frames = np.zeros((len(points), 2), dtype=np.int64)
-    weights, gap = np.tile([1.0, 0.0], (len(points), 1)), np.zeros(len(points))
     image_from_world = world_from_image.inv().as_matrix()
     rows = max(_AT_ONCE // len(world_from_image), 1)
-    for first in range(0, len(points), rows):
-        some = slice(first, first + rows)
-        _place(points[some], image_from_world, grid, frames[some], weights[some], gap[some])
-    return Belonging(frames, weights, gap)
+    parts = [
+        _place(points[first : first + rows], image_from_world, grid)
+        for first in range(0, max(len(points), 1), rows)
+    ]
+    return Belonging(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 def require_inside(
@@ -67,28 +66,20 @@ def require_inside(
 
 
 def _place(
-    points: FloatArray,
-    image_from_world: FloatArray,
-    grid: ImageGrid,
-    frames: IntArray,
-    weights: FloatArray,
-    gap: FloatArray,
-) -> None:
-    """Fill the rows of some points."""
-    q = points @ image_from_world[:, 2, :3].T + image_from_world[:, 2, 3]
-    beside = np.zeros_like(q)
-    for axis, (low, high) in enumerate(((0.0, grid.width_mm), (grid.first_sample_depth_mm, grid.depth_mm))):
-        at = points @ image_from_world[:, axis, :3].T + image_from_world[:, axis, 3]
-        beside += (at - np.clip(at, low, high)) ** 2
+    points: FloatArray, image_from_world: FloatArray, grid: ImageGrid
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Frames, weights and gaps of some points."""
+    x, y, q = np.moveaxis(image_from_world[:, :3] @ np.insert(points, 3, 1.0, axis=1).T, 1, 0)
+    beside = (x - np.clip(x, 0.0, grid.width_mm)) ** 2
+    beside += (y - np.clip(y, grid.first_sample_depth_mm, grid.depth_mm)) ** 2
     away = q**2 + beside
-    row, best = np.arange(len(points)), away.argmin(axis=1)
-    frames[:, 0], own = best, q[row, best]
+    row, best = np.arange(len(points)), away.argmin(axis=0)
+    own, second, weight = q[best, row], np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
     for step in (-1, 1):
-        other = np.clip(best + step, 0, q.shape[1] - 1)
-        across = (own * q[row, other] < 0) & (other != best)
-        share = np.abs(own) / np.maximum(np.abs(own) + np.abs(q[row, other]), 1e-12)
+        other = np.clip(best + step, 0, len(q) - 1)
+        share = np.abs(own) / np.maximum(np.abs(own) + np.abs(q[other, row]), 1e-12)
         # Of two neighbours on the other side, where the probe turns back, the nearer.
-        across &= (weights[:, 1] == 0.0) | (share > weights[:, 1])
-        frames[across, 1] = other[across]
-        weights[across] = np.column_stack([1.0 - share, share])[across]
-    gap[:] = np.sqrt(np.where(weights[:, 1] > 0.0, beside[row, best], away[row, best]))
+        across = (own * q[other, row] < 0) & (other != best) & (share > weight)
+        second[across], weight[across] = other[across], share[across]
+    gap = np.sqrt(np.where(weight > 0.0, beside[best, row], away[best, row]))
+    return np.stack([best, second], axis=1), np.stack([1.0 - weight, weight], axis=1), gap

@@ -48,8 +48,8 @@ class Measurement:
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the value; none reaches below zero, or past pi for angles."""
-        half, most = NORMAL_95 * self.sigma, np.pi if self.unit == "rad" else np.inf
-        return max(self.value - half, 0.0), min(self.value + half, float(most))
+        half, most = NORMAL_95 * self.sigma, math.pi if self.unit == "rad" else math.inf
+        return max(self.value - half, 0.0), min(self.value + half, most)
 
     @property
     def shown_in(self) -> tuple[float, str]:

@@ -75,19 +75,17 @@ def surface_of(
     >>> round(surface.volume_mm3), round(4 / 3 * np.pi * 4**3)
     (266, 268)
     """
-    if smooth < 0:
-        raise InvalidInputError(f"smooth: expected zero or more passes, got {smooth}")
     held = known_voxels(volume) if known is None else known
-    if held.shape != volume.shape:
-        raise InvalidInputError(f"known: expected shape {volume.shape}, got {held.shape}")
-    values = volume.voxels[held]
-    low, high = (float(values.min()), float(values.max())) if values.size else (np.nan, np.nan)
-    if not low <= level <= high:
+    if smooth < 0 or held.shape != volume.shape:
         raise InvalidInputError(
-            f"level: expected a grey level of the volume, {low:g} to {high:g}, got {level:g}"
+            f"surface: expected zero or more passes of smoothing and known voxels of shape {volume.shape}, "
+            f"got {smooth} and {held.shape}"
         )
-    found = _marched(volume, volume.voxels, level, inside, held)
-    return smoothed(found, smooth) if smooth else found
+    values = volume.voxels[held]
+    if not (values.size and values.min() <= level <= values.max()):
+        among = f"{values.min():g} to {values.max():g}" if values.size else "of which there is none"
+        raise InvalidInputError(f"level: expected a grey level of the volume, {among}, got {level:g}")
+    return smoothed(_marched(volume, volume.voxels, level, inside, held), smooth)
 
 
 def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
@@ -103,20 +101,17 @@ def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
         If there is no label.
     """
     voxels = volume.voxels
-    if voxels.dtype.kind == "f" and not np.array_equal(voxels, np.rint(voxels)):
-        raise InvalidInputError("labels: expected whole numbers, got fractions or empty voxels")
-    labels = [int(label) for label in np.unique(voxels) if label != 0]
-    if not labels:
-        raise InsufficientDataError("labels: expected voxels other than 0, got none")
-    if len(labels) > MAX_LABELS:
+    labels = np.unique(voxels)
+    if not np.array_equal(labels, np.rint(labels)) or len(labels) > MAX_LABELS:
         raise InvalidInputError(
-            f"labels: expected at most {MAX_LABELS}, got {len(labels)}: are these grey levels?"
+            f"labels: expected whole numbers, at most {MAX_LABELS}, got others: are these grey levels?"
         )
-    every = np.ones(volume.shape, dtype=bool)
-    found = {}
-    for label in labels:
+    every, found = np.ones(volume.shape, dtype=bool), {}
+    for label in (int(label) for label in labels if label != 0):
         surface = _marched(volume, (voxels == label).astype(np.float32), 0.5, "above", every)
         found[label] = replace(surface, fields={**surface.fields, "label": str(label)})
+    if not found:
+        raise InsufficientDataError("labels: expected voxels other than 0, got none")
     return found
 
 
@@ -146,8 +141,7 @@ def smoothed(surface: Surface, passes: int) -> Surface:
     beside = coo_array((np.ones(len(both)), both.T), shape=(n, n)).tocsr()
     beside.data[:] = 1.0
     mean = diags_array(1.0 / np.maximum(beside.sum(axis=1), 1.0)) @ beside
-    free = np.ones((n, 1))
-    free[surface.open_edges().ravel()] = 0.0
+    free = ~np.isin(np.arange(n), surface.open_edges())[:, None]
     vertices = surface.vertices_mm
     for _ in range(passes):
         for share in TAUBIN:
@@ -209,19 +203,17 @@ def largest_part(surface: Surface) -> Surface:
 def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
     """The parts of a surface that have no border, and of cavities those within the bounds of such a part."""
     part = surface.parts()
-    is_open = np.zeros(len(surface.vertices_mm), dtype=bool)
-    is_open[open_edges] = True
-    whole = np.ones(int(part.max()) + 1, dtype=bool)
-    whole[part[is_open[surface.triangles].any(axis=1)]] = False
     middles = surface.vertices_mm[surface.triangles].mean(axis=1)
     inner = np.einsum("ij,ij->i", surface.normals_mm2, middles - middles.mean(axis=0))
-    body = whole & (np.bincount(part, inner) > 0.0)
-    low, high = np.full((len(whole), 3), np.inf), np.full((len(whole), 3), -np.inf)
-    np.minimum.at(low, part, middles)
-    np.maximum.at(high, part, middles)
-    for cavity in np.flatnonzero(whole & ~body):
-        around = (low[body] <= low[cavity]).all(axis=1) & (high[body] >= high[cavity]).all(axis=1)
-        whole[cavity] = around.any()
+    faces_out = np.bincount(part, inner) > 0.0
+    numbers = np.arange(len(faces_out))
+    whole = ~np.isin(numbers, part[np.isin(surface.triangles, open_edges).any(axis=1)])
+    low, high = ndimage.minimum, ndimage.maximum
+    bounds = [low(c, part, numbers) for c in middles.T] + [-high(c, part, numbers) for c in middles.T]
+    corners = np.stack(bounds, axis=1)
+    bodies = corners[whole & faces_out]
+    for cavity in np.flatnonzero(whole & ~faces_out):
+        whole[cavity] = (bodies <= corners[cavity]).all(axis=1).any()
     return surface.of_triangles(whole[part])
 
 

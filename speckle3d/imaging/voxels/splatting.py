@@ -82,12 +82,23 @@ def splat_images(
     Raises
     ------
     MismatchError
-        If there is not one weight per frame, or the mask is not of the images' shape.
+        If images differ in type.
     InvalidInputError
-        If a pose or a weight is not finite, no sample counts, an image reaches too far beyond the grid, or
-        with "plus" images are not of uint8.
+        If a pose is not finite, there is not one weight per frame, the mask is not of the images' shape, no
+        sample counts, an image reaches too far beyond the grid, or with "plus" images are not of uint8.
     """
-    weights, mask = _checked_weights(weights, rule, len(source)), _checked_mask(mask, source)
+    side, n = (source.grid.vectors, source.grid.samples), len(source)
+    mask = np.ones(side, dtype=bool) if mask is None else mask
+    if mask.shape != side or not mask.any():
+        raise InvalidInputError(f"region: expected a mask of shape {side} with samples inside, got none")
+    if rule != "weighted":
+        weights = np.ones(n)
+    if weights is None or (
+        isinstance(weights, np.ndarray)
+        and weights.ndim == 1
+        and not (len(weights) == n and (weights >= 0).all())
+    ):
+        raise InvalidInputError(f"weights: expected zero or more for each of {n} frames, or images of them")
     maps, shape = index_from_sample(source, voxel_grid), voxel_grid.shape[::-1]
     near = _frames_near(maps, source, voxel_grid)
     if not near.size:
@@ -156,8 +167,7 @@ def index_from_sample(source: PosedImages, voxel_grid: VoxelGrid) -> FloatArray:
     maps = (grid_from_image @ source.grid.image_from_sample)[:, :3]
     maps = np.asarray(maps / np.asarray(voxel_grid.spacing_mm)[:, None])
     if not np.isfinite(maps).all():
-        bad = int(np.flatnonzero(~np.isfinite(maps).all(axis=(1, 2)))[0])
-        raise InvalidInputError(f"world_from_image[{bad}]: expected a finite pose, got {maps[bad]}")
+        raise InvalidInputError("world_from_image: expected finite poses")
     return maps
 
 
@@ -174,33 +184,6 @@ def _frames_near(maps: FloatArray, source: PosedImages, voxel_grid: VoxelGrid) -
             "the grid: take larger voxels, or check the poses"
         )
     return np.flatnonzero(near)
-
-
-def _checked_weights(weights: Weights | None, rule: Rule, frames: int) -> Weights | None:
-    if rule != "weighted":
-        return None
-    if weights is None:
-        raise InvalidInputError(
-            "weights: expected one per frame, or images of them, with the rule 'weighted'"
-        )
-    if isinstance(weights, np.ndarray) and weights.ndim == 1:
-        if weights.shape != (frames,):
-            raise MismatchError(f"weights: expected {frames}, one per frame, got {weights.size}")
-        bad = np.flatnonzero(~(np.isfinite(weights) & (weights >= 0)))
-        if bad.size:
-            raise InvalidInputError(f"weights[{bad[0]}]: expected zero or above, got {weights[bad[0]]}")
-    return weights
-
-
-def _checked_mask(mask: BoolArray | None, source: PosedImages) -> BoolArray:
-    shape = source.grid.vectors, source.grid.samples
-    if mask is None:
-        return np.ones(shape, dtype=bool)
-    if mask.shape != shape:
-        raise MismatchError(f"region: expected a mask of shape {shape}, got {mask.shape}")
-    if not mask.any():
-        raise InvalidInputError("region: expected samples of the image inside, got none")
-    return mask
 
 
 def _batches(
@@ -278,11 +261,9 @@ def _few_samples(source: PosedImages, voxel_grid: VoxelGrid) -> bool:
 
 
 def _weights_of(
-    weights: Weights | None, source: PosedImages, frames: IntArray, images: npt.NDArray[Any], turned: bool
+    weights: Weights, source: PosedImages, frames: IntArray, images: npt.NDArray[Any], turned: bool
 ) -> Float32Array:
-    """Weights of the samples of a batch, shape (n, line, sample); all one without any."""
-    if weights is None:
-        return np.broadcast_to(np.float32(1.0), images.shape)
+    """Weights of the samples of a batch, shape (n, line, sample)."""
     if isinstance(weights, np.ndarray) and weights.ndim == 1:
         return np.broadcast_to(weights[frames].astype(np.float32)[:, None, None], images.shape)
     placed = PosedImages(weights, source.grid, source.world_from_image)
