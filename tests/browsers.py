@@ -83,7 +83,9 @@ def opened(browser, address, width=1366, height=768):
     # Where no kernel has been compiled yet, that comes first.
     page.set_default_timeout(120_000)
     page.complaints, page.requests = [], []
-    page.on("console", lambda m: page.complaints.append(m.text) if m.type == "error" else None)
+    page.on(
+        "console", lambda m: page.complaints.append(f"{m.text} {m.location}") if m.type == "error" else None
+    )
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
     page.on(
         "request", lambda r: page.requests.append(r.url) if not r.url.startswith(("data:", "blob:")) else None

@@ -68,7 +68,6 @@ def inside(pages: Sequence[Page]) -> Viewable:
     opened = {0}
     tabs = pn.Tabs(
         *((page.title, view) for page, view in zip(pages, views, strict=True)),
-        dynamic=True,
         sizing_mode="stretch_both",
     )
 

@@ -1,42 +1,42 @@
-"""The server of the app: on this machine alone, for whoever has the token, while someone looks."""
+"""The server of the app: on this machine alone, for whoever has its signed address, while someone looks."""
 
 from __future__ import annotations
 
 import logging
+import secrets
 import time
 from collections.abc import Sequence
 
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
+from bokeh.util.token import generate_session_id
 from panel.io.application import build_applications
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.netutil import bind_sockets
+from tornado.web import HTTPError, RequestHandler
 
-from speckle3d.app.guard import LOOPBACK, Careful, Gate, Guard
 from speckle3d.app.look import shell
 from speckle3d.app.page import Page
 from speckle3d.core.errors import FileError
 
+LOOPBACK = "127.0.0.1"
 UNSEEN_S = 600.0
 """Without a viewer for so long, the server ends."""
 
 _LOOK_S = 1.0
-_MOST_HEADER_BYTES = 32 * 1024
-_MOST_BODY_BYTES = 1024
-"""Of requests, none of which has a body."""
-
-_MOST_MESSAGE_BYTES = 4 * 2**20
-"""Of what a page sends: a drawn outline of a hundred thousand corners."""
 
 
 class AppServer:
     """Serve pages until nobody looks any more.
 
+    Bokeh serves a session alone whose identity is signed: the page and its websocket answer 403 without, and
+    to pages of other origins. There is no cookie: browsers send those to every port of this machine.
+
     Parameters
     ----------
     pages : sequence of Page
-        Shared by all viewers; each is shown views of their own.
+        Shared by all viewers.
     title : str
         Name of what is looked at.
     port : int
@@ -53,43 +53,37 @@ class AppServer:
     def __init__(self, pages: Sequence[Page], title: str, port: int = 0, unseen_s: float = UNSEEN_S) -> None:
         self._unseen_s, self._seen_s = unseen_s, time.monotonic()
         self._sessions: set[str] = set()
-        self._guard = Guard()
         try:
             sockets = bind_sockets(port, LOOPBACK)
         except OSError as error:
             raise FileError(f"port {port}: expected a free one: {error.strerror or error}") from error
-        self._port: int = sockets[0].getsockname()[1]
+        self._origin = f"http://{LOOPBACK}:{sockets[0].getsockname()[1]}"
+        key = secrets.token_bytes(32)
+        self.address = f"{self._origin}/?bokeh-session-id={generate_session_id(key, signed=True)}"
+        self._tickets: dict[str, str] = {}
+        own_port = self._origin.rpartition(":")[2]
         application = BokehTornado(
             build_applications(lambda: shell(pages, title), title=f"{title} - speckle3d"),
-            # The gate looks at origins, by the name that was asked for.
-            extra_websocket_origins=["*"],
-            secret_key=self._guard.secret_key,
+            extra_websocket_origins=[f"{LOOPBACK}:{own_port}", f"localhost:{own_port}"],
+            extra_patterns=[(r"/once/([\w-]+)", _Once, {"addresses": self._tickets})],
+            secret_key=key,
             sign_sessions=True,
-            websocket_max_message_size_bytes=_MOST_MESSAGE_BYTES,
+            generate_session_ids=False,
             # What is refused is told to who asked, not to the terminal.
             log_function=lambda _: None,
         )
-        application.add_transform(Careful)
-        http = HTTPServer(
-            Gate(application, self._guard),
-            max_header_size=_MOST_HEADER_BYTES,
-            max_body_size=_MOST_BODY_BYTES,
-            idle_connection_timeout=60.0,
-        )
+        http = HTTPServer(application)
         http.add_sockets(sockets)
         self._server = BaseServer(IOLoop.current(), application, http)
 
-    @property
-    def address(self) -> str:
-        """What to open in a browser, with the token."""
-        return self._address(self._guard.token)
-
     def address_for_once(self) -> str:
-        """Address that leads to `address` at its first use and nowhere after."""
-        return self._address(self._guard.ticket())
+        """Address that leads to `address` at its first use and nowhere after.
 
-    def _address(self, token: str) -> str:
-        return f"http://{LOOPBACK}:{self._port}/?token={token}"
+        A browser is started with its address as an argument, and other users see arguments.
+        """
+        ticket = secrets.token_urlsafe(32)
+        self._tickets[ticket] = self.address.removeprefix(self._origin)
+        return f"{self._origin}/once/{ticket}"
 
     def run(self) -> None:
         """Serve until nobody has looked for a while, or the process is told to end."""
@@ -113,6 +107,18 @@ class AppServer:
             self._seen_s = now
         elif now - self._seen_s > self._unseen_s:
             self._server.io_loop.stop()
+
+
+class _Once(RequestHandler):
+    """Send on to an address whoever has its ticket first."""
+
+    def initialize(self, addresses: dict[str, str]) -> None:
+        self._addresses = addresses
+
+    def get(self, ticket: str) -> None:
+        if ticket not in self._addresses:
+            raise HTTPError(403)
+        self.redirect(self._addresses.pop(ticket))
 
 
 def _is_no_farewell(record: logging.LogRecord) -> bool:

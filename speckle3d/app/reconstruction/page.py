@@ -184,13 +184,14 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
             None if trust is None else trust.covariance,
         )
         drift = plot_curves(curves)
-        drift.update_layout(height=None)
+        drift.update_layout(
+            height=None, font_size=9, showlegend=False, updatemenus=[], margin={"t": 10, "r": 10}
+        )
         over_frames = pn.pane.Plotly(drift, sizing_mode="stretch_both")
         self._draw_planes()
         return pn.Tabs(
             ("in space", self._space),
             ("over the frames", over_frames),
-            dynamic=True,
             sizing_mode="stretch_both",
         )
 

@@ -23,6 +23,7 @@ _REJECTED = "#ff4d4d"
 _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
 _UNITS = {"distance": "mm", "sigma": "mm", "correlation": ""}
+_PATCHES = "x", "y", "angle", "value", "alpha", "line", "cross", "state", "distance", "sigma", "correlation"
 _ROW_PX, _LEFT_PX = 16, 108
 
 
@@ -40,7 +41,7 @@ class ImagePlot:
     def __init__(self, grid: ImageGrid, patch_mm: tuple[float, float]) -> None:
         self.levels = LinearColorMapper(palette=Greys256, low=0.0, high=255.0)
         self._image = ColumnDataSource({"image": []}, name="sweep image")
-        self._patches = ColumnDataSource({})
+        self._patches = ColumnDataSource({name: [] for name in _PATCHES})
         self._colours = LinearColorMapper(palette=Viridis256, low=0.0, nan_color="rgba(0,0,0,0)")
         self.plot = figure(
             x_axis_label="lateral / mm", y_axis_label="depth / mm", match_aspect=True,
@@ -79,7 +80,7 @@ class ImagePlot:
         """Draw patches coloured by a quantity from zero to `most`; none where there are none."""
         self._bar.visible = patches is not None
         if patches is None:
-            self._patches.data = {name: [] for name in self._patches.data}
+            self._patches.data = {name: [] for name in _PATCHES}
             return
         known = np.isfinite(patches.distance_mm)
         used = np.ones(len(known), bool) if patches.used is None else patches.used
@@ -118,7 +119,7 @@ class TimePlots:
         ends = self._time_s[[0, -1]] + 2 * self._half_s * np.array([-1, 1])
         self._range = Range1d(start=float(ends[0]), end=float(ends[1]), min_interval=8 * self._half_s)
         self.cursor = Span(dimension="height", line_color="#cc0000", line_width=1.5)
-        self._marks = ColumnDataSource({})
+        self._marks = ColumnDataSource({name: [] for name in ("row", "left", "right", "colour", "words")})
         self.marks = self._plot(_ROW_PX, y_range=FactorRange(factors=["no frame"]))
         marks = self.marks.hbar(
             "row", left="left", right="right", height=0.7, color="colour", source=self._marks

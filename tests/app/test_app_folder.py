@@ -1,0 +1,51 @@
+"""Where the app may write."""
+
+import os
+
+import pytest
+
+from speckle3d.app.folder import Folder
+from speckle3d.core.errors import FileError, InvalidInputError
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "sweep.h5").write_bytes(b"sweep")
+    return Folder(tmp_path / "sweep.h5")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        " ",
+        "..",
+        "../a.csv",
+        "/x/a.csv",
+        "a/b.csv",
+        "a\\b.csv",
+        ".hidden",
+        "a\0.csv",
+        "C:a.csv",
+        "x" * 201,
+    ],
+)
+def test_only_a_new_name_in_it_is_taken(folder, tmp_path, name):
+    os.symlink(tmp_path.parent / "elsewhere.csv", tmp_path / "link.csv")
+    for wrong in (name, "sweep.h5", "link.csv"):
+        with pytest.raises(InvalidInputError):
+            folder.save(wrong, lambda path: path.write_text("new"))
+    assert (tmp_path / "sweep.h5").read_bytes() == b"sweep"
+    assert not (tmp_path.parent / "elsewhere.csv").exists()
+
+
+def test_a_file_appears_whole_or_not_at_all(folder, tmp_path):
+    assert folder.save("points.csv", lambda path: path.write_text("1,2")).read_text() == "1,2"
+
+    def breaks(path):
+        path.write_text("1,")
+        raise FileError("no")
+
+    with pytest.raises(FileError):
+        folder.save("more.csv", breaks)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["points.csv", "sweep.h5"]
