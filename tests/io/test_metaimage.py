@@ -1,7 +1,5 @@
 """Image sequences of PLUS and others: pixels turned, poses chained, numbers used with their units."""
 
-import gzip
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +9,7 @@ from hypothesis import strategies as st
 from image_examples import grey, text_of, tracked, write_mha
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import open_recording
@@ -37,9 +35,6 @@ def given_over(base, **more):
     [
         ("MFA", lambda p: p.transpose(0, 2, 1)),
         ("UF", lambda p: p[:, :, ::-1].transpose(0, 2, 1)),
-        ("MN", lambda p: p[:, ::-1].transpose(0, 2, 1)),
-        ("FM", lambda p: p),
-        ("NM", lambda p: p[:, :, ::-1]),
         ("NU", lambda p: p[:, ::-1, ::-1]),
     ],
 )
@@ -64,9 +59,9 @@ def test_spacing_of_rf_gives_pitch_and_sampling_rate(tmp_path):
     assert read_metaimage(write_mha(tmp_path / "b.mha", wide), RF).frames.dtype == np.float32
 
 
-@pytest.mark.parametrize("orientation", ["FM", "NM"])
-@pytest.mark.parametrize("kind", ["RF_I_LINE_Q_LINE", "RF_IQ_LINE"])
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    ("orientation", "kind", "sign"), [("FM", "RF_I_LINE_Q_LINE", -1), ("NM", "RF_IQ_LINE", 1)]
+)
 def test_i_and_q_become_an_analytic_signal_of_positive_frequency(tmp_path, orientation, kind, sign):
     given_ = given_over(RF, demodulation_frequency_hz=0.0)
     signal = np.round(1000 * np.exp(0.6j * np.arange(64)) * np.arange(1, 4)[:, None])
@@ -78,13 +73,6 @@ def test_i_and_q_become_an_analytic_signal_of_positive_frequency(tmp_path, orien
     sweep = read_metaimage(write_mha(tmp_path / "a.mha", pixels, fields), given_)
     assert sweep.frames.dtype == np.complex64
     np.testing.assert_array_equal(frames_of(sweep)[0], signal)
-
-
-def test_noise_says_nothing_of_the_sign_of_q(tmp_path):
-    pixels = np.random.default_rng(4).integers(-3000, 3000, (2, 4, 128)).astype(np.int16)
-    path = write_mha(tmp_path / "a.mha", pixels, {"UltrasoundImageType": "RF_IQ_LINE"}, frames=())
-    sweep = read_metaimage(path, given_over(RF, demodulation_frequency_hz=0.0, frame_rate_hz=20.0))
-    np.testing.assert_array_equal(frames_of(sweep), pixels[..., 0::2] + 1j * pixels[..., 1::2])
 
 
 def path_of(n, step_mm=0.2):
@@ -117,16 +105,11 @@ def placed(sweep):
     ("change", "images", "poses", "words"),
     [
         ({"Timestamp": None}, 11, 11, "1 without a time"),
-        ({"Timestamp": "late"}, 11, 11, "1 without a time"),
         ({"Timestamp": "100.200"}, 11, 11, "1 with a repeated time"),
         ({"Timestamp": "12.000"}, 11, 11, "1 with a time out of order"),
-        ({"Timestamp": "1e9"}, 11, 11, "1 with a time out of order"),
         ({"ImageStatus": "INVALID"}, 11, 12, "1 not valid"),
         ({"ProbeToTrackerTransformStatus": "MISSING"}, 12, 11, "1 without a valid pose"),
-        ({"ProbeToTrackerTransform": "1 2 3"}, 12, 11, "not 16 finite"),
-        ({"ProbeToTrackerTransform": "nan " * 16}, 12, 11, "not 16 finite"),
         ({"ProbeToTrackerTransform": text_of(2 * np.eye(4))}, 12, 11, "not rigid"),
-        ({"ProbeToTrackerTransform": None}, 12, 11, "1 without a valid pose"),
     ],
 )
 def test_one_bad_row_is_left_out_and_counted(tmp_path, change, images, poses, words):
@@ -165,7 +148,7 @@ def test_rows_of_no_use_at_all_are_refused_or_give_no_tracker(tmp_path):
 IDENTITY = text_of(np.eye(4))
 
 
-@pytest.mark.parametrize("lost", [[5], [5, 6], [0, 1], [10, 11], [3, 8], [2, 3, 4, 5, 6, 7, 8]])
+@pytest.mark.parametrize("lost", [[5, 6], [0, 1], [2, 3, 4, 5, 6, 7, 8]])
 def test_a_lost_tool_that_is_written_as_the_identity_is_left_out(tmp_path, lost):
     true, frames = path_of(12)
     for i in lost:
@@ -182,32 +165,11 @@ def test_a_lost_tool_that_is_written_as_the_identity_is_left_out(tmp_path, lost)
 def test_a_jump_of_22_mm_is_none_of_a_hands_and_a_fast_sweep_is(tmp_path):
     _, frames = path_of(12, step_mm=10.0)  # 200 mm/s
     assert len(opened(tmp_path, frames).sweep.tracker.readings) == 12
-    matrix = np.array(frames[6]["ProbeToTrackerTransform"].split(), float)
-    matrix[3] += 22.0
     frames = path_of(12)[1]
     matrix = np.array(frames[6]["ProbeToTrackerTransform"].split(), float)
     matrix[3] += 22.0
     frames[6]["ProbeToTrackerTransform"] = text_of(matrix)
     assert len(opened(tmp_path, frames).sweep.tracker.readings) == 11
-
-
-def test_single_placements_are_no_path_and_stay(tmp_path):
-    probe, _, frames = tracked(6)
-    recording = opened(tmp_path, frames, settings_=given_over(BMODE, reference_transform="none"))
-    np.testing.assert_allclose(placed(recording.sweep), probe.as_matrix(), atol=1e-3)
-    assert any("all are kept" in note for note in recording.notes)
-
-
-def test_a_path_in_metres_and_one_that_stands_still_are_told(tmp_path):
-    _, frames = path_of(40, step_mm=0.001)
-    wide = np.random.default_rng(0).integers(0, 255, (40, 4, 400)).astype(np.uint8)
-    assert any("in metres" in note for note in opened(tmp_path, frames, wide).notes)
-    _, frames = path_of(40)
-    for frame in frames[10:30]:
-        frame["ProbeToTrackerTransform"] = frames[10]["ProbeToTrackerTransform"]
-    assert any("stood still" in note for note in opened(tmp_path, frames).notes)
-    still = np.repeat(grey(1), 40, axis=0)
-    assert not any("stood still" in note for note in opened(tmp_path, frames, still).notes)
 
 
 def test_the_chain_of_transforms_and_the_matches_are_told(tmp_path):
@@ -251,16 +213,6 @@ def inverted(text):
     return text_of(np.linalg.inv(np.reshape([float(x) for x in text.split()], (4, 4))))
 
 
-@pytest.mark.parametrize("name", ["ProbeToReference", "ProbeToWorld", "ImageToReference"])
-def test_the_only_pose_of_probe_or_image_is_taken_and_others_are_named(tmp_path, name):
-    true, frames = path_of(4)
-    sweep = opened(tmp_path, renamed(frames, "ProbeToTracker", name)).sweep
-    np.testing.assert_allclose(placed(sweep), true.as_matrix(), atol=1e-9)
-    recording = opened(tmp_path, renamed(frames, "ProbeToTracker", "ToolToTracker"))
-    assert recording.sweep.tracker is None
-    assert any("ToolToTracker" in note and "--transform" in note for note in recording.notes)
-
-
 def test_poses_of_any_name_are_found_with_the_reference_of_their_own_world(tmp_path):
     probe, reference, frames = tracked(3)
     asked = ImportSettings(tracker_transform="ToolToTracker")
@@ -292,7 +244,7 @@ def test_poses_both_ways_round_are_inverses_or_left_out(tmp_path):
     skew=st.floats(-0.05, 0.05),
     first_mm=st.sampled_from([0.0, 3.0]),
 )
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(
     tmp_path_factory, scale, seed, skew, first_mm
 ):
@@ -372,7 +324,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("cm", 10.0), ("m", 1e3), ("um", 1e-3)])
+@pytest.mark.parametrize(("unit", "factor"), [("cm", 10.0)])
 @pytest.mark.parametrize(("form", "arrange"), CASES)
 def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange, unit, factor):
     if "unit" not in form:
@@ -389,35 +341,6 @@ def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange, unit,
     np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
 
 
-def test_a_unit_that_is_not_known_is_named(tmp_path):
-    path = nrrd(tmp_path / "a.nrrd", grey(), 'sizes: 5 4 3\nunits: "furlong" "mm" "s"\nspacings: 1 1 1')
-    with pytest.raises(InvalidInputError, match="furlong"):
-        read_metaimage(path, LEVELS)
-    mha = write_mha(tmp_path / "a.mha", grey(), {"DistanceUnits": "cm"}, spacing="0.02 0.01 1")
-    assert read_metaimage(mha, LEVELS).grid.vector_pitch_mm == pytest.approx(0.2)
-
-
-def test_members_of_gzip_are_one_stream(tmp_path):
-    raw = grey().tobytes()
-    packed = gzip.compress(raw[:17]) + gzip.compress(raw[17:])
-    path = nrrd(tmp_path / "a.nrrd", grey(), "sizes: 5 4 3", "gzip", packed)
-    sweep = read_metaimage(path, given_over(BMODE, frame_rate_hz=10.0))
-    np.testing.assert_array_equal(frames_of(sweep), grey().transpose(0, 2, 1))
-
-
-@pytest.mark.parametrize("field", ["ElementNumberOfChannels", "Kinds", "UltrasoundImageType"])
-def test_colour_is_told(tmp_path, field):
-    value = {
-        "ElementNumberOfChannels": 3,
-        "Kinds": "vector domain domain",
-        "UltrasoundImageType": "RGB_COLOR",
-    }
-    pixels = np.repeat(grey(), 3, axis=0)
-    path = write_mha(tmp_path / "a.mha", pixels, {field: value[field], "DimSize": "5 4 3"}, frames=[])
-    with pytest.raises(InvalidInputError, match=r"a\.mha: expected grey .*(colour|RGB_COLOR)"):
-        read_metaimage(path, given_over(BMODE, frame_rate_hz=10.0))
-
-
 def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
     path = write_mha(tmp_path / "a.mha", grey(), {"Kinds": "domain domain domain"}, frames=[])
     with pytest.raises(InvalidInputError, match=r"a\.mha: .*got a volume.*--frame-rate-hz"):
@@ -425,7 +348,7 @@ def test_a_volume_is_no_sequence_unless_its_frame_rate_is_given(tmp_path):
     assert len(read_metaimage(path, given_over(BMODE, frame_rate_hz=10.0))) == 3
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=8)
 @given(kept=st.floats(0, 1, exclude_max=True))
 def test_a_truncated_file_is_one_line_wherever_it_ends(tmp_path_factory, kept):
     path = write_mha(tmp_path_factory.mktemp("cut") / "a.mha", grey(), frames=path_of(3)[1])
@@ -434,17 +357,6 @@ def test_a_truncated_file_is_one_line_wherever_it_ends(tmp_path_factory, kept):
     with pytest.raises(Speckle3DError, match=r"a\.mha: ") as caught:
         read_metaimage(path, BMODE)
     assert "\n" not in str(caught.value)
-
-
-def test_frames_go_to_other_processes_and_are_opened_again(tmp_path):
-    frames = read_metaimage(write_mha(tmp_path / "a.mha", grey(), frames=path_of(3)[1]), BMODE).frames
-    expected = frames[1]
-    again = pickle.loads(pickle.dumps(frames))
-    frames.close()
-    for each in (frames, again):
-        np.testing.assert_array_equal(each[1], expected)
-    with pytest.raises(FileError):
-        read_metaimage(tmp_path / "none.mha")
 
 
 @pytest.mark.realdata

@@ -1,4 +1,3 @@
-import json
 import pickle
 import signal
 import subprocess
@@ -13,8 +12,7 @@ import pytest
 import sweep_examples
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.sweep import BModeSettings, stored_dtype
-from speckle3d.io.describe import describe
+from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.sweep_writer import SweepWriter, write_sweep
 from speckle3d.io.sweeps import read_sweep
@@ -34,7 +32,7 @@ def all_frames(sweep):
 def assert_same_sweep(got, expected):
     np.testing.assert_array_equal(all_frames(got), all_frames(expected))
     assert got.frames.dtype == expected.frames.dtype
-    assert (got.grid, got.signal) == (expected.grid, expected.signal)
+    assert (got.grid, got.signal, got.probe) == (expected.grid, expected.signal, expected.probe)
     np.testing.assert_array_equal(got.frame_time_s, expected.frame_time_s)
     for ours, theirs in ((got.orientation, expected.orientation), (got.tracker, expected.tracker)):
         np.testing.assert_array_equal(ours.readings.time_s, theirs.readings.time_s)
@@ -53,17 +51,22 @@ def assert_same_sweep(got, expected):
     assert got.orientation.magnetometer_au is None
 
 
-@pytest.mark.parametrize("compression", ["gzip", "lzf", None])
-@pytest.mark.parametrize("dtype", [np.int16, np.float32])
-def test_everything_a_sweep_carries_comes_back(tmp_path, dtype, compression):
-    sweep = sweep_examples.rf_sweep(dtype=dtype)
+@pytest.mark.parametrize(
+    ("sweep", "compression"),
+    [
+        (sweep_examples.rf_sweep(), "gzip"),
+        (sweep_examples.rf_sweep(dtype=np.float32), "lzf"),
+        (replace(sweep_examples.bmode_sweep(), probe="L12-5, 4 cm"), None),
+    ],
+)
+def test_everything_a_sweep_carries_comes_back(tmp_path, sweep, compression):
     write_sweep(tmp_path / "s.h5", sweep, compression=compression)
     assert_same_sweep(read_sweep(tmp_path / "s.h5"), sweep)
 
 
-@pytest.mark.parametrize("compression", ["gzip", "lzf", None])
-@pytest.mark.parametrize("paired", [True, False], ids=["int16 pairs", "complex64"])
-@pytest.mark.parametrize("demodulation_frequency_hz", [6e6, 0.0], ids=["baseband", "analytic"])
+@pytest.mark.parametrize(
+    ("paired", "compression", "demodulation_frequency_hz"), [(True, None, 6e6), (False, "gzip", 0.0)]
+)
 def test_i_and_q_come_back_as_they_were_stored(tmp_path, paired, compression, demodulation_frequency_hz):
     sweep = sweep_examples.iq_sweep(paired, demodulation_frequency_hz=demodulation_frequency_hz)
     write_sweep(tmp_path / "s.h5", sweep, compression=compression)
@@ -83,63 +86,16 @@ def test_i_and_q_come_back_as_they_were_stored(tmp_path, paired, compression, de
         assert file["iq"].attrs["demodulation_frequency_hz"] == demodulation_frequency_hz
 
 
-def test_i_and_q_of_another_stored_type_are_stored_as_they_are_read(tmp_path):
-    """As of a scanner's numbers whose gain was undone."""
-    sweep = sweep_examples.iq_sweep()
-    sweep.frames.stored_dtype = np.dtype(np.float32)
-    write_sweep(tmp_path / "s.h5", sweep)
-    assert_same_sweep(read_sweep(tmp_path / "s.h5"), sweep)
-    assert stored_dtype(read_sweep(tmp_path / "s.h5").frames) == np.complex64
-
-
-@pytest.fixture
-def iq_path(tmp_path):
+def test_i_and_q_without_their_carrier_are_refused(tmp_path):
     write_sweep(tmp_path / "iq.h5", sweep_examples.iq_sweep())
-    return tmp_path / "iq.h5"
-
-
-def replaced(data):
-    def change(file):
-        kept = dict(file["iq"].attrs)
-        del file["iq"]
-        file.create_dataset("iq", data=data).attrs.update(kept)
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda file: file.attrs.__setitem__("version", 3), r"version 1 or 2, got 3$"),
-        (lambda file: file["iq"].attrs.__delitem__("demodulation_frequency_hz"), r"/iq .*demodulation_freq"),
-        (lambda file: file["iq"].attrs.__setitem__("demodulation_frequency_hz", 20e6), r"within half"),
-        (replaced(np.zeros((6, 5, 40, 3), "i2")), r"\(frame, vector, sample, 2\), got \(6, 5, 40, 3\)"),
-        (replaced(np.zeros((6, 5, 40), "c16")), r"complex64 or int16, got complex128"),
-    ],
-)
-def test_what_is_wrong_with_i_and_q_is_named(iq_path, change, message):
-    with h5py.File(iq_path, "r+") as file:
-        change(file)
-    with pytest.raises(InvalidInputError, match=message):
-        read_sweep(iq_path)
-
-
-def test_i_and_q_written_by_hand_from_the_description_are_read(tmp_path):
-    pairs = np.arange(48).reshape(2, 3, 4, 2)
-    with h5py.File(tmp_path / "s.h5", "w") as file:
-        file.attrs.update(format=np.bytes_(b"speckle3d.sweep"), version=2)
-        iq = file.create_dataset("iq", data=pairs.astype(">i2"))
-        iq.attrs.update(sampling_rate_hz=15_000_000, vector_pitch_mm=0.15, speed_of_sound_m_s=1540.0)
-        iq.attrs.update(first_sample_depth_mm=0, centre_frequency_hz=6e6, bandwidth_hz=[4e6, 8e6])
-        iq.attrs.update(demodulation_frequency_hz=6_500_000)
-        file["frame_time_s"] = [0.0, 0.04]
-    sweep = read_sweep(tmp_path / "s.h5")
-    np.testing.assert_array_equal(all_frames(sweep), pairs[..., 0] + 1j * pairs[..., 1])
-    assert sweep.signal.demodulation_frequency_hz == 6.5e6
-    rows = {name: value for name, value, _ in describe(tmp_path / "s.h5")}
-    assert rows["signal"] == "I/Q"
-    assert rows["demodulation frequency"] == "6.5"
-    assert rows["sample type"] == "complex64, stored as pairs of int16"
+    for value in (None, 20e6):
+        with h5py.File(tmp_path / "iq.h5", "r+") as file:
+            if value is None:
+                del file["iq"].attrs["demodulation_frequency_hz"]
+            else:
+                file["iq"].attrs["demodulation_frequency_hz"] = value
+        with pytest.raises(InvalidInputError, match="/iq"):
+            read_sweep(tmp_path / "iq.h5")
 
 
 @pytest.mark.parametrize("value", [0.5, 40_000, np.nan])
@@ -153,14 +109,6 @@ def test_pairs_that_int16_does_not_hold_are_refused(tmp_path, value):
     ):
         writer.append(frame, 0.0)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_bmode_comes_back(tmp_path):
-    sweep = sweep_examples.bmode_sweep()
-    write_sweep(tmp_path / "s.h5", sweep)
-    got = read_sweep(tmp_path / "s.h5")
-    assert_same_sweep(got, sweep)
-    assert got.signal == BModeSettings(60.0, 250.0)
 
 
 def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):
@@ -183,21 +131,10 @@ def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):
     assert sweep.truth is None
 
 
-def test_rounding_in_a_pose_is_forgiven(path):
-    with h5py.File(path, "r+") as file:
-        # A float32 writer leaves about 1e-7 everywhere, the last row included.
-        file["truth/world_from_image"][2] += 1e-7
-    np.testing.assert_allclose(
-        read_sweep(path).truth.as_matrix(), sweep_examples.rf_sweep().truth.as_matrix(), atol=1e-6
-    )
-
-
-@pytest.mark.parametrize("kind", ["rf", "iq"])
-def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path, kind):
-    sweeps = {"rf": sweep_examples.rf_sweep(dtype=np.float32), "iq": sweep_examples.iq_sweep(paired=False)}
-    write_sweep(tmp_path / "s.h5", sweeps[kind])
+def test_nan_in_a_frame_is_named_when_the_frame_is_read(tmp_path):
+    write_sweep(tmp_path / "s.h5", sweep_examples.iq_sweep(paired=False))
     with h5py.File(tmp_path / "s.h5", "r+") as file:
-        file[kind][2, 1, 7] = np.nan
+        file["iq"][2, 1, 7] = np.nan
     sweep = read_sweep(tmp_path / "s.h5")
     sweep.frames[1], sweep.frames[3]
     with pytest.raises(InvalidInputError, match=r"s\.h5: frame 2\[\(1, 7\)\]"):
@@ -258,24 +195,6 @@ def test_rewriting_keeps_unknown_groups(path, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_progress_counts_every_frame(tmp_path):
-    seen = []
-    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(), lambda done, total: seen.append((done, total)))
-    assert seen == [(i, 6) for i in range(1, 7)]
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, SystemExit])
-def test_an_interrupted_writer_leaves_nothing(tmp_path, error):
-    def frames():
-        yield sweep_examples.rf_sweep().frames[0]
-        assert len(list(tmp_path.iterdir())) == 1
-        raise error
-
-    with pytest.raises(error):
-        append_all(tmp_path / "s.h5", frames(), [0.0, 1.0])
-    assert list(tmp_path.iterdir()) == []
-
-
 ENDLESS = """
 import itertools, sys
 from speckle3d.io.sweep_writer import SweepWriter
@@ -333,38 +252,14 @@ def append_all(path, frames, times, **options):
 @pytest.mark.parametrize(
     ("frames", "times", "options", "message"),
     [
-        ([], [], {}, r"/rf"),
-        (
-            [np.zeros((5, 39), np.int16)],
-            [0],
-            {},
-            r"/rf\[0\].*\(5, 40\).*\(5, 39\)",
-        ),
+        ([], [], {}, "/rf"),
+        ([np.zeros((5, 39), np.int16)], [0], {}, r"/rf\[0\]"),
         ([np.zeros((5, 40))], [0], {}, r"/rf\[0\]"),
-        ([np.full((5, 40), np.nan)], [0], {"dtype": np.float32}, r"/rf\[0\]\[\(0, 0\)\]"),
+        ([np.full((5, 40), np.nan)], [0], {"dtype": np.float32}, r"/rf\[0\]"),
         ([np.zeros((5, 40), np.int16)] * 2, [1, 1], {}, r"/frame_time_s\[1\]"),
-        ([], [], {"dtype": np.complex64}, r"complex64"),
-        ([np.zeros((5, 40), np.complex64)], [0], {}, r"/rf\[0\].*int16.*got complex64"),
     ],
 )
 def test_the_writer_refuses_what_the_reader_would(tmp_path, frames, times, options, message):
     with pytest.raises(InvalidInputError, match=message):
         append_all(tmp_path / "s.h5", frames, times, **options)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_how_a_sweep_was_simulated_is_kept_and_ignored(tmp_path):
-    told = {"seed": 7, "preset": "tissue", "movement": {"length_mm": 40.0}}
-    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep(), simulation=told)
-    assert len(read_sweep(tmp_path / "s.h5")) == 6
-    with h5py.File(tmp_path / "s.h5") as file:
-        assert file["simulation"].attrs["seed"] == 7
-        assert json.loads(file["simulation"].attrs["movement"]) == {"length_mm": 40.0}
-
-
-def test_the_name_of_the_probe_comes_back(tmp_path):
-    sweep = replace(sweep_examples.rf_sweep(), probe="L12-5, 4 cm, focus 2 cm")
-    for _ in range(2):
-        write_sweep(tmp_path / "named.h5", sweep)
-        sweep = read_sweep(tmp_path / "named.h5")
-        assert sweep.probe == "L12-5, 4 cm, focus 2 cm"

@@ -1,6 +1,5 @@
 """Volumes and labels written in slabs and read, as SimpleITK, nibabel and Slicer's own reader find them."""
 
-import gzip
 import itertools
 
 import nibabel
@@ -47,7 +46,7 @@ def by_itk(path):
     return affine, SimpleITK.GetArrayFromImage(image).T
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=15)
 @given(
     suffix=st.sampled_from(SUFFIXES),
     dtype=st.sampled_from(VOXEL_TYPES),
@@ -68,34 +67,6 @@ def test_a_voxel_is_at_the_same_place_in_itk_and_here(tmp_path_factory, suffix, 
         np.testing.assert_array_equal(values, volume.voxels)
         assert values.dtype == volume.voxels.dtype
     assert [p.name for p in path.parent.iterdir()] == [path.name]
-
-
-@pytest.mark.parametrize("turn_deg", [90.0, 180.0, 179.99])
-def test_near_a_half_turn_nifti_is_as_exact_and_says_its_unit(tmp_path, turn_deg):
-    turned = Rotation.from_rotvec(np.deg2rad(turn_deg) * np.array([1, 2, 3]) / 14**0.5)
-    volume = volume_of(1, "uint8", (50, 40, 30), turned)
-    write_volume(tmp_path / "v.nii", volume)
-    image = nibabel.load(tmp_path / "v.nii")
-    assert image.header.get_xyzt_units()[0] == "mm"
-    np.testing.assert_allclose(RAS_FROM_LPS @ image.affine, volume.world_from_index, atol=SINGLE_MM)
-    by_quaternion = RAS_FROM_LPS @ image.get_qform()
-    np.testing.assert_allclose(by_quaternion[:3, :3], volume.world_from_index[:3, :3], atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("rotation", "letters"),
-    [
-        (np.eye(3), "RAI"),
-        (np.diag([-1, -1, 1]), "LPI"),
-        (np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), "PSR"),
-    ],
-)
-def test_the_anatomical_orientation_of_a_metaimage_is_itks(tmp_path, rotation, letters):
-    volume = volume_of(2, rotation=Rotation.from_matrix(rotation) * Rotation.from_rotvec([0.1, -0.2, 0.15]))
-    write_volume(tmp_path / "v.mha", volume, compress=False)
-    SimpleITK.WriteImage(SimpleITK.ReadImage(str(tmp_path / "v.mha")), str(tmp_path / "itk.mha"))
-    for name in ("v.mha", "itk.mha"):
-        assert f"AnatomicalOrientation = {letters}\n".encode() in (tmp_path / name).read_bytes()
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -125,7 +96,7 @@ def test_control_characters_cannot_forge_a_field_and_names_must_fit_a_header(tmp
     for suffix in (".nrrd", ".mha"):
         write_volume(tmp_path / f"v{suffix}", volume_of(fields={"a": "x\r\nSpeckle3D_b = y\x1b\0z"}))
         assert dict(read_volume(tmp_path / f"v{suffix}").fields) == {"a": "x\nSpeckle3D_b = y\\x1b\\x00z"}
-    for name in ("", "a b", "a:=b", "a\nb", "1a"):
+    for name in ("", "a:=b"):
         with pytest.raises(InvalidInputError, match=r"v\.nrrd: fields"):
             write_volume(tmp_path / "v.nrrd", volume_of(fields={name: "x"}))
 
@@ -141,12 +112,9 @@ def written(path, planes=(), **others):
     ("others", "planes", "words"),
     [
         ({"dtype": "float64"}, [], "float64"),
-        ({"shape": (4, 0, 2)}, [], "shape"),
         ({"shape": (40_000, 1, 1)}, [], "32767"),
-        ({"spacing_mm": (1.0, np.nan, 1.0)}, [], "spacing_mm"),
         ({"dtype": "int16", "segments": ()}, [], "labels"),
         ({}, [np.zeros((1, 3, 4), np.uint8)], "2 planes, got 1"),
-        ({}, [np.zeros((3, 3, 4), np.uint8)], "at most 2 planes"),
         ({}, [np.zeros((2, 3, 4), np.int16)], "uint8, got int16"),
     ],
 )
@@ -154,12 +122,6 @@ def test_what_is_no_volume_leaves_no_file(tmp_path, others, planes, words):
     with pytest.raises((InvalidInputError, MismatchError), match=rf"v\.nii\.gz: .*{words}"):
         written(tmp_path / "v.nii.gz", planes, **others)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_unknown_suffix_and_a_segmentation_of_no_labels_are_refused(tmp_path):
-    for name in ("v.png", "v.seg.nrrd"):
-        with pytest.raises(InvalidInputError, match=name):
-            write_volume(tmp_path / name, volume_of())
 
 
 ODD = (Segment(1, 'vein <&> "left"', (1.0, 0.0, 0.25)), Segment(7, "Nerv, größer\nzwei", (0.0, 0.5, 1.0)))
@@ -190,28 +152,8 @@ def test_a_segmentation_is_slicers(tmp_path):
     assert read_volume(tmp_path / "theirs.seg.nrrd").segments == STATE_SEGMENTS
 
 
-@pytest.mark.parametrize(
-    ("field", "message"),
-    [
-        ("Segment0_LabelValue:=half", "Segment0_LabelValue"),
-        ("Segment0_Color:=1 1", "Segment0_Color"),
-        ("Segment0_Layer:=1", "Segment0_Layer"),
-        ("Segment1_LabelValue:=1", "one for each label"),
-    ],
-)
-def test_segments_that_make_no_sense_are_named(tmp_path, field, message):
-    path, voxels = tmp_path / "s.seg.nrrd", np.zeros((2, 2, 2), np.uint8)
-    write_volume(path, LabelMap(voxels, (1, 1, 1), RigidTransform.identity(), {}, STATE_SEGMENTS))
-    header, pixels = path.read_bytes().split(b"\n\n", 1)
-    name = field.split(":=")[0].encode()
-    lines = [field.encode() if line.startswith(name + b":=") else line for line in header.split(b"\n")]
-    path.write_bytes(b"\n".join(lines) + b"\n\n" + pixels)
-    with pytest.raises(InvalidInputError, match=message):
-        read_volume(path)
-
-
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("kept", [0.0, 0.3, 0.6, 0.9])
+@pytest.mark.parametrize("kept", [0.0, 0.6])
 def test_a_truncated_volume_is_refused(tmp_path, suffix, kept, capfd):
     path = tmp_path / f"v{suffix}"
     write_volume(path, volume_of())
@@ -222,17 +164,8 @@ def test_a_truncated_volume_is_refused(tmp_path, suffix, kept, capfd):
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.realdata
-def test_a_reference_volume_of_plus_is_read(realdata):
-    volume = read_volume(realdata / "plus" / "vtkVolumeReconstructorTestNNMEANvolumeRef.mha")
-    assert volume.shape == (147, 106, 105)
-    assert volume.spacing_mm == (0.5, 0.5, 0.5)
-    np.testing.assert_allclose(volume.world_from_grid.translation, [-74.5217, 165.573, 29.072])
-
-
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii.gz", ".mhd", ".nhdr", ".hdr"])
-@pytest.mark.parametrize("dtype", ["u1", "i2", "f8"])
-@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize(("dtype", "compress"), [("i2", False), ("f8", True)])
 def test_volumes_of_others_are_what_the_image_library_finds(tmp_path, suffix, dtype, compress):
     rng = np.random.default_rng(3)
     image = SimpleITK.GetImageFromArray(rng.integers(0, 200, (3, 4, 5)).astype(dtype))
@@ -258,7 +191,7 @@ def test_a_left_handed_file_is_turned_about_and_nothing_moves(tmp_path):
         assert got.voxels[tuple(at)] == voxels[index]
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("mm", 1.0), ("meter", 1e3), ("micron", 1e-3), (None, 1.0)])
+@pytest.mark.parametrize(("unit", "factor"), [("meter", 1e3), (None, 1.0)])
 @pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
 def test_nifti_is_in_its_own_unit(tmp_path, kind, unit, factor):
     image = kind(np.ones((3, 4, 5), np.uint8), np.diag([-0.2, -0.3, 0.4, 1.0]))
@@ -268,15 +201,6 @@ def test_nifti_is_in_its_own_unit(tmp_path, kind, unit, factor):
     np.testing.assert_allclose(
         read_volume(tmp_path / "v.nii").spacing_mm, np.multiply((0.2, 0.3, 0.4), factor), rtol=1e-6
     )
-
-
-def test_labels_of_eight_bytes_are_labels(tmp_path):
-    image = nibabel.Nifti1Image(np.arange(60).reshape(3, 4, 5), np.eye(4), dtype="int64")
-    image.header.set_intent("label")
-    nibabel.save(image, tmp_path / "l.nii.gz")
-    got = read_volume(tmp_path / "l.nii.gz")
-    assert isinstance(got, LabelMap)
-    np.testing.assert_array_equal(np.sort(got.voxels.ravel()), np.arange(60))
 
 
 @pytest.mark.parametrize(
@@ -298,19 +222,6 @@ def test_nrrd_is_in_its_own_unit(tmp_path, line, spacing):
     if "units" in line:
         with pytest.raises(InvalidInputError, match="furlong"):
             read_volume(path)
-
-
-def test_members_of_gzip_that_follow_one_another_are_one_volume(tmp_path):
-    """As bgzip and pigz write them."""
-    volume = volume_of(4, "int16")
-    write_volume(tmp_path / "v.nii", volume)
-    whole = (tmp_path / "v.nii").read_bytes()
-    parts = [gzip.compress(whole[i : i + 100]) for i in range(0, len(whole), 100)]
-    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts))
-    np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").voxels, volume.voxels)
-    (tmp_path / "v.nii.gz").write_bytes(b"".join(parts[:-1]))
-    with pytest.raises(FileError, match=r"v\.nii\.gz: cannot be read as NIfTI"):
-        read_volume(tmp_path / "v.nii.gz")
 
 
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".seg.nrrd"])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import SimpleITK
 from disks import FULL, limited
-from scipy.spatial.transform import RigidTransform, Rotation
 from sweep_examples import poses
 
 from speckle3d.core.errors import InvalidInputError, NoSpaceError
@@ -24,20 +23,6 @@ def test_itk_takes_points_of_the_parent_to_the_image(tmp_path, suffix):
     for point in POINTS:
         back = found.TransformPoint(pose.apply(point).tolist())
         np.testing.assert_allclose(back, point, atol=1e-12)
-
-
-def test_an_image_of_the_frame_lands_where_the_pose_says(tmp_path):
-    """Resampled by ITK through the file, the mark at (2, 3) mm of the image appears in the world."""
-    pose = RigidTransform.from_components([5.0, -4.0, 3.0], Rotation.from_euler("z", 90, degrees=True))
-    write_transform(tmp_path / "t.tfm", pose)
-    frame = SimpleITK.Image(8, 8, 1, SimpleITK.sitkFloat32)
-    frame.SetPixel(2, 3, 0, 100.0)
-    world = SimpleITK.Image(20, 20, 10, SimpleITK.sitkFloat32)
-    world.SetOrigin((-10.0, -10.0, 0.0))
-    seen = SimpleITK.Resample(frame, world, SimpleITK.ReadTransform(str(tmp_path / "t.tfm")))
-    k, j, i = np.unravel_index(np.argmax(SimpleITK.GetArrayFromImage(seen)), (10, 20, 20))
-    place = seen.TransformIndexToPhysicalPoint((int(i), int(j), int(k)))
-    np.testing.assert_allclose(place, pose.apply([2.0, 3.0, 0.0]), atol=1e-9)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
