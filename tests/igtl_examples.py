@@ -7,7 +7,7 @@ import numpy as np
 import pyigtl
 from pyigtl.messages import CRC64
 
-from speckle3d.io.igtl.messages import HEADER, decode, read_header
+from speckle3d.io.igtl.messages import HEADER, body_bytes, decode
 
 
 def image(columns=6, rows=9, dtype=np.int16, device="Image_Reference", seed=0, version=1, **said):
@@ -40,9 +40,11 @@ def with_body(message, body, crc=None):
 
 def decoded(message):
     """A packed message as we read it; of a STRING, the words behind its type."""
-    header, body = read_header(message[: HEADER.size]), message[HEADER.size :]
-    got = decode(header, body)
-    return replace(got, type=f"STRING {body[4:].decode()}") if header.type == "STRING" else got
+    start, body = message[: HEADER.size], message[HEADER.size :]
+    body_bytes(start)
+    got = decode(start, body)
+    is_text = getattr(got, "type", "") == "STRING"
+    return replace(got, type=f"STRING {body[4:].decode()}") if is_text else got
 
 
 def changed(at, form, *values):

@@ -43,16 +43,8 @@ from speckle3d.io.records import HDF5Writer, put, read_record
 
 FORMAT = "speckle3d.reconstruction"
 
-_PAIR_ROWS: dict[str, tuple[int, ...]] = {
-    "first": (),
-    "second": (),
-    "first_from_second": (4, 4),
-    "covariance": (6, 6),
-    "distance_mm": (-1,),
-    "sigma_mm": (-1,),
-    "used": (-1,),
-}
-"""Shape of a pair's row, -1 for the patches, in every data set of /pairs but ``patch_centre_mm``."""
+_PAIR_ROWS = ("first", "second", "first_from_second", "covariance", "distance_mm", "sigma_mm", "used")
+"""Data sets of /pairs with a row for each pair."""
 
 _EARLIER = {"consistent-subset": "image+subset"}
 """Names of modes in older files."""
@@ -99,7 +91,7 @@ class ReconstructionWriter(HDF5Writer):
         Raises
         ------
         InvalidInputError
-            If a field has another shape or a frame index is out of range.
+            If they are of other patches, or a frame index is out of range.
         """
         where = f"{self.path}: /pairs"
         _check_pairs(pairs, self._times.size, where)
@@ -178,12 +170,9 @@ load_reconstruction = read_reconstruction
 
 
 def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
-    patches = len(pairs.patch_centre_mm)
-    for name, row in _PAIR_ROWS.items():
-        expected = (len(pairs), *(patches if n < 0 else n for n in row))
-        got = np.shape(getattr(pairs, name))
-        if got != expected:
-            raise InvalidInputError(f"{where}/{name}: expected shape {expected}, got {got}")
+    lengths = {name: len(getattr(pairs, name)) for name in _PAIR_ROWS}
+    if len({*lengths.values()}) > 1:
+        raise InvalidInputError(f"{where}: expected equally many rows, got {lengths}")
     bad = np.flatnonzero((pairs.first < 0) | (pairs.second <= pairs.first) | (pairs.second >= frames))
     if bad.size:
         i = int(bad[0])

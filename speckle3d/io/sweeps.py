@@ -28,7 +28,7 @@ from speckle3d.core.sweep import (
     Sweep,
     Tracker,
 )
-from speckle3d.io.frames import FileFrames, HDF5Slices
+from speckle3d.io.frames import FileFrames, HDF5Slices, Turn
 from speckle3d.io.hdf5 import (
     PathLike,
     find_group,
@@ -80,11 +80,6 @@ class SweepSlices(HDF5Slices):
     """Opens the frames of a sweep file."""
 
 
-def as_stored(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Frame as the file has it."""
-    return values
-
-
 def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
     """Complex samples of pairs of I and Q, the last axis."""
     return pairs.astype(np.float32).view(np.complex64)[..., 0]
@@ -101,7 +96,7 @@ def read_sweep(path: PathLike) -> Sweep:
         Naming the file, the data set and the first bad index.
     """
     with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
-        times = _read_rows(file, "frame_time_s", ("frame",))
+        times = _read_times(file, "frame_time_s")
         if not times.size:
             raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
         frames, grid, signal = _read_image(file, times.size)
@@ -110,7 +105,7 @@ def read_sweep(path: PathLike) -> Sweep:
             frames=frames,
             grid=grid,
             signal=signal,
-            frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
+            frame_time_s=times,
             orientation=_read_orientation(file),
             tracker=_read_tracker(file),
             truth=None if truth is None else read_transforms(truth, "world_from_image", times.size),
@@ -124,20 +119,26 @@ def is_growing(file: h5py.File) -> bool:
     return file.swmr_mode or (has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_)))
 
 
+def _read_times(group: h5py.Group, name: str = "time_s") -> FloatArray:
+    """Read times that increase; of a file that grows those before NaN, as many as there are whole rows."""
+    times = read_checked(group, name, ("row",))
+    if is_growing(group.file) and np.isnan(times).any():
+        times = times[: np.argmax(np.isnan(times))]
+    return require_increasing(times, locate(group, name))
+
+
 def _read_rows(
-    group: h5py.Group, name: str, shape: tuple[int | str, ...], dtype: npt.DTypeLike = np.float64
+    group: h5py.Group, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64
 ) -> npt.NDArray[Any]:
-    """Read a data set; of one that grows the rows that are whole, as many as there are times before NaN."""
-    if not is_growing(group.file):
-        return read_checked(group, name, shape, dtype)
+    """Read a data set of a shape; a file that grows may have more rows, which are left out."""
     values = read_checked(group, name, ("row", *shape[1:]), dtype)
-    count = shape[0]
-    if isinstance(count, str):
-        unwritten = np.flatnonzero(np.isnan(values))
-        return values[: unwritten[0]] if unwritten.size else values
-    if len(values) < count:
-        raise InvalidInputError(f"{locate(group, name)}: expected {count} rows or more, got {len(values)}")
-    return values[:count]
+    _require_count(group, name, len(values), shape[0])
+    return values[: shape[0]]
+
+
+def _require_count(group: h5py.Group, name: str, got: int, count: int) -> None:
+    if got < count or (got > count and not is_growing(group.file)):
+        raise InvalidInputError(f"{locate(group, name)}: expected {count} rows, one for each time, got {got}")
 
 
 def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:
@@ -152,10 +153,9 @@ def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFS
     if node.ndim != 3 + in_pairs or (in_pairs and node.shape[3] != 2) or 0 in node.shape:
         expected = f"(frame, vector, sample{', 2' if in_pairs else ''})"
         raise InvalidInputError(f"{where}: expected shape {expected}, got {node.shape}")
-    if not (node.shape[0] == count or (grows and node.shape[0] > count)):
-        raise InvalidInputError(f"{where}: expected {count} frames, one for each time, got {node.shape[0]}")
+    _require_count(file, name, node.shape[0], count)
     _, vectors, samples = node.shape[:3]
-    turn = from_pairs if in_pairs else as_stored
+    turn: Turn = from_pairs if in_pairs else np.asarray
     slices = SweepSlices(Path(file.filename).absolute(), name, turn, count, grows)
     frames = FileFrames(
         file.filename, slices, (count, vectors, samples), np.complex64 if in_pairs else dtype, dtype
@@ -180,8 +180,8 @@ def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
 
 
 def _read_orientation(file: h5py.File) -> OrientationSensor | None:
-    group, time_s = _read_times(file, "orientation")
-    if group is None or time_s is None:
+    group = find_group(file, "orientation")
+    if group is None or not (time_s := _read_times(group)).size:
         return None
     quaternions = _read_rows(group, "quaternion_wxyz", (time_s.size, 4))
     rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
@@ -199,28 +199,16 @@ def _read_orientation(file: h5py.File) -> OrientationSensor | None:
         return OrientationSensor(TimedRotations(time_s, rotations), mounting, offset_s, **vectors)
 
 
-def _read_times(file: h5py.File, name: str) -> tuple[h5py.Group | None, FloatArray | None]:
-    """A sensor's group and the times of its readings; none of one that sent nothing during a recording."""
-    group = find_group(file, name)
-    if group is None:
-        return None, None
-    times = _read_rows(group, "time_s", ("sample",))
-    if not times.size and has_member(file, GROWING):
-        return group, None
-    return group, require_increasing(times, locate(group, "time_s"))
-
-
 def _read_tracker(file: h5py.File) -> Tracker | None:
-    group, time_s = _read_times(file, "tracker")
-    if group is None or time_s is None:
+    group = find_group(file, "tracker")
+    if group is None:
         return None
+    time_s = _read_times(group)
     valid = np.ones(time_s.size, dtype=bool)
     if has_member(group, "valid"):
         valid = _read_rows(group, "valid", (time_s.size,), np.bool_)
     if not valid.any():
-        if has_member(file, GROWING):
-            return None
-        raise InvalidInputError(f"{locate(group, 'valid')}: expected a valid sample, got none")
+        return None
     matrices = _read_rows(group, "world_from_sensor", (time_s.size, 4, 4))
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
@@ -241,7 +229,7 @@ def unfinished_note(path: PathLike) -> str | None:
     with reading(path), open_hdf5(path) as file:
         if not has_format(file, FORMAT) or not is_growing(file):
             return None
-        count = _read_rows(file, "frame_time_s", ("frame",)).size
+        count = _read_times(file, "frame_time_s").size
     return (
         f"{path}: the recording goes on, or was ended without being closed: {count} frames so far, of "
         "which speckle3d convert makes a whole file"

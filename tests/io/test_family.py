@@ -82,7 +82,6 @@ WRONG = {
         (replaced("orientation/quaternion_wxyz", np.zeros((4, 3))), "/quaternion_wxyz"),
         (entry("orientation/gyroscope_rad_s", (3, 1), np.nan), "/gyroscope_rad_s"),
         (entry("tracker/world_from_sensor", 2, np.diag([1, 1, -1, 1])), r"/world_from_sensor\[2\]"),
-        (entry("tracker/valid", slice(None), False), "/tracker/valid"),
         (attribute("rf", "vector_pitch_mm", 0.0), "/rf: vector_pitch_mm"),
         (attribute("rf", "sampling_rate_hz", "fast"), "/rf.*sampling_rate_hz"),
         (attribute("tracker", "sensor_from_image", np.zeros((4, 4))), "/tracker"),
@@ -205,7 +204,7 @@ def test_pairs_come_back_in_the_order_they_were_appended_or_are_left_out(tmp_pat
     ("change", "message"),
     [
         ({"chunks": [replace(old_files.pairs(), second=np.array([4, 4, 4]))]}, r"/pairs\[0\].*4"),
-        ({"chunks": [replace(old_files.pairs(), used=np.ones((3, 3), bool))]}, r"/pairs/used.*\(3, 2\)"),
+        ({"chunks": [replace(old_files.pairs(), used=np.ones((2, 2), bool))]}, "/pairs"),
         (
             {"chunks": [old_files.pairs(), replace(old_files.pairs(), patch_centre_mm=np.zeros((2, 2)))]},
             "/patch_centre_mm",

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
 
-from speckle3d.io.igtl.messages import HEADER, MessageError, Received, decode, read_header
+from speckle3d.io.igtl.messages import HEADER, MessageError, Received, body_bytes, decode
 
 _LOOK_S = 0.1
 """How often a waiting thread looks whether it is to end."""
@@ -238,13 +238,13 @@ class Link:
         while not self._over.is_set():
             start = self._receive(HEADER.size, is_start=True)
             try:
-                header = read_header(start)
+                size = body_bytes(start)
             except MessageError as error:
                 self._end.refuse(error)
                 raise
-            body = self._receive(header.body_bytes)
+            body = self._receive(size)
             try:
-                self._end.put(decode(header, body), self._over)
+                self._end.put(decode(start, body), self._over)
             except MessageError as error:
                 self._end.refuse(error)
 

@@ -87,68 +87,50 @@ class Other:
 Received: TypeAlias = ImageReceived | TransformReceived | Other
 
 
-@dataclass(frozen=True)
-class Header:
-    """The first 58 bytes of a message.
-
-    Attributes
-    ----------
-    type : str
-        As IMAGE or TRANSFORM.
-    device : str
-        Name of what sent it, as PLUS's ``ProbeToTracker``.
-    time_s : float
-        The sender's clock.
-    """
-
-    version: int
-    type: str
-    device: str
-    time_s: float
-    body_bytes: int
-    crc: int
-
-
-def read_header(content: bytes) -> Header:
-    """Read the first 58 bytes of a message.
+def body_bytes(start: bytes) -> int:
+    """Length of a message's body, from its first 58 bytes.
 
     Raises
     ------
     MessageError
-        If they are none, after which nothing in the stream can be trusted.
+        If they begin none, after which nothing in the stream can be trusted.
     """
-    version, kind, device, seconds, fraction, size, crc = HEADER.unpack(content)
+    version, kind, _, _, _, size, _ = HEADER.unpack(start)
     if version not in (1, 2, 3) or not _TYPE.fullmatch(kind) or size > _MOST_BYTES:
         raise MessageError(
             f"expected the header of a message, got version {version}, type {_text(kind)!r} and {size} bytes"
         )
-    return Header(version, _text(kind), _text(device), seconds + fraction / 2**32, size, crc)
+    return int(size)
 
 
-def decode(header: Header, body: bytes) -> Received:
-    """Make a message of its header and its body; a check sum of 0 is one that was not made.
+def decode(start: bytes, body: bytes) -> Received:
+    """Make a message of its first 58 bytes and its body; a check sum of 0 is one that was not made.
 
     Raises
     ------
     MessageError
         If its check sum is wrong, or its content is not what its type says.
     """
-    where = f"{header.type} {header.device}"
-    if header.crc and ecma_182(body) != header.crc:
-        raise MessageError(f"{where}: expected a body of check sum {header.crc:016x}, got another")
+    version, kind, name, seconds, fraction, _, crc = HEADER.unpack(start)
+    type_, device, time_s = _text(kind), _text(name), seconds + fraction / 2**32
+    where = f"{type_} {device}"
+    if crc and ecma_182(body) != crc:
+        raise MessageError(f"{where}: expected a body of check sum {crc:016x}, got another")
+    made = {"IMAGE": ImageMessage, "TRANSFORM": TransformMessage}.get(type_)
+    if made is None:
+        return Other(device, time_s, type_)
+    fields = {"message_type": type_, "device_name": device, "timestamp": time_s, "header_version": version}
     try:
         with np.errstate(all="ignore"):  # infinite matrices are refused below
-            if header.type == "IMAGE":
-                return _image(header, body)
-            if header.type == "TRANSFORM":
-                return _transform(header, body)
+            message = made()
+            message.unpack(fields, body)
+            return (_image if type_ == "IMAGE" else _transform)(message)
     except MessageError:
         raise
-    # A damaged body shows in whatever pyigtl happens to stumble over.
+    # pyigtl trusts a body: what makes no sense shows in whatever it stumbles over.
     except Exception as error:
         words = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise MessageError(f"{where}: cannot be unpacked: {words}") from error
-    return Other(header.device, header.time_s, header.type)
 
 
 def packed_image(
@@ -221,14 +203,7 @@ def _with_header(kind: str, device: str, time_s: float, body: bytes) -> bytes:
     return HEADER.pack(1, kind.encode(), name, seconds, fraction, len(body), ecma_182(body)) + body
 
 
-def _unpacked(message: MessageBase, header: Header, body: bytes) -> Any:
-    fields = {"message_type": header.type, "device_name": header.device, "timestamp": header.time_s}
-    message.unpack(fields | {"header_version": header.version}, body)
-    return message
-
-
-def _image(header: Header, body: bytes) -> ImageReceived:
-    message = _unpacked(ImageMessage(), header, body)
+def _image(message: Any) -> ImageReceived:
     matrix = _finite(message.ijk_to_world_matrix)
     if message.world_coordinate_system == "lps":
         matrix = _RAS_FROM_LPS @ matrix
@@ -241,14 +216,13 @@ def _image(header: Header, body: bytes) -> ImageReceived:
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     components = by_slice.shape[3] if by_slice.ndim == 4 else 1
     spacing = np.linalg.norm(matrix[:3, :3], axis=0)
-    return ImageReceived(header.device, header.time_s, pixels, matrix, spacing, components)
+    return ImageReceived(message.device_name, message.timestamp, pixels, matrix, spacing, components)
 
 
-def _transform(header: Header, body: bytes) -> TransformReceived:
-    message = _unpacked(TransformMessage(), header, body)
+def _transform(message: Any) -> TransformReceived:
     said = message.metadata
     valid = said.get("TransformValid", "True") != "False" and said.get("TransformStatus", "OK") == "OK"
-    return TransformReceived(header.device, header.time_s, _finite(message.matrix), valid)
+    return TransformReceived(message.device_name, message.timestamp, _finite(message.matrix), valid)
 
 
 def _finite(matrix: npt.ArrayLike) -> FloatArray:
