@@ -8,15 +8,10 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import open_regular
 
 Model = TypeVar("Model", bound=BaseModel)
-
-_MOST_BYTES = 2**20
-"""A hundred times what every setting takes."""
-
-_SHOWN = 200
 
 
 def load_toml(model: type[Model], path: Path) -> Model:
@@ -42,41 +37,26 @@ def read_toml(path: Path) -> str:
     InvalidInputError
         If it is no UTF-8.
     """
+    with open_regular(path) as stream:
+        content = stream.read()
     try:
-        with open_regular(path) as stream:
-            content = stream.read(_MOST_BYTES + 1)
-        text = content.decode("utf-8")
+        return content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"{path}: expected UTF-8 text, got other bytes") from error
-    if len(content) > _MOST_BYTES:
-        raise FileError(f"{path}: expected at most {_MOST_BYTES} bytes of TOML, got more")
-    return text
 
 
 def parsed(text: str, where: str) -> dict[str, Any]:
     """Parse TOML text; `where` is named in errors."""
     try:
         return tomllib.loads(text)
-    except RecursionError:
-        raise InvalidInputError(f"{where}: expected TOML, got brackets within brackets without end") from None
-    # Of TOML, and of numbers with thousands of digits.
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InvalidInputError(f"{where}: expected TOML, got an error: {error}") from error
 
 
 def first_fault(error: ValidationError) -> tuple[str, str]:
     """Return the name of the first setting that is wrong, and what is wrong with it."""
     first = error.errors()[0]
-    return ".".join(str(part) for part in first["loc"]), f"{first['msg']}, got {_shown(first['input'])}"
-
-
-def _shown(value: Any) -> str:
-    """A value as it is written, cut where it is long."""
-    try:
-        text = repr(value)
-    except ValueError:  # Python writes no number of thousands of digits
-        return "a number of thousands of digits"
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return ".".join(str(part) for part in first["loc"]), f"{first['msg']}, got {first['input']!r:.200}"
 
 
 def validated(values: dict[str, Any], where: str, model: type[Model]) -> Model:

@@ -35,26 +35,20 @@ def write_polylines(
     FileError
         If the file cannot be written.
     """
-    if lines_mm.ndim != 3 or lines_mm.shape[2] != 3 or not lines_mm.size:
-        raise InvalidInputError(f"{path}: expected lines of shape (n, points, 3), got {lines_mm.shape}")
-    if not np.isfinite(lines_mm).all():
-        raise InvalidInputError(f"{path}: expected finite points, got others")
-    count, each = lines_mm.shape[:2]
-    cells = np.column_stack((np.full(count, each), np.arange(count * each).reshape(count, each)))
+    if not lines_mm.size or not np.isfinite(lines_mm).all():
+        raise InvalidInputError(f"{path}: expected lines of finite points, got shape {lines_mm.shape}")
+    count, points = lines_mm.shape[:2]
+    cells = np.insert(np.arange(count * points).reshape(count, points), 0, points, axis=1)
     pieces: list[bytes] = [
         f"# vtk DataFile Version 4.2\nspeckle3d lines. {SPACE}\nBINARY\nDATASET POLYDATA\n".encode(),
-        f"POINTS {count * each} float\n".encode(),
+        f"POINTS {count * points} float\n".encode(),
         lines_mm.astype(">f4").tobytes(),
         f"\nLINES {count} {cells.size}\n".encode(),
         cells.astype(">i4").tobytes(),
         f"\nCELL_DATA {count}\n".encode() if values else b"",
     ]
     for name, numbers in (values or {}).items():
-        if numbers.shape != (count,) or not name.isidentifier():
-            raise InvalidInputError(f"{path}: {name!r}: expected {count} values, got shape {numbers.shape}")
-        pieces += [
-            f"SCALARS {name} float 1\nLOOKUP_TABLE default\n".encode(),
-            numbers.astype(">f4").tobytes(),
-        ]
+        pieces.append(f"SCALARS {name} float 1\nLOOKUP_TABLE default\n".encode())
+        pieces.append(numbers.astype(">f4").tobytes())
     with atomic_path(path) as part:
         part.write_bytes(b"".join(pieces) + b"\n")

@@ -60,12 +60,21 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
         raise InvalidInputError(f"{path}: expected a name ending in {' or '.join(SUFFIXES)}, got {suffix!r}")
     if not world_from_image.single:
         raise InvalidInputError(f"{path}: expected one pose, got a row of {len(world_from_image)}")
-    parameters = _parameters(world_from_image.inv())
+    matrix = world_from_image.inv().as_matrix()
+    # Matrix, row by row, and translation; no number is a negative zero.
+    parameters = np.concatenate((matrix[:3, :3].ravel(), matrix[:3, 3])) + 0.0
     with atomic_path(path) as part:
-        if suffix == ".tfm":
-            part.write_text(_text(parameters), encoding="ascii")
-        else:
+        if suffix == ".h5":
             _write_hdf5(part, parameters)
+        else:
+            lines = (
+                "#Insight Transform File V1.0",
+                "#Transform 0",
+                f"Transform: {_TYPE}",
+                f"Parameters: {' '.join(map(repr, parameters.tolist()))}",
+                "FixedParameters: 0 0 0",
+            )
+            part.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def write_transforms(path: PathLike, world_from_image: RigidTransform) -> None:
@@ -94,31 +103,15 @@ def transform_paths(path: PathLike, count: int) -> list[Path]:
     return [given.with_name(f"{given.stem}-{i:04d}{given.suffix}") for i in range(count)]
 
 
-def _parameters(image_from_world: RigidTransform) -> FloatArray:
-    """Matrix, row by row, and translation, shape (12,)."""
-    matrix = image_from_world.as_matrix()
-    # No number is a negative zero.
-    return np.concatenate((matrix[:3, :3].ravel(), matrix[:3, 3])) + 0.0
-
-
-def _text(parameters: FloatArray) -> str:
-    lines = (
-        "#Insight Transform File V1.0",
-        "#Transform 0",
-        f"Transform: {_TYPE}",
-        f"Parameters: {' '.join(map(repr, parameters.tolist()))}",
-        "FixedParameters: 0 0 0",
-    )
-    return "\n".join(lines) + "\n"
-
-
 def _write_hdf5(part: Path, parameters: FloatArray) -> None:
     with Room(part) as room, h5py.File(part, "w", locking=False) as file:
         room.require(0)
-        text = h5py.string_dtype("ascii")
-        for name, value in (("ITKVersion", "5.4"), ("HDFVersion", h5py.version.hdf5_version)):
-            file.create_dataset(name, data=[value], dtype=text)
-        group = file.create_group("TransformGroup/0")
-        group.create_dataset("TransformType", data=[_TYPE], dtype=text)
-        group["TransformParameters"] = parameters
-        group["TransformFixedParameters"] = np.zeros(3)
+        names = {
+            "ITKVersion": "5.4",
+            "HDFVersion": h5py.version.hdf5_version,
+            "TransformGroup/0/TransformType": _TYPE,
+        }
+        for name, value in names.items():
+            file.create_dataset(name, data=[value], dtype=h5py.string_dtype("ascii"))
+        file["TransformGroup/0/TransformParameters"] = parameters
+        file["TransformGroup/0/TransformFixedParameters"] = np.zeros(3)

@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import one_line
 from speckle3d.io.headers import mm_per
@@ -58,8 +57,6 @@ def nifti_header(volume: Volume, fields: Mapping[str, str], is_labels: bool) -> 
     header.set_slope_inter(1, 0)
     if is_labels:
         header.set_intent(_LABELS)
-    words = printable("; ".join((_OWN, *(f"{name}: {value}" for name, value in fields.items()))))
-    header["descrip"] = words.encode("ascii", "replace")[:79]
     if fields:
         text = json.dumps({_OWN: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")
         header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", text))

@@ -17,7 +17,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import nibabel
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
@@ -45,8 +44,6 @@ PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
-_SIDES = (("L", "R"), ("P", "A"), ("S", "I"))
-"""Sides that an axis along a world axis leads to or comes from, by MetaImage's letters."""
 
 
 class VolumeWriter:
@@ -213,7 +210,6 @@ class VolumeWriter:
             f"TransformMatrix = {_texts((matrix[:3, :3] / spacing).T.ravel())}",
             f"Offset = {_texts(matrix[:3, 3])}",
             "CenterOfRotation = 0 0 0",
-            f"AnatomicalOrientation = {''.join(nibabel.aff2axcodes(matrix, _SIDES))}",
             f"ElementSpacing = {_texts(spacing)}",
             f"DimSize = {_texts(self._volume.shape)}",
             # As PLUS tells a volume from a sequence of frames.
