@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,10 +34,8 @@ _MM_PER = {
 }  # fmt: skip
 _S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6}
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
-_PACKINGS = {
-    "raw": "raw", "gz": "deflate", "gzip": "deflate", "bz2": "bzip2", "bzip2": "bzip2",
-    "txt": "text", "text": "text", "ascii": "text",
-}  # fmt: skip
+_PACKINGS = {"raw": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "as": "text"}
+"""By how NRRD's words for them begin, as bzip2 or bz2; raw is whole."""
 
 NRRD_NAMES = {
     "ultrasound image orientation": "UltrasoundImageOrientation",
@@ -58,6 +56,8 @@ class SequenceHeader:
         Of the first two axes; None where the header holds the pixel unit 1 that stands for "unknown".
     fields : dict
         Fields of the whole file.
+    said : dict
+        What they say in NRRD's words, whatever the format.
     frames : tuple of dict
         Fields of each frame, without the ``Seq_FrameNNNN_`` before their names; empty for a plain image.
     pixels : Pixels
@@ -76,6 +76,7 @@ class SequenceHeader:
     size: tuple[int, ...]
     spacing_mm: tuple[float, float] | None
     fields: dict[str, str]
+    said: dict[str, str]
     frames: tuple[dict[str, str], ...]
     pixels: Pixels
     stored: tuple[int, ...]
@@ -91,7 +92,7 @@ class SequenceHeader:
     @property
     def is_volume(self) -> bool:
         """Whether all three axes are of space, as they say and frames' fields do not contradict."""
-        kinds = (self.fields.get("Kinds") or self.fields.get("kinds", "")).lower().split()
+        kinds = self.said.get("kinds", "").lower().split()
         is_spatial = len(kinds) == 3 and kinds[2] in ("domain", "space")
         return is_spatial and (not self.frames or self.frame_count > len(self.frames))
 
@@ -150,9 +151,11 @@ def read_header(path: PathLike) -> SequenceHeader:
         start = stream.read(512)
         stream.seek(0)
         if is_nrrd(start):
-            return _nrrd_header(Path(path), stream)
+            fields = _nrrd_fields(path, stream)
+            return _header(Path(path), fields, fields, stream.tell())
         if is_metaimage(start):
-            return _meta_header(Path(path), stream)
+            fields = _meta_fields(path, stream)
+            return _header(Path(path), fields, _in_words_of_nrrd(fields), stream.tell())
     raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
 
 
@@ -177,90 +180,66 @@ def _lines(stream: BinaryIO) -> Iterator[str]:
             yield line.decode("latin-1").rstrip("\r\n")
 
 
-def _meta_header(path: Path, stream: BinaryIO) -> SequenceHeader:
-    lines: dict[str, str] = {}
+def _meta_fields(path: PathLike, stream: BinaryIO) -> dict[str, str]:
+    fields: dict[str, str] = {}
     for line in _lines(stream):
         name, _, value = line.partition("=")
-        lines[name.strip()] = value.strip()
+        fields[name.strip()] = value.strip()
         if name.strip() == "ElementDataFile":
-            break
-    else:
-        raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
-    stored = _sizes(path, lines, "DimSize")
-    text, steps = lines.get("ElementSpacing") or lines.get("ElementSize"), None
-    if text:
-        factor = mm_per(lines.get("DistanceUnits", ""), f"{path}: DistanceUnits")
-        steps = [factor * step for step in numbers(text, len(stored), f"{path}: ElementSpacing")]
-    channels = int(lines.get("ElementNumberOfChannels", "1"))
-    count, name = math.prod(stored) * channels, lines["ElementDataFile"]
-    skipped = int(lines.get("HeaderSize", "0") or 0)
-    source, start = path, skipped if skipped < 0 else stream.tell()
-    if name.upper() != "LOCAL":
-        source, start = _beside(path, name, "ElementDataFile"), skipped
-    is_big = any(_is_set(lines, name) for name in ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"))
-    word = lines.get("ElementType", "") if count else "MET_UCHAR"  # a tracker's recording may name no type
-    packing = "deflate" if _is_set(lines, "CompressedData") else "raw"
-    if not _is_set(lines, "BinaryData", "True"):
-        packing = "text"
-    pixels = Pixels(source, start, number_type(word, is_big, f"{path}: ElementType"), count, packing)
-    return _header(path, lines, stored, lines.get("Kinds", ""), steps, pixels, channels)
+            return fields
+    raise FileError(f"{path}: expected a MetaImage header up to ElementDataFile, got a truncated one")
 
 
-def _nrrd_header(path: Path, stream: BinaryIO) -> SequenceHeader:
-    lines: dict[str, str] = {}
-    is_whole = False
+def _nrrd_fields(path: PathLike, stream: BinaryIO) -> dict[str, str]:
+    fields: dict[str, str] = {}
     for line in _lines(stream):
-        if is_whole := not line.strip():
-            break
+        if not line.strip():
+            return fields
         if line.startswith(("#", "NRRD")):
             continue
         if ":=" in line:
             name, _, value = line.partition(":=")
-            lines[NRRD_NAMES.get(name.strip(), name.strip())] = value.strip()
+            fields[NRRD_NAMES.get(name.strip(), name.strip())] = value.strip()
         else:
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
             name, _, value = line.partition(":")
-            lines[name.strip().lower()] = value.strip()
-    data = lines.get("data file", lines.get("datafile"))
-    if not (is_whole or data is not None):
+            fields[name.strip().lower().replace("datafile", "data file")] = value.strip()
+    if "data file" not in fields:
         raise FileError(f"{path}: expected an NRRD header up to an empty line, got a truncated one")
-    stored = _sizes(path, lines, "sizes")
-    dtype = number_type(lines.get("type", ""), lines.get("endian", "").lower() == "big", f"{path}: type")
-    packing = lines.get("encoding", "").lower()
-    if packing not in _PACKINGS:
-        raise InvalidInputError(f"{path}: encoding: expected raw, gzip, bzip2 or text, got {packing!r}")
-    source, start = (path, stream.tell()) if data is None else (_beside(path, data, "data file"), 0)
-    lines_skipped, skipped = (
-        int(lines.get(f"{what} skip", lines.get(f"{what}skip", "0"))) for what in ("line", "byte")
-    )
-    pixels = Pixels(
-        source,
-        -1 if skipped < 0 else start + skipped,
-        dtype,
-        math.prod(stored),
-        _PACKINGS[packing],
-        lines_skipped,
-    )
-    axes = nrrd_axes_mm(path, lines, len(stored))
-    steps = None if axes is None else np.linalg.norm(axes, axis=1).tolist()
-    return _header(path, lines, stored, lines.get("kinds", ""), steps, pixels)
+    return fields
 
 
-def _is_set(lines: dict[str, str], name: str, default: str = "False") -> bool:
-    return lines.get(name, default)[:1] in ("T", "t", "1")
+def _in_words_of_nrrd(fields: dict[str, str]) -> dict[str, str]:
+    """What the fields of a MetaImage say."""
+
+    def is_set(name: str, default: str = "False") -> bool:
+        return fields.get(name, default)[:1] in ("T", "t", "1")
+
+    packing = "gzip" if is_set("CompressedData") else "raw"
+    is_big = is_set("BinaryDataByteOrderMSB") or is_set("ElementByteOrderMSB")
+    said = {
+        "sizes": fields.get("DimSize", ""),
+        "kinds": fields.get("Kinds", ""),
+        "type": fields.get("ElementType", ""),
+        "endian": "big" if is_big else "little",
+        "encoding": packing if is_set("BinaryData", "True") else "text",
+        "spacings": fields.get("ElementSpacing") or fields.get("ElementSize", ""),
+        "units": len(fields.get("DimSize", "").split()) * f'"{fields.get("DistanceUnits", "")}" ',
+        "channels": fields.get("ElementNumberOfChannels", "1"),
+    }
+    data, skipped = fields["ElementDataFile"], fields.get("HeaderSize") or "0"
+    if data.upper() != "LOCAL":
+        said["data file"] = data
+    if data.upper() != "LOCAL" or skipped.startswith("-"):
+        said["byte skip"] = skipped
+    return said
 
 
-def _header(
-    path: Path,
-    lines: dict[str, str],
-    stored: tuple[int, ...],
-    kinds_text: str,
-    steps: list[float] | None,
-    pixels: Pixels,
-    channels: int = 1,
-) -> SequenceHeader:
+def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int) -> SequenceHeader:
     """Tell axes of the image, of frames and of colours by their kinds; without, as PLUS orders them."""
-    kinds = kinds_text.lower().split()
+    stored, channels = _sizes(path, said.get("sizes", "")), int(said.get("channels", "1"))
+    count = math.prod(stored) * channels
+    kinds = said.get("kinds", "").lower().split()
     if len(kinds) != len(stored):
         kinds = ["domain"] * len(stored)
     spatial = [i for i, kind in enumerate(kinds) if kind in _SPACE]
@@ -277,46 +256,61 @@ def _header(
             f"{path}: sizes: expected images on two axes and at most one of frames, got lengths "
             f"{' '.join(map(str, stored))} of kinds {' '.join(kinds)}"
         )
-    spacing = None if steps is None else (steps[spatial[0]], steps[spatial[1]])
+    axes = axes_mm(path, said, len(stored))
+    spacing = None if axes is None else (*np.linalg.norm(axes, axis=1)[spatial].tolist(),)
     if spacing is not None and (not all(map(math.isfinite, spacing)) or spacing == (1.0, 1.0)):
         spacing = None  # PLUS and ITK write 1 where nobody told them
-    size = tuple(stored[i] for i in (*spatial, *(() if frame_axis is None else (frame_axis,))))
-    fields, frames = _split(lines)
-    if frame_axis is not None and len(frames) == stored[frame_axis] + 1 and not frames[0]:
-        frames = frames[1:]  # of a writer that counts from 1
-    if frame_axis is not None and frame_axis == len(stored) - 1:
-        pixels = replace(pixels, frames=max(stored[frame_axis], 1))
-    times = None if frame_axis is None else _nrrd_times(lines, frame_axis, stored)
+    own, frames = _split(fields)
+    times, one_by_one = None, 1
+    size = tuple(stored[i] for i in spatial)
+    if frame_axis is not None:
+        length = stored[frame_axis]
+        size, times = (*size, length), _frame_times(said, frame_axis, stored)
+        one_by_one = max(length, 1) if frame_axis == len(stored) - 1 else 1
+        if len(frames) == length + 1 and not frames[0]:
+            frames = frames[1:]  # of a writer that counts from 1
+    pixels = _pixels(path, said, start, count, one_by_one)
     return SequenceHeader(
-        str(path), size, spacing, fields, frames, pixels, stored, frame_axis, channels, times
+        str(path), size, spacing, own, said, frames, pixels, stored, frame_axis, channels, times
     )
 
 
-def nrrd_axes_mm(path: PathLike, lines: dict[str, str], count: int) -> FloatArray | None:
-    """Step along each axis of an NRRD file, shape (axis, coordinate of space); NaN of an axis that has none.
+def _pixels(path: Path, said: dict[str, str], start: int, count: int, frames: int) -> Pixels:
+    word = said.get("type", "") if count else "uchar"  # a tracker's recording may name no type
+    dtype = number_type(word, said.get("endian", "").lower() == "big", f"{path}: type")
+    encoding = said.get("encoding", "").lower()
+    packing = _PACKINGS.get(encoding if encoding == "raw" else encoding[:2])
+    if packing is None:
+        raise InvalidInputError(f"{path}: encoding: expected raw, gzip, bzip2 or text, got {encoding!r}")
+    source = path
+    if "data file" in said:
+        source, start = _beside(path, said["data file"]), 0
+    lines, skipped = (
+        int(said.get(f"{what} skip", said.get(f"{what}skip", "0"))) for what in ("line", "byte")
+    )
+    return Pixels(source, -1 if skipped < 0 else start + skipped, dtype, count, packing, lines, frames)
+
+
+def axes_mm(path: PathLike, said: dict[str, str], count: int) -> FloatArray | None:
+    """Step along each axis, shape (axis, coordinate of space); NaN of an axis that has none.
 
     Raises
     ------
     InvalidInputError
         If there is another number of them than of axes, or a unit is not known.
     """
-    if "spacings" in lines:
-        steps = [float(word) for word in lines["spacings"].split()]
-        for i, unit in enumerate(_quoted(lines.get("units", ""))[: len(steps)]):
+    if said.get("spacings"):
+        steps = [float(word) for word in said["spacings"].split()]
+        for i, unit in enumerate(_quoted(said.get("units", ""))[: len(steps)]):
             steps[i] *= 1.0 if unit in _S_PER else mm_per(unit, f"{path}: units")
         axes = np.diag(steps)
-    elif "space directions" in lines:
-        rows = re.findall(r"\(([^)]*)\)|none", lines["space directions"].lower())
-        vectors = [
-            numbers(row.replace(",", " "), None, f"{path}: space directions") if row else () for row in rows
-        ]
-        units = _quoted(lines.get("space units", lines.get("units", "")))
-        factor = mm_per(next((unit for unit in units if unit not in _S_PER), ""), f"{path}: space units")
-        width = max(map(len, vectors), default=0)
-        axes = np.full((len(rows), width), np.nan)
+    elif "space directions" in said:
+        rows = re.findall(r"\(([^)]*)\)|none", said["space directions"].lower())
+        vectors = [_vector(row, f"{path}: space directions") if row else [] for row in rows]
+        axes = np.full((len(rows), max(map(len, vectors), default=0)), np.nan)
         for axis, vector in zip(axes, vectors, strict=True):
-            if vector:
-                axis[:] = np.multiply(vector, factor)
+            axis[: len(vector)] = vector
+        axes *= space_unit_mm(path, said)
     else:
         return None
     if len(axes) != count:
@@ -324,13 +318,22 @@ def nrrd_axes_mm(path: PathLike, lines: dict[str, str], count: int) -> FloatArra
     return axes
 
 
-def _nrrd_times(lines: dict[str, str], axis: int, stored: tuple[int, ...]) -> FloatArray | None:
+def space_unit_mm(path: PathLike, said: dict[str, str]) -> float:
+    """Millimetres of the unit of directions and origin."""
+    units = _quoted(said.get("space units", said.get("units", "")))
+    return mm_per(next((unit for unit in units if unit not in _S_PER), ""), f"{path}: space units")
+
+
+def _vector(text: str, where: str) -> list[float]:
+    return [*numbers(text.replace(",", " "), None, where)]
+
+
+def _frame_times(said: dict[str, str], axis: int, stored: tuple[int, ...]) -> FloatArray | None:
     """Times of frames by their axis: its index, as 3D Slicer writes it, or its spacing in a unit of time."""
-    units = _quoted(lines.get("units", ""))
+    units, steps = _quoted(said.get("units", "")), said.get("spacings", "").split()
     unit = units[axis] if len(units) == len(stored) else ""
-    values = lines.get(f"axis {axis} index values", "").split()
-    steps = lines.get("spacings", "").split()
-    if lines.get(f"axis {axis} index type", "numeric") == "numeric" and len(values) == stored[axis]:
+    values = said.get(f"axis {axis} index values", "").split()
+    if said.get(f"axis {axis} index type", "numeric") == "numeric" and len(values) == stored[axis]:
         return np.array(values, dtype=float) * _S_PER.get(unit, 1.0)
     if unit in _S_PER and len(steps) == len(stored) and float(steps[axis]) > 0:
         return np.arange(float(stored[axis])) * float(steps[axis]) * _S_PER[unit]
@@ -353,22 +356,22 @@ def _split(lines: dict[str, str]) -> tuple[dict[str, str], tuple[dict[str, str],
     return fields, tuple(frames.get(i, {}) for i in range(max(frames, default=-1) + 1))
 
 
-def _sizes(path: Path, lines: dict[str, str], name: str) -> tuple[int, ...]:
-    sizes = numbers(lines.get(name, ""), None, f"{path}: {name}")
+def _sizes(path: Path, text: str) -> tuple[int, ...]:
+    sizes = numbers(text, None, f"{path}: sizes")
     if any(length != int(length) or not 0 <= length < 2**40 for length in sizes):
-        raise InvalidInputError(f"{path}: {name}: expected whole numbers from 0, got {lines[name]}")
+        raise InvalidInputError(f"{path}: sizes: expected whole numbers from 0, got {text}")
     return tuple(map(int, sizes))
 
 
-def _beside(path: Path, name: str, field: str) -> Path:
+def _beside(path: Path, name: str) -> Path:
     """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
     if name.split()[:1] == ["LIST"] or ("%" in name and len(name.split()) > 1):
         raise InvalidInputError(
-            f"{path}: {field}: expected LOCAL or the name of one file, got a list of files ({name!r}), which "
-            "is not read: write the images into one file"
+            f"{path}: expected pixels in one file, got a list of files ({name!r}), which is not read: write "
+            "the images into one file"
         )
     folder = path.parent.resolve()
     data = (folder / name).resolve()
     if not name or Path(name).is_absolute() or not data.is_relative_to(folder):
-        raise InvalidInputError(f"{path}: {field}: expected a file in the header's own folder, got {name!r}")
+        raise InvalidInputError(f"{path}: expected pixels in a file in the header's own folder, got {name!r}")
     return data

@@ -17,7 +17,14 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, mm_per, nrrd_axes_mm, read_header
+from speckle3d.io.headers import (
+    SequenceHeader,
+    axes_mm,
+    is_metaimage,
+    is_nrrd,
+    read_header,
+    space_unit_mm,
+)
 from speckle3d.io.pixels import map_pixels
 from speckle3d.io.text import numbers
 from speckle3d.io.voxels.nifti import is_nifti, read_nifti
@@ -134,7 +141,7 @@ def read_volume(path: PathLike) -> Volume:
             raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
         # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
         voxels = np.array(map_pixels(header.pixels)).reshape(header.size[::-1]).T
-        matrix = (_nrrd_matrix if header.is_nrrd else _meta_matrix)(header)
+        matrix = _world_from_index(header)
     else:
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
@@ -211,34 +218,26 @@ def _labels(voxels: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return labels
 
 
-def _meta_matrix(header: SequenceHeader) -> FloatArray:
-    """World (LPS, mm) from index of a MetaImage."""
+def _world_from_index(header: SequenceHeader) -> FloatArray:
+    """World (LPS, mm) from index of a MetaImage or NRRD file."""
+    fields, said, matrix = header.fields, header.said, np.eye(4)
 
-    def numbers_of(default: FloatArray, *names: str) -> FloatArray:
-        text = next((header.fields[name] for name in names if name in header.fields), None)
-        where = f"{header.path}: {names[0]}"
-        return default if text is None else np.array(numbers(text, default.size, where))
+    def numbers_of(count: int, *names: str) -> FloatArray | None:
+        name = next((name for name in names if name in fields), None)
+        text = None if name is None else re.sub("[(),]", " ", fields[name])
+        return None if text is None else np.array(numbers(text, count, f"{header.path}: {name}"))
 
-    matrix = np.eye(4)
-    axes = numbers_of(np.eye(3).ravel(), "TransformMatrix", "Rotation", "Orientation")
-    matrix[:3, :3] = axes.reshape(3, 3).T * numbers_of(np.ones(3), "ElementSpacing", "ElementSize")
-    matrix[:3, 3] = numbers_of(np.zeros(3), "Offset", "Position", "Origin")
-    matrix[:3] *= mm_per(header.fields.get("DistanceUnits", ""), f"{header.path}: DistanceUnits")
-    return matrix
-
-
-def _nrrd_matrix(header: SequenceHeader) -> FloatArray:
-    """World (LPS, mm) from index of an NRRD file."""
-    fields, matrix = header.fields, np.eye(4)
-    axes = nrrd_axes_mm(header.path, fields, 3)
+    axes = axes_mm(header.path, said, 3)
     if axes is not None:
         if axes.shape != (3, 3):
             raise InvalidInputError(f"{header.path}: expected steps in three dimensions, got {axes.shape}")
         matrix[:3, :3] = axes.T
-    if "space origin" in fields:
-        units = re.findall(r'"([^"]*)"', fields.get("space units", "")) or [""]
-        origin = numbers(re.sub("[(),]", " ", fields["space origin"]), 3, f"{header.path}: space origin")
-        matrix[:3, 3] = np.multiply(origin, mm_per(units[0], f"{header.path}: space units"))
+    turn = numbers_of(9, "TransformMatrix", "Rotation", "Orientation")
+    if turn is not None:
+        matrix[:3, :3] = turn.reshape(3, 3).T @ matrix[:3, :3]
+    origin = numbers_of(3, "space origin", "Offset", "Position", "Origin")
+    if origin is not None:
+        matrix[:3, 3] = origin * space_unit_mm(header.path, said)
     space = fields.get("space", "").lower()
     if space in ("right-anterior-superior", "ras"):
         matrix[0] *= -1.0
