@@ -192,14 +192,6 @@ def reconstruct(path, chunks, finish=True, poses=None, trust=None):
             writer.finish(poses or whole.poses, whole.provenance, "", trust or whole.trust)
 
 
-def test_pairs_come_back_in_the_order_they_were_appended_or_are_left_out(tmp_path):
-    pairs = old_files.pairs()
-    reconstruct(tmp_path / "r.h5", [pairs, replace(pairs, sigma_mm=pairs.sigma_mm + 1)])
-    got = read_reconstruction(tmp_path / "r.h5")
-    np.testing.assert_array_equal(got.pairs.sigma_mm, np.concatenate([pairs.sigma_mm, pairs.sigma_mm + 1]))
-    assert read_reconstruction(tmp_path / "r.h5", with_pairs=False).pairs is None
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

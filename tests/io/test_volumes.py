@@ -14,7 +14,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.labels import STATE_SEGMENTS, LabelMap, Segment
 from speckle3d.core.volume import VOXEL_TYPES, Volume
-from speckle3d.io.describe import describe
 from speckle3d.io.voxels.volume_writer import SUFFIXES, VolumeWriter
 from speckle3d.io.voxels.volumes import read_volume, write_volume
 
@@ -90,15 +89,6 @@ def test_fields_come_back_and_take_nobodys_place(tmp_path, suffix):
     write_volume(path, volume)
     assert dict(read_volume(path).fields) == FIELDS
     np.testing.assert_array_equal(by_itk(path)[1], volume.voxels)
-
-
-def test_control_characters_cannot_forge_a_field_and_names_must_fit_a_header(tmp_path):
-    for suffix in (".nrrd", ".mha"):
-        write_volume(tmp_path / f"v{suffix}", volume_of(fields={"a": "x\r\nSpeckle3D_b = y\x1b\0z"}))
-        assert dict(read_volume(tmp_path / f"v{suffix}").fields) == {"a": "x\nSpeckle3D_b = y\\x1b\\x00z"}
-    for name in ("", "a:=b"):
-        with pytest.raises(InvalidInputError, match=r"v\.nrrd: fields"):
-            write_volume(tmp_path / "v.nrrd", volume_of(fields={name: "x"}))
 
 
 def written(path, planes=(), **others):
@@ -222,16 +212,3 @@ def test_nrrd_is_in_its_own_unit(tmp_path, line, spacing):
     if "units" in line:
         with pytest.raises(InvalidInputError, match="furlong"):
             read_volume(path)
-
-
-@pytest.mark.parametrize("suffix", [*SUFFIXES, ".seg.nrrd"])
-def test_info_tells_what_a_volume_holds(tmp_path, suffix):
-    path, place = tmp_path / f"v{suffix}", ((0.5, 0.25, 1.0), RigidTransform.identity(), {"levels": "linear"})
-    voxels = np.full((4, 3, 2), 2, np.uint8)
-    volume = LabelMap(voxels, *place, STATE_SEGMENTS) if "seg" in suffix else Volume(voxels, *place)
-    write_volume(path, volume)
-    rows = {what: (value, unit) for what, value, unit in describe(path)}
-    assert rows["voxels"] == ("4 x 3 x 2", "")
-    assert rows["spacing"] == ("0.5 x 0.25 x 1", "mm")
-    assert rows["levels"] == ("linear", "")
-    assert rows.get("label 2", rows.get("levels found")) in (("filled: 24", "voxels"), ("2 to 2", ""))
