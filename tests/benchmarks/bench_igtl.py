@@ -1,18 +1,15 @@
-"""Frames served, received and recorded over the loopback: what is lost, its cost, and what a kill leaves.
+"""Frames served, received and recorded over the loopback: what is lost, and its cost.
 
 Run: ``python tests/benchmarks/bench_igtl.py [SECONDS]`` (60; 600 for the README's figure). For RF of 127 x
 3818 samples and B-mode of 640 x 480 pixels, each at 25 frames/s: `speckle3d play` in a process of its own,
 received by a `Connection` and recorded by a `GrowingSweep` here. Every frame carries its number. Printed are
 frames received and recorded, the time from due to recorded, and this process's share of a core. Then the
-server is killed and started again while a recording goes on, and a recorder is killed: what it had told of
-must be in its file.
+server is killed and started again while a recording goes on. Of killed recorders: bench_growing.py.
 """
 
 from __future__ import annotations
 
-import os
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
@@ -64,7 +61,7 @@ def ended(process, number=signal.SIGTERM):
     process.communicate()
 
 
-def recorded(path, sweep, port, seconds, told=None, kill=None):
+def recorded(path, sweep, port, seconds, kill=None):
     """Receive and record; returns numbers of the frames, delays, and the connection's state."""
     numbers, delays, later_s, last_s = [], [], 0.0, -1.0
     end = time.monotonic() + seconds
@@ -87,8 +84,6 @@ def recorded(path, sweep, port, seconds, told=None, kill=None):
                 numbers.append(int(frame[0, 0]))
                 start = time.monotonic() - last_s if start is None else start
                 delays.append(time.monotonic() - start - last_s)
-                if told is not None:
-                    os.write(told, struct.pack("i", len(growing)))
         return numbers, delays, connection.state
 
 
@@ -140,34 +135,12 @@ def kill_server(folder):
     return (state.reconnections != 1) + (found != len(numbers))
 
 
-def kill_recorder(folder):
-    """Kill a recorder while frames come."""
-    sweep, reading_told = example("rf"), os.pipe()
-    server, port = played(folder / "rf.h5", 0)
-    child = os.fork()
-    if not child:
-        recorded(folder / "killed.h5", sweep, port, 60.0, told=reading_told[1])
-        os._exit(0)
-    os.close(reading_told[1])
-    time.sleep(5.0)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    told = struct.unpack("i", os.read(reading_told[0], 2**16)[-4:])[0]
-    ended(server)
-    found = load_sweep(folder / "killed.h5")
-    same = all(int(found.frames[i][0, 0]) == i % FRAMES for i in range(len(found)))
-    print(
-        f"recorder killed: {told} frames told of, {len(found)} in the file, {'whole' if same else 'DAMAGED'}"
-    )
-    return (len(found) < told) + (not same)
-
-
 def main(seconds=60.0):
     """Run all; returns how much was lost."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         wrong = sum(measure(kind, seconds, folder) for kind in ("rf", "bmode"))
-        return wrong + kill_recorder(folder) + kill_server(folder)
+        return wrong + kill_server(folder)
 
 
 if __name__ == "__main__":
