@@ -74,13 +74,20 @@ class Config(BaseModel):
     fused: FusedSettings = FusedSettings()
     volume: CompoundingSettings = CompoundingSettings()
 
-    def with_choices(self, consistent_subset: bool | None, drift_curves: str | None) -> Config:
+    def with_choices(
+        self,
+        consistent_subset: bool | None = None,
+        drift_curves: str | None = None,
+        region: str | None = None,
+    ) -> Config:
         """Return a configuration with command-line choices in place of its own; None leaves one as it is."""
         values = self.model_dump()
         if consistent_subset is not None:
             values["sensors"]["consistent_subset"] = consistent_subset
         if drift_curves is not None:
             values["drift"]["curves"] = drift_curves
+        if region is not None:
+            values["patches"]["region"] = region
         return validated(values, "configuration", Config)
 
     def to_toml(self, comments: bool = False) -> str:

@@ -27,8 +27,10 @@ LENGTH_SIGMA = 0.005
 """Of a tracker's millimetres and of how well its mounting is known, beside its jitter."""
 ALIKE_FRAMES = 10
 """Frames over which the images' departure from the tracker stays the same."""
-LEAST_SURE = 0.03
-"""Relative standard deviation of length beyond which a tracker corrects no curves: data sheets have 0.07."""
+LEAST_FRAMES = 5
+"""Frames with readings from which a length and its error are estimated."""
+LEAST_SURE = 0.3
+"""Relative standard deviation of length beyond which it corrects nothing; up to it the curves claim it."""
 STEADY_MM = 0.01
 """Jitter up to which positions are a stage's, exact enough for each step; trackers have 0.05 to 0.3."""
 ROUNDS = 2
@@ -93,9 +95,9 @@ def tracker_scale(sweep: Sweep, tracked: Tracked) -> Length:
             "speckle3d calibrate images or plane tells how it sits on the probe"
         )
     known = tracker.covers(sweep.frame_time_s) & (tracked.flags == 0)
-    if known.sum() < 2 * ALIKE_FRAMES:
+    if known.sum() < LEAST_FRAMES:
         raise InsufficientDataError(
-            f"{sweep.name}: expected {2 * ALIKE_FRAMES} frames with tracker readings, got {known.sum()}"
+            f"{sweep.name}: expected {LEAST_FRAMES} frames with tracker readings, got {known.sum()}"
         )
     poses = tracker.world_from_image(sweep.frame_time_s[known])
     middle = len(poses) // 2
@@ -104,7 +106,8 @@ def tracker_scale(sweep: Sweep, tracked: Tracked) -> Length:
     z, seen = z - z.mean(), seen - seen.mean()
     scale = abs(float(z @ seen)) / float(seen @ seen)
     left = z - np.sign(z @ seen) * scale * seen
-    sigma = float(np.sqrt(ALIKE_FRAMES * left.var() / (seen @ seen))) / scale
+    variance = float(left @ left) / (left.size - 2)
+    sigma = float(np.sqrt(min(ALIKE_FRAMES, left.size) * variance / (seen @ seen))) / scale
     sigma = float(np.hypot(sigma, LENGTH_SIGMA))
     if not sigma < LEAST_SURE:
         raise InsufficientDataError(

@@ -26,6 +26,16 @@ def narrowed(sweep, vectors=24):
     return spoiled(replace(sweep, frames=frames, grid=replace(sweep.grid, vectors=vectors)), frames)
 
 
+def shadowed(sweep, columns, rows, seed=5):
+    """A bone's shadow: nothing but fresh noise of 3 counts in some vectors and samples of every frame."""
+    rng, frames = (
+        np.random.default_rng(seed),
+        np.array([sweep.frames[k] for k in range(len(sweep))], np.float32),
+    )
+    frames[:, columns, rows] *= 0.002
+    return spoiled(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
+
+
 def in_order(sweep, order):
     """Frames of a sweep in another order, some of them twice or not at all."""
     return spoiled(sweep, sweep.frames[np.asarray(order)], order)

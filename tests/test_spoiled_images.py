@@ -46,6 +46,15 @@ def test_noise_on_a_probe_at_rest_is_no_sweep(narrow, curves):
         track(spoil.at_rest(spoil.in_order(narrow, range(40)), 3.0), curves)
 
 
+def test_a_shadow_is_left_out_and_told_and_the_length_stays(sweep, curves):
+    spoilt = spoil.shadowed(sweep.part(0, 48), slice(12, 36), slice(1200, None))
+    found = track(spoilt, curves)
+    true, seen, claimed = length_of(spoilt, found)
+    assert abs(seen / true - 1) < 0.03
+    assert abs(seen - true) < 2 * claimed
+    assert any("which is left out" in str(doubt) for doubt in found.doubts)
+
+
 REFUSED = {
     "clutter at -6 dB": lambda s, p: spoil.cluttered(s, p, -6.0),
     "clutter in the upper half": lambda s, p: spoil.cluttered(s, p, 6.0, (0.0, 0.5)),

@@ -9,6 +9,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.motion.diffraction import half_distance
+from speckle3d.pipeline import track
 from speckle3d.tracked_curves import jitters, tracked_curves, tracker_scale
 
 
@@ -29,8 +30,19 @@ def test_the_length_is_the_trackers_and_its_error_grows_with_jitter(sweep, track
     for length in scales:
         assert abs(length.log_scale - np.log(z / seen)) < 3 * length.sigma
     assert 0.005 < scales[0].sigma < scales[1].sigma < 0.03
-    with pytest.raises(InsufficientDataError, match="expected a length that the tracker knows to 3 %, got"):
-        tracker_scale(shaken(sweep, 2.0), tracked)
+    with pytest.raises(InsufficientDataError):
+        tracker_scale(shaken(sweep, 20.0), tracked)
+
+
+def test_curves_of_few_tracked_frames_claim_what_they_leave_open(sweep, curves):
+    few = shaken(sweep.part(0, 32), 0.1)
+    corrected = tracked_curves([few], curves)
+    assert 0.01 < corrected.scale_sigma < 0.2
+    rest = sweep.part(40, 88)
+    true = (rest.truth[0].inv() * rest.truth).apply(rest.grid.centre_mm)[:, 2]
+    found = track(rest, corrected)
+    error = abs(found.image.apply(rest.grid.centre_mm)[-1, 2] / true[-1]) - 1
+    assert abs(error) < 2 * found.scale_sigma
 
 
 def test_a_sweep_without_a_calibrated_tracker_is_named(sweep, tracked):

@@ -41,6 +41,7 @@ def reconstruct(
     frames: str | None = None,
     crossing_frames: str | None = None,
     reference: Reference | None = None,
+    region: str | None = None,
     consistent_subset: Annotated[
         bool | None, typer.Option("--consistent-subset/--no-consistent-subset")
     ] = None,
@@ -71,6 +72,9 @@ def reconstruct(
         Write a volume, too (.nrrd, .mha, .nii.gz, .nii), as group `volume` of the settings says.
     reference
         What to compare with.
+    region
+        Part of the image to look at, in mm: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or 'fan x,y
+        angle,angle radius,radius'; several joined by ' and '.
     as_json
 
     Other Parameters
@@ -100,7 +104,7 @@ def reconstruct(
     from speckle3d.study.job import run_job
 
     settings = load_settings(config_file).with_choices(
-        consistent_subset=consistent_subset, drift_curves=drift_curves
+        consistent_subset=consistent_subset, drift_curves=drift_curves, region=region
     )
     modes, calibrations = list[str](dict.fromkeys(drift or ())), calibration or ()
     sweep = load_sweep(sweep_file)

@@ -28,6 +28,8 @@ from speckle3d.motion.trajectory import HELD_MM
 IMAGES = "images"
 """What all doubts of this module are about."""
 
+SHADOW_TOLD = 0.02
+"""Share of patches without an echo that is told."""
 OPEN_SHARE, LOOSE_SHARE = 0.5, 0.25
 """Standard error over length from which a length is refused and flagged. Good sweeps claim up to 0.06, those
 with noise of half the signal's power 0.15."""
@@ -100,6 +102,7 @@ def examine_images(
     pairs, path_mm = motion.motion.pairs, motion.motion.path[:, 0]
     doubts = unrefuted(
         [
+            shadowed(matches.left_out),
             interleaved(matches.table, len(sweep), motion.motion.problem.trajectory.least_correlation),
             _standing_echoes(sweep, matcher, far_apart(path_mm, usable, curves), curves),
         ],
@@ -123,6 +126,21 @@ def _standing_echoes(
         return None
     share = standing_share(sweep, matcher, frames.tolist())
     return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
+
+
+def shadowed(left_out: FloatArray) -> Doubt | None:
+    """Tell that patches without an echo were left out.
+
+    Parameters
+    ----------
+    left_out : ndarray, shape (p,)
+        Share of the frames in which each was.
+    """
+    share = float(left_out.mean())
+    if share < SHADOW_TOLD:
+        return None
+    evidence = f"expected echoes all over the image, got none in {share:.0%} of it, which is left out"
+    return Doubt(IMAGES, "shadow, noise, lost contact, or text on the image", evidence, False)
 
 
 def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:

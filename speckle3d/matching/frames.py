@@ -8,14 +8,15 @@ from itertools import groupby
 from operator import itemgetter
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import Float32Array
-from speckle3d.core.sweep import Sweep, read_frame
+from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.matching.inplane import InPlaneMotion, MatchedPair, compose, inverse
 from speckle3d.matching.matcher import Echo, FrameMatcher, ReadyFrame
-from speckle3d.matching.quality import FrameFeatures, FrameInspector, QualitySettings
+from speckle3d.matching.quality import DrawnOver, FrameFeatures, FrameInspector, QualitySettings
 from speckle3d.matching.schedule import Schedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import FRAMES, Texture, spread_frames
@@ -40,11 +41,15 @@ class MatchedSweep:
         Of every frame.
     texture : Texture
         Of some frames.
+    left_out : ndarray, shape (p,)
+        Share of the frames in which each patch in the region holds no echo that could be matched: shadow,
+        noise, no contact, or something drawn on the image.
     """
 
     table: CorrelationTable
     features: Sequence[FrameFeatures]
     texture: Texture
+    left_out: FloatArray
 
 
 def match_sweep(
@@ -70,9 +75,13 @@ def match_sweep(
     maker, matched = FrameMaker(sweep, matcher, quality), FrameByFrame(matcher, schedule)
     texture, chosen = Texture(sweep.signal, matcher), spread_frames(len(sweep), textures)
     features: list[FrameFeatures] = []
+    drawn = DrawnOver(matcher.patches) if isinstance(sweep.signal, BModeSettings) else None
 
     def make(number: int) -> tuple[int, MadeReady]:
-        made = maker.make(read_frame(sweep.frames, number))
+        frame = read_frame(sweep.frames, number)
+        made = maker.make(frame)
+        if drawn:
+            drawn.keep(frame)
         if number in chosen:
             texture.keep(number, made.echo, made.features.usable)
         return number, made
@@ -87,7 +96,10 @@ def match_sweep(
             if progress:
                 progress(number + 1, len(sweep))
 
-    return MatchedSweep(CorrelationTable.of(pairs(), len(matcher.patches)), features, texture)
+    table = CorrelationTable.of(pairs(), len(matcher.patches))
+    over = drawn.patches if drawn else np.zeros(len(matcher.patches), dtype=bool)
+    left_out = matcher.patches.inside - np.mean([f.usable & ~over for f in features], axis=0)
+    return MatchedSweep(table.among(~over), features, texture, left_out)
 
 
 @dataclass(frozen=True)

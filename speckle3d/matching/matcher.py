@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -124,11 +123,11 @@ class FrameMatcher:
         Parameters
         ----------
         usable : ndarray of bool, shape (p,), optional
-            Patches that may be matched; by default all.
+            Patches that may be matched; by default all in the region.
         """
         image, parts = self.equalised(echo)
-        every = np.ones(len(self.patches), dtype=bool) if usable is None else usable
-        return ReadyFrame(every, image, self._coarse.spectrum(image), parts)
+        kept = self.patches.inside if usable is None else self.patches.inside & usable
+        return ReadyFrame(kept, image, self._coarse.spectrum(image), parts)
 
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array | None]:
         """Intensity and, where there is phase, echo over their local mean; see `ReadyFrame`."""

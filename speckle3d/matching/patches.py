@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.region import REGION_HELP, Region
 from speckle3d.core.sweep import ImageGrid
 
 
@@ -23,6 +26,9 @@ class PatchSettings(BaseModel):
     width_mm: float = Field(3.6, gt=0, description="Lateral side of a patch.")
     height_mm: float = Field(3.0, gt=0, description="Axial side of a patch.")
     top_mm: float = Field(2.0, ge=0, description="Depth above which nothing is used: the near field.")
+    region: str = Field(
+        "", description=f"Part of the image whose patches are used: {REGION_HELP}; empty: the whole image."
+    )
 
 
 @dataclass(frozen=True)
@@ -39,12 +45,15 @@ class PatchGrid:
         Lateral and axial position of each patch's centre.
     spacing_mm : ndarray, shape (2,)
         Vector pitch and sample spacing.
+    inside : ndarray of bool, shape (p,)
+        Patches in the region that counts.
     """
 
     first: IntArray
     size: IntArray
     centre_mm: FloatArray
     spacing_mm: FloatArray
+    inside: BoolArray
 
     def __len__(self) -> int:
         return int(self.first.shape[0])
@@ -54,7 +63,7 @@ class PatchGrid:
         """Depth of the centres of each row of patches, shape (r,), increasing."""
         return np.unique(self.centre_mm[:, 1])
 
-    def rows_of(self, values: FloatArray) -> FloatArray:
+    def rows_of(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values of patches, shape (..., p), as rows and columns, shape (..., r, c)."""
         by_column = values.reshape(*values.shape[:-1], -1, self.row_depth_mm.size)
         return np.asarray(by_column.swapaxes(-1, -2))
@@ -76,10 +85,16 @@ class PatchGrid:
                 f"{high:.1f} mm, got {rows[0]:.1f} to {rows[-1]:.1f} mm, {kept.sum()} of {rows.size} rows "
                 "between them"
             )
+        return self.with_rows(kept)
+
+    def with_rows(self, kept: BoolArray) -> PatchGrid:
+        """Keep some of the rows, shape (r,)."""
         if kept.all():
             return self
-        inside = np.isin(self.centre_mm[:, 1], rows[kept])
-        return replace(self, first=self.first[inside], centre_mm=self.centre_mm[inside])
+        chosen = np.isin(self.centre_mm[:, 1], self.row_depth_mm[kept])
+        return replace(
+            self, first=self.first[chosen], centre_mm=self.centre_mm[chosen], inside=self.inside[chosen]
+        )
 
 
 def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> PatchGrid:
@@ -88,7 +103,7 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     Raises
     ------
     InvalidInputError
-        If not one column or not two rows of patches fit.
+        If not one column or not two rows of patches fit, or the region holds none of them.
     """
     s = settings or PatchSettings()
     spacing = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
@@ -105,4 +120,13 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     v, d = np.meshgrid(left + size[0] * np.arange(columns), top + size[1] * np.arange(rows), indexing="ij")
     first = np.stack([v.ravel(), d.ravel()], axis=1).astype(np.int64)
     centre = (first + (size - 1) / 2) * spacing + [0.0, grid.first_sample_depth_mm]
-    return PatchGrid(first=first, size=size, centre_mm=centre, spacing_mm=spacing)
+    inside = np.ones(len(first), dtype=bool)
+    if s.region:
+        # Most of a patch must lie in the region.
+        mask = Region.from_text(s.region).mask(grid)
+        inside = np.array([mask[v : v + size[0], d : d + size[1]].mean() >= 0.5 for v, d in first])
+    patches = PatchGrid(first, size, centre, spacing, inside)
+    kept = np.asarray(patches.rows_of(inside).any(axis=1))
+    if kept.sum() < 2:
+        raise InvalidInputError(f"region: expected two rows of patches in it, got {kept.sum()}: {s.region}")
+    return patches.with_rows(kept)

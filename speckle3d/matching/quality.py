@@ -15,6 +15,7 @@ References
 from __future__ import annotations
 
 import enum
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -48,6 +49,10 @@ _CONSTANT = 1e-4
 _NOISY = 1 / 3
 """Share of patches with noise alone, in a frame without speckle, from which it is said to be lifted. Noise of
 an amplifier is in all patches that hold no echo; only the name of the flag hangs on it."""
+
+_DRAWN_SHARE, _DRAWN_FRAMES = 0.01, 8
+"""Share of a patch's pixels that no frame changes, from which something is drawn on it, and frames that must
+have been seen: speckle of so many frames agrees in no pixel by chance."""
 
 _LISTED = 8
 """Frames named in a line of `describe`."""
@@ -161,7 +166,7 @@ class FrameInspector:
         self.settings = settings or QualitySettings()
         self._bmode = isinstance(signal, BModeSettings)
         self._columns = int(np.unique(patches.first[:, 0]).size)
-        self._first, self._size = patches.first, patches.size
+        self._first, self._size, self._inside = patches.first, patches.size, patches.inside
         self._pitch_mm = float(patches.spacing_mm[0])
 
     def inspect(self, frame: npt.NDArray[Any], intensity: Float32Array) -> FrameFeatures:
@@ -205,7 +210,7 @@ class FrameInspector:
                 level_db=_decibel(mean[live].mean(axis=0)),
                 speckle=speckle[live].mean(axis=0),
                 noise_share=float(noise[live].mean()),
-                usable=(usable & finite).ravel(),
+                usable=(usable & finite).ravel() & self._inside,
             )
 
     def _rails(self, samples: npt.NDArray[Any], counted: bool) -> tuple[float, float]:
@@ -247,6 +252,44 @@ class FrameInspector:
         varies: BoolArray = contrast > _CONSTANT
         live = np.asarray(varies.any(axis=1) | ~varies.any())
         return echo & together & fine, echo & ~together, echo & together, live
+
+
+class DrawnOver:
+    """Patches on which something is drawn that no frame changes: text, a ruler, a logo.
+
+    Parameters
+    ----------
+    patches : PatchGrid
+    """
+
+    def __init__(self, patches: PatchGrid) -> None:
+        self._patches = patches
+        self._lock = threading.Lock()
+        self._frames = 0
+        self._darkest: npt.NDArray[Any] | None = None
+        self._brightest: npt.NDArray[Any] | None = None
+
+    def keep(self, frame: npt.NDArray[Any]) -> None:
+        """Look at one frame of grey levels, on any thread."""
+        with self._lock:
+            self._frames += 1
+            if self._darkest is None or self._brightest is None:
+                self._darkest, self._brightest = frame.copy(), frame.copy()
+            else:
+                np.minimum(self._darkest, frame, out=self._darkest)
+                np.maximum(self._brightest, frame, out=self._brightest)
+
+    @property
+    def patches(self) -> BoolArray:
+        """Which patches something is drawn on, shape (p,); none where the probe may have been at rest."""
+        none = np.zeros(len(self._patches), dtype=bool)
+        if self._darkest is None or self._frames < _DRAWN_FRAMES:
+            return none
+        fixed = (self._darkest == self._brightest) & (self._darkest > 0)
+        wide, high = self._patches.size
+        share = np.array([fixed[v : v + wide, s : s + high].mean() for v, s in self._patches.first])
+        drawn = share > _DRAWN_SHARE
+        return none if drawn.mean() > 0.5 else np.asarray(drawn)
 
 
 def _digest(samples: npt.NDArray[Any]) -> int:

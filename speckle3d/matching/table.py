@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -51,6 +51,17 @@ class CorrelationTable:
 
     def __len__(self) -> int:
         return int(self.first.size)
+
+    def among(self, usable: BoolArray) -> CorrelationTable:
+        """The same pairs without the correlations of some patches."""
+        if usable.all() or not len(self):
+            return self
+        correlation = np.where(usable, self.correlation, np.float32(np.nan))
+        known = np.sort(correlation, axis=1)
+        count = np.isfinite(known).sum(axis=1)
+        pair, half = np.arange(len(self)), np.maximum(count - 1, 0)
+        median = (known[pair, half // 2] + known[pair, np.minimum((half + 1) // 2, half)]) / 2.0
+        return replace(self, correlation=correlation, median=np.where(count > 0, median, 0.0).astype(float))
 
     def where(self, kept: BoolArray, shift: int = 0) -> CorrelationTable:
         """Some of the pairs, their frames numbered `shift` higher."""

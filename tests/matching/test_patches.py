@@ -88,3 +88,16 @@ def test_depths_that_hold_less_than_half_of_the_rows_are_refused(depths):
         MismatchError, match=rf"depths of {depths[0]:.1f} to {depths[1]:.1f} mm, got 3.5 to 33.5"
     ):
         lay_patches(ROWS).between(np.array(depths))
+
+
+def test_a_region_keeps_its_patches_and_rows():
+    grid = ImageGrid(96, 1000, 0.3, 0.04)
+    every = lay_patches(grid)
+    some = lay_patches(grid, PatchSettings(region="rectangle 0,8 15,20"))
+    assert len(every) > len(some) > some.inside.sum() > 0
+    x, y = some.centre_mm[some.inside].T
+    assert (x < 15).all()
+    assert (y > 8).all()
+    assert (y < 20).all()
+    with pytest.raises(InvalidInputError):
+        lay_patches(grid, PatchSettings(region="rectangle 0,8 15,9"))

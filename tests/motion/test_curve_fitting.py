@@ -42,7 +42,8 @@ def samples(law, distances, noise_floor=1.0, cells=np.inf, repeats=1, seed=0, de
 def read_distance(curves, correlation, depths=DEPTHS_MM):
     """Distance at each depth for each correlation, shape (depth, correlation)."""
     centres = np.array([(10.0, depth) for depth in depths])
-    patches = PatchGrid(np.zeros((len(depths), 2), int), np.array([12, 50]), centres, np.array([0.3, 0.06]))
+    first, spacing = np.zeros((len(depths), 2), int), np.array([0.3, 0.06])
+    patches = PatchGrid(first, np.array([12, 50]), centres, spacing, np.ones(len(depths), bool))
     estimator = DistanceEstimator(curves, patches)
     return np.array([estimator.distances(row).distance_mm for row in np.transpose(correlation)]).T
 

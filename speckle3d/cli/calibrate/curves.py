@@ -23,6 +23,7 @@ def curves(
     probe: Path | None = None,
     like: Path | None = None,
     start: Path | None = None,
+    region: str | None = None,
     config_file: ConfigFile = None,
     as_json: Json = False,
 ) -> None:
@@ -42,6 +43,9 @@ def curves(
         TOML with a probe's data sheet: elevation_aperture_mm, elevation_focus_mm, band_mhz.
     like
         With --probe: sweep whose signal, depths and echoes to calculate for.
+    region
+        Part of the image to look at, in mm: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or 'fan x,y
+        angle,angle radius,radius'; several joined by ' and '.
     as_json
 
     Other Parameters
@@ -56,7 +60,7 @@ def curves(
     from speckle3d.io.load import load_sweep
 
     require_own_place(out, "curves", *(sweeps or []), config_file, probe, like, start)
-    settings = load_settings(config_file)
+    settings = load_settings(config_file).with_choices(region=region)
     if (probe is None) == (not sweeps):
         raise InvalidInputError("expected sweeps to measure curves on, or --probe, got both or neither")
     if probe is not None:
@@ -90,11 +94,14 @@ def _measured(sweeps: list[Any], start: DecorrelationCurves | None, settings: Co
 
 
 def _show(curves: DecorrelationCurves, as_json: bool) -> None:
+    import numpy as np
+
     first = (curves.correlation < 0.5).argmax(axis=1)
     below = curves.correlation.min(axis=1) < 0.5
     half = [float(curves.distance_mm[i]) if b else float("nan") for i, b in zip(first, below, strict=True)]
     if as_json:
-        by_depth = {"depth_mm": curves.depth_mm.tolist(), "half_mm": half, "cells": curves.cells.tolist()}
+        told = [width if np.isfinite(width) else None for width in half]
+        by_depth = {"depth_mm": curves.depth_mm.tolist(), "half_mm": told, "cells": curves.cells.tolist()}
         tilt = {} if curves.tilt is None else {name: v.tolist() for name, v in vars(curves.tilt).items()}
         about = {"pairs": curves.pairs_used, "origin": curves.origin, "scale_sigma": curves.scale_sigma}
         emit_json(by_depth | tilt | about)
@@ -102,7 +109,8 @@ def _show(curves: DecorrelationCurves, as_json: bool) -> None:
     seen = f"{curves.pairs_used} frame pairs" if curves.pairs_used else "calculated, not measured"
     emit(f"{seen}; correlation falls to one half at")
     for depth, distance, cells in zip(curves.depth_mm, half, curves.cells, strict=True):
-        emit(f"  {depth:5.1f} mm depth: {distance:.2f} mm  ({cells:.0f} independent cells in a patch)")
+        width = f"{distance:.2f}" if np.isfinite(distance) else f"more than {curves.distance_mm[-1]:.2f}"
+        emit(f"  {depth:5.1f} mm depth: {width} mm  ({cells:.0f} independent cells in a patch)")
     emit(f"lengths read with them on sweeps of a probe like this: +- {196 * curves.scale_sigma:.1f} % (95 %)")
     if curves.tilt is None:
         note("the phantom sweeps hardly turned: tilt will be taken to be about the image's centre")

@@ -107,7 +107,7 @@ def volume(
     --------
     $ speckle3d volume out/reconstruction.h5 -o volume.nrrd
     """
-    from speckle3d.imaging.region import Region
+    from speckle3d.core.region import Region
     from speckle3d.study.pose_errors import caution
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 

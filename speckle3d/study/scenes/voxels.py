@@ -17,10 +17,10 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.progress import Progress
+from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.measures.uncertainty import deviation_volume
-from speckle3d.imaging.region import Region
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, grid_like, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.volume import compound_onto

@@ -8,9 +8,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core import threads
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
+from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.region import Region
 from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
 from speckle3d.kernels.cuts import EDGE_TOLERANCE

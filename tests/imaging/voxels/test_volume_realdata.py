@@ -17,9 +17,9 @@ from igsio_twin import Clip
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.labels import MEASURED
+from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.region import Region
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_like
 from speckle3d.imaging.voxels.splatting import splat_images
 from speckle3d.imaging.voxels.volume import compound

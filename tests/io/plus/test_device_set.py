@@ -7,8 +7,8 @@ from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.region import Region
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, recording_files
 from speckle3d.io.plus.device_set import read_device_set
