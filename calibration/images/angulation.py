@@ -175,7 +175,8 @@ def angulation(
         (_fan_deg(one), _fan_deg(other)),
         overlap,
         alone,
-        _with_others_free(information),
+        # Roots of the Schur complements: what is left of each with the others free to make up for it.
+        np.diag(np.linalg.inv(information + (1e-10 * np.trace(information) + 1e-30) * np.eye(6))) ** -0.5,
         float(np.linalg.norm(half[:2]) / np.sqrt(2.0)),
     )
 
@@ -183,14 +184,6 @@ def angulation(
 def point_motion(local_mm: FloatArray) -> FloatArray:
     """How points of the image move with its turns and shifts, in its frame, shape (p, 3) to (p, 3, 6)."""
     return np.concatenate([-skew(local_mm), np.broadcast_to(np.eye(3), (len(local_mm), 3, 3))], axis=2)
-
-
-def _grid(corners_mm: FloatArray) -> FloatArray:
-    low, high = corners_mm.min(axis=0), corners_mm.max(axis=0)
-    # Centres of cells, so that each point stands for the same area.
-    share = (np.arange(_POINTS) + 0.5) / _POINTS
-    x, y = np.meshgrid(low[0] + share * (high - low)[0], low[1] + share * (high - low)[1])
-    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
 
 
 def _both_ways(
@@ -210,34 +203,32 @@ def _disagreements(
 
     Shapes (p, 3, 6) and (p,); NaN where the other sweep's planes never pass the point.
     """
-    points, centre, half = _grid(corners_mm), corners_mm.mean(axis=0), 0.5 * np.ptp(corners_mm, axis=0)
-    chosen = np.unique(np.linspace(0, len(one) - 1, _FRAMES).round().astype(int))
+    low, size = corners_mm.min(axis=0), np.ptp(corners_mm, axis=0)
+    centre = low + size / 2.0
+    # Centres of cells, so that each point stands for the same area.
+    share = (np.arange(_POINTS) + 0.5) / _POINTS
+    across, down = np.meshgrid(share, share)
+    points = low + size * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
     blocks, inside = [], []
-    for frame in chosen:
-        world = one[frame].apply(points)
-        seen = np.stack([other[k].inv().apply(world) for k in range(len(other))])
-        away = seen[..., 2]
+    for pose in _some(one):
+        seen = other.inv().as_matrix() @ pose.as_matrix() @ np.column_stack([points, np.ones(len(points))]).T
+        away = seen[:, 2]
         nearest = np.abs(away).argmin(axis=0)
+        local = seen[nearest, :3, np.arange(len(points))]
+        turns = other.as_matrix()[nearest][:, :3, :3]
+        block = turns @ point_motion(local - centre) - pose.rotation.as_matrix() @ point_motion(
+            points - centre
+        )
         passes = (away.min(axis=0) <= 0.0) & (away.max(axis=0) >= 0.0)
-        local = seen[nearest, np.arange(len(points))]
-        there = other.as_matrix()[nearest][:, :3, :3]
-        here = one[frame].rotation.as_matrix()
-        block = there @ point_motion(local - centre) - here @ point_motion(points - centre)
         block[~passes] = np.nan
         blocks.append(block)
-        inside.append(passes & (np.abs(local - centre)[:, :2] <= half[:2] + 1e-9).all(axis=1))
+        inside.append(passes & (np.abs(local - centre)[:, :2] <= size[:2] / 2.0 + 1e-9).all(axis=1))
     return np.concatenate(blocks), np.concatenate(inside)
 
 
-def _with_others_free(information: FloatArray) -> FloatArray:
-    """Square root of the Schur complement of each parameter; zero where others can make up for it."""
-    found = np.zeros(len(information))
-    for k in range(len(information)):
-        rest = np.delete(np.arange(len(information)), k)
-        cross = information[rest, k]
-        hidden = cross @ np.linalg.lstsq(information[np.ix_(rest, rest)], cross, rcond=1e-10)[0]
-        found[k] = np.sqrt(max(information[k, k] - hidden, 0.0))
-    return found
+def _some(sweep: RigidTransform) -> RigidTransform:
+    """Poses of a few images spread over a sweep."""
+    return sweep[np.unique(np.linspace(0, len(sweep) - 1, _FRAMES).round().astype(int))]
 
 
 def _crossing_deg(one: RigidTransform, other: RigidTransform) -> float:
@@ -252,6 +243,5 @@ def _crossing_deg(one: RigidTransform, other: RigidTransform) -> float:
 
 def _fan_deg(sweep: RigidTransform) -> float:
     """The largest angle between the beams of a few of a sweep's images."""
-    chosen = np.unique(np.linspace(0, len(sweep) - 1, _FRAMES).round().astype(int))
-    beams = sweep[chosen].rotation.apply([0.0, 1.0, 0.0])
+    beams = _some(sweep).rotation.apply([0.0, 1.0, 0.0])
     return float(np.rad2deg(np.arccos(np.clip((beams @ beams.T).min(), -1.0, 1.0))))

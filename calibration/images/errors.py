@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
 from calibration.images.fit import LEVERS_MM, Refined, about_pivot, refine
 from calibration.images.search import apart_mm
-from calibration.images.similarity import Comparison, Estimate, Level, Similarity
+from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Similarity
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -36,7 +36,7 @@ _FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0, 0.2, 0.2])
 """Largest steps, rad, mm and relative sizes: of an error that hardly shows no step would be wide enough."""
 
 APART_MM = 0.3
-"""Displacement of the image's edge for differences of slopes where steps are taken, mm: less than speckle."""
+"""Displacement of the image's edge for the curvature with which last steps are taken: less than speckle."""
 LEAST_CURVATURE = 0.01
 """Least curvature in any direction, as a share of Gauss-Newton's. Layers have 0.01 to 0.06, other tissue 0.07
 and more: below, the standard errors are so large that the answer is refused."""
@@ -82,53 +82,27 @@ RIVAL_MM, CLEAR_LEAD = 3.0, 2.0
 the lead over it, in standard errors of their difference, that an answer must have."""
 
 
-def curvature_of(
-    refined: Refined, angulation: Angulation, unit: float, share: bool = False
-) -> tuple[FloatArray, FloatArray]:
-    """Curvature of each patch's weighted correlation, (p, f, f), and of all, (f, f), over speckle's width.
+def curvature_of(refined: Refined, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Curvature of each patch's weighted correlation, (p, f, f), and of all, (f, f), over steps either way.
 
     By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full,
     is several times too stiff.
     """
     base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
-    wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
-    steps, columns = _steps(angulation, wide, unit), []
+    columns = []
     for parameter in refined.free:
         step = np.zeros(len(LEVERS_MM))
         step[parameter] = steps[parameter]
         places = (refined.estimate.stepped(sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
-        seen = [refined.comparison.at(place, True, share) for place in places]
+        seen = [refined.comparison.at(place, True) for place in places]
         columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
     bends = np.stack(columns, axis=2)
     return bends, positive(bends.sum(axis=0), refined.system[0])
 
 
-def curvature_at(refined: Refined, share: bool = False) -> FloatArray:
-    """Curvature of the similarity where it is, for steps: differences of its exact slope, shape (f, f)."""
-    chosen, base = list(refined.free), about_pivot(refined.pivot_mm)
-    columns = []
-    for parameter in chosen:
-        slopes = []
-        for sign in (1.0, -1.0):
-            step = np.zeros(len(LEVERS_MM))
-            step[parameter] = sign * APART_MM / LEVERS_MM[parameter]
-            there = refined.estimate.stepped(step, refined.pivot_mm)
-            seen = refined.comparison.at(there, True, share)
-            weight = np.where(seen.valid, refined.weight, 0.0)
-            slopes.append((base.T @ (weight @ seen.gradient))[chosen])
-        columns.append((slopes[1] - slopes[0]) * LEVERS_MM[parameter] / (2.0 * APART_MM))
-    return positive(np.stack(columns, axis=1), refined.system[0])
-
-
 def claimed(
-    refined: Refined,
-    bends: FloatArray,
-    curvature: FloatArray,
-    restarted: Comparison,
-    unit: float,
-    tracker: tuple[float, float],
-    share: bool = False,
-) -> FloatArray:
+    refined: Refined, angulation: Angulation, crossing: CrossingSweeps, tracker: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
     """Covariance of an answer's turns, displacements and relative pixel sizes at the image's origin, (8, 8).
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
@@ -138,35 +112,40 @@ def claimed(
 
     Parameters
     ----------
-    bends, curvature
-        See `curvature_of`.
-    restarted : Comparison
-        At `RESTARTED`.
-    unit : float
-        Size of the images relative to the usual.
     tracker : tuple of float
         Standard deviation of what the tracker displaces and turns one sweep against the other by, on each
         axis, mm and rad.
+
+    Returns
+    -------
+    covariance : ndarray, shape (8, 8)
+    curvature : ndarray, shape (f, f)
+        Of the similarity over more than speckle's width.
 
     References
     ----------
     .. [1] A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference", Journal of
        Human Resources, 2015 (the jackknife over clusters).
     """
-    base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
-    slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
+    unit, base = crossing.unit, about_pivot(refined.pivot_mm)[:, list(refined.free)]
     wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
+    shows = np.append(angulation.alone, 0.5 * LEVERS_MM[6:])
+    shows[:3] /= np.deg2rad(1.0)
+    farthest = _FARTHEST * np.repeat([1.0, unit, 1.0], [3, 3, 2])
+    bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), farthest))
+    slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
     blocks = _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit)))
     sweep, image = refined.comparison.images.T
     stretches = _numbered(np.column_stack([sweep, _numbered(np.column_stack([sweep, image])) // STRETCH]))
     left_out = [_left_out(slopes, bends, one, curvature) for one in (blocks, stretches)]
-    pulls = _pulls(refined, wide, base, share)
     moved = np.linalg.inv(curvature)
-    wander = moved @ _wandering(refined, pulls, np.repeat(np.square(tracker), 3)) @ moved.T
+    wander = (
+        moved @ _wandering(refined, _pulls(refined, wide, base), np.repeat(np.square(tracker), 3)) @ moved.T
+    )
     covariance = base @ (sum(left_out) + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
-    covariance[:6, :6] += _scatter(refined, restarted, unit, share)
-    return np.asarray(covariance)
+    covariance[:6, :6] += _scatter(refined, crossing)
+    return np.asarray(covariance), curvature
 
 
 def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: FloatArray) -> None:
@@ -195,10 +174,9 @@ def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: Flo
 
 def require_one_answer(
     comparison: Comparison,
-    found: Estimate,
+    answer: Estimate,
     rivals: list[Estimate],
     centre_mm: FloatArray,
-    share: bool = False,
 ) -> None:
     """Refuse an answer if another that the search found, far from it, is as good for all that is known.
 
@@ -207,17 +185,17 @@ def require_one_answer(
     InsufficientDataError
         Saying how far off the other is.
     """
-    here = comparison.at(found, share=share)
+    here = comparison.at(answer)
     for rival in rivals:
-        apart = apart_mm(rival, found, centre_mm)
+        apart = apart_mm(rival, answer, centre_mm)
         if apart < RIVAL_MM:
             continue
-        there = comparison.at(rival, share=share)
+        there = comparison.at(rival)
         if there.score < LEAST_SIMILARITY:
             continue
         both = here.valid & there.valid
         lead = here.score - there.score
-        blocks = _numbered(np.floor(comparison.places_mm(found.sensor_from_image)[both] / BLOCK_MM))
+        blocks = _numbered(np.floor(comparison.places_mm(answer.sensor_from_image)[both] / BLOCK_MM))
         gain = np.bincount(blocks, here.alike[both] - there.alike[both]) / max(int(both.sum()), 1)
         noise = float(np.sqrt(np.square(gain - gain.mean()).sum())) if both.any() else 0.0
         if lead < CLEAR_LEAD * noise:
@@ -228,18 +206,18 @@ def require_one_answer(
             )
 
 
-def _scatter(refined: Refined, restarted: Comparison, unit: float, share: bool) -> FloatArray:
+def _scatter(refined: Refined, crossing: CrossingSweeps) -> FloatArray:
     """Mean square of how far fits that start beside the answer end from one that starts at it, shape (6, 6).
 
     Not about their own mean: fits that all end in the same other place are in doubt, too. Nor about the
     answer, for at `RESTARTED` images are blurred, which moves all ends alike.
     """
-    beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * unit], 3)
+    comparison = crossing.level(RESTARTED, refined.estimate.sensor_from_image)
+    beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * crossing.unit], 3)
 
     def end(side: FloatArray) -> RigidTransform:
         start = refined.estimate.stepped(np.append(side * beside, [0.0, 0.0]), refined.pivot_mm)
-        found = refine(restarted, start, max_steps=_RESTART_STEPS, share=share).estimate
-        return found.sensor_from_image
+        return refine(comparison, start, max_steps=_RESTART_STEPS).estimate.sensor_from_image
 
     back = end(np.zeros(6)).inv()
     away = [back * end(side) for side in np.concatenate([_SIDES, -_SIDES])]
@@ -247,16 +225,7 @@ def _scatter(refined: Refined, restarted: Comparison, unit: float, share: bool) 
     return np.asarray(ends.T @ ends / (len(ends) - 1))
 
 
-def _steps(angulation: Angulation, wide_mm: float, unit: float) -> FloatArray:
-    """Steps of the parameters that displace the sweeps against each other by a width."""
-    shows = np.append(angulation.alone, [1.0, 1.0])
-    shows[:3] /= np.deg2rad(1.0)
-    shows[6:] = 0.5 * LEVERS_MM[6:]
-    farthest = _FARTHEST * np.repeat([1.0, unit, 1.0], [3, 3, 2])
-    return np.asarray(np.minimum(wide_mm / np.maximum(shows, 1e-6), farthest))
-
-
-def _pulls(refined: Refined, step_mm: float, base: FloatArray, share: bool) -> FloatArray:
+def _pulls(refined: Refined, step_mm: float, base: FloatArray) -> FloatArray:
     """How each patch's slopes change as the second sweep is displaced along the world's axes, (p, f, 3)."""
     first, second = refined.comparison.stacks
     columns = []
@@ -265,7 +234,7 @@ def _pulls(refined: Refined, step_mm: float, base: FloatArray, share: bool) -> F
         for sign in (-1.0, 1.0):
             world = RigidTransform.from_translation(sign * step_mm * axis) * second.world_from_sensor
             moved = replace(refined.comparison, stacks=(first, replace(second, world_from_sensor=world)))
-            seen.append(moved.at(refined.estimate, True, share))
+            seen.append(moved.at(refined.estimate, True))
         columns.append(_fallen(refined, seen) @ base / (2.0 * step_mm))
     return np.stack(columns, axis=2)
 
@@ -312,16 +281,11 @@ def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvatur
     slope, bend = np.zeros((count, slopes.shape[1])), np.zeros((count, *curvature.shape))
     np.add.at(slope, cluster, slopes)
     np.add.at(bend, cluster, bends)
-    moves = np.array(
-        [_solved(curvature, curvature - 0.5 * (b + b.T), s) for b, s in zip(bend, slope, strict=True)]
-    )
+    # The rest of the tissue counts at least a fifth of the whole.
+    rests = (positive(curvature - b, curvature, 0.2) for b in bend)
+    moves = np.array([np.linalg.solve(rest, s) for rest, s in zip(rests, slope, strict=True)])
     moves -= moves.mean(axis=0)
     return np.asarray((count - 1.0) / count * moves.T @ moves)
-
-
-def _solved(whole: FloatArray, rest: FloatArray, slope: FloatArray) -> FloatArray:
-    """The step that is left to take; the rest of the tissue counts at least a fifth of the whole."""
-    return np.asarray(np.linalg.solve(positive(rest, whole, 0.2), slope))
 
 
 def _numbered(cells: FloatArray) -> IntArray:

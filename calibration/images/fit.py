@@ -1,4 +1,4 @@
-"""Gauss-Newton on the correlation of patches, and Newton's last steps.
+"""The optimiser: Gauss-Newton on the correlation of patches, and Newton's last steps.
 
 The patch and its cut, both without their mean and of unit length, differ by a vector whose squared length is
 2 (1 - correlation); its derivative gives Gauss-Newton its matrix, and the exact derivative of the correlation
@@ -27,12 +27,11 @@ MAX_STEPS = 25
 LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])
 """How far the image's edge moves per unit of each parameter, mm."""
 
-SETTLED = 2e-3
+CLOSE_MM = 2e-3
 """Step of the image's edge, mm, at which the fit has converged: a hundredth of speckle's error."""
 
-_MOST_STEPS, _LONGEST_MM, _SHORTER = 8, 1.0, 3
-"""Steps, how far one may move the image's edge, mm, since over speckle's blur the curvature changes, and how
-often a step that makes things worse is shortened to a quarter."""
+LONGEST_MM = 1.0
+"""How far a step with a given curvature may move the image's edge: over speckle's blur it changes."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,6 @@ class Refined:
     comparison: Comparison
     pivot_mm: FloatArray
     free: tuple[int, ...]
-    evaluations: int = 0
     converged: bool = False
 
     @property
@@ -70,9 +68,9 @@ class Refined:
     @property
     def system(self) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton's matrix and the slope of the similarity, of the free parameters at the pivot."""
-        chosen = np.array(self.free)
-        normal, gradient = _system(self.similarity, self.weight, about_pivot(self.pivot_mm))
-        return normal[np.ix_(chosen, chosen)], gradient[chosen]
+        base = about_pivot(self.pivot_mm)[:, list(self.free)]
+        normal = np.einsum("p,pij->ij", self.weight, self.similarity.normal)
+        return base.T @ normal @ base, base.T @ (self.weight @ self.similarity.gradient)
 
 
 def refine(
@@ -80,39 +78,41 @@ def refine(
     start: Estimate,
     free: tuple[int, ...] = (0, 1, 2, 3, 4, 5),
     max_steps: int = MAX_STEPS,
-    share: bool = False,
+    curvature: FloatArray | None = None,
 ) -> Refined:
-    """Levenberg-Marquardt steps until they are too small to matter."""
-    pivot = comparison.stacks[0].centre_mm
-    base = about_pivot(pivot)
-    chosen = np.array(free)
+    """Levenberg-Marquardt steps until they are too small to matter.
 
-    def look(estimate: Estimate) -> Similarity:
-        return comparison.at(estimate, True, share)
+    Parameters
+    ----------
+    curvature : ndarray, shape (f, f), optional
+        In place of Gauss-Newton's matrix, for Newton's last steps.
+    """
+    pivot, chosen = comparison.stacks[0].centre_mm, list(free)
 
-    estimate, here = start, look(start)
-    weight = weights(here)
-    damping, evaluations, converged = 1e-2, 1, False
-    while evaluations < max_steps and here.valid.sum() >= 3:
-        normal, gradient = _system(here, weight, base)
-        matrix, slope = normal[np.ix_(chosen, chosen)], gradient[chosen]
+    def look(estimate: Estimate) -> Refined:
+        seen = comparison.at(estimate, True)
+        return Refined(estimate, seen, weights(seen), comparison, pivot, free)
+
+    now, damping = look(start), 1e-2
+    for _ in range(max_steps - 1):
+        if now.similarity.valid.sum() < 3 or damping > 1e6:
+            break
+        matrix, slope = now.system
+        matrix = matrix if curvature is None else curvature
         lift = damping * np.diag(matrix) + 1e-9 * np.trace(matrix)
-        step = np.zeros(8)
+        step = np.zeros(len(LEVERS_MM))
         step[chosen] = np.linalg.solve(matrix + np.diag(lift), slope)
-        trial = estimate.stepped(step, pivot)
-        there = look(trial)
-        evaluations += 1
-        if better(here, there, weight):
-            estimate, here, damping = trial, there, max(0.2 * damping, 1e-5)
-            weight = weights(here)
+        size = float(np.abs(step * LEVERS_MM).max())
+        if curvature is not None:
+            step *= min(1.0, LONGEST_MM / max(size, LONGEST_MM))
+        trial = look(now.estimate.stepped(step, pivot))
+        if better(now.similarity, trial.similarity, now.weight):
+            now, damping = trial, max(0.2 * damping, 1e-5)
         else:
             damping *= 8.0
-        if np.abs(step * LEVERS_MM).max() < SETTLED:
-            converged = True
-            break
-        if damping > 1e6:
-            break
-    return Refined(estimate, here, weight, comparison, pivot, free, evaluations, converged)
+        if size < CLOSE_MM:
+            return replace(now, converged=True)
+    return now
 
 
 def weights(similarity: Similarity) -> FloatArray:
@@ -134,11 +134,6 @@ def about_pivot(pivot_mm: FloatArray) -> FloatArray:
     return base
 
 
-def _system(similarity: Similarity, weight: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
-    normal = base.T @ np.einsum("p,pij->ij", weight, similarity.normal) @ base
-    return normal, base.T @ (weight @ similarity.gradient)
-
-
 def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
     """Whether patches supported at both places correlate better; others would reward losing bad patches."""
     both = here.valid & there.valid
@@ -148,33 +143,3 @@ def better(here: Similarity, there: Similarity, weight: FloatArray) -> bool:
     # The weight of contrast alone, since the loss accounts for the correlation.
     base = weight[both] * ((ROBUST + 1.0 - here.alike[both]) / ROBUST) ** 2
     return bool(base @ loss[1] < base @ loss[0])
-
-
-def settle(refined: Refined, curvature: FloatArray, share: bool = False) -> Refined:
-    """Take Newton steps from where Gauss-Newton stopped, all with one curvature, shape (f, f)."""
-    now, converged = refined, False
-    for _ in range(_MOST_STEPS):
-        step = np.zeros(len(LEVERS_MM))
-        step[list(now.free)] = np.linalg.solve(curvature, now.system[1])
-        size = float(np.abs(step * LEVERS_MM).max())
-        step *= min(1.0, _LONGEST_MM / size) if size > 0.0 else 1.0
-        for _ in range(_SHORTER):
-            moved = _stepped(now, step, share)
-            if size < SETTLED or better(now.similarity, moved.similarity, now.weight):
-                break
-            step /= 4.0
-        else:
-            converged = size < 10.0 * SETTLED  # no better within rounding
-            break
-        now = moved
-        if size < SETTLED:
-            converged = True
-            break
-    return replace(now, converged=converged)
-
-
-def _stepped(refined: Refined, step: FloatArray, share: bool) -> Refined:
-    estimate = refined.estimate.stepped(step, refined.pivot_mm)
-    seen = refined.comparison.at(estimate, True, share)
-    count = refined.evaluations + 1
-    return replace(refined, estimate=estimate, similarity=seen, weight=weights(seen), evaluations=count)

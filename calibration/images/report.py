@@ -16,9 +16,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.angulation import PARAMETERS, Angulation
-from calibration.images.similarity import Comparison, Estimate
-from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration, Improvement
+from calibration.images.angulation import PARAMETERS
+from calibration.images.similarity import Comparison, Estimate, Level
+from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
@@ -33,8 +33,8 @@ _UNSEEN = "#33415c"
 """Where the other sweep has no frame: blue-grey, as in cuts."""
 _REACH_MM = 1.5
 
-IMAGES, SIGMA_MM = 10, 1.0
-"""Images of each sweep, and their blur, in the similarity curves."""
+CURVES = Level(1.0, images=10)
+"""What is compared for the similarity curves."""
 
 CURVES_TO, CURVE_POINTS = 6.0, 25
 """Reach of the similarity curves in mm and degrees, and how finely they are drawn."""
@@ -48,7 +48,7 @@ answers from different starts."""
 
 
 def calibration_from_images(
-    result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
+    result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImages]
 ) -> Calibration:
     """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
     counts = [len(each.frame_time_s) for each in sweeps]
@@ -69,38 +69,30 @@ def calibration_from_images(
             sum(counts), (*first.tolist(), *(counts[0] + second).tolist()), _uncovered(result, counts)
         ),
         time_offset_s=sweeps[0].time_offset_s,
-        verdict=_verdict(result, angulation),
+        verdict=_verdict(result),
     )
 
 
-def notes_of(result: ImageCalibration, angulation: Angulation) -> list[str]:
+def notes_of(result: ImageCalibration) -> list[str]:
     """Lines for the report that show whether the answer is right."""
     centre = np.sqrt(np.diag(result.covariance_of(result.sweeps.centre_mm)))
-    used, held = result.similarity, result.held_out
-    kept = sum(map(len, result.sweeps.frames_held_out))
+    gained, angles, settings = result.held_out, result.angulation, result.settings
+    before = f"{gained.before:.3f}" if np.isfinite(gained.before) else "no overlap"
     return [
-        f"correlation of images with the other sweep: {_told(used)}",
-        f"of {kept} frames kept out of it for this check: {_told(held)}",
+        f"correlation with the other sweep of {sum(map(len, result.sweeps.frames_held_out))} frames kept out "
+        f"of everything for this check: {before} before, {gained.after:.3f} after",
         f"image centre known to {centre[0]:.2f}, {centre[1]:.2f} and {centre[2]:.2f} mm across, along the "
         "beam and out of plane",
-        f"sweeps at {angulation.crossing_deg:.0f} degrees, fans of {angulation.fan_deg[0]:.0f} and "
-        f"{angulation.fan_deg[1]:.0f}; they share {100 * angulation.overlap[0]:.0f} % and "
-        f"{100 * angulation.overlap[1]:.0f} % of their images",
+        f"sweeps at {angles.crossing_deg:.0f} degrees, fans of {angles.fan_deg[0]:.0f} and "
+        f"{angles.fan_deg[1]:.0f}; they share {100 * angles.overlap[0]:.0f} % and "
+        f"{100 * angles.overlap[1]:.0f} % of their images",
         "what both sweeps have wrong alike, as pixel sizes or a clock offset, shows in none of these",
         f"claimed errors allow for a tracker that displaces one sweep against the other by "
-        f"{result.settings.tracker_mm:g} mm and {result.settings.tracker_deg:g} degrees",
-        f"{result.evaluations} comparisons",
+        f"{settings.tracker_mm:g} mm and {settings.tracker_deg:g} degrees",
     ]
 
 
-def _told(gained: Improvement) -> str:
-    before = f"{gained.before:.3f}" if np.isfinite(gained.before) else "no overlap"
-    return f"{before} before, {gained.after:.3f} after"
-
-
-def figure_of(
-    result: ImageCalibration, angulation: Angulation, sweeps: tuple[TrackedImages, TrackedImages]
-) -> Figure:
+def figure_of(result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImages]) -> Figure:
     """One page: images beside reslices before and after, similarity about the answer, effect of errors."""
     figure = Figure(figsize=(12.0, 10.8), layout="constrained")
     FigureCanvasAgg(figure)
@@ -108,18 +100,25 @@ def figure_of(
     for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
         held = result.sweeps.frames_held_out[k]
         _draw_images(panels[k], result, one, other, int(held[len(held) // 2]))
-    comparison = result.sweeps.whole(SIGMA_MM, result.sensor_from_image, IMAGES)
+    comparison = result.sweeps.level(CURVES, result.sensor_from_image)
     about = Estimate(result.sensor_from_image, result.scales)
     offset = np.linspace(-CURVES_TO, CURVES_TO, CURVE_POINTS)
-    for axes, names in ((panels[2, 0], PARAMETERS[3:]), (panels[2, 1], PARAMETERS[:3])):
+    for axes, names, unit in zip(
+        panels[2], (PARAMETERS[3:], PARAMETERS[:3]), ("mm", "degrees"), strict=False
+    ):
         for name, colour in zip(names, _COLOURS, strict=True):
             axes.plot(offset, similarities(comparison, about, name, offset), color=colour, label=name)
-        axes.set(xlabel=f"off the answer / {_unit_of(names[0])}", ylabel="mean correlation")
+        axes.set(xlabel=f"off the answer / {unit}", ylabel="mean correlation")
         axes.legend(fontsize=8)
-    _draw_strength(panels[2, 2], angulation)
+    bars, place = panels[2, 2], np.arange(len(PARAMETERS))
+    bars.bar(place - 0.2, result.angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
+    bars.bar(place + 0.2, result.angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")
+    bars.set_xticks(place, [f"{name}\n{'1°' if k < 3 else '1 mm'}" for k, name in enumerate(PARAMETERS)])
+    bars.set(xlabel="error of the calibration", ylabel="disagreement of the sweeps / mm")
+    bars.legend(fontsize=8)
     for axes in panels[2:].flat:
         axes.grid(alpha=0.3)
-    figure.suptitle(f"verdict: {_verdict(result, angulation)}", fontsize=10)
+    figure.suptitle(f"verdict: {_verdict(result)}", fontsize=10)
     return figure
 
 
@@ -152,7 +151,10 @@ def cut_of(
     poses = other.world_from_sensor(frames) * sensor_from_image
     sensor = shown.world_from_sensor(np.array([frame]))[0]
     plane = image_plane(sensor * sensor_from_image, shown.grid, PIXEL_MM)
-    return reslice_frames(ChosenImages(other.images, frames), other.grid, poses, plane, _reach_mm(poses))
+    # A little more than the distance between frames deep in a fan.
+    steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
+    reach = max(_REACH_MM, 1.5 * float(np.percentile(steps, 98)))
+    return reslice_frames(ChosenImages(other.images, frames), other.grid, poses, plane, reach)
 
 
 def _draw_images(
@@ -169,32 +171,9 @@ def _draw_images(
     }
     for axes, (title, image) in zip(row, drawn.items(), strict=True):
         axes.set_facecolor(_UNSEEN)
-        axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="bilinear")
+        axes.imshow(image, cmap="gray", vmin=low, vmax=high, extent=extent)
         axes.set_title(title, fontsize=8)
-        axes.set_xlabel("lateral / mm", fontsize=8)
-        axes.tick_params(labelsize=7)
-    row[0].set_ylabel("depth / mm", fontsize=8)
-
-
-def _reach_mm(poses: RigidTransform) -> float:
-    """A little more than the distance between frames deep in a fan."""
-    steps = np.linalg.norm(np.diff(poses.apply([0.0, 40.0, 0.0]), axis=0), axis=1)
-    return max(_REACH_MM, 1.5 * float(np.percentile(steps, 98))) if len(steps) else _REACH_MM
-
-
-def _unit_of(name: str) -> str:
-    return "mm" if name in ("x", "y", "z") else "degrees"
-
-
-def _draw_strength(axes: Axes, angulation: Angulation) -> None:
-    """Disagreement caused by each error, by itself and with the other parameters free to make up for it."""
-    place = np.arange(len(PARAMETERS))
-    axes.bar(place - 0.2, angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
-    axes.bar(place + 0.2, angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")
-    axes.set_xticks(place, [f"{name}\n{'1°' if k < 3 else '1 mm'}" for k, name in enumerate(PARAMETERS)])
-    axes.tick_params("x", labelsize=8)
-    axes.set(xlabel="error of the calibration", ylabel="disagreement of the sweeps / mm")
-    axes.legend(fontsize=8)
+        axes.set(xlabel="lateral / mm", ylabel="depth / mm")
 
 
 def _parameters(result: ImageCalibration) -> tuple[Parameter, ...]:
@@ -220,7 +199,7 @@ def _uncovered(result: ImageCalibration, counts: list[int]) -> dict[int, str]:
     return reasons
 
 
-def _verdict(result: ImageCalibration, angulation: Angulation) -> str:
+def _verdict(result: ImageCalibration) -> str:
     if result.scale_errors.max() > WEAK_SCALE:
         lateral, axial = 100.0 * result.scale_errors
         return (
@@ -236,4 +215,4 @@ def _verdict(result: ImageCalibration, angulation: Angulation) -> str:
             f"doubtful: the sweeps are little alike (correlation {result.alike:.2f}), which may displace the "
             "answer by more than its errors say"
         )
-    return angulation.verdict
+    return result.angulation.verdict

@@ -5,9 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -15,11 +14,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.images.stacks import BASE_PIXEL_MM, WHOLE, Stack, TrackedImages, read_stack
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.progress import Progress
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.slicing import PARAMETERS, PatchGrid, PatchScores, PlacedImages, compare_patches
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage, the number of its steps that are done, and the number of all."""
 
 USUAL_EXTENT_MM = 40.0
 """Geometric mean of width and depth of images whose `CrossingSweeps.unit` is one."""
@@ -105,10 +102,9 @@ class Comparison:
     sources: tuple[Stack, Stack] | None = None
     least_share: float = LEAST_SHARE
 
-    def at(self, estimate: Estimate, derivatives: bool = False, share: bool = False) -> Similarity:
-        """Compare at a calibration; shared out to the cores if there is nothing else to be done."""
-        run = ahead if share else map
-        parts = list(run(lambda way: self._one_way(way, estimate, derivatives), (0, 1)))
+    def at(self, estimate: Estimate, derivatives: bool = False) -> Similarity:
+        """Compare at a calibration."""
+        parts = list(ahead(lambda way: self._one_way(way, estimate, derivatives), (0, 1)))
         return Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     @property
@@ -239,9 +235,7 @@ class CrossingSweeps:
     frames_held_out: tuple[IntArray, IntArray]
     pixel_mm: FloatArray
     unit: float
-    _kept: dict[tuple[int, float, float, bool], Stack] = field(
-        default_factory=dict, repr=False, compare=False
-    )
+    _blurred: dict[tuple[int, float, float], Stack] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def centre_mm(self) -> FloatArray:
@@ -258,41 +252,25 @@ class CrossingSweeps:
         ]
         return Comparison(thin, (patches[0], patches[1]), self._gap(sigma, thin, sensor_from_image))
 
-    def whole(
-        self, sigma_mm: float, sensor_from_image: RigidTransform, images: int | None = None
-    ) -> Comparison:
-        """Comparison of whole blurred images, near a calibration: of some used ones, or of those held out."""
+    def of_held_out(self, sigma_mm: float, sensor_from_image: RigidTransform) -> Comparison:
+        """Comparison of the whole blurred images that are held out, near a calibration."""
         sigma = sigma_mm * self.unit
         thin = self._thinned(sigma, sensor_from_image)
-        shown = thin
-        if images is None:
-            shown = self._blurred(0, sigma, held_out=True), self._blurred(1, sigma, held_out=True)
-        a, b = (
-            whole_images(one, np.arange(len(one)) if images is None else evenly(len(one), images), sigma)
-            for one in shown
-        )
-        gap = self._gap(sigma, thin, sensor_from_image)
-        return Comparison(shown, (a, b), gap, sources=thin, least_share=LEAST_OVERLAP)
+        shown = self.held_out[0].blurred(sigma), self.held_out[1].blurred(sigma)
+        a, b = (whole_images(one, np.arange(len(one)), sigma) for one in shown)
+        return Comparison(shown, (a, b), self._gap(sigma, thin, sensor_from_image), thin, LEAST_OVERLAP)
 
     def _thinned(
         self, sigma_mm: float, sensor_from_image: RigidTransform, least_weight: float = WHOLE
     ) -> tuple[Stack, Stack]:
-        spacing = [frame_spacing(stack, sensor_from_image) for stack in self.used]
-        a, b = (
-            self._blurred(way, sigma_mm, least_weight).thinned(
-                sensor_from_image, max(0.75 * sigma_mm, spacing[way]), max(0.7 * sigma_mm, 0.5 * spacing[way])
-            )
-            for way in (0, 1)
-        )
-        return a, b
-
-    def _blurred(
-        self, way: int, sigma_mm: float, least_weight: float = WHOLE, held_out: bool = False
-    ) -> Stack:
-        key = way, sigma_mm, least_weight, held_out
-        if key not in self._kept:
-            self._kept[key] = (self.held_out if held_out else self.used)[way].blurred(sigma_mm, least_weight)
-        return self._kept[key]
+        stacks = []
+        for way, stack in enumerate(self.used):
+            key, spacing = (way, sigma_mm, least_weight), frame_spacing(stack, sensor_from_image)
+            if key not in self._blurred:
+                self._blurred[key] = stack.blurred(sigma_mm, least_weight)
+            apart, width = max(0.75 * sigma_mm, spacing), max(0.7 * sigma_mm, 0.5 * spacing)
+            stacks.append(self._blurred[key].thinned(sensor_from_image, apart, width))
+        return stacks[0], stacks[1]
 
     def _gap(self, sigma_mm: float, stacks: tuple[Stack, Stack], sensor_from_image: RigidTransform) -> float:
         """Largest gap that is interpolated across: three times the usual distance between images."""
@@ -312,26 +290,33 @@ def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | No
     InsufficientDataError
         If a sweep has too few frames with readings, or its images never change.
     """
-    _require_one_scanner(first, second)
     grid = first.grid
+    ours, theirs = (
+        (one.grid.vector_pitch_mm, one.grid.sample_spacing_mm, one.grid.first_sample_depth_mm)
+        for one in (first, second)
+    )
+    if not np.allclose(ours, theirs, rtol=1e-3, atol=1e-6):
+        raise MismatchError(
+            f"{second.name}: expected the pixels of {first.name}, {ours[0]:g} x {ours[1]:g} mm from "
+            f"{ours[2]:g} mm, got {theirs[0]:g} x {theirs[1]:g} mm from {theirs[2]:g} mm"
+        )
     extent = float(np.sqrt(max(grid.width_mm, 1.0) * (grid.depth_mm - grid.first_sample_depth_mm)))
     unit = float(np.clip(extent / USUAL_EXTENT_MM, 0.5, 4.0))
     stacks, numbers = [], []
     for tracked in (first, second):
-        step = None if progress is None else partial(progress, f"reading {tracked.name}")
-        stack, frames = read_stack(tracked, BASE_PIXEL_MM * unit, step)
+        stack, frames = read_stack(tracked, BASE_PIXEL_MM * unit, progress)
         stacks.append(stack)
         numbers.append(frames)
     aside = [_set_aside(len(stack)) for stack in stacks]
     kept = [np.setdiff1d(np.arange(len(s)), out) for s, out in zip(stacks, aside, strict=True)]
-    return CrossingSweeps(
-        (stacks[0][kept[0]], stacks[1][kept[1]]),
-        (stacks[0][aside[0]], stacks[1][aside[1]]),
-        (numbers[0][kept[0]], numbers[1][kept[1]]),
-        (numbers[0][aside[0]], numbers[1][aside[1]]),
-        np.array([grid.vector_pitch_mm, grid.sample_spacing_mm]),
-        unit,
-    )
+
+    def of(parts: list[IntArray]) -> tuple[tuple[Stack, Stack], tuple[IntArray, IntArray]]:
+        (a, b), (m, n) = parts, numbers
+        return (stacks[0][a], stacks[1][b]), (m[a], n[b])
+
+    (used, frames_used), (held_out, frames_held_out) = of(kept), of(aside)
+    pixel_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
+    return CrossingSweeps(used, held_out, frames_used, frames_held_out, pixel_mm, unit)
 
 
 def evenly(count: int, wanted: int) -> IntArray:
@@ -357,15 +342,3 @@ def _inverted(matrices: FloatArray) -> FloatArray:
 def _set_aside(count: int) -> IntArray:
     wanted = min(_MOST_HELD_OUT, max(1, count // _HELD_OUT_EVERY))
     return np.unique((np.arange(1, 2 * wanted, 2) * count / (2.0 * wanted)).astype(np.int64))
-
-
-def _require_one_scanner(first: TrackedImages, second: TrackedImages) -> None:
-    a, b = (
-        np.array([t.grid.vector_pitch_mm, t.grid.sample_spacing_mm, t.grid.first_sample_depth_mm])
-        for t in (first, second)
-    )
-    if not np.allclose(a, b, rtol=1e-3, atol=1e-6):
-        raise MismatchError(
-            f"{second.name}: expected the pixels of {first.name}, {a[0]:g} x {a[1]:g} mm from {a[2]:g} mm, "
-            f"got {b[0]:g} x {b[1]:g} mm from {b[2]:g} mm"
-        )

@@ -18,22 +18,22 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import Angulation, angulation, point_motion
 from calibration.images.errors import (
+    APART_MM,
     LEAST_SIMILARITY,
-    RESTARTED,
     claimed,
-    curvature_at,
     curvature_of,
     require_known,
     require_one_answer,
 )
-from calibration.images.fit import refine, settle
+from calibration.images.fit import LEVERS_MM, refine
 from calibration.images.search import DECIDED, search
-from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Progress, prepare
+from calibration.images.similarity import CrossingSweeps, Estimate, Level, prepare
 from calibration.images.stacks import TrackedImages
 from calibration.settings import ImageFit
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.leastsquares import condition_number
+from speckle3d.core.progress import Progress
 from speckle3d.core.shown import shown
 
 FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
@@ -83,10 +83,10 @@ class ImageCalibration:
     alike : float
         Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
         support; see `LEAST_SIMILARITY`.
-    similarity, held_out : Improvement
-        Of images that were compared, and of frames that were left out of everything.
-    evaluations : int
-        How many times the sweeps were compared.
+    held_out : Improvement
+        Of frames that were left out of everything.
+    angulation : Angulation
+        How strongly each error of the answer would show.
     sweeps : CrossingSweeps
         What was compared, with the numbers of the frames used and held out.
     """
@@ -100,10 +100,9 @@ class ImageCalibration:
     covariance: FloatArray
     condition_number: float
     alike: float
-    similarity: Improvement
     held_out: Improvement
-    evaluations: int
     converged: bool
+    angulation: Angulation
     sweeps: CrossingSweeps = field(repr=False)
 
     def covariance_of(self, point_mm: FloatArray) -> FloatArray:
@@ -126,7 +125,7 @@ def calibrate_images(
     start : RigidTransform
         A guess of sensor from image: a ruler's, or an old calibration.
     progress : callable, optional
-        Called with the stage, and how many of how many of its steps are done.
+        Called with how many of how many steps of a stage are done.
 
     Raises
     ------
@@ -149,64 +148,48 @@ def calibrate_from_sweeps(
     if not start.single:
         raise InvalidInputError("start: expected a single transform, got a row of them")
     chosen = settings or ImageFit()
-    first = found = Estimate(start, np.ones(2))
-    free, looks, rivals = tuple(range(8 if chosen.scales else 6)), 0, list[Estimate]()
+    first = answer = Estimate(start, np.ones(2))
+    free, rivals = tuple(range(8 if chosen.scales else 6)), list[Estimate]()
     if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
         reach = float(np.deg2rad(chosen.capture_deg))
-        (found, *rivals), looks = search(crossing, first, chosen.capture_mm, reach, progress)
+        answer, *rivals = search(crossing, first, chosen.capture_mm, reach, progress)
     for number, level in enumerate(FINE):
-        refined = refine(crossing.level(level, found.sensor_from_image), found, free, share=True)
-        found, looks = refined.estimate, looks + refined.evaluations
+        refined = refine(crossing.level(level, answer.sensor_from_image), answer, free)
+        answer = refined.estimate
         if progress:
-            progress("refining", number + 1, len(FINE))
-    alike = _require_alike(crossing, found)
-    angles = _angulation(crossing, found.sensor_from_image)
-    angles.require()
-    bends, curvature = curvature_of(refined, angles, crossing.unit, share=True)
-    refined = settle(refined, curvature_at(refined, share=True), share=True)
-    found, near = refined.estimate, refined.estimate.sensor_from_image
-    tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
-    restarted = crossing.level(RESTARTED, near)
-    covariance = claimed(refined, bends, curvature, restarted, crossing.unit, tracker, share=True)
-    if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
-        require_known(covariance, angles, crossing.centre_mm)
-    require_one_answer(crossing.level(DECIDED, near), found, rivals, crossing.centre_mm, share=True)
-    return ImageCalibration(
-        settings=chosen,
-        start=start,
-        sensor_from_image=near,
-        scales=found.scales,
-        scale_errors=np.sqrt(np.diag(covariance)[6:8]),
-        pixel_mm=crossing.pixel_mm * found.scales,
-        covariance=covariance[:6, :6],
-        condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, np.float64)),
-        alike=alike,
-        similarity=_improvement(crossing.whole(SHOWN_SIGMA_MM, near, 10), first, found),
-        held_out=_improvement(crossing.whole(SHOWN_SIGMA_MM, near), first, found),
-        evaluations=looks,
-        converged=refined.converged,
-        sweeps=crossing,
-    )
-
-
-def _angulation(crossing: CrossingSweeps, sensor_from_image: RigidTransform) -> Angulation:
-    first, second = crossing.used
-    poses = first.world_from_sensor, second.world_from_sensor
-    return angulation(*poses, sensor_from_image, first.corners_mm)
-
-
-def _require_alike(crossing: CrossingSweeps, found: Estimate) -> float:
-    """Score of the sweeps at an answer, with speckle blurred away; refuse one below `LEAST_SIMILARITY`."""
-    seen = crossing.level(DECIDED, found.sensor_from_image)
-    score = seen.at(found, share=True).score
-    if score < LEAST_SIMILARITY:
-        got = "no overlap" if score < 0 else f"{score:.2f} at best"
+            progress(number + 1, len(FINE))
+    poses = [stack.world_from_sensor for stack in crossing.used]
+    decided = crossing.level(DECIDED, answer.sensor_from_image)
+    alike = decided.at(answer).score
+    if alike < LEAST_SIMILARITY:
+        got = "no overlap" if alike < 0 else f"{alike:.2f} at best"
         raise InsufficientDataError(
             "expected sweeps that show the same structure, with a correlation of at least "
             f"{LEAST_SIMILARITY:g} over what both cover, got {got}"
         )
-    return score
-
-
-def _improvement(comparison: Comparison, first: Estimate, found: Estimate) -> Improvement:
-    return Improvement(comparison.at(first).mean, comparison.at(found).mean)
+    angles = angulation(poses[0], poses[1], answer.sensor_from_image, crossing.used[0].corners_mm)
+    angles.require()
+    _, narrow = curvature_of(refined, APART_MM / LEVERS_MM)
+    refined = refine(refined.comparison, answer, free, curvature=narrow)
+    answer = refined.estimate
+    tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
+    covariance, curvature = claimed(refined, angles, crossing, tracker)
+    if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
+        require_known(covariance, angles, crossing.centre_mm)
+    require_one_answer(decided, answer, rivals, crossing.centre_mm)
+    check = crossing.of_held_out(SHOWN_SIGMA_MM, answer.sensor_from_image)
+    return ImageCalibration(
+        settings=chosen,
+        start=start,
+        sensor_from_image=answer.sensor_from_image,
+        scales=answer.scales,
+        scale_errors=np.sqrt(np.diag(covariance)[6:8]),
+        pixel_mm=crossing.pixel_mm * answer.scales,
+        covariance=covariance[:6, :6],
+        condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, np.float64)),
+        alike=alike,
+        held_out=Improvement(check.at(first).mean, check.at(answer).mean),
+        converged=refined.converged,
+        angulation=angles,
+        sweeps=crossing,
+    )

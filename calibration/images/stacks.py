@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.extras import extra_module
 from speckle3d.core.streams import TimedPoses
@@ -173,32 +173,17 @@ class Stack:
         # Frames count by the distance they stand for, so that a pause does not outweigh its neighbours.
         weight *= np.maximum(np.gradient(way), 1e-3 * way[-1] / len(way))
         weight /= weight.sum(axis=1, keepdims=True)
-        held = RigidTransform.from_components(weight @ centre.translation, mean_rotations(centre, weight))
+        turns = Rotation.concatenate([centre.rotation.mean(one) for one in weight])
+        held = RigidTransform.from_components(weight @ centre.translation, turns)
         return Stack(self._weighted(weight), self.pixels, held * to_centre.inv())
-
-    @cached_property
-    def _shown(self) -> tuple[Float32Array, BoolArray]:
-        """Images with zero where they show nothing, and where they show something, both of shape (n, u v)."""
-        flat = self.images.reshape(len(self), -1)
-        there = np.isfinite(flat)
-        return np.where(there, flat, np.float32(0.0)), there
-
-    @cached_property
-    def _same_everywhere(self) -> bool:
-        """Whether all images show something in the same places."""
-        there = self._shown[1]
-        return bool(there.all(axis=0).sum() + (~there).all(axis=0).sum() == there.shape[1])
 
     def _weighted(self, weight: FloatArray) -> Float32Array:
         """Weighted means over images, shape (k, u, v); NaN where the images that count most are."""
-        filled, there = self._shown
-        share = weight.astype(np.float32)
-        total = share @ filled
-        if self._same_everywhere:
-            mean = np.where(there[0], total, np.float32(np.nan))
-        else:
-            seen = share @ there.astype(np.float32)
-            mean = np.where(seen > 0.5, total / np.maximum(seen, np.float32(1e-6)), np.float32(np.nan))
+        flat, share = self.images.reshape(len(self), -1), weight.astype(np.float32)
+        there = np.isfinite(flat)
+        seen = share @ there.astype(np.float32)
+        total = share @ np.where(there, flat, np.float32(0.0))
+        mean = np.where(seen > 0.5, total / np.maximum(seen, np.float32(1e-6)), np.float32(np.nan))
         return np.asarray(mean.reshape(len(weight), *self.images.shape[1:]), dtype=np.float32)
 
 
@@ -233,9 +218,12 @@ def read_stack(
             f"{tracked.name}: expected images of at least 8 pixels of {pixel_mm:g} mm either way, "
             f"got {shape[1]} x {shape[2]}"
         )
+    transform = extra_module("skimage.transform", "calibrate", "a calibration from images")
     images = np.empty(shape, np.float32)
     for n, frame in enumerate(frames):
-        images[n] = block_means(source.read(int(frame)), (int(bins[0]), int(bins[1])))
+        # Whole blocks; a block is NaN where any of its pixels is.
+        whole = source.read(int(frame))[: shape[1] * bins[0], : shape[2] * bins[1]]
+        images[n] = transform.downscale_local_mean(whole, tuple(bins))
         if progress:
             progress(n + 1, len(frames))
     still = ~(np.ptp(images, axis=0) > 0)
@@ -246,18 +234,3 @@ def read_stack(
     images[:, still & ~np.isnan(images).any(axis=0)] = np.nan
     first = size * (bins - 1) / 2.0 + [0.0, grid.first_sample_depth_mm]
     return Stack(images, np.concatenate([size * bins, first]), tracked.world_from_sensor(frames)), frames
-
-
-def block_means(image: Float32Array, by: tuple[int, int]) -> Float32Array:
-    """Means over whole blocks of `by` pixels, those left over at the far edges dropped; NaN where any is."""
-    transform = extra_module("skimage.transform", "calibrate", "a calibration from images")
-    across, down = by
-    whole = image[: image.shape[0] // across * across, : image.shape[1] // down * down]
-    return np.asarray(transform.downscale_local_mean(whole, by), dtype=np.float32)
-
-
-def mean_rotations(poses: RigidTransform, weights: FloatArray) -> Rotation:
-    """`Rotation.mean` for many rows of weights, shape (k, n), at once."""
-    quaternions = poses.rotation.as_quat()
-    products = np.einsum("ni,nj->nij", quaternions, quaternions).reshape(-1, 16)
-    return Rotation.from_quat(np.linalg.eigh((weights @ products).reshape(-1, 4, 4))[1][:, :, -1])

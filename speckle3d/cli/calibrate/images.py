@@ -114,11 +114,9 @@ def images(
             f"{first.name} and {second.name}: the solution did not converge: expected a better start, or "
             "longer sweeps with more structure; nothing is written"
         )
-    # Checked again at the answer, because the overlap of the sweeps depends on the mounting.
-    enough = _angulation(sweeps, found.sensor_from_image)
-    notes = notes_of(found, enough) + words
-    made = calibration_from_images(found, enough, sweeps)
-    written = write_with_report(made, (first, second), out, lambda _: figure_of(found, enough, sweeps), notes)
+    notes = notes_of(found) + words
+    made = calibration_from_images(found, sweeps)
+    written = write_with_report(made, (first, second), out, lambda _: figure_of(found, sweeps), notes)
     report_written(written, notes, as_json=as_json)
 
 
@@ -160,4 +158,4 @@ def _solve(
     from calibration.images.solver import calibrate_images
 
     with progress_bar("comparing sweeps") as bar:
-        return calibrate_images(*sweeps, start, settings, lambda _stage, done, of: bar(done, of))
+        return calibrate_images(*sweeps, start, settings, bar)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.images.angulation import Angulation
 from calibration.images.errors import (
     DEEP_MM,
-    MOST_MM,
     _left_out,
     require_known,
     require_one_answer,
@@ -23,11 +22,6 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 
 CENTRE = np.array([15.0, 20.0, 0.0])
-FANNED = Angulation(90.0, (45.0, 45.0), (0.8, 0.8), np.ones(6), np.ones(6), 20.0)
-
-
-def known(y_mm=0.1):
-    return np.diag([1e-5, 1e-5, 1e-5, 0.01, y_mm**2, 0.01, 0.0, 0.0])
 
 
 def test_leaving_out_blocks_gives_the_standard_error_of_a_mean():
@@ -41,22 +35,13 @@ def test_leaving_out_blocks_gives_the_standard_error_of_a_mean():
     assert found[0, 0] == pytest.approx(blocks.var(ddof=1) / 100.0, rel=0.03)
 
 
-@pytest.mark.parametrize(
-    ("certainty", "angulation", "told"),
-    [
-        (
-            known(1.2),
-            dataclasses.replace(FANNED, fan_deg=(20.0, 20.0), recoverable=np.array([1, 1, 1, 1, 0.15, 1])),
-            "y to 1 mm.*tilt the probe to and fro",
-        ),
-        (known(1.2), FANNED, "more structure"),
-    ],
-    ids=["motion", "little structure"],
-)
-def test_an_answer_that_is_not_known_is_refused_with_what_would_help(certainty, angulation, told):
-    with pytest.raises(InsufficientDataError, match=told) as refusal:
+def test_an_answer_that_is_not_known_is_refused():
+    certainty = np.diag([1e-5, 1e-5, 1e-5, 0.01, 1.2**2, 0.01, 0.0, 0.0])
+    angulation = Angulation(90.0, (45.0, 45.0), (0.8, 0.8), np.ones(6), np.ones(6), 20.0)
+    with pytest.raises(InsufficientDataError, match="y to 1 mm"):
         require_known(certainty, angulation, CENTRE)
-    assert f"expected sweeps that tell y to {MOST_MM:g} mm" in str(refusal.value)
+    certainty[4, 4] = 0.01
+    require_known(certainty, angulation, CENTRE)
 
 
 @pytest.fixture(scope="module")

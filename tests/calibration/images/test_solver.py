@@ -5,7 +5,7 @@ import pytest
 from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
 
 from calibration.images.angulation import PARAMETERS
-from calibration.images.report import similarities
+from calibration.images.report import CURVES, similarities
 from calibration.images.similarity import Estimate, prepare
 from calibration.images.solver import calibrate_from_sweeps, calibrate_images
 from calibration.settings import ImageFit
@@ -31,12 +31,6 @@ def found(scene, crossing):
     return calibrate_from_sweeps(crossing, start)
 
 
-@pytest.fixture(scope="module")
-def others():
-    """Sweeps of something else."""
-    return crossing_sweeps(1, frames=20)
-
-
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     start = displaced(scene[2], np.random.default_rng(seed))
@@ -48,7 +42,7 @@ def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
     assert np.rad2deg(turned) < 0.5
     assert result.converged
-    assert min(result.similarity.after, result.held_out.after) > 0.9
+    assert result.held_out.after > 0.9
 
 
 def test_errors_are_within_what_the_covariance_says(scene, found):
@@ -60,18 +54,6 @@ def test_errors_are_within_what_the_covariance_says(scene, found):
     # Neither is it a bound that anything keeps. What the tracker may displace a sweep by, 0.15 mm, makes up
     # most of it: 0.1 mm across and out of plane, twice that along the beam.
     assert (spread < [0.15, 0.3, 0.15]).all()
-
-
-@pytest.mark.slow
-def test_held_out_frames_have_no_say(scene, crossing):
-    first, second, truth = scene
-    spoilt = first.images.copy()
-    spoilt[crossing.frames_held_out[0]] = 255 - spoilt[crossing.frames_held_out[0]]
-    start = displaced(truth, np.random.default_rng(3), 2.0, 2.0)
-    plain = calibrate_from_sweeps(crossing, start, REFINE)
-    other = calibrate_images(dataclasses.replace(first, images=spoilt), second, start, REFINE)
-    np.testing.assert_array_equal(other.sensor_from_image.as_matrix(), plain.sensor_from_image.as_matrix())
-    assert other.held_out.after < plain.held_out.after - 0.3
 
 
 @pytest.mark.slow
@@ -90,29 +72,26 @@ def test_pixel_sizes_are_found():
     np.testing.assert_allclose(
         result.pixel_mm / result.scales, [wrong.vector_pitch_mm, wrong.sample_spacing_mm]
     )
-    held = calibrate_images(first, second, start, REFINE)
-    assert (held.scales == 1.0).all()
-    assert (held.scale_errors == 0.0).all()
 
 
-def test_parallel_sweeps_are_refused_however_they_fan():
-    first, _, truth = crossing_sweeps(2, frames=20, fan_deg=50.0, jitter=(0.0, 0.0))
-    second, *_ = crossing_sweeps(2, frames=20, fan_deg=50.0, crossing_deg=4.0, jitter=(0.0, 0.0))
+@pytest.mark.parametrize(
+    ("fan_deg", "crossing_deg", "advice"),
+    [
+        (50.0, 4.0, "turn the probe by about 90 degrees"),
+        pytest.param(0.0, 90.0, "tilt the probe to and fro", marks=pytest.mark.slow),
+    ],
+)
+def test_sweeps_that_hardly_cross_or_fan_are_refused(fan_deg, crossing_deg, advice):
+    first, _, truth = crossing_sweeps(2, frames=20, fan_deg=fan_deg, jitter=(0.0, 0.0))
+    options = {"fan_deg": fan_deg, "crossing_deg": crossing_deg, "jitter": (0.0, 0.0)}
+    second = crossing_sweeps(2, frames=20, **options)[1]
     start = displaced(truth, np.random.default_rng(9), 0.5, 0.5)
-    with pytest.raises(InsufficientDataError, match="turn the probe by about 90 degrees"):
-        calibrate_images(first, second, start, REFINE)
-
-
-@pytest.mark.slow
-def test_sweeps_without_fan_are_refused():
-    first, second, truth = crossing_sweeps(2, frames=30, fan_deg=0.0)
-    start = displaced(truth, np.random.default_rng(9), 0.5, 0.5)
-    with pytest.raises(InsufficientDataError, match="tilt the probe to and fro"):
+    with pytest.raises(InsufficientDataError, match=advice):
         calibrate_images(first, second, start, REFINE)
 
 
 def test_similarity_falls_from_the_answer_whichever_parameters_move(crossing, found):
-    comparison = crossing.whole(1.0, found.sensor_from_image, 10)
+    comparison = crossing.level(CURVES, found.sensor_from_image)
     about = Estimate(found.sensor_from_image, found.scales)
     offset = np.linspace(-6.0, 6.0, 13)
     curves = np.stack([similarities(comparison, about, name, offset) for name in PARAMETERS])
@@ -121,9 +100,9 @@ def test_similarity_falls_from_the_answer_whichever_parameters_move(crossing, fo
 
 
 @pytest.mark.slow
-def test_sweeps_of_different_things_are_refused(scene, others):
+def test_sweeps_of_different_things_are_refused(scene):
     with pytest.raises(InsufficientDataError):
-        calibrate_images(scene[0], others[1], scene[2])
+        calibrate_images(scene[0], crossing_sweeps(1, frames=20)[1], scene[2])
 
 
 @pytest.mark.slow
