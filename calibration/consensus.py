@@ -16,9 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import binom
 
-from calibration.points import ImagePoints
+from calibration.points import ImagePoints, affine_equations
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -47,7 +47,7 @@ _LOOSE_MM = 6.0
 _TIGHTER_MM = (6.0, 5.0, 4.0, 3.0, 3.0)
 _PLAUSIBLE_PIXEL = 2.0
 """Greatest ratio of a pixel size to the one given, either way; those of samples are uncertain."""
-_PIXEL_MM = 0.02, 1.5
+_PIXEL_MM = np.array([0.02, 1.5])
 """Plausible pixels if none are given."""
 _SQUARE = 0.6
 """Greatest cosine between the axes of a sample; 90 degrees minus 37."""
@@ -117,22 +117,17 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
         The one with the fewest false alarms; the caller judges them (`Consensus.require`).
     """
     voters = _Candidates(points.of_some_frames(_MOST_FRAMES), pixel_mm)
-    rng = np.random.default_rng(0)
-    best: tuple[float, float, FloatArray] = (np.inf, GATES_MM[-1], np.zeros(12))
-    # Where the motion leaves axes open, no sample is plausible, and any will do to say so.
-    for plausible in (True, False):
-        for count in _BATCHES if plausible else _BATCHES[:2]:
-            for model in voters.promising(voters.samples(rng, count), plausible):
-                best = min(best, (*voters.false_alarms(model), model), key=lambda one: one[0])
-            if best[0] < _SURE * len(voters.frames):
-                break
-        if best[0] < np.log10(FALSE_ALARMS):
+    rng, best = np.random.default_rng(0), (np.inf, GATES_MM[-1], np.zeros(12))
+    for count in _BATCHES:
+        for model in voters.promising(voters.samples(rng, count)):
+            best = min(best, (*voters.false_alarms(model), model), key=lambda one: one[0])
+        if best[0] < _SURE * len(voters.frames):
             break
     log_alarms, gate, model = best
-    affine = voters.affine(model)
+    axes = model[3:9].reshape(2, 3) / voters.spread
+    affine = np.vstack([model[:3] - voters.centre @ axes, axes]), model[9:] + voters.middle
     nearest, away = nearest_candidates(points, *affine)
-    alarms = float(10.0 ** min(log_alarms, 300.0))
-    return Consensus(affine, nearest, away, gate, alarms)
+    return Consensus(affine, nearest, away, gate, float(10.0 ** min(log_alarms, 300.0)))
 
 
 def nearest_candidates(
@@ -169,62 +164,51 @@ class _Candidates:
 
     def __init__(self, points: ImagePoints, pixel_mm: FloatArray | None) -> None:
         self.points = points
-        self.frames, self.of_frame = np.unique(points.frame, return_inverse=True)
-        self.start = np.searchsorted(self.of_frame, np.arange(len(self.frames)))
-        self.count = np.bincount(self.of_frame)
-        self.centre = points.pixels.mean(axis=0)
-        self.spread = float(points.pixels.std()) or 1.0
-        self.middle = points.shifts_mm.mean(axis=0)
-        seen = (points.pixels - self.centre) / self.spread
-        turns = points.turns
-        lifted = np.concatenate([np.ones((len(seen), 1)), seen], axis=1)
-        image = np.einsum("nk,nri->nrki", lifted, turns).reshape(-1, 3, 9)
-        self.rows = np.concatenate([image, np.broadcast_to(-np.eye(3), (len(seen), 3, 3))], axis=2)
-        self.wanted = -(points.shifts_mm - self.middle)
-        low, high = (
-            (np.full(2, one) for one in _PIXEL_MM)
-            if pixel_mm is None
-            else (np.asarray(pixel_mm) / _PLAUSIBLE_PIXEL, np.asarray(pixel_mm) * _PLAUSIBLE_PIXEL)
+        self.frames, self.of_frame, self.count = np.unique(
+            points.frame, return_inverse=True, return_counts=True
         )
-        self.shortest, self.longest = low * self.spread, high * self.spread
-        axes = np.repeat(self.longest, 3)
-        self.prior = np.diag(np.concatenate([np.full(3, _FAR_MM), axes, np.full(3, _FAR_MM)]) ** -2.0)
+        self.start = np.cumsum(self.count) - self.count
+        self.centre, self.spread = points.pixels.mean(axis=0), float(points.pixels.std()) or 1.0
+        self.middle = points.shifts_mm.mean(axis=0)
+        self.seen = (points.pixels - self.centre) / self.spread
+        minus = np.broadcast_to(-np.eye(3), (len(points), 3, 3))
+        self.rows = np.concatenate([affine_equations(self.seen, points.turns), minus], axis=2)
+        self.wanted = self.middle - points.shifts_mm
+        sizes = _PIXEL_MM[:, None] * np.ones(2)
+        if pixel_mm is not None:
+            sizes = np.outer([1.0 / _PLAUSIBLE_PIXEL, _PLAUSIBLE_PIXEL], pixel_mm)
+        self.shortest, self.longest = sizes * self.spread
+        widths = [np.full(3, _FAR_MM), np.repeat(self.longest, 3), np.full(3, _FAR_MM)]
+        self.prior = np.diag(np.concatenate(widths) ** -2.0)
 
     def samples(self, rng: np.random.Generator, count: int) -> FloatArray:
         """Models of candidates drawn from four frames each, the likelier more often, shape (count, 12)."""
         frames = np.argsort(rng.random((count, len(self.frames))), axis=1)[:, :_SAMPLE]
         rank = np.arange(len(self.of_frame)) - self.start[self.of_frame]
-        weight = np.cumsum(1.0 / (1.0 + rank))
-        before = np.concatenate([[0.0], weight])[self.start]
-        last = weight[self.start + self.count - 1]
-        drawn = before[frames] + rng.random(frames.shape) * (last - before)[frames]
-        chosen = np.minimum(np.searchsorted(weight, drawn, side="right"), len(weight) - 1)
+        weight = np.append(0.0, np.cumsum(1.0 / (1.0 + rank)))
+        before, after = weight[self.start], weight[self.start + self.count]
+        drawn = before[frames] + rng.random(frames.shape) * (after - before)[frames]
+        chosen = np.minimum(np.searchsorted(weight[1:], drawn, side="right"), len(rank) - 1)
         return self._solved(self.rows[chosen].reshape(count, -1, 12), self.wanted[chosen].reshape(count, -1))
 
     def _solved(self, matrix: FloatArray, wanted: FloatArray) -> FloatArray:
         turned = np.swapaxes(matrix, -1, -2)
         return np.asarray(np.linalg.solve(turned @ matrix + self.prior, turned @ wanted[..., None])[..., 0])
 
-    def promising(self, models: FloatArray, plausible: bool) -> list[FloatArray]:
-        """Refine the models with which most frames agree."""
-        if plausible:
-            models = models[self._plausible(models)]
-        best = [self._refined(models[n]) for n in np.argsort(self._cost(models), kind="stable")[:_KEPT]]
-        refined = np.reshape(best, (-1, 12))
-        if plausible:
-            refined = refined[self._plausible(refined)]
-        return list(refined[np.argsort(self._cost(refined), kind="stable")[:_JUDGED]])
+    def promising(self, models: FloatArray) -> FloatArray:
+        """Refine the plausible models with which most frames agree; the best of them."""
+        best = [self._refined(model) for model in self._best(models, _KEPT)]
+        return self._best(np.reshape(best, (-1, 12)), _JUDGED)
 
-    def _cost(self, models: FloatArray) -> FloatArray:
-        """Sum over the frames of their nearest candidate's squared distance, bounded; shape (models,)."""
-        return np.asarray(np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1))
-
-    def _plausible(self, models: FloatArray) -> BoolArray:
+    def _best(self, models: FloatArray, most: int) -> FloatArray:
+        """The plausible models with the least sum of the frames' squared distances, each bounded."""
         axes = models[:, 3:9].reshape(-1, 2, 3)
         length = np.linalg.norm(axes, axis=2)
         cosine = np.abs(np.sum(axes[:, 0] * axes[:, 1], axis=1)) / np.prod(np.maximum(length, 1e-9), axis=1)
         sized = np.all((length > self.shortest) & (length < self.longest), axis=1)
-        return np.asarray(sized & (cosine < _SQUARE))
+        models = models[sized & (cosine < _SQUARE)]
+        cost = np.minimum(self._nearest(models), _LOOSE_MM**2).sum(axis=1)
+        return np.asarray(models[np.argsort(cost, kind="stable")[:most]])
 
     def _nearest(self, models: FloatArray) -> FloatArray:
         """Squared distance of each frame's nearest candidate from the point, shape (models, frames)."""
@@ -236,45 +220,33 @@ class _Candidates:
     def _refined(self, model: FloatArray) -> FloatArray:
         for gate in _TIGHTER_MM:
             squares = np.sum((self.rows @ model - self.wanted) ** 2, axis=1)
-            order = np.lexsort((squares, self.of_frame))
-            first = order[self.start]
+            first = np.lexsort((squares, self.of_frame))[self.start]
             agreeing = first[squares[first] < gate**2]
             if len(agreeing) <= _SAMPLE:
-                return model
+                break
             model = self._solved(self.rows[agreeing].reshape(-1, 12), self.wanted[agreeing].ravel())
         return model
 
     def false_alarms(self, model: FloatArray) -> tuple[float, float]:
         """Logarithm of the number of false alarms at the gate where it is least, and that gate, mm."""
-        n = len(self.frames)
+        n, each = len(self.frames), float(self.count.mean())
         if n <= _SAMPLE:
             return np.inf, GATES_MM[-1]
-        away = np.sqrt(self._nearest(model[None])[0])
-        exchanged = self._exchanged(model)
-        area = float(np.prod(np.maximum(np.ptp(self.points.pixels, axis=0) / self.spread, 0.1)))
-        area *= float(np.prod(np.linalg.norm(model[3:9].reshape(2, 3), axis=1)))
+        away, axes = np.sqrt(self._nearest(model[None])[0]), model[3:9].reshape(2, 3)
+        # The nearest candidate of each other frame, had it each frame's pose.
+        place, turns = model[:3] + self.seen @ axes, self.points.turns[self.start]
+        apart = np.einsum("fij,nj->fni", turns, place) - self.wanted[self.start][:, None] - model[9:]
+        exchanged = np.minimum.reduceat(np.linalg.norm(apart, axis=2), self.start, axis=1)
+        exchanged = exchanged[~np.eye(n, dtype=bool)]
+        area = float(np.prod(np.maximum(np.ptp(self.seen, axis=0), 0.1) * np.linalg.norm(axes, axis=1)))
         tried = []
         for gate in GATES_MM:
             # Few frames have few pairs to count: at least what candidates all over the image would give.
-            least = np.pi * gate**2 * self.count.mean() / max(area, np.pi * gate**2)
+            least = np.pi * gate**2 * each / max(area, np.pi * gate**2)
             chance = min(max(float(np.mean(exchanged < gate)), least), 1.0)
-            tried.append(_log_false_alarms(n, int(np.sum(away < gate)), chance, float(self.count.mean())))
+            tried.append(_log_false_alarms(n, int(np.sum(away < gate)), chance, each))
         best = int(np.argmin(tried))
         return tried[best] + np.log10(len(GATES_MM)), GATES_MM[best]
-
-    def _exchanged(self, model: FloatArray) -> FloatArray:
-        """Distance from the point of the nearest candidate of each other frame, had it each frame's pose."""
-        seen = (self.points.pixels - self.centre) / self.spread
-        place = model[:3] + seen @ model[3:9].reshape(2, 3)
-        turns, shifts = self.points.turns[self.start], self.wanted[self.start]
-        away = np.einsum("fij,nj->fni", turns, place) - shifts[:, None] - model[9:]
-        nearest = np.minimum.reduceat(np.linalg.norm(away, axis=2), self.start, axis=1)
-        return np.asarray(nearest[~np.eye(len(nearest), dtype=bool)])
-
-    def affine(self, model: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The image and the point of a model as `nearest_candidates` has them."""
-        axes = model[3:9].reshape(2, 3) / self.spread
-        return np.vstack([model[:3] - self.centre @ axes, axes]), model[9:] + self.middle
 
 
 def _log_false_alarms(frames: int, agreeing: int, chance: float, candidates: float) -> float:
@@ -284,8 +256,7 @@ def _log_false_alarms(frames: int, agreeing: int, chance: float, candidates: flo
     in each frame, and the chance that the rest of the set agrees (reference 2, equation 2).
     """
     if agreeing <= _SAMPLE:
-        return float("inf")
-    sets = gammaln(frames + 1) - gammaln(agreeing + 1) - gammaln(frames - agreeing + 1)
-    samples = gammaln(agreeing + 1) - gammaln(_SAMPLE + 1) - gammaln(agreeing - _SAMPLE + 1)
-    total = np.log(frames - _SAMPLE) + sets + samples + _SAMPLE * np.log(candidates)
-    return float((total + (agreeing - _SAMPLE) * np.log(chance)) / np.log(10.0))
+        return np.inf
+    sets = binom(frames, agreeing) * binom(agreeing, _SAMPLE)
+    total = np.log10(frames - _SAMPLE) + np.log10(sets) + _SAMPLE * np.log10(candidates)
+    return float(total + (agreeing - _SAMPLE) * np.log10(chance))

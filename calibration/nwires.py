@@ -22,8 +22,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.detection.dots import Dots
 from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.plane import Chain
-from calibration.points import ImagePoints, Seen
-from calibration.wires import affine_equations, wire_start
+from calibration.points import ImagePoints, Seen, affine_equations
+from calibration.wires import wire_start
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import nearest_rotation

@@ -175,3 +175,17 @@ def as_directions(lines: ImagePoints) -> ImagePoints:
     """Directions of lines given by two points each; their poses keep the rotation alone."""
     turns = RigidTransform.from_rotation(lines.world_from_sensor[::2].rotation)
     return replace(lines[::2], pixels=lines.pixels[1::2] - lines.pixels[::2], world_from_sensor=turns)
+
+
+def affine_equations(places: FloatArray, rows: FloatArray) -> FloatArray:
+    """Equations of points of an image in its origin and two axes, shape (..., r, 9).
+
+    Parameters
+    ----------
+    places : ndarray, shape (..., 2)
+        In the image.
+    rows : ndarray, shape (..., r, 3)
+        Of each point's equations for its position.
+    """
+    lifted = np.concatenate([np.ones((*places.shape[:-1], 1)), places], axis=-1)
+    return np.asarray(np.einsum("...k,...ri->...rki", lifted, rows).reshape(*rows.shape[:-1], 9))

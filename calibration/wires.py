@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
 from calibration.motion import require_adequate
 from calibration.plane import Chain, Equations, Problem, Solution, probe_parameters
-from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs
+from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
 from calibration.settings import Registration, WireFit
 from calibration.starts import rotations_all_over
 from speckle3d.core.arrays import FloatArray
@@ -274,17 +274,3 @@ def wire_start(
     probe = RigidTransform.from_components(fit.parameters[:3] - centre @ axes, turn)
     shift = RigidTransform.from_translation(fit.parameters[9:] if shifted else np.zeros(3))
     return Chain(size, probe, shift * known), fit
-
-
-def affine_equations(places: FloatArray, rows: FloatArray) -> FloatArray:
-    """Equations of points of an image in its origin and two axes, shape (..., r, 9).
-
-    Parameters
-    ----------
-    places : ndarray, shape (..., 2)
-        In the image.
-    rows : ndarray, shape (..., r, 3)
-        Of each point's equations for its position.
-    """
-    lifted = np.concatenate([np.ones((*places.shape[:-1], 1)), places], axis=-1)
-    return np.asarray(np.einsum("...k,...ri->...rki", lifted, rows).reshape(*rows.shape[:-1], 9))

@@ -22,8 +22,7 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.dots import Dots
 from calibration.plane import Chain
-from calibration.points import Seen
-from calibration.wires import affine_equations
+from calibration.points import Seen, affine_equations
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.wires import WirePhantom
