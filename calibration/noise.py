@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.points import SeenAs, columns_of
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.wander import innovations
 
@@ -86,27 +86,13 @@ class Noise:
     spread: FloatArray
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Sizes of wandering and jitter over the white noise, and time constants, tried together."""
-
-    wander: FloatArray
-    jitter: FloatArray
-    time_s: FloatArray
-    unit: FloatArray
-    """Variance of each component of an error whose root mean square effect is one, shape (g, k)."""
-    prior: FloatArray
-
-    def __getitem__(self, some: BoolArray) -> Grid:
-        return Grid(
-            self.wander[some], self.jitter[some], self.time_s[some], self.unit[some], self.prior[some]
-        )
-
-
 def make_grid(
     effects: FloatArray, frame_time_s: FloatArray, proportions: Sequence[FloatArray], jitter: Sequence[float]
-) -> Grid:
-    """All that is tried.
+) -> FloatArray:
+    """All that is tried, shape (g, 4 + k).
+
+    Sizes of wandering and of jitter over the white noise, time constant, probability beforehand, and the
+    variance of each component of an error whose root mean square effect is one.
 
     Parameters
     ----------
@@ -122,11 +108,23 @@ def make_grid(
     for proportion in proportions:
         effect = float(np.mean((effects * proportion) ** 2)) * len(proportion)
         units.append(proportion**2 / max(effect, _SMALLEST**2))
-    steady = [(0.0, shake, times[0], unit) for shake in jitter for unit in (units if shake else units[:1])]
-    moving = [(w, shake, t, unit) for w in WANDER for shake in jitter for t in times for unit in units]
-    wander, shake, time, unit = (np.array(column) for column in zip(*steady, *moving, strict=True))
-    prior = np.where(wander == 0, STEADY / len(steady), (1.0 - STEADY) / len(moving))
-    return Grid(wander, shake, time, unit, prior)
+    few, many = (
+        1.0 / (1 + len(units) * sum(shake > 0 for shake in jitter)),
+        len(WANDER) * len(jitter) * _TIMES * len(units),
+    )
+    rows = [
+        (0.0, shake, times[0], STEADY * few, *unit)
+        for shake in jitter
+        for unit in (units if shake else units[:1])
+    ]
+    rows += [
+        (wander, shake, time, (1.0 - STEADY) / many, *unit)
+        for wander in WANDER
+        for shake in jitter
+        for time in times
+        for unit in units
+    ]
+    return np.array(rows)
 
 
 def fit_wandering(
@@ -135,10 +133,10 @@ def fit_wandering(
     effects: FloatArray,
     starts: IntArray,
     frame_time_s: FloatArray,
-    grid: Grid,
+    grid: FloatArray,
     prior: FloatArray | None = None,
     excess: FloatArray | None = None,
-) -> tuple[Noise, Grid]:
+) -> tuple[Noise, FloatArray]:
     """Solve linear least squares whose residuals carry white noise and a sensor's wandering error.
 
     Parameters
@@ -155,14 +153,23 @@ def fit_wandering(
     Returns
     -------
     noise : Noise
-    grid : Grid
+    grid : ndarray
         The part of the grid that has a say.
     """
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     information = np.zeros((len(scale), len(scale))) if prior is None else prior / np.outer(scale, scale)
     columns = np.ascontiguousarray(np.column_stack([jacobian / scale, residuals]))
-    normal, log_determinant = _whitened(columns, np.ascontiguousarray(effects), starts, frame_time_s, grid)
+    wandering, jitter, constant_s, before, units = *grid.T[:4], grid[:, 4:]
+    pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
+    normal, effects = np.empty((len(grid), columns.shape[1], columns.shape[1])), np.ascontiguousarray(effects)
+
+    def whitened(g: int) -> float:
+        kept = np.exp(-pauses_s / constant_s[g])
+        wander, shake = units[g] * wandering[g] ** 2, units[g] * jitter[g] ** 2
+        return float(innovations(columns, effects, starts, kept, wander, shake, normal[g]))
+
+    log_determinant = np.array(list(ahead(whitened, range(len(grid)))))
     matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
     free = max(len(residuals) - len(scale), 1)
     sizes, axes = np.linalg.eigh(matrix)
@@ -171,7 +178,7 @@ def fit_wandering(
     variance = np.maximum(np.maximum(energy - (along**2 / firm).sum(axis=1), 0.0) / free, _SMALLEST**2)
     volume = np.log(np.maximum(sizes, _SINGULAR * sizes[:, -1:] + _SMALLEST)).sum(axis=1)
     likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
-    weight = grid.prior * np.exp(likelihood - likelihood.max())
+    weight = before * np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
     back = np.zeros(len(scale)) if excess is None else information @ (excess * scale)
     spread = np.linalg.pinv(matrix / variance[:, None, None] + information, rcond=_SINGULAR, hermitian=True)
@@ -179,31 +186,16 @@ def fit_wandering(
     step = weight @ steps
     away = steps - step
     covariance = np.einsum("g,gij->ij", weight, spread) + (weight * away.T) @ away
-    moving = weight * (grid.wander > 0)
+    moving = weight * (wandering > 0)
     noise = Noise(
         step / scale,
         covariance / np.outer(scale, scale),
         float(np.sqrt(weight @ variance)),
-        float(np.sqrt(weight @ (variance * grid.wander**2))),
-        float(np.exp(moving @ np.log(grid.time_s) / moving.sum())) if moving.sum() > 0 else np.nan,
-        (weight * variance * (grid.wander**2 + grid.jitter**2)) @ grid.unit,
+        float(np.sqrt(weight @ (variance * wandering**2))),
+        float(np.exp(moving @ np.log(constant_s) / moving.sum())) if moving.sum() > 0 else np.nan,
+        (weight * variance * (wandering**2 + jitter**2)) @ units,
     )
     return noise, grid[weight > _NEGLIGIBLE * weight.max()]
-
-
-def _whitened(
-    columns: FloatArray, effects: FloatArray, starts: IntArray, frame_time_s: FloatArray, grid: Grid
-) -> tuple[FloatArray, FloatArray]:
-    """Products of the columns' innovations, (g, c, c), and logarithms of their variance, (g,)."""
-    pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
-    normal = np.empty((len(grid.wander), columns.shape[1], columns.shape[1]))
-
-    def one(g: int) -> float:
-        kept, unit = np.exp(-pauses_s / grid.time_s[g]), grid.unit[g]
-        wander, shake = unit * grid.wander[g] ** 2, unit * grid.jitter[g] ** 2
-        return float(innovations(columns, effects, starts, kept, wander, shake, normal[g]))
-
-    return normal, np.array(list(ahead(one, range(len(normal)))))
 
 
 def sensor_effects(equations: Equations, chain: Chain) -> FloatArray:

@@ -16,6 +16,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Protocol
@@ -36,7 +37,7 @@ from calibration.points import (
     as_directions,
     columns_of,
 )
-from calibration.settings import OUTLIER_SIGMA, PlaneFit, Stages
+from calibration.settings import OUTLIER_SIGMA, PlaneFit
 from calibration.starts import Angles, angle_starts, hemisphere, in_plane_mirror, rotation_to_z
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -539,32 +540,31 @@ class Problem:
         lines of a plane that is always equally deep do not tell the image from its in-plane mirror.
         """
         few = points.of_some_frames(SOME_FRAMES)
-        chains = [chain for start in starts if (chain := self._tried(few, start)) is not None]
+        chains = self._ends(few, starts)
         if not chains:
             return self.solve(points, starts[0])
         best = chains[int(np.argmin(self._costs(few, chains)))]
-        turned = [self._tried(few, start) for start in half_turns(best, few, self.phantom)]
-        chains += [chain for chain in turned if chain is not None]
+        chains += self._ends(few, half_turns(best, few, self.phantom))
         costs = self._costs(few, chains)
         best = chains[int(np.argmin(costs))]
         solution = self.solve(points, best)
         others = [k for k, chain in enumerate(chains) if apart(best, chain, few, self.phantom)]
-        if not others:
-            return solution
-        rival = self._tried(points, chains[min(others, key=lambda k: float(costs[k]))])
-        if rival is None or not apart(solution.chain, rival, points, self.phantom):
-            return solution
-        ours, theirs = self._costs(solution.points_used, [solution.chain, rival])
-        if theirs < ours:
-            return replace(self.solve(points, rival), rival=Rival(solution.chain, float(ours - theirs)))
-        return replace(solution, rival=Rival(rival, float(theirs - ours)))
+        nearest = [chains[min(others, key=lambda k: float(costs[k]))]] if others else []
+        for rival in self._ends(points, nearest):
+            if apart(solution.chain, rival, points, self.phantom):
+                ours, theirs = self._costs(solution.points_used, [solution.chain, rival])
+                if theirs < ours:
+                    rival, solution = solution.chain, self.solve(points, rival)
+                return replace(solution, rival=Rival(rival, abs(float(theirs - ours))))
+        return solution
 
-    def _tried(self, points: ImagePoints, start: Chain) -> Chain | None:
-        """Where iterations from a start end; None if most points contradict it there."""
-        try:
-            return self.agreed(points, start)[0]
-        except InsufficientDataError:
-            return None
+    def _ends(self, points: ImagePoints, starts: Sequence[Chain]) -> list[Chain]:
+        """Where iterations from each start end, unless most points contradict it there."""
+        ends = []
+        for start in starts:
+            with suppress(InsufficientDataError):
+                ends.append(self.agreed(points, start)[0])
+        return ends
 
     def _costs(self, points: ImagePoints, chains: Sequence[Chain]) -> FloatArray:
         """Sums of squared residuals, each cut off, in the variance of an independent one at the least sum."""
@@ -575,12 +575,10 @@ class Problem:
         sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in residuals])
         best = np.clip(residuals[int(np.argmin(sums))], -cut, cut)
         independent = best.size / together(best, points.frame)
-        priors = [
-            0.0 if self.prior is None else np.sum(self.prior.deviation(c.pixel_mm) ** 2) for c in chains
-        ]
-        return np.asarray(
-            independent * sums / max(float(sums.min()), np.finfo(float).tiny) + np.array(priors)
-        )
+        sums *= independent / max(float(sums.min()), np.finfo(float).tiny)
+        if self.prior is not None:
+            sums += [np.sum(self.prior.deviation(one.pixel_mm) ** 2) for one in chains]
+        return sums
 
 
 def _within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
@@ -672,29 +670,27 @@ def calibrate_plane(
     prior = None
     if fixed_mm is None and pixel_mm is not None and np.isfinite(s.pixel_error):
         prior = PixelPrior(np.asarray(pixel_mm, dtype=float), s.pixel_error)
-    solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma, prior), fixed_mm, s.stages)
+    solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma, prior), fixed_mm)
     if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
         solution = _without_prior(lines, solution, s)
     return _facing_up(require_adequate(solution))
 
 
-def _from_stages(
-    lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | None, stages: Stages
-) -> Solution:
-    """Angles from line directions, then distances, then all; or all at once from several mountings."""
-    pixel_mm = fixed_mm if problem.prior is None else problem.prior.pixel_mm
+def _from_stages(lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | None) -> Solution:
+    """Angles from line directions, then distances, then all."""
+    pixel_mm, few = (
+        fixed_mm if problem.prior is None else problem.prior.pixel_mm,
+        lines.of_some_frames(SOME_FRAMES),
+    )
+    directions = as_directions(few)
 
     def starts(size: FloatArray | None) -> list[Chain]:
-        few = lines.of_some_frames(SOME_FRAMES)
-        directions, ratio = as_directions(few), 1.0 if size is None else float(size[0] / size[1])
-        three = stages == "three"
-        mountings = angle_starts(
-            directions.pixels, directions.turns, ratio, hemisphere(), size is None and three, refine=three
-        )
-        return [_with_distances(few, angles, size) for angles in mountings]
+        ratio = 1.0 if size is None else float(size[0] / size[1])
+        angles = angle_starts(directions.pixels, directions.turns, ratio, hemisphere(), size is None)
+        return [_with_distances(few, one, size) for one in angles]
 
     solution = problem.best(lines, starts(pixel_mm))
-    if pixel_mm is not None or stages == "one" or not solution.adequacy.refused:
+    if pixel_mm is not None or not solution.adequacy.refused:
         return solution
     # Free pixels may shrink to nothing on the way where the motion is poor.
     return problem.best(lines, [solution.chain, *starts(np.full(2, _PIXEL_MM))])
@@ -735,7 +731,7 @@ def _without_prior(lines: ImagePoints, solution: Solution, s: PlaneFit) -> Solut
     InsufficientDataError
         If they do not.
     """
-    alone = _from_stages(lines, Problem(Plane(), PROBE, s.outlier_sigma), None, s.stages)
+    alone = _from_stages(lines, Problem(Plane(), PROBE, s.outlier_sigma), None)
     if not alone.adequacy.refused:
         return alone
     if solution.adequacy.refused or solution.prior is None:

@@ -10,7 +10,6 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Place = Literal["front", "slope", "peak"]
-Stages = Literal["three", "one"]
 Viewed = Literal["above", "below"]
 Registration = Literal["held", "turned", "free"]
 
@@ -46,7 +45,6 @@ class PlaneFit(PixelSettings):
     pixel_error: float = Field(
         PIXEL_ERROR, gt=0.0, description="Standard error of the pixel size, as a share of it; inf if a guess."
     )
-    stages: Stages = Field("three", description="Angles, distances, all; or all at once.")
 
 
 class OrientationFit(FitSettings):

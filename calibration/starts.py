@@ -83,7 +83,6 @@ def angle_starts(
     normals: FloatArray,
     fit_ratio: bool = False,
     level: bool = False,
-    refine: bool = True,
 ) -> list[Angles]:
     """Find the angles that make line directions lie in a plane, robustly; the best first.
 
@@ -99,8 +98,6 @@ def angle_starts(
         Of the plane, tried first.
     level : bool
         The normal stays what it is.
-    refine : bool
-        Without it, the best of those tried are returned as they are.
 
     Raises
     ------
@@ -120,8 +117,6 @@ def angle_starts(
     mounting, plane = np.unravel_index(np.argsort(costs, axis=None)[:_REFINED], costs.shape)
     probe, normal = tried[mounting].as_matrix(), normals[plane].astype(float)
     ratios = np.full(len(probe), ratio)
-    if not refine:
-        return [Angles(ratio, tried[int(m)], normals[p]) for m, p in zip(mounting, plane, strict=True)]
     for _ in range(_ROUNDS):
         _step(unit, turns, ratios, probe, normal, fit_ratio, level)
     left = np.abs(_sines(unit, turns, ratios, probe, normal)[0]).mean(axis=1)

@@ -68,7 +68,7 @@ def test_a_clock_offset_is_seconds_or_to_be_estimated():
             time_offset_s=-0.01,
             outlier_sigma=3.5, region=((0.5, 1.0), (20.0, 1e-3), (7.25, 80.0)), leave_out=(0, 3, 4, 5),
             columns=41, smoothing_mm=0.1 + 0.2, threshold=12.5, tolerance_mm=0.4, place="front",
-            fixed_pixels=True, pixel_error=float("inf"), stages="one", reflector="bar", beam_mm=[1.5, 2.0],
+            fixed_pixels=True, pixel_error=float("inf"), reflector="bar", beam_mm=[1.5, 2.0],
         ),
         OrientationSettings(level=True, viewed_from="below", sensor="tracker", time_offset_s="estimate"),
         WireSettings(phantom="three", points=Path("a b.csv"), registration="held", fixed_pixels=True),

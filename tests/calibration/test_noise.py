@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.noise import JITTER, Grid, fit_wandering, make_grid
+from calibration.noise import JITTER, fit_wandering, make_grid
 
 
 def drawn(rng, size, frames=60, several=2, spacing_s=0.2, constant_s=4.0):
@@ -26,8 +26,8 @@ def grid_of(problem):
 
 def test_one_size_and_time_give_what_dense_algebra_gives():
     jacobian, residuals, effects, starts, time_s = drawn(np.random.default_rng(1), 1.0)
-    unit, one = 1.0 / np.mean(np.sum(effects**2, axis=1)), np.ones(1)
-    grid = Grid(2.0 * one, 0.5 * one, 0.8 * one, np.full((1, 2), unit), one)
+    unit = 1.0 / np.mean(np.sum(effects**2, axis=1))
+    grid = np.array([[2.0, 0.5, 0.8, 1.0, unit, unit]])
     noise, _ = fit_wandering(jacobian, residuals, effects, starts, time_s, grid)
     group = np.repeat(np.arange(60), 2)
     lag = np.abs(time_s[group][:, None] - time_s[group])
@@ -48,7 +48,7 @@ def test_what_is_known_before_counts_as_one_more_measurement():
     problem = drawn(np.random.default_rng(2), 0.0)
     grid = grid_of(problem)
     prior, excess = np.diag([0.0, 50.0, 0.0]), np.array([0.0, 0.3, 0.0])
-    still = grid[(grid.wander == 0) & (grid.jitter == 0)]
+    still = grid[(grid[:, :2] == 0).all(axis=1)]
     noise, _ = fit_wandering(*problem, still, prior, excess)
     rows = np.vstack([problem[0] / noise.white, [0.0, np.sqrt(50.0), 0.0]])
     wanted = -np.append(problem[1] / noise.white, np.sqrt(50.0) * 0.3)

@@ -73,12 +73,11 @@ def test_the_noise_column_is_as_published():
     assert np.linalg.norm(moved_mm(solution)) < 1.0
 
 
-@pytest.mark.parametrize("stages", ["three", "one"])
 @pytest.mark.parametrize("fixed", [True, False])
-def test_exact_lines_give_the_exact_calibration(stages, fixed):
+def test_exact_lines_give_the_exact_calibration(fixed):
     floor = RigidTransform.from_components([30.0, -200.0, 150.0], Rotation.from_euler("xyz", [0.1, -0.3, 1]))
     scan = scan_plane(np.random.default_rng(3), 80, floor=floor)
-    solution = calibrate_plane(scan.lines, PIXEL_MM, PlaneFit(stages=stages, fixed_pixels=fixed))
+    solution = calibrate_plane(scan.lines, PIXEL_MM, PlaneFit(fixed_pixels=fixed))
     np.testing.assert_allclose(solution.chain.sensor_from_image.as_matrix(), TRIAL_1.as_matrix(), atol=1e-6)
     np.testing.assert_allclose(solution.chain.pixel_mm, PIXEL_MM, rtol=1e-8)
     assert solution.used.all()

@@ -13,7 +13,7 @@ from speckle3d.app.phantom.work import in_turn
 from speckle3d.calibrating.settings import ScanSettings, offset_of
 
 _SHOWN = {
-    "plane": ("reflector", "stages", "pixel_error", "fixed_pixels"),
+    "plane": ("reflector", "pixel_error", "fixed_pixels"),
     "orientation": ("viewed_from", "level"),
     "wires": ("registration", "fixed_pixels", "beside_mm"),
 }
