@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from calibration.motion import require_adequate
-from calibration.plane import Chain, LineDirections, Problem, Solution
+from calibration.plane import LineDirections, Problem, Solution, angle_starts
 from calibration.points import ANGLES, SOME_FRAMES, ImagePoints, as_directions
 from calibration.settings import OrientationFit
-from calibration.starts import angle_starts, hemisphere, in_plane_mirror, rotation_to_z
+from calibration.starts import hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -61,18 +61,9 @@ def calibrate_orientation(
         raise InsufficientDataError(
             f"expected lines in at least {FEWEST_LINES} frames, got {len(directions)}"
         )
-    ratio = float(pixel_mm[0] / pixel_mm[1])
-    normals = hemisphere()
+    normals, size = hemisphere(), np.array([pixel_mm[0] / pixel_mm[1], 1.0])
     normals = normals[:1] if s.level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
-    few, size = directions.of_some_frames(SOME_FRAMES), np.array([ratio, 1.0])
-    starts = [
-        Chain(
-            size,
-            RigidTransform.from_rotation(angles.sensor_from_image),
-            RigidTransform.from_rotation(rotation_to_z(angles.normal)),
-        )
-        for angles in angle_starts(few.pixels, few.turns, ratio, normals, level=s.level)
-    ]
+    starts = angle_starts(directions.of_some_frames(SOME_FRAMES), size, normals, s.level)
     problem = Problem(LineDirections(size, s.level), ANGLES, s.outlier_sigma)
     solution = problem.best(directions, starts)
     solution = require_adequate(replace(solution, assumed=_assumption(s.viewed_from)))

@@ -27,6 +27,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.motion import Adequacy, judge, require_adequate
 from calibration.noise import Noise, fit_noise
 from calibration.points import (
+    ANGLES,
     CHAIN,
     POSE,
     PROBE,
@@ -38,7 +39,7 @@ from calibration.points import (
     columns_of,
 )
 from calibration.settings import OUTLIER_SIGMA, PlaneFit
-from calibration.starts import Angles, angle_starts, hemisphere, in_plane_mirror, rotation_to_z
+from calibration.starts import hemisphere, in_plane_mirror, rotation_to_z, rotations_all_over
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import roll_yaw_tilt, skew
@@ -59,6 +60,10 @@ centimetres."""
 _MOST_STEPS = 100
 _TOLERANCE = 1e-12
 """Relative decrease of the sum of squares that a last step promises."""
+_REFINED, _KEPT, _ANGLE_FRAMES = 12, 3, 30
+"""Mountings whose angles are refined, from so many frames, and those that go on to the next stage."""
+_HOPELESS, _TINY = 3.0, 1e-12
+"""Ends whose mean absolute residual is as many times the least are not looked at again."""
 _ROUGHLY = 1e-3
 _NEARLY_ABSOLUTE = 0.06745
 """Limit of Huber's weights, a tenth of the median: nearly all residuals count by their absolute value."""
@@ -575,7 +580,7 @@ class Problem:
         sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in residuals])
         best = np.clip(residuals[int(np.argmin(sums))], -cut, cut)
         independent = best.size / together(best, points.frame)
-        sums *= independent / max(float(sums.min()), np.finfo(float).tiny)
+        sums *= independent / max(float(sums.min()), _SMALLEST_SIGMA**2)
         if self.prior is not None:
             sums += [np.sum(self.prior.deviation(one.pixel_mm) ** 2) for one in chains]
         return sums
@@ -676,17 +681,66 @@ def calibrate_plane(
     return _facing_up(require_adequate(solution))
 
 
+def angle_starts(
+    directions: ImagePoints, size: FloatArray, normals: FloatArray, level: bool = False
+) -> list[Chain]:
+    """First stage: angles with which line directions lie in a plane, whatever the mounting; the best first.
+
+    A line of the plane lies in it, wherever the plane is. Mountings are tried all over, and the best refined.
+
+    Parameters
+    ----------
+    directions : ImagePoints
+        See `as_directions`.
+    size : ndarray, shape (2,)
+        Of pixels, in any unit.
+    normals : ndarray, shape (k, 3)
+        Of the plane, in the world.
+    level : bool
+        The normal stays what it is.
+
+    Returns
+    -------
+    list of Chain
+        Without distances.
+    """
+    phantom = LineDirections(size, level)
+    tried = rotations_all_over()
+    # Half a turn about z leaves the directions of lines as they are.
+    tried = tried[tried.as_matrix()[:, 0, 0] >= 0]
+    along = directions.pixels * size
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    up = np.einsum("ki,nij->knj", normals, directions.turns)
+    sines = np.einsum("kni,jia,na->jkn", up, tried.as_matrix()[:, :, :2], along, optimize=True)
+    costs = np.abs(sines).mean(axis=2)
+    few = Equations.of(directions.of_some_frames(_ANGLE_FRAMES), phantom)
+    ends = list[tuple[float, Chain]]()
+    for best in np.argsort(costs, axis=None)[:_REFINED]:
+        mounting, plane = np.unravel_index(best, costs.shape)
+        turns = tried[int(mounting)], rotation_to_z(normals[plane])
+        start = Chain(size, *map(RigidTransform.from_rotation, turns))
+        end = nearly_absolute(few, start, (*ANGLES, *phantom.determined), 4)
+        # The world is turned as little as puts the plane's normal upright.
+        upright = rotation_to_z(end.target_from_world.rotation.as_matrix()[2])
+        end = replace(end, target_from_world=RigidTransform.from_rotation(upright))
+        ends.append((float(np.abs(few.residuals(end)).mean()), end))
+    ends.sort(key=lambda one: one[0])
+    kept = list[Chain]()
+    for cost, end in ends:
+        hopeless = cost > _HOPELESS * ends[0][0] + _TINY
+        if not hopeless and all(apart(end, one, directions, phantom) for one in kept):
+            kept.append(end)
+    return kept[:_KEPT]
+
+
 def _from_stages(lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | None) -> Solution:
     """Angles from line directions, then distances, then all."""
-    pixel_mm, few = (
-        fixed_mm if problem.prior is None else problem.prior.pixel_mm,
-        lines.of_some_frames(SOME_FRAMES),
-    )
-    directions = as_directions(few)
+    few = lines.of_some_frames(SOME_FRAMES)
+    pixel_mm = fixed_mm if problem.prior is None else problem.prior.pixel_mm
 
     def starts(size: FloatArray | None) -> list[Chain]:
-        ratio = 1.0 if size is None else float(size[0] / size[1])
-        angles = angle_starts(directions.pixels, directions.turns, ratio, hemisphere(), size is None)
+        # Where nothing is known of pixels, they are taken for square until all is solved for.
+        angles = angle_starts(as_directions(few), np.ones(2) if size is None else size, hemisphere())
         return [_with_distances(few, one, size) for one in angles]
 
     solution = problem.best(lines, starts(pixel_mm))
@@ -696,31 +750,28 @@ def _from_stages(lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | No
     return problem.best(lines, [solution.chain, *starts(np.full(2, _PIXEL_MM))])
 
 
-def _with_distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> Chain:
+def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> Chain:
     """Second stage: linear distances, for the image or its in-plane mirror, which they tell apart."""
-    mirror = replace(angles, sensor_from_image=in_plane_mirror(angles.sensor_from_image))
-    return min((_distances(lines, either, pixel_mm) for either in (angles, mirror)), key=lambda one: one[1])[
-        0
-    ]
-
-
-def _distances(lines: ImagePoints, angles: Angles, pixel_mm: FloatArray | None) -> tuple[Chain, float]:
-    """The chain with these angles, and the median height, mm, at which it leaves the points."""
-    up, turn = angles.normal @ lines.turns, angles.sensor_from_image
-    square = np.array([angles.ratio, 1.0]) if pixel_mm is None else pixel_mm
-    height = np.sum(up * ((lines.pixels * square) @ turn.as_matrix()[:, :2].T), axis=1)
-    unknown, target_mm = [up, np.ones((len(lines), 1))], -lines.shifts_mm @ angles.normal
-    if pixel_mm is None:
-        unknown.append(height[:, None])
-    else:
-        target_mm = target_mm - height
-    fit = robust_linear(np.hstack(unknown), target_mm, partial(huber_weights, limit=0.6745), rounds=4)
-    size = square * (fit.parameters[4] if pixel_mm is None else 1.0)
-    if size[1] < 0:
-        turn, size = in_plane_mirror(turn), -size
-    probe = RigidTransform.from_components(fit.parameters[:3], turn)
-    target = RigidTransform.from_components([0.0, 0.0, fit.parameters[3]], rotation_to_z(angles.normal))
-    return Chain(size, probe, target), float(np.median(np.abs(fit.residuals)))
+    up = angles.target_from_world.rotation.as_matrix()[2] @ lines.turns
+    square = angles.pixel_mm if pixel_mm is None else pixel_mm
+    ends = list[tuple[float, Chain]]()
+    for turn in (angles.sensor_from_image.rotation, in_plane_mirror(angles.sensor_from_image.rotation)):
+        height = np.sum(up * ((lines.pixels * square) @ turn.as_matrix()[:, :2].T), axis=1)
+        unknown = [up, np.ones((len(lines), 1))]
+        target_mm = -lines.shifts_mm @ angles.target_from_world.rotation.as_matrix()[2]
+        if pixel_mm is None:
+            unknown.append(height[:, None])
+        else:
+            target_mm = target_mm - height
+        fit = robust_linear(np.hstack(unknown), target_mm, partial(huber_weights, limit=0.6745), rounds=4)
+        size = square * (fit.parameters[4] if pixel_mm is None else 1.0)
+        if size[1] < 0:
+            turn, size = in_plane_mirror(turn), -size
+        probe = RigidTransform.from_components(fit.parameters[:3], turn)
+        shift = RigidTransform.from_translation([0.0, 0.0, fit.parameters[3]])
+        median = float(np.median(np.abs(fit.residuals)))
+        ends.append((median, Chain(size, probe, shift * angles.target_from_world)))
+    return min(ends, key=lambda one: one[0])[1]
 
 
 def _without_prior(lines: ImagePoints, solution: Solution, s: PlaneFit) -> Solution:

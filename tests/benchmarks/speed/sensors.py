@@ -5,7 +5,7 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-from bench_calibration import LINES, by_scipy, by_us_once
+from bench_calibration import LINES, differences
 from bench_image_calibration import displaced, prepared
 from bench_imu_reading import LOGS
 from calibration_examples import scan_plane
@@ -13,7 +13,7 @@ from imu_logs import samples
 from vqf import VQF, offlineVQF
 
 from calibration.images.solver import calibrate_from_sweeps
-from calibration.plane import _three_stages, calibrate_plane
+from calibration.plane import Equations, Plane, calibrate_plane, least_squares
 from calibration.settings import ImageFit
 from speed.rows import Row, timed
 from xsens.fusion.methods import Method
@@ -28,10 +28,11 @@ PLANE_MS, IMAGES_S, READ_MB_S, READ_TIMES, FILTERED = 50.0, 3.0, 50.0, 3.0, 250e
 def plane(runs: int) -> list[Row]:
     """All of a plane's calibration, and its least squares beside SciPy's with finite differences."""
     lines = scan_plane(np.random.default_rng(0), LINES, line_noise_mm=0.2).lines
-    (start, *_) = _three_stages(lines, None)
+    solution, equations = calibrate_plane(lines), Equations.of(lines, Plane())
+    start = solution.chain.displaced(np.append(np.full(5, 0.01), np.full(9, 0.02)))
     whole = timed(lambda: calibrate_plane(lines), runs)
-    ours = timed(lambda: by_us_once(lines, start), runs).seconds
-    theirs = timed(lambda: by_scipy(lines, start), runs).seconds
+    ours = timed(lambda: least_squares(equations, start, solution.free), runs).seconds
+    theirs = timed(lambda: differences(equations, start, solution.free), runs).seconds
     what = f"calibrate_plane, {LINES} lines"
     return [
         Row(what, 1e3 * whole.seconds, "ms", target=PLANE_MS, falling=True, cores=whole.cores),
