@@ -13,12 +13,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import Sweep
-from speckle3d.io.calibrations import apply_calibrations
-from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.quality import describe
 from speckle3d.scoring.references import SweepCurves, find_reference, sweep_curves, tracker_alone
+from speckle3d.study.images import sweep_of
 from speckle3d.study.results import VERSION, Summary, read_summary
 
 Record = Mapping[str, Any]
@@ -132,7 +130,8 @@ def load_view(directory: Path, entry: Record) -> SweepView:
     summary, reference, poses = read_summary(folder, str(entry["name"])), None, dict(made.poses)
     notes = list(summary.lines)
     try:
-        sweep = _open_sweep(directory, str(entry["path"]), made)
+        source = Path(str(entry["path"]))
+        sweep = sweep_of(made, source if source.exists() else directory / source)
         alone = tracker_alone(sweep)
         if alone is not None and any(row.mode == "tracker" for row in summary.rows):
             poses["tracker"] = alone
@@ -153,13 +152,3 @@ def load_view(directory: Path, entry: Record) -> SweepView:
         poses,
         notes,
     )
-
-
-def _open_sweep(directory: Path, stored: str, made: Reconstruction) -> Sweep:
-    """Open the sweep that was reconstructed, where the study found it or from the study's folder."""
-    path = Path(stored) if Path(stored).exists() else directory / stored
-    if not path.exists():
-        raise InvalidInputError(f"{stored}: expected the sweep, got no file")
-    if recording_sha256(path) != made.provenance.input_sha256:
-        raise InvalidInputError(f"{stored}: expected the sweep that was reconstructed, got another")
-    return apply_calibrations(load_sweep(path), [c.path for c in made.provenance.calibrations])[0]

@@ -17,6 +17,7 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.imaging.voxels.settings import Levels
+from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
@@ -178,22 +179,35 @@ def usual_levels(sweep: Sweep) -> Levels:
 
 
 def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Reconstruction, Sweep]:
-    """Open a reconstruction and the sweep it was made from.
-
-    Raises
-    ------
-    MismatchError
-        If the sweep's bytes are not those that were reconstructed.
-    """
+    """Open a reconstruction and the sweep it was made from, as `sweep_of`."""
     reconstruction = read_reconstruction(path, with_pairs=False)
     stored = Path(reconstruction.provenance.input_path)
     # The stored path is tried as it is, then from the reconstruction's folder.
     source = sweep_file or (stored if stored.exists() else path.parent / stored)
+    return reconstruction, sweep_of(reconstruction, source)
+
+
+def sweep_of(reconstruction: Reconstruction, source: Path) -> Sweep:
+    """Open the sweep that a reconstruction was made from, with the calibrations that it was made with.
+
+    Those that are no longer there are left out.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no such file.
+    MismatchError
+        If the sweep's bytes are not those that were reconstructed.
+    """
+    made = reconstruction.provenance
     if not source.exists():
-        raise InvalidInputError(f"{path}: expected its sweep at {source}, got none; say where it is: --sweep")
-    if recording_sha256(source) != reconstruction.provenance.input_sha256:
-        raise MismatchError(f"{source}: expected the sweep that {path} was made from, got another (SHA-256)")
-    return reconstruction, part_at(load_sweep(source), reconstruction.frame_time_s)
+        raise InvalidInputError(
+            f"{source}: expected the sweep that was reconstructed, got none: give --sweep"
+        )
+    if recording_sha256(source) != made.input_sha256:
+        raise MismatchError(f"{source}: expected the sweep that was reconstructed, got another (SHA-256)")
+    mounted = [each.path for each in made.calibrations if Path(each.path).exists()]
+    return apply_calibrations(part_at(load_sweep(source), reconstruction.frame_time_s), mounted)[0]
 
 
 def part_at(sweep: Sweep, time_s: FloatArray) -> Sweep:
