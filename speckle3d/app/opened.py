@@ -91,11 +91,11 @@ def opened(path: Path, record: Path | None = None, **of_file: Any) -> Iterator[S
         Also if a file is to be recorded.
     """
     if is_port(path):
-        from speckle3d.app.sensor.live import LiveSensorPage
+        from speckle3d.app.sensor.page import SensorPage
         from speckle3d.app.sensor.watch import SensorWatch
 
         with SensorWatch(str(path), record) as watch:
-            yield [LiveSensorPage(watch)]
+            yield [SensorPage(watch)]
         return
     if record is not None:
         raise InvalidInputError(f"{path}: expected a serial port beside --record, got something else")
@@ -163,6 +163,7 @@ def _logged(path: Path) -> list[Page]:
 
 
 def _sensor(log: ImuLog, mounting: Rotation | None = None) -> Page:
+    from speckle3d.app.sensor.log import LogReadings
     from speckle3d.app.sensor.page import SensorPage
 
-    return SensorPage(log, mounting)
+    return SensorPage(LogReadings(log), mounting)

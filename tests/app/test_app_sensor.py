@@ -1,15 +1,18 @@
-"""What the sensor's pages show, computed without a browser."""
+"""What the sensor's page shows, of a log and of a sensor at work, computed without a browser."""
 
 import numpy as np
 import pytest
 from field_scenes import simulated, with_readings
 from scipy.spatial.transform import Rotation
 
-from speckle3d.app.sensor.live import columns, judged
-from speckle3d.app.sensor.probe import ProbePicture
-from speckle3d.app.sensor.readings import Readings, Trace, thinned
+from speckle3d.app.sensor.log import LogReadings
+from speckle3d.app.sensor.page import SensorPage, _Viewer
+from speckle3d.app.sensor.probe import figure_probe, turn_probe
+from speckle3d.app.sensor.source import thinned
+from speckle3d.app.sensor.watch import SensorWatch
 from xsens.fusion.field import Trust
 from xsens.fusion.online import OnlineState
+from xsens.fusion.orient import orient
 from xsens.live.monitor import LiveState
 from xsens.logs.samples import Gap, ImuLog
 
@@ -21,82 +24,77 @@ def motion():
 
 @pytest.fixture(scope="module")
 def readings(motion):
-    return Readings.of(motion.log)
+    return LogReadings(motion.log)
 
 
-def test_the_orientation_at_a_time_is_the_fusions(readings):
-    stream = readings.found.rotations
-    for k in (0, 500, len(stream) - 1):
-        held = readings.orientation_at(float(stream.time_s[k]) - readings.start_s)
-        assert (held * stream.world_from_sensor[k].inv()).magnitude() < 1e-9
-    between = readings.orientation_at(float(stream.time_s[500:502].mean()) - readings.start_s)
-    pair = stream.world_from_sensor[500:502]
-    assert (between * pair.mean().inv()).magnitude() < 1e-6
+@pytest.fixture(scope="module")
+def found(motion):
+    return orient(motion.log)
 
 
-def test_the_dip_is_that_of_the_field_in_the_world(readings):
-    (dip,) = readings.dip()
+def test_columns_are_those_of_the_fusion(readings, motion, found):
+    columns = readings.columns()
+    at = np.searchsorted(motion.log.time_s, found.rotations.time_s - 1e-9)
+    np.testing.assert_allclose(columns["z"], np.degrees(motion.log.gyroscope_rad_s[at, 2]))
+    half = 1.96 * np.degrees(found.standard_deviation_rad[:, 2])
+    np.testing.assert_allclose(columns["high"] - columns["heading"], half)
+    assert np.abs(np.diff(columns["heading"])).max() < 20.0
+    np.testing.assert_array_equal(
+        np.isfinite(columns["doubt"]), found.disturbed & np.isfinite(columns["field"])
+    )
     # The fields of these scenes: 45 down over 18 north.
-    assert np.median(dip.values) == pytest.approx(np.degrees(np.arctan2(45, 18)), abs=1.0)
-    (norm,) = readings.norm()
-    assert np.median(norm.values) == pytest.approx(1.0)
+    assert np.nanmedian(columns["dip"]) == pytest.approx(np.degrees(np.arctan2(45, 18)), abs=1.0)
+    stream = found.rotations
+    for k in (0, 500, len(stream) - 1):
+        held = readings.orientation_at(float(stream.time_s[k] - motion.log.time_s[0]))
+        assert (held * stream.world_from_sensor[k].inv()).magnitude() < 1e-6
 
 
-def test_the_heading_has_the_fusions_band_and_no_jumps(readings):
-    heading, half = readings.heading()
-    assert np.abs(np.diff(heading.values)).max() < 20.0
-    np.testing.assert_allclose(half, 1.96 * np.degrees(readings.found.standard_deviation_rad[:, 2]))
-
-
-def test_a_log_without_readings_shows_the_sensors_own_and_says_why_nothing_is_judged():
+def test_a_log_without_readings_shows_the_sensors_own_and_says_why_nothing_is_judged(motion):
     turns = Rotation.from_euler("z", np.linspace(0, 90, 50)[:, None], degrees=True)
     log = ImuLog(np.arange(50) / 50, world_from_sensor=turns, gaps=(Gap(9, 3, 0.08),), source="own")
-    shown = Readings.of(log)
-    assert shown.trust is Trust.UNKNOWN
-    assert "no readings of one" in shown.sentence()
-    assert shown.rotations()[2] == "the sensor's own"
-    heading, half = shown.heading()
-    assert (heading.values[-1], half.max()) == (pytest.approx(90.0), 0.0)
-    assert shown.gaps() == [(pytest.approx(9 / 50), 0.08)]
-    assert "3 samples in 1 gaps" in shown.losses()
+    shown = LogReadings(log)
+    trust, sentence = shown.judgement()
+    assert (trust, "no readings of one" in sentence) == (Trust.UNKNOWN, True)
+    assert shown.columns()["heading"][-1] == pytest.approx(90.0)
+    assert shown.gaps_s() == [pytest.approx(9 / 50)]
+    facts = dict(shown.facts(1.0))
+    assert facts["orientation"].startswith("the sensor's own")
+    assert "3 samples in 1 gaps" in facts["lost"]
+    lone = LogReadings(with_readings(motion.log, gyroscope_rad_s=None))
+    assert "expected gyroscope" in lone.judgement()[1]
 
 
-def test_a_log_with_a_field_alone_says_what_is_missing(motion):
-    lone = with_readings(motion.log, gyroscope_rad_s=None)
-    assert "expected gyroscope" in Readings.of(lone).sentence()
+def test_a_step_moves_the_probe_and_the_cursor(motion, readings):
+    viewer = _Viewer(readings, None)
+    viewer.layout()
+    viewer._go(3.04)
+    assert (viewer.step, viewer._cursor.location) == (30, pytest.approx(3.0))
+    figure = figure_probe()
+    turn_probe(figure, readings.orientation_at(3.0))
+    np.testing.assert_allclose(viewer._probe.object.data[0].x, figure.data[0].x)
+    viewer._draw(2.0, 4.0)
+    shown = viewer._data.data["t"]
+    assert (shown[0], shown[-1]) == (pytest.approx(2.0, abs=0.02), pytest.approx(4.0, abs=0.02))
 
 
-def test_stretches_of_disbelief_are_those_of_the_fusion(readings):
-    inside = np.zeros(len(readings.found), dtype=bool)
-    times = readings.found.rotations.time_s - readings.start_s
-    for begin, end in readings.disbelieved():
-        inside |= (times >= begin) & (times <= end)
-    np.testing.assert_array_equal(inside, readings.found.disturbed)
-
-
-def test_thinning_keeps_every_extreme_and_what_is_near():
+def test_thinning_keeps_every_extreme():
     rng = np.random.default_rng(1)
     values = rng.normal(size=100_000)
     values[[31_415, 92_653]] = 50.0, -50.0
-    values[5] = np.nan
-    trace = Trace("", np.arange(values.size) / 100.0, values)
-    time_s, kept = thinned(trace, -np.inf, np.inf, most=2000)
-    assert len(kept) <= 2100
-    assert (np.nanmax(kept), np.nanmin(kept)) == (50.0, -50.0)
-    assert (np.diff(time_s) >= 0).all()
-    time_s, kept = thinned(trace, 300.0, 301.0)
-    assert (time_s[0], time_s[-1], len(kept)) == (pytest.approx(299.99), pytest.approx(301.0), 102)
+    values[:60] = np.nan
+    kept = thinned({"t": np.arange(values.size) / 100.0, "x": values}, most=2000)
+    assert len(kept["x"]) <= 2100
+    assert (np.nanmax(kept["x"]), np.nanmin(kept["x"])) == (50.0, -50.0)
+    assert (np.diff(kept["t"]) > 0).all()
 
 
-def test_the_probe_turns_as_it_is_held():
-    picture = ProbePicture()
-    before = np.concatenate(picture._patches.data["xs"])
-    picture.turn(Rotation.identity())
-    np.testing.assert_allclose(np.concatenate(picture._patches.data["xs"]), before)
+def test_the_probe_points_where_it_is_held():
+    figure = figure_probe()
     # Depth down: nothing is drawn below the far end of the image.
-    picture.turn(Rotation.from_euler("x", -90.0, degrees=True))
-    lowest = {c: min(ys) for c, ys in zip(*map(picture._patches.data.get, ("color", "ys")), strict=True)}
-    assert lowest["#f2be3c"] == min(lowest.values())
+    turn_probe(figure, Rotation.from_euler("x", -90.0, degrees=True))
+    lowest = [min(trace.z) for trace in figure.data[:4]]
+    assert lowest[2] == min(lowest) == pytest.approx(-0.95)
 
 
 def live(elapsed_s, heading_deg=0.0, started=True, stray=0.01, disturbed=False, **more):
@@ -109,11 +107,20 @@ def live(elapsed_s, heading_deg=0.0, started=True, stray=0.01, disturbed=False, 
     )  # fmt: skip
 
 
+def watch(states):
+    watch = SensorWatch("port")
+    watch.states.extend(states)
+    return watch
+
+
 def test_live_columns_run_to_now_without_a_jump_of_the_heading():
-    shown = columns([live(0.1 * k, 170.0 + k) for k in range(20)])
-    assert (shown["t"][0], shown["t"][-1]) == (pytest.approx(-1.9), 0.0)
-    np.testing.assert_allclose(np.diff(shown["heading"]), 1.0, atol=1e-6)
-    np.testing.assert_allclose(shown["high"] - shown["low"], 2 * 1.96 * np.degrees(0.02))
+    source = watch([live(0.1 * k, 170.0 + k) for k in range(20)])
+    columns = source.columns()
+    assert (columns["t"][0], columns["t"][-1]) == (pytest.approx(-1.9), 0.0)
+    np.testing.assert_allclose(np.diff(columns["heading"]), 1.0, atol=1e-6)
+    np.testing.assert_allclose(columns["high"] - columns["low"], 2 * 1.96 * np.degrees(0.02))
+    SensorPage(source).view()
+    assert len(watch([]).columns()["t"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -122,14 +129,13 @@ def test_live_columns_run_to_now_without_a_jump_of_the_heading():
         ([], Trust.UNKNOWN, "first samples"),
         ([live(1.0, connected=False, note="the port is gone")], Trust.UNKNOWN, "the port is gone"),
         ([live(1.0, started=False)], Trust.UNKNOWN, "still"),
-        ([live(1.0, field=float("nan"))], Trust.UNKNOWN, "sends none"),
-        ([live(1.0, fused=None)], Trust.UNKNOWN, "missing"),
+        ([live(1.0, field=float("nan"))], Trust.UNKNOWN, "missing"),
         ([live(1.0)], Trust.YES, "can be trusted here"),
         ([live(0.1 * k, disturbed=k > 7) for k in range(10)], Trust.CARE, "20.0"),
         ([live(1.0, stray=0.08)], Trust.NO, "8.0"),
     ],
 )
 def test_the_live_sentence_is_from_the_filters_numbers(states, trust, words):
-    found, sentence = judged(states)
+    found, sentence = watch(states).judgement()
     assert found is trust
     assert words in sentence

@@ -1,20 +1,24 @@
-"""The orientation sensor's log: how it was held, what it read, whether its magnetometer can be trusted."""
+"""An orientation sensor, live or of a log: how it is held, what it reads, and whether to trust its field."""
 
 from __future__ import annotations
 
-from functools import cached_property
 from html import escape
+from typing import Any
 
 import numpy as np
 import panel as pn
+import param
+from bokeh.events import RangesUpdate, Tap
+from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models.annotations import Span
+from bokeh.plotting import figure
 from panel.viewable import Viewable
 from scipy.spatial.transform import Rotation
 
-from speckle3d.app.sensor.plots import DOUBT, LOSS, TimePlots
-from speckle3d.app.sensor.probe import AZIMUTH_DEG, ProbePicture
-from speckle3d.app.sensor.readings import Readings
+from speckle3d.app.sensor.probe import figure_probe, turn_probe
+from speckle3d.app.sensor.source import COLUMNS, Source, thinned
+from speckle3d.app.sensor.watch import SHOWN_S
 from xsens.fusion.field import Trust
-from xsens.logs.samples import ImuLog
 
 _COLOURS = {
     Trust.YES: ("#2e7d32", "#edf6ee"),
@@ -22,16 +26,29 @@ _COLOURS = {
     Trust.NO: ("#b3261e", "#fcebea"),
     Trust.UNKNOWN: ("#6b7780", "#f1f3f4"),
 }
-_PLAY_MS = 100
+_LINES = {"x": "#b3261e", "y": "#2e7d32", "z": "#20507a"}
+_PLOTS = {
+    "rate, °/s": ("x", "y", "z"),
+    "field, sensor's unit": ("field",),
+    "dip, °": ("dip",),
+    "heading, °": ("heading",),
+}
+_REFRESH_MS, _STEP_S = 125, 0.1
 _LEFT_PX = 350
+_KEY = (
+    '<span style="color:#6b7780"><span style="color:#e8a33d">&#9632;</span> the field is not believed &emsp;'
+    '<span style="color:#b3261e">|</span> samples are missing &emsp;'
+    '<span style="background:#20507a40">&emsp;</span> 95 % interval</span>'
+)
 
 
 class SensorPage:
-    """What an orientation sensor read, and what follows from it.
+    """What an orientation sensor reads, and what follows from it.
 
     Parameters
     ----------
-    log : ImuLog
+    source : Source
+        `LogReadings` of a log, or a `SensorWatch` that runs.
     sensor_from_image : Rotation, optional
         How the sensor sits on the probe.
 
@@ -40,170 +57,127 @@ class SensorPage:
     In a notebook:
 
     >>> import numpy as np
+    >>> from speckle3d.app.sensor.log import LogReadings
     >>> from speckle3d.app.sensor.page import SensorPage
     >>> from xsens import ImuLog
-    >>> page = SensorPage(ImuLog(np.arange(300) / 100.0, gyroscope_rad_s=np.zeros((300, 3))))
-    >>> view = page.view()
+    >>> log = ImuLog(np.arange(300) / 100.0, gyroscope_rad_s=np.zeros((300, 3)))
+    >>> view = SensorPage(LogReadings(log)).view()
     """
 
     title = "Sensor"
+    extensions = ("plotly",)
 
-    def __init__(self, log: ImuLog, sensor_from_image: Rotation | None = None) -> None:
-        self._log, self._mounting = log, sensor_from_image
-
-    @cached_property
-    def _readings(self) -> Readings:
-        """What is found of the log, once for all viewers."""
-        return Readings.of(self._log)
+    def __init__(self, source: Source, sensor_from_image: Rotation | None = None) -> None:
+        self._source, self._mounting = source, sensor_from_image
 
     def view(self) -> Viewable:
         """The sentence on the magnetometer above, the probe on the left, readings over time on the right."""
-        readings = self._readings
-        plots = time_plots(readings)
-        picture = ProbePicture(self._mounting)
-        duration_s = self._log.duration_s
-        when = pn.widgets.FloatSlider(
-            name="time, s", start=0.0, end=max(duration_s, 1e-3), step=max(duration_s / 2000.0, 0.001),
-            format="0.00", width=_LEFT_PX - 100,
-        )  # fmt: skip
-        play = pn.widgets.Toggle(name="play", width=70, align="end")
-        side = pn.widgets.IntSlider(
-            name="seen from, degrees from north to west", start=0, end=359, step=5, value=int(AZIMUTH_DEG),
-            width=_LEFT_PX - 20,
-        )  # fmt: skip
-        words = pn.pane.HTML("", width=_LEFT_PX - 10)
-
-        def show(_: object = None) -> None:
-            now_s = float(when.value or 0.0)
-            plots.point_at(now_s)
-            held = readings.orientation_at(now_s)
-            if held is not None:
-                picture.turn(held)
-            words.object = table(_now(readings, now_s, held))
-
-        def step() -> None:
-            on_s = float(when.value or 0.0) + _PLAY_MS / 1000.0
-            when.value = 0.0 if on_s > duration_s else on_s
-
-        def go(at_s: float) -> None:
-            when.value = float(np.clip(at_s, 0.0, duration_s))
-
-        clock = pn.state.add_periodic_callback(step, period=_PLAY_MS, start=False)
-        play.param.watch(lambda event: clock.start() if event.new else clock.stop(), "value")
-        when.param.watch(show, "value")
-        side.param.watch(lambda event: picture.look_from(float(event.new)), "value")
-        plots.on_tap(go)
-        show()
-        left = pn.Column(
-            pn.pane.Bokeh(picture.plot), side, pn.Row(when, play, margin=0), words, width=_LEFT_PX, margin=0
-        )
-        right = pn.Column(
-            *(pn.pane.Bokeh(each, sizing_mode="stretch_width", margin=0) for each in plots.finish()),
-            pn.pane.HTML(_KEY, margin=(4, 10)),
-            sizing_mode="stretch_width",
-        )
-        return pn.Column(
-            banner(readings.trust, readings.sentence()),
-            pn.Row(left, right, sizing_mode="stretch_width"),
-            pn.pane.HTML(table(_facts(readings, self._mounting)), margin=(6, 10), max_width=1200),
-            sizing_mode="stretch_width",
-        )
+        return _Viewer(self._source, self._mounting).layout()
 
 
-_KEY = (
-    '<span style="color:#6b7780"><span style="background:#e8a33d55">&emsp;</span> the field is hardly '
-    'believed &emsp;<span style="color:#b3261e">|</span> samples are missing &emsp;'
-    '<span style="background:#20507a40">&emsp;</span> 95 % band &emsp; '
-    "click: go there; drag, wheel: move and zoom in time</span>"
-)
+class _Viewer(param.Parameterized):  # type: ignore[misc]
+    """What one viewer sees of a sensor."""
 
+    step = param.Integer(0, label="step of 0.1 s")
 
-def time_plots(readings: Readings) -> TimePlots:
-    """Rates, field and heading over time; of what there is."""
-    plots = TimePlots(readings.log.duration_s)
-    if rates := readings.rates():
-        plots.add("rate, \N{DEGREE SIGN}/s", rates, 125, legend=True)
-    elif forces := readings.forces():
-        plots.add("force, m/s\N{SUPERSCRIPT TWO}", forces, 125, legend=True)
-    of_field = []
-    if norm := readings.norm():
-        of_field.append(plots.add("field / median", norm, 100))
-    if dip := readings.dip():
-        of_field.append(plots.add("dip, \N{DEGREE SIGN}", dip, 100))
-    if (found := readings.heading()) is not None:
-        heading, half = found
-        of_field.append(plots.add("heading, \N{DEGREE SIGN}", [heading], 125))
-        plots.band(of_field[-1], heading, half)
-    plots.shade(readings.disbelieved(), DOUBT, of_field)
-    plots.mark([at_s for at_s, _ in readings.gaps()], LOSS)
-    if not plots.figures:
-        plots.add("nothing read", [], 125)
-    return plots
+    def __init__(self, source: Source, mounting: Rotation | None) -> None:
+        super().__init__()
+        self._source, self._mounting = source, mounting
+        self._columns = source.columns()
+        self._data = ColumnDataSource({name: [] for name in COLUMNS})
+        end_s = 0.0 if source.is_live else max(float(self._columns["t"][-1]), 1e-3)
+        self.param.step.bounds = (0, max(int(end_s / _STEP_S), 1))
+        self._range = Range1d(-SHOWN_S if source.is_live else 0.0, end_s)
+        self._cursor = Span(location=0.0, dimension="height", line_dash="dotted")
+        self._probe = pn.pane.Plotly(figure_probe(), width=_LEFT_PX, height=330, margin=0)
+        self._facts = pn.pane.HTML("", width=_LEFT_PX - 10)
+        self._banner = pn.pane.HTML("", margin=(8, 10), sizing_mode="stretch_width")
+        self.param.watch(self._show, "step")
+        self._draw()
+        self._show()
 
-
-def banner(trust: Trust, sentence: str) -> Viewable:
-    """The sentence on the magnetometer, coloured by what it says."""
-    return pn.pane.HTML(banner_html(trust, sentence), margin=(8, 10), sizing_mode="stretch_width")
-
-
-def banner_html(trust: Trust, sentence: str) -> str:
-    """HTML of `banner`."""
-    line, ground = _COLOURS[trust]
-    style = (
-        f"border-left:5px solid {line};background:{ground};padding:7px 12px;font-size:14px;line-height:1.4"
-    )
-    return f'<div class="magnetometer" style="{style}">{escape(sentence)}</div>'
-
-
-def _now(readings: Readings, now_s: float, held: Rotation | None) -> list[tuple[str, str]]:
-    if held is None:
-        return [("orientation", "none: neither the sensor's own nor readings that tell it")]
-    yaw, pitch, roll = held.as_euler("ZYX", degrees=True)
-    rows = [
-        (
-            "roll, pitch, yaw",
-            f"{roll:+.1f}\N{DEGREE SIGN}, {pitch:+.1f}\N{DEGREE SIGN}, {yaw:+.1f}\N{DEGREE SIGN}",
-        )
-    ]
-    found = readings.found
-    if found is not None:
-        at = int(np.searchsorted(found.rotations.time_s - readings.start_s, now_s).clip(max=len(found) - 1))
-        north, west, up = np.degrees(found.standard_deviation_rad[at])
-        rows.append(
-            (
-                "standard deviation",
-                f"inclination {max(north, west):.2f}\N{DEGREE SIGN}, heading {up:.1f}\N{DEGREE SIGN}",
+    def layout(self) -> Viewable:
+        """Lay everything out, and begin to follow a live sensor."""
+        shown = {
+            label: names for label, names in _PLOTS.items()
+            if self._source.is_live or np.isfinite(self._columns[names[0]]).any()
+        }  # fmt: skip
+        plots = [self._plot(label, names) for label, names in (shown or _PLOTS).items()]
+        plots[-1].xaxis.axis_label = "time before now, s" if self._source.is_live else "time, s"
+        left: list[Any] = [self._probe, self._facts]
+        if self._source.is_live:
+            pn.state.add_periodic_callback(self._refresh, period=_REFRESH_MS)
+        else:
+            player = pn.widgets.Player.from_param(
+                self.param.step, interval=round(1000 * _STEP_S), show_loop_controls=False, width=_LEFT_PX - 20
             )
+            left.insert(1, player)
+        right = pn.Column(
+            *(pn.pane.Bokeh(plot, sizing_mode="stretch_both", margin=0) for plot in plots),
+            pn.pane.HTML(_KEY, margin=(4, 10)),
+            sizing_mode="stretch_both",
         )
-        state = ["at rest" if found.resting[at] else "moving"]
-        if found.magnetic:
-            state.append("field hardly believed" if found.disturbed[at] else "field believed")
-        rows.append(("state", ", ".join(state)))
-    return rows
+        row = pn.Row(
+            pn.Column(*left, width=_LEFT_PX + 10, scroll="y-auto"), right, sizing_mode="stretch_both"
+        )
+        return pn.Column(self._banner, row, sizing_mode="stretch_both")
+
+    def _plot(self, label: str, names: tuple[str, ...]) -> figure:
+        plot = figure(
+            x_range=self._range, tools="xpan,xwheel_zoom,reset", active_scroll="xwheel_zoom",
+            y_axis_label=label, toolbar_location=None, min_border_left=64, sizing_mode="stretch_both",
+        )  # fmt: skip
+        plot.axis.axis_label_text_font_style = "normal"
+        for name in names:
+            legend = {"legend_label": name} if len(names) > 1 else {}
+            plot.line("t", name, source=self._data, color=_LINES.get(name, "#1c2730"), **legend)
+        if names == ("field",):
+            plot.scatter("t", "doubt", source=self._data, color="#e8a33d", size=6, marker="square")
+        if names == ("heading",):
+            plot.varea("t", "low", "high", source=self._data, fill_color="#20507a", fill_alpha=0.25)
+        for legend in plot.legend:
+            legend.update(orientation="horizontal", location="top_left", padding=2, margin=2)
+        if gaps := self._source.gaps_s():
+            plot.vspan(x=gaps, line_color="#b3261e", line_width=1.5)
+        plot.add_layout(self._cursor)
+        plot.on_event(Tap, lambda event: self._go(event.x))
+        plot.on_event(RangesUpdate, lambda event: self._draw(event.x0, event.x1))
+        return plot
+
+    def _go(self, time_s: float) -> None:
+        low, high = self.param.step.bounds
+        self.step = int(np.clip(round(time_s / _STEP_S), low, high))
+
+    def _refresh(self) -> None:
+        self._columns = self._source.columns()
+        self._draw()
+        self._show()
+
+    def _draw(self, from_s: float = -np.inf, until_s: float = np.inf) -> None:
+        """Draw what is in sight, as fine as a screen shows it."""
+        first, last = np.searchsorted(self._columns["t"], [from_s, until_s])
+        part = slice(max(first - 1, 0), last + 1)
+        self._data.data = thinned({name: values[part] for name, values in self._columns.items()})
+
+    def _show(self, *_: Any) -> None:
+        """Show how it is held, and what is to say."""
+        time_s = _STEP_S * self.step
+        self._cursor.location = time_s
+        held = self._source.orientation_at(time_s)
+        if held is not None:
+            turn_probe(self._probe.object, held if self._mounting is None else held * self._mounting)
+            self._probe.param.trigger("object")
+        rows = self._source.facts(time_s)
+        if self._mounting is None:
+            rows.append(("probe", "not calibrated: the sensor's axes drawn as the image's"))
+        cell = '<tr><td style="color:#6b7780;vertical-align:top;white-space:nowrap">{}</td><td>{}</td></tr>'
+        self._facts.object = f"<table>{''.join(cell.format(*map(escape, row)) for row in rows)}</table>"
+        if self._source.is_live or not self._banner.object:
+            self._banner.object = banner(*self._source.judgement())
 
 
-def _facts(readings: Readings, mounting: Rotation | None) -> list[tuple[str, str]]:
-    log = readings.log
-    rate = f"{log.rate_hz:.1f} samples/s" if np.isfinite(log.rate_hz) else "rate unknown"
-    stream = readings.rotations()
-    whose = "none" if stream is None else stream[2]
-    return [
-        ("log", f"{len(log)} samples, {log.duration_s:.1f} s, {rate}"),
-        ("lost", readings.losses()),
-        ("orientation", whose if not readings.why_not or stream is None else f"{whose}: {readings.why_not}"),
-        ("world", readings.world()),
-        (
-            "probe",
-            "as calibrated"
-            if mounting is not None
-            else "not calibrated: the sensor's axes drawn as the image's",
-        ),
-        *(("note", text) for text in readings.notes()),
-    ]
-
-
-def table(rows: list[tuple[str, str]]) -> str:
-    """HTML of rows of name and value."""
-    style = "color:#6b7780;padding:1px 12px 1px 0;white-space:nowrap;vertical-align:top"
-    cell = f'<tr><td style="{style}">{{}}</td><td>{{}}</td></tr>'
-    return f"<table>{''.join(cell.format(escape(name), escape(value)) for name, value in rows)}</table>"
+def banner(trust: Trust, sentence: str) -> str:
+    """HTML of the sentence on the magnetometer, coloured by what it says."""
+    line, ground = _COLOURS[trust]
+    style = f"border-left:5px solid {line};background:{ground};padding:7px 12px;font-size:14px"
+    return f'<div class="magnetometer" style="{style}">{escape(sentence)}</div>'

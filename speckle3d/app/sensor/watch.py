@@ -11,14 +11,18 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Self
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from speckle3d.app.sensor.source import COLUMNS, NORMAL_95, Columns, angles, heading_rad
 from speckle3d.core.errors import Speckle3DError
+from xsens.fusion.field import Trust, field_now
 from xsens.live.device import DeviceSettings
 from xsens.live.monitor import LiveState
 from xsens.live.recording import Recorder
 
 INTERVAL_S = 0.1
 """Between two states: a display follows a hand, and the filter takes a percent of it."""
-
 SHOWN_S = 60.0
 """Time that is kept to be shown; a recording keeps all."""
 
@@ -39,23 +43,23 @@ class SensorWatch:
         If no sensor answers on the port, or the file cannot be written.
     """
 
+    is_live = True
+
     def __init__(self, port: str, record: Path | None = None, settings: DeviceSettings | None = None) -> None:
-        self.port, self.record = port, record
-        self._settings = settings
-        self._lock = threading.Lock()
-        self._states: deque[LiveState] = deque(maxlen=round(SHOWN_S / INTERVAL_S))
+        self._port, self._record, self._settings = port, record, settings
+        self.states: deque[LiveState] = deque(maxlen=round(SHOWN_S / INTERVAL_S))
         self._end = threading.Event()
-        self.failure = ""
+        self._failure = ""
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            path = self.record
+            path = self._record
             if path is None:
                 path = Path(stack.enter_context(TemporaryDirectory(prefix="speckle3d-"))) / "sensor.mtb"
-            self._recorder = stack.enter_context(Recorder(self.port, path, self._settings))
-            self._thread = threading.Thread(target=self._ask, daemon=True)
-            self._thread.start()
-            stack.callback(self._thread.join)
+            self._recorder = stack.enter_context(Recorder(self._port, path, self._settings))
+            thread = threading.Thread(target=self._ask, daemon=True)
+            thread.start()
+            stack.callback(thread.join)
             stack.callback(self._end.set)
             self._stack = stack.pop_all()
         return self
@@ -65,19 +69,80 @@ class SensorWatch:
     ) -> None:
         self._stack.__exit__(kind, error, trace)
 
-    def states(self) -> list[LiveState]:
-        """States of the last minute, the oldest first."""
-        with self._lock:
-            return list(self._states)
-
     def _ask(self) -> None:
         next_s = time.monotonic()
         while not self._end.wait(max(next_s - time.monotonic(), 0.0)):
             next_s = max(next_s + INTERVAL_S, time.monotonic())
             try:
-                state = self._recorder.state()
+                self.states.append(self._recorder.state())
             except Speckle3DError as error:
-                self.failure = str(error)
+                self._failure = str(error)
                 return
-            with self._lock:
-                self._states.append(state)
+
+    def columns(self) -> Columns:
+        """The last minute, by the time before now."""
+        rows = np.array([_row(state) for state in list(self.states)], dtype=float).reshape(-1, len(COLUMNS))
+        columns = dict(zip(COLUMNS, rows.T, strict=True))
+        columns["t"] = columns["t"] - columns["t"][-1:]
+        there = np.isfinite(columns["heading"])
+        heading = columns["heading"][there]
+        columns["heading"][there] = np.degrees(np.unwrap(np.radians(heading)))
+        for end in ("low", "high"):
+            columns[end][there] += columns["heading"][there] - heading
+        return columns
+
+    def gaps_s(self) -> list[float]:
+        """None: losses are counted."""
+        return []
+
+    def judgement(self) -> tuple[Trust, str]:
+        """By the filter's last state and what it disbelieved lately."""
+        if self._failure:
+            return Trust.NO, f"The recording has ended: {self._failure}"
+        states = list(self.states)
+        if not states:
+            return Trust.UNKNOWN, "Waiting for the sensor's first samples."
+        now = states[-1]
+        if not now.connected:
+            return Trust.UNKNOWN, f"The sensor is not connected: {now.note or 'waiting for it'}."
+        if now.fused is None or not np.isfinite(now.field):
+            lacking = "gyroscope or accelerometer" if now.fused is None else "the magnetometer"
+            return Trust.UNKNOWN, f"The magnetometer cannot be judged here: {lacking} is missing."
+        if not now.fused.started:
+            return Trust.UNKNOWN, "Hold the sensor still: its filter is finding up and north."
+        known = [state.fused.disturbed for state in states if state.fused is not None and state.fused.started]
+        found = field_now(now.fused, float(np.mean(known)))
+        return found.trust, found.sentence()
+
+    def orientation_at(self, time_s: float) -> Rotation | None:
+        """World from sensor now."""
+        return self.states[-1].world_from_sensor if self.states else None
+
+    def facts(self, time_s: float) -> list[tuple[str, str]]:
+        """How it is held, and what has arrived."""
+        if not self.states:
+            return []
+        now = self.states[-1]
+        kept = f"in {self._record}" if self._record else "nowhere: named with --record they are kept"
+        return [
+            ("sensor", f"on {self._port}" if now.connected else f"NOT CONNECTED: {now.note}"),
+            *([] if now.world_from_sensor is None else [angles(now.world_from_sensor)]),
+            ("samples", f"{now.samples} in {now.elapsed_s:.0f} s, {now.rate_hz:.1f} per second"),
+            ("lost", f"{now.lost} samples, {now.interruptions} interruptions"),
+            ("world", "x magnetic north, y west, z up"),
+            ("its bytes", kept),
+        ]
+
+
+def _row(state: LiveState) -> tuple[float, ...]:
+    """Values of `COLUMNS`, with the time since the beginning."""
+    nan = float("nan")
+    rate = [nan] * 3 if state.rate_rad_s is None else np.degrees(state.rate_rad_s).tolist()
+    heading = half = nan
+    if state.world_from_sensor is not None:
+        heading = float(np.degrees(heading_rad(state.world_from_sensor)[0]))
+    if state.fused is not None and state.fused.started:
+        half = NORMAL_95 * float(np.degrees(state.fused.standard_deviation_rad[2]))
+    doubt = state.field if state.disturbed else nan
+    dip = float(np.degrees(state.dip_rad))
+    return (state.elapsed_s, *rate, state.field, dip, heading, heading - half, heading + half, doubt)

@@ -1,0 +1,126 @@
+"""A log of an orientation sensor on its own clock, from zero, with what its readings tell."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from speckle3d.app.sensor.source import COLUMNS, NORMAL_95, Columns, angles, heading_rad
+from speckle3d.core.arrays import FloatArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from xsens.fusion.field import Trust, dip_rad, field_of
+from xsens.fusion.orient import Orientation, orient
+from xsens.logs.samples import ImuLog
+
+
+class LogReadings:
+    """What a log shows, found once for all viewers.
+
+    Parameters
+    ----------
+    log : ImuLog
+    """
+
+    is_live = False
+
+    def __init__(self, log: ImuLog) -> None:
+        self._log = log
+        self._start_s = float(log.time_s[0])
+
+    @cached_property
+    def _orientation(self) -> Orientation | str:
+        """Orientation by the readings, or why they tell none; takes a second for ten minutes."""
+        try:
+            return orient(self._log)
+        except (InvalidInputError, InsufficientDataError) as error:
+            return str(error)
+
+    @cached_property
+    def _stream(self) -> tuple[FloatArray, Rotation, str] | None:
+        """Times on the sensor's clock, world from sensor, and whose; None where nothing tells it."""
+        if isinstance(self._orientation, Orientation):
+            rotations, whose = self._orientation.rotations, "found from its readings"
+        elif self._log.oriented.any():
+            rotations, whose = self._log.rotations(), f"the sensor's own: {self._orientation}"
+        else:
+            return None
+        return rotations.time_s, rotations.world_from_sensor, whose
+
+    def columns(self) -> Columns:
+        """Readings at the times of the orientation, or at all where there is none."""
+        log, found, stream = self._log, self._orientation, self._stream
+        at = slice(None) if stream is None else np.searchsorted(log.time_s, stream[0] - 1e-9)
+        time_s = log.time_s[at]
+        columns = {name: np.full(len(time_s), np.nan) for name in COLUMNS} | {"t": time_s - self._start_s}
+        if log.gyroscope_rad_s is not None:
+            columns |= dict(zip("xyz", np.degrees(log.gyroscope_rad_s[at]).T, strict=True))
+        field = None if log.magnetometer_au is None else log.magnetometer_au[at]
+        if field is not None:
+            columns["field"] = np.linalg.norm(field, axis=1)
+        if stream is None:
+            return columns
+        heading = np.degrees(heading_rad(stream[1]))
+        columns |= {"heading": heading, "low": heading, "high": heading}
+        if field is not None:
+            there = np.flatnonzero(np.isfinite(field).all(axis=1))
+            columns["dip"][there] = np.degrees(dip_rad(stream[1][there].apply(field[there])))
+        if isinstance(found, Orientation):
+            half = NORMAL_95 * np.degrees(found.standard_deviation_rad[:, 2])
+            columns |= {"low": heading - half, "high": heading + half}
+            columns["doubt"] = np.where(found.disturbed & found.magnetic, columns["field"], np.nan)
+        return columns
+
+    def gaps_s(self) -> list[float]:
+        """When samples are missing."""
+        return [float(self._log.time_s[gap.after_index] - self._start_s) for gap in self._log.gaps]
+
+    def judgement(self) -> tuple[Trust, str]:
+        """Whether the magnetometer can be trusted here, and why."""
+        field, found = self._log.magnetometer_au, self._orientation
+        if field is None or not np.isfinite(field).any():
+            return Trust.UNKNOWN, "The magnetometer cannot be judged here: the log has no readings of one."
+        if isinstance(found, str):
+            return Trust.UNKNOWN, f"The magnetometer cannot be judged here: {found}."
+        judged = field_of(self._log, found)
+        return judged.trust, judged.sentence()
+
+    def orientation_at(self, time_s: float) -> Rotation | None:
+        """World from sensor at a time from zero; the nearest before and after the stream."""
+        if self._stream is None:
+            return None
+        times, rotations, _ = self._stream
+        if len(times) < 2:
+            return rotations[0]
+        return Slerp(times, rotations)(float(np.clip(time_s + self._start_s, times[0], times[-1])))
+
+    def facts(self, time_s: float) -> list[tuple[str, str]]:
+        """How it was held at a time, and what the log is."""
+        log, found, held = self._log, self._orientation, self.orientation_at(time_s)
+        rows = [] if held is None else [angles(held)]
+        north = "magnetic north, y west"
+        if isinstance(found, Orientation):
+            at = min(int(np.searchsorted(found.rotations.time_s, time_s + self._start_s)), len(found) - 1)
+            *inclination, heading = NORMAL_95 * np.degrees(found.standard_deviation_rad[at])
+            rows.append(("known to (95 %)", f"inclination {max(inclination):.1f}°, heading {heading:.1f}°"))
+            rows.append(("state", "at rest" if found.resting[at] else "moving"))
+            north = north if found.magnetic else "where it was at the start, y to its left"
+        longest = max((gap.duration_s for gap in log.gaps), default=0.0)
+        lost = (
+            f"{log.lost} samples in {len(log.gaps)} gaps, the longest of {longest:.3f} s"
+            if log.gaps
+            else "none"
+        )
+        notes = (*log.notes, *(found.notes if isinstance(found, Orientation) else ()))
+        return [
+            *rows,
+            ("log", f"{len(log)} samples, {log.duration_s:.1f} s, {log.rate_hz:.1f} per second"),
+            ("lost", lost),
+            (
+                "orientation",
+                "none: neither its own nor by its readings" if self._stream is None else self._stream[2],
+            ),
+            ("world", f"x {north}, z up"),
+            *(("note", text) for text in notes),
+        ]
