@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.kernels.orientation import heading as kernel
 from xsens.fusion.settings import FusionSettings
 
@@ -83,6 +83,9 @@ class Headings:
     disturbed: BoolArray
     stray: FloatArray
     iron: FloatArray
+
+    def __getitem__(self, which: IntArray) -> Headings:
+        return Headings(*(values[which] for values in vars(self).values()))
 
 
 class HeadingFilter:

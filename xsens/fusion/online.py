@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,7 @@ from speckle3d.core.shown import shown
 from speckle3d.kernels.orientation.inclination import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingFilter
-from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, joined
+from xsens.fusion.inclination import CLAIMED, forward, fresh_filter
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
@@ -83,8 +84,8 @@ class OnlineFilter:
     def __init__(self, settings: FusionSettings | None = None) -> None:
         self._settings = settings or FusionSettings()
         self._level, self._heading = fresh_filter(self._settings), HeadingFilter(self._settings)
-        self._steps: list[FilterSteps] = []
-        self._last: FilterSteps | None = None
+        self._rows: list[Any] = []
+        self._last: Any = None
         self._turn_rad, self._heading_sd_rad = 0.0, math.pi
         self._field = (False, math.nan, math.nan)
         self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
@@ -134,17 +135,17 @@ class OnlineFilter:
         last = self._last
         if last is None:
             return None
-        bias, resting = last.bias_rad_s[0], bool(last.resting[0])
-        rotation = Rotation.from_euler("z", self._turn_rad) * Rotation.from_matrix(last.corrected[0])
+        bias, resting = last["bias"].copy(), bool(last["resting"])
+        rotation = Rotation.from_euler("z", self._turn_rad) * Rotation.from_quat(last["level"])
         if not resting:
             for step_s, rate, _, _ in self._pending:
                 rotation *= Rotation.from_rotvec((rate - bias) * step_s)
-        sd_rad = last.claimed_sd_rad[0]
+        sd_rad = last["sd"][:3] * CLAIMED
         if self._settings.use_magnetometer:
             sd_rad[2] = self._heading_sd_rad
-        started = bool(last.started[0])
+        started = bool(last["started"])
         disturbed, stray, iron = self._field
-        return OnlineState(rotation, sd_rad, bias.copy(), disturbed, resting, started, stray, iron)
+        return OnlineState(rotation, sd_rad, bias, disturbed, resting, started, stray, iron)
 
     def _judge(self, step_s: float, force: FloatArray) -> None:
         """Raise if the accelerometer is in other units, after a second of it."""
@@ -194,27 +195,25 @@ class OnlineFilter:
             self._heading.resume()
             self._heading_sd_rad = math.pi  # until the first bin after it
             pause_s = self._pause_s
-        magnetic = self._settings.use_magnetometer
         if self._last is None:
             self._usual_s = float(np.median(samples.step_s))
         for step_s in samples.step_s.tolist():
             self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)
-        self._last = forward(
-            samples, self._settings, self._level, pause_s, heading_apart=magnetic, usual_s=self._usual_s
-        )
+        rows = forward(samples, self._settings, self._level, pause_s, usual_s=self._usual_s).rows
         self._pause_s = 0.0
-        self._steps.append(self._last)
-        if len(self._steps) == steps_per_bin(self._settings):
+        self._last = rows[0]
+        self._rows.append(rows)
+        if len(self._rows) == steps_per_bin(self._settings):
             self._find_north()
 
     def _find_north(self) -> None:
         """Make a bin of the increments since the last one."""
-        if not self._steps:
+        if not self._rows:
             return
-        steps = joined(self._steps)
-        self._steps = []
+        rows = np.concatenate(self._rows)
+        self._rows = []
         if self._settings.use_magnetometer:
-            found = self._heading.follow(filtered_bins(steps, self._settings), steps.bias_rad_s[-1:])
+            found = self._heading.follow(filtered_bins(rows, self._settings), rows["bias"][-1:])
             self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
             self._field = (bool(found.disturbed[0]), float(found.stray[0]), float(found.iron[0]))
 

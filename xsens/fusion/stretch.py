@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from xsens.fusion.bins import averaged_bins, filtered_bins, lasts_of_bins, steps_per_bin
 from xsens.fusion.heading import HeadingFilter, Headings
-from xsens.fusion.inclination import FilterSteps, forward, fresh_filter, smooth, within_steps
+from xsens.fusion.inclination import CLAIMED, FilterSteps, forward, fresh_filter, smooth, within_steps
 from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
-
-_Field: TypeAlias = tuple[BoolArray, FloatArray, FloatArray]
-"""Where it was hardly believed, how much it strays, and the weight of iron on the sensor; a row a step."""
 
 
 class StretchFilter:
@@ -29,80 +24,56 @@ class StretchFilter:
     def run(self, samples: Samples, pause_s: float) -> Estimate:
         """Orientation of the next stretch, `pause_s` after the last, by the readings so far."""
         settings = self._settings
-        magnetic = settings.use_magnetometer
-        steps = forward(samples, settings, self._level, pause_s, heading_apart=magnetic)
-        starts, sd = steps.start, steps.claimed_sd_rad
-        field = _no_field(len(starts))
-        if magnetic:
+        steps = forward(samples, settings, self._level, pause_s)
+        rows, starts, sd, headings = steps.rows, steps.rows["start"], steps.rows["sd"][:, :3] * CLAIMED, None
+        if settings.use_magnetometer:
             self._heading.resume()
-            found = self._heading.follow(filtered_bins(steps, settings), _ends(steps, settings))
+            ends = rows["bias"][lasts_of_bins(len(rows), settings)]
             # A step turns by the heading of the last whole bin; those of the first bin by its own.
-            known = np.maximum(_bin_of(steps, settings) - 1, 0)
-            starts = _turned(found.turn_rad[known], starts)
-            sd = np.column_stack([sd[:, :2], found.sd_rad[known]])
-            field = _field_of(found, known)
-        xyzw = within_steps(steps, starts, steps.start_bias_rad_s)
-        return _each_sample(steps, xyzw, sd, steps.bias_rad_s, field)
+            known = np.maximum(np.arange(len(rows)) // steps_per_bin(settings) - 1, 0)
+            headings = self._heading.follow(filtered_bins(rows, settings), ends)[known]
+            starts = _turned(headings.turn_rad, starts)
+            sd[:, 2] = headings.sd_rad
+        xyzw = within_steps(samples, steps, np.ascontiguousarray(starts), rows["start_bias"])
+        return _each_sample(steps, xyzw, sd, rows["bias"], headings)
 
 
 def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     """Orientation of a stretch by all its readings; it must be longer than a second."""
     steps, level = smooth(samples, settings)
-    nodes, sd = level.matrices, level.sd_rad
-    field = _no_field(len(steps.last))
-    if settings.use_magnetometer and np.isfinite(steps.field_au[:, 0]).any():
+    rows, nodes, sd, headings = steps.rows, level.levels, level.sd_rad, None
+    if settings.use_magnetometer and np.isfinite(rows["field"][:, 0]).any():
         bias, bias_sd = level.bias_rad_s[1:], level.bias_sd_rad_s[1:]
-        bins = averaged_bins(steps, nodes[:-1], bias, bias_sd, sd[1:], settings)
+        bins = averaged_bins(rows, nodes[:-1], bias, bias_sd, sd[1:], settings)
         found = HeadingFilter(settings, online=False).smooth(bins)
-        turn, heading_sd = _at_nodes(steps, found, settings)
-        nodes = _turned(turn, nodes)
-        sd = np.column_stack([sd[:, :2], heading_sd])
-        field = _field_of(found, _bin_of(steps, settings))
+        time_s = np.concatenate([[0.0], np.cumsum(rows["duration_s"])])
+        ends_s = time_s[1:][lasts_of_bins(len(rows), settings)]
+        nodes = _turned(np.interp(time_s, ends_s, np.unwrap(found.turn_rad)), nodes)
+        sd[:, 2] = np.interp(time_s, ends_s, found.sd_rad)
+        headings = found[np.arange(len(rows)) // steps_per_bin(settings)]
     elif settings.use_magnetometer:
-        sd = np.column_stack([sd[:, :2], np.full(len(sd), np.pi)])
-    xyzw = within_steps(steps, nodes[:-1], level.bias_rad_s[:-1], nodes[1:])
-    return _each_sample(steps, xyzw, sd[1:], level.bias_rad_s[1:], field)
+        sd[:, 2] = np.pi
+    xyzw = within_steps(samples, steps, nodes[:-1], level.bias_rad_s[:-1], nodes[1:])
+    return _each_sample(steps, xyzw, sd[1:], level.bias_rad_s[1:], headings)
 
 
-def _ends(steps: FilterSteps, settings: FusionSettings) -> FloatArray:
-    """Bias at the end of each bin."""
-    return steps.bias_rad_s[lasts_of_bins(steps, settings)]
-
-
-def _no_field(count: int) -> _Field:
-    """Of steps whose heading no field tells."""
-    return np.zeros(count, dtype=bool), np.full(count, np.nan), np.full(count, np.nan)
-
-
-def _field_of(found: Headings, bins: IntArray) -> _Field:
-    """What the bins of some steps tell of the field."""
-    return found.disturbed[bins], found.stray[bins], found.iron[bins]
-
-
-def _turned(angles_rad: FloatArray, matrices: FloatArray) -> FloatArray:
-    """Rotations, shape (k, 3, 3), turned about up."""
-    turns = Rotation.from_euler("z", angles_rad[:, None]).as_matrix()
-    return np.asarray(turns @ matrices)
-
-
-def _bin_of(steps: FilterSteps, settings: FusionSettings) -> IntArray:
-    """Bin of each step."""
-    return np.asarray(np.arange(len(steps.last)) // steps_per_bin(settings))
-
-
-def _at_nodes(steps: FilterSteps, found: Headings, settings: FusionSettings) -> tuple[FloatArray, FloatArray]:
-    """Angle to north and its deviation at the start and at each step's end."""
-    time_s = np.concatenate([[0.0], np.cumsum(steps.duration_s)])
-    ends_s = time_s[1:][lasts_of_bins(steps, settings)]
-    turn = np.interp(time_s, ends_s, np.unwrap(found.turn_rad))
-    return turn, np.interp(time_s, ends_s, found.sd_rad)
+def _turned(angles_rad: FloatArray, xyzw: FloatArray) -> FloatArray:
+    """Quaternions, shape (k, 4), turned about up."""
+    return (Rotation.from_euler("z", angles_rad[:, None]) * Rotation.from_quat(xyzw)).as_quat()
 
 
 def _each_sample(
-    steps: FilterSteps, xyzw: FloatArray, sd_rad: FloatArray, bias_rad_s: FloatArray, field: _Field
+    steps: FilterSteps,
+    xyzw: FloatArray,
+    sd_rad: FloatArray,
+    bias_rad_s: FloatArray,
+    headings: Headings | None,
 ) -> Estimate:
     """Give every sample what was found for its step."""
-    each = np.repeat(np.arange(len(steps.last)), np.diff(steps.last, prepend=0))
-    disturbed, stray, iron = field
-    found = (xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], steps.resting[each])
+    count = len(steps.last)
+    each = np.repeat(np.arange(count), np.diff(steps.last, prepend=0))
+    disturbed, stray, iron = np.zeros(count, dtype=bool), np.full(count, np.nan), np.full(count, np.nan)
+    if headings is not None:
+        disturbed, stray, iron = headings.disturbed, headings.stray, headings.iron
+    found = (xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], steps.rows["resting"][each])
     return Estimate(*found, stray[each], iron[each])

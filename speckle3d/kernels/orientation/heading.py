@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.kernels.orientation.rotations import inverse
 
 ROOM, BIAS, IRON, PLACE, STRAY, LAG, SIZE = 0, 3, 6, 9, 12, 15, 16
 """Places in the state: the room's field (level axes), what is left of the gyroscope's bias (sensor axes), the
@@ -222,14 +223,14 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
         rows[i, LAG] = b.field_rate[i]
         rows[i, IRON : IRON + 3] = b.level[i]
     off, cross, total = _innovation(s, b, m, rows)
-    inverse, determinant = _inverse(total)
-    misfit = float(off @ (inverse @ off))
+    weight, determinant = inverse(total)
+    misfit = float(off @ (weight @ off))
     if not b.resting:
-        _adapt(s, b, off, misfit, inverse)
+        _adapt(s, b, off, misfit, weight)
     if misfit > _OUTLIER and _changed(s, m, f, q, off, total):
         off, cross, total = _innovation(s, b, m, rows)
-        inverse, determinant = _inverse(total)
-        misfit = float(off @ (inverse @ off))
+        weight, determinant = inverse(total)
+        misfit = float(off @ (weight @ off))
     v = _FREEDOM
     out.evidence = -0.5 * math.log(determinant) - 0.5 * (v + 3.0) * math.log(1.0 + misfit / v)
     out.trust = min((v + 3.0) / (v + misfit), 1.0)
@@ -239,8 +240,8 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
         return
     if out.trust < 1.0:
         more = (1.0 / out.trust - 1.0) * (total[0, 0] + total[1, 1] + total[2, 2]) / 3.0
-        inverse, _ = _inverse(total + more * np.eye(3))
-    gain = cross @ inverse
+        weight, _ = inverse(total + more * np.eye(3))
+    gain = cross @ weight
     s.x[:] += gain @ off
     p = s.p - gain @ cross.T
     s.p[:] = 0.5 * (p + p.T)
@@ -255,7 +256,7 @@ def _changed(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, tota
             s.p[i, i] += m.iron_put_on**2
             q[i, i] += m.iron_put_on**2
         return True
-    wide, _ = _inverse(total + m.place**2 * np.eye(3))
+    wide, _ = inverse(total + m.place**2 * np.eye(3))
     if not s.beside or off @ (wide @ off) <= _OUTLIER:
         return False
     s.beside = False
@@ -281,26 +282,13 @@ def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, F
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _inverse(m: FloatArray) -> tuple[FloatArray, float]:
-    """Inverse of a symmetric matrix, shape (3, 3), and its determinant."""
-    out = np.empty((3, 3))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        for n in range(3):
-            o, p = (n + 1) % 3, (n + 2) % 3
-            out[i, n] = m[j, o] * m[k, p] - m[j, p] * m[k, o]
-    determinant = m[0, 0] * out[0, 0] + m[0, 1] * out[0, 1] + m[0, 2] * out[0, 2]
-    return out / determinant, determinant
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _adapt(s: Any, b: Any, off: FloatArray, misfit: float, inverse: FloatArray) -> None:
+def _adapt(s: Any, b: Any, off: FloatArray, misfit: float, weight: FloatArray) -> None:
     """Follow the stray's variance by the slope of the reading's likelihood: the room may become another."""
-    weighted = inverse @ off
+    weighted = weight @ off
     believed = min(1.0, _LARGEST_SCORE / misfit)
     score = 0.0
     for i in range(3):
-        score += 0.5 * s.p[STRAY + i, STRAY + i] * (believed * weighted[i] ** 2 - inverse[i, i])
+        score += 0.5 * s.p[STRAY + i, STRAY + i] * (believed * weighted[i] ** 2 - weight[i, i])
     change = score * b.span_s / (_ADAPTED * _ADAPTS_S)
     s.stray *= math.exp(0.5 * min(max(change, -_LARGEST_CHANGE), _LARGEST_CHANGE))
     s.stray = min(max(s.stray, _LEAST_STRAY), _MOST_STRAY)

@@ -5,81 +5,143 @@ direction of gravity in spite of movement, where the accelerometer itself shows 
 error is the invariant one (velocity turns with it), so that errors of heading and velocity stay separate. The
 magnetometer has no part in it: it cannot tilt the orientation; `heading` beside this turns that to north.
 
+An increment sums the turn and the turned specific force of its samples, each with the attitude in the middle
+of the sample's interval, so that the filter may run more slowly than the sensor without losing coning and
+sculling motion [4]_.
+
 References
 ----------
 .. [1] F. L. Markley, "Attitude error representations for Kalman filtering", J. Guid. Control Dyn., 2003.
 .. [2] A. Barrau, S. Bonnabel, "The invariant extended Kalman filter as a stable observer", IEEE TAC, 2017.
 .. [3] D. Laidig, T. Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation and magnetic
    disturbance rejection", Information Fusion, 2023 (rest detection; inclination and heading apart).
+.. [4] P. G. Savage, "Strapdown inertial navigation integration algorithm design", J. Guid. Control
+   Dyn., 1998.
+.. [5] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA
+   J., 1965.
 """
 
 import math
+from typing import Any
 
+import numpy as np
 from numba import njit
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.kernels.orientation.inclination_arrays import (
-    ASSUMED,
-    BIAS,
-    BIAS_WALK,
-    BRIDGED,
-    DEVIATION,
-    DURATION,
-    FIRST_MOVING_S,
-    FIRST_S,
-    FORCE,
-    GRAVITY,
-    HEADING_APART,
-    LAST_RATE,
-    LEVEL,
-    LONGEST_S,
-    MATRIX,
-    NOISE,
-    NOISES,
-    PREDICTED,
-    PREDICTED_SPEED,
-    RATE,
-    RESIDUAL,
-    REST_BIAS_VARIANCE,
-    REST_FORCE,
-    REST_KNOWN,
-    REST_MEMORY_S,
-    REST_RATE,
-    REST_SPEED_VARIANCE,
-    RESTED,
-    RESTING,
-    RUNNING,
-    SHOWS,
-    SIZE,
-    SPEED,
-    SPEED_VARIANCE,
-    START_FORCE,
-    START_S,
-    START_TURN,
-    STARTED,
-    STARTING,
-    STEP_BIAS,
-    STEP_SPEED,
-    STEP_START,
-    STEP_START_BIAS,
-    STILL,
-    STILL_BIAS,
-    STILL_FORCE,
-    STILL_RATE,
-    STILL_S,
-    TRANSITION,
-    TURN,
-    TURNS,
+from speckle3d.kernels.orientation.rotations import (
+    Quaternion,
+    Vector,
+    inverse,
+    inverted,
+    product,
+    quaternion,
+    quaternion_of,
+    rotated,
+    vector_of,
 )
-from speckle3d.kernels.orientation.increments import rate_beyond, sum_samples
-from speckle3d.kernels.orientation.kalman import predict_covariance, update
-from speckle3d.kernels.orientation.rotations import product_into, turn_into
 
-SHOCK_M_S2 = 60.0
-"""Mean force of an increment beyond which it is not believed: a board shaken by hand in BROAD reads 51."""
+ATTITUDE, BIAS, SPEED, SIZE = 0, 3, 6, 9
+"""Places in the error state: attitude (world axes), gyroscope bias (sensor axes), velocity (world axes)."""
+
+LIMITS = np.dtype(
+    [
+        (name, "f8")
+        for name in (
+            "gravity_m_s2",
+            "gyro_noise_rad_sqrt_s",
+            "gyro_scale_noise_sqrt_s",
+            "bias_walk_rad_s_sqrt_s",
+            "speed_m_s",
+            "speed_time_s",
+            "force_noise_m_s_sqrt_s",
+            "rest_rate_rad_s",
+            "rest_force_m_s2",
+            "rest_after_s",
+            "rest_bias_rad_s",
+            "longest_s",  # step without lost samples
+        )
+    ]
+)
+"""Settings of the filter, as `xsens.fusion.settings` explains them."""
+
+FILTER = np.dtype(
+    [
+        ("running", "?"),
+        ("starting", "?"),
+        ("resting", "?"),
+        ("level", "f8", 4),  # world from sensor
+        ("bias", "f8", 3),
+        ("speed", "f8", 3),
+        ("p", "f8", (SIZE, SIZE)),
+        ("fresh", "f8", SIZE),  # variances at a start
+        ("rest_known", "?"),
+        ("rest_rate", "f8", 3),  # means of lately
+        ("rest_force", "f8", 3),
+        ("still_s", "f8"),
+        ("start_s", "f8"),
+        ("start_force", "f8", 3),  # sum since the start, in its first axes
+        ("start_turn", "f8", 4),  # those axes from the present ones
+        ("last_rate", "f8", 3),
+    ],
+    align=True,
+)
+"""What is kept from one increment to the next, and from one stretch to the next."""
+
+STEP = np.dtype(
+    [
+        ("duration_s", "f8"),
+        ("rate", "f8", 3),  # mean reading of the gyroscope
+        ("field", "f8", 3),  # mean, in the axes at the start; NaN where there is none
+        ("force", "f8", 3),  # integral of the specific force, likewise
+        ("turn", "f8", 4),  # start from end
+        ("lost_rad2", "f8"),  # variance of the turn over lost samples
+        ("start", "f8", 4),  # world from sensor before the increment,
+        ("start_bias", "f8", 3),  # with which its turns are summed,
+        ("predicted", "f8", 4),  # after it,
+        ("predicted_speed", "f8", 3),
+        ("level", "f8", 4),  # and after its correction
+        ("speed", "f8", 3),
+        ("bias", "f8", 3),
+        ("noise", "f8", SIZE),  # diagonal
+        ("sd", "f8", 6),  # of attitude and bias
+        ("resting", "?"),
+        ("started", "?"),
+    ],
+    align=True,
+)
+"""One increment, and the filter before and after it."""
 
 GOES_ON = -1.0
 """Pause before a stretch that is none: the stretch goes on from the last one."""
+
+_SHOCK_M_S2 = 60.0
+"""Mean force of an increment beyond which it is not believed: a board shaken by hand in BROAD reads 51."""
+
+_START_S, _MOVING_START_S = 1.0, 3.0
+"""Inclination at the start is that of the mean force over this time, at rest and in movement."""
+
+_REST_SPEED_M_S, _REST_TIME_S = 0.02, 0.5
+"""Standard deviation of a resting sensor's velocity, and how long the accelerometer's error persists."""
+
+_REST_BIAS_RAD = math.radians(0.03)
+"""Error of the bias after one second of rest: an MT9-B's Allan deviation at 1 s is 0.05 deg/s."""
+
+_REST_NOISE = 0.1
+"""Random walk of a resting sensor's attitude, as a fraction of the gyroscope's. The gyroscope is not
+integrated at rest; this allows for turning too slow to notice."""
+
+_REST_MEMORY_S = 0.5
+"""Time over which a resting sensor's readings are averaged."""
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _three(v: FloatArray) -> Vector:
+    return v[0], v[1], v[2]
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _norm(v: FloatArray) -> float:
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -89,17 +151,12 @@ def run_filter(
     force_m_s2: FloatArray,
     field_au: FloatArray,
     last: IntArray,
-    chunk: int,
     pause_s: float,
-    s: FloatArray,
-    p: FloatArray,
-    fresh: FloatArray,
-    limits: FloatArray,
-    steps: FloatArray,
-    within: FloatArray,
+    filters: Any,
+    limits: Any,
+    steps: Any,
     covariance: FloatArray,
     transition: FloatArray,
-    work: FloatArray,
 ) -> None:
     """Run the filter over a stretch.
 
@@ -109,220 +166,338 @@ def run_filter(
     rate_rad_s, force_m_s2, field_au : ndarray, shape (m, 3)
     last : ndarray of int, shape (n,)
         Sample after each increment's last.
-    chunk : int
-        Increments summed with one bias.
     pause_s : float
-        Time since the stretch before, of which `s` and `p` are the end; `GOES_ON` if there was no pause.
-    s, p : ndarray, shapes (STATE,) and (9, 9)
-        State and covariance of the filter, changed in place.
-    fresh : ndarray, shape (9, 9)
-        Covariance at a start.
-    limits : ndarray, shape (LIMITS,)
-    steps, within : ndarray, shapes (n, STEP) and (m, SAMPLE)
+        Time since the stretch before, at whose end the filter is; `GOES_ON` if there was no pause.
+    filters, limits : structured ndarray, shape (1,), of `FILTER` and `LIMITS`
+        The filter is changed in place.
+    steps : structured ndarray, shape (n,), of `STEP`
         Filled.
     covariance, transition : ndarray, shape (n, 9, 9), or (0, 9, 9) if they are not wanted
         Filled.
-    work : ndarray, shape (WORK, 9)
-        Buffers, zeros.
     """
-    whole = last.shape[0]
-    if whole > 1 and last[whole - 1] - last[whole - 2] != last[0]:
-        whole -= 1  # samples left over, summed with a bias of their own
+    s, r, f = filters[0], limits[0], np.zeros((SIZE, SIZE))
+    if pause_s != GOES_ON:
+        s.last_rate[:] = math.nan
+    first = 0
     for n in range(last.shape[0]):
         step = steps[n]
-        for i in range(3):
-            step[ASSUMED + i] = s[BIAS + i] if n % chunk == 0 or n == whole else steps[n - 1, ASSUMED + i]
-        first = 0 if n == 0 else last[n - 1]
-        before = s[LAST_RATE : LAST_RATE + 3]
+        step.start_bias[:] = s.bias
+        _sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], r.longest_s, s.last_rate, step)
+        first = last[n]
         if n == 0 and pause_s != GOES_ON:
-            before[:] = math.nan
-        longest_s = limits[LONGEST_S]
-        sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], longest_s, before, step, within)
-        if n == 0 and pause_s != GOES_ON:
-            _set_up(s, p, fresh, limits, step, pause_s)
-        for i in range(9):
-            step[STEP_START + i] = s[LEVEL + i]
-        for i in range(3):
-            step[STEP_START_BIAS + i] = s[BIAS + i]
-        _predict(s, p, limits, step, work)
-        if s[STARTING] > 0.0:
-            _begin(s, limits, step, work[TURNS])
+            _set_up(s, r, step, pause_s)
+        step.start[:] = s.level
+        _predict(s, r, step, f)
+        if s.starting:
+            _begin(s, step)
         else:
-            _speed_is_zero(s, p, limits, step, work)
-            _rest_shows_bias(s, p, limits, step, work)
-        _note(s, p, step, work)
+            _correct_by_speed(s, r, step)
+            if s.resting:
+                off = step.rate - s.bias
+                gain = _correct(s.p, BIAS, _REST_BIAS_RAD**2 / step.duration_s, _LEVEL)
+                _inject(s, gain @ off)
+        step.level[:], step.speed[:], step.bias[:] = s.level, s.speed, s.bias
+        step.resting, step.started = s.resting, not s.starting
+        for i in range(6):
+            step.sd[i] = math.sqrt(s.p[i, i])
         if covariance.shape[0] > 0:
-            for i in range(SIZE):
-                for j in range(SIZE):
-                    covariance[n, i, j], transition[n, i, j] = p[i, j], work[TRANSITION + i, j]
+            covariance[n], transition[n] = s.p, f
+
+
+# -- increments
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _note(s: FloatArray, p: FloatArray, step: FloatArray, work: FloatArray) -> None:
-    """Note the filter in the step, after its correction."""
-    for i in range(9):
-        step[MATRIX + i] = s[LEVEL + i]
-        step[NOISE + i] = work[NOISES + i, i]
-    for i in range(3):
-        step[STEP_SPEED + i], step[STEP_BIAS + i] = s[SPEED + i], s[BIAS + i]
-    for i in range(6):
-        step[DEVIATION + i] = math.sqrt(p[i, i])
-    step[RESTED], step[STARTED] = s[RESTING], 1.0 - s[STARTING]
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _upright(force: FloatArray, out: FloatArray) -> None:
-    """Fill the shortest rotation that takes `force` to up."""
-    norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
-    x, y, z = 0.0, 0.0, 1.0
-    if norm > 0.0:
-        x, y, z = force[0] / norm, force[1] / norm, force[2] / norm
-    sine = math.sqrt(x * x + y * y)
-    if sine < 1e-9:
-        for i in range(9):
-            out[i] = 0.0
-        out[0], out[4], out[8] = 1.0, math.copysign(1.0, z), math.copysign(1.0, z)
-        return
-    angle = math.atan2(sine, z)
-    turn_into(y / sine * angle, -x / sine * angle, 0.0, out)
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _set_up(
-    s: FloatArray, p: FloatArray, fresh: FloatArray, limits: FloatArray, step: FloatArray, pause_s: float
+def _sum_samples(
+    step_s: FloatArray,
+    rate: FloatArray,
+    force: FloatArray,
+    field: FloatArray,
+    first: int,
+    last: int,
+    longest_s: float,
+    before: FloatArray,
+    step: Any,
 ) -> None:
+    """Sum the samples from `first` to before `last`, with the step's bias.
+
+    Over a step longer than `longest_s` the rate may change as much as it did from the sample before, `before`
+    (which becomes that of the last), to the one after.
+    """
+    q = (0.0, 0.0, 0.0, 1.0)
+    step.duration_s = step.lost_rad2 = 0.0
+    step.rate[:], step.field[:], step.force[:] = 0.0, 0.0, 0.0
+    fields = 0
+    for k in range(first, last):
+        dt = step_s[k]
+        for i in range(3):
+            if dt > longest_s and math.isfinite(before[i]):
+                step.lost_rad2 += (dt * (rate[k, i] - before[i])) ** 2
+            before[i] = rate[k, i]
+            step.rate[i] += dt * rate[k, i]
+        half = _turn(rate[k], step.start_bias, 0.5 * dt)
+        q = product(q, half)
+        x, y, z = rotated(q, (force[k, 0], force[k, 1], force[k, 2]))
+        step.force[0] += dt * x
+        step.force[1] += dt * y
+        step.force[2] += dt * z
+        q = product(q, half)
+        if math.isfinite(field[k, 0] + field[k, 1] + field[k, 2]):
+            x, y, z = rotated(q, (field[k, 0], field[k, 1], field[k, 2]))
+            step.field[0] += x
+            step.field[1] += y
+            step.field[2] += z
+            fields += 1
+        step.duration_s += dt
+    step.turn[:] = q
+    for i in range(3):
+        step.rate[i] /= step.duration_s
+        step.field[i] = step.field[i] / fields if fields > 0 else math.nan
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _turn(rate: FloatArray, bias: FloatArray, span_s: float) -> Quaternion:
+    """Turn by a reading of the gyroscope over some time."""
+    x, y, z = rate[0] - bias[0], rate[1] - bias[1], rate[2] - bias[2]
+    return quaternion_of(x * span_s, y * span_s, z * span_s)
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def orient_samples(
+    step_s: FloatArray,
+    rate_rad_s: FloatArray,
+    last: IntArray,
+    resting: FloatArray,
+    starts: FloatArray,
+    biases: FloatArray,
+    ends: FloatArray,
+    xyzw: FloatArray,
+) -> None:
+    """Fill the orientation of every sample, by the gyroscope from the start of its step.
+
+    Parameters
+    ----------
+    step_s, rate_rad_s : ndarray, shapes (m,) and (m, 3)
+    last, resting : ndarray, shape (n,)
+        Sample after each step's last; whether the sensor stays at its step's start.
+    starts, biases : ndarray, shapes (n, 4) and (n, 3)
+        At the start of each step.
+    ends : ndarray, shape (n, 4) or (0, 4)
+        At the end of each step: the error there is spread over the step. Empty: it is left.
+    xyzw : ndarray, shape (m, 4)
+    """
+    first = 0
+    for n in range(last.shape[0]):
+        q, whole_s, span_s = quaternion(starts[n]), 0.0, 0.0
+        for k in range(first, last[n]):
+            if not resting[n]:
+                q = product(q, _turn(rate_rad_s[k], biases[n], step_s[k]))
+            xyzw[k] = q
+            whole_s += step_s[k]
+        if ends.shape[0] > 0:
+            x, y, z = vector_of(product(quaternion(ends[n]), inverted(q)))
+            for k in range(first, last[n]):
+                span_s += step_s[k]
+                share = span_s / whole_s
+                xyzw[k] = product(quaternion_of(share * x, share * y, share * z), quaternion(xyzw[k]))
+        first = last[n]
+
+
+# -- start and rest
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _upright(force: FloatArray) -> Quaternion:
+    """The shortest rotation that takes a force to up."""
+    norm = _norm(force)
+    if norm == 0.0 or force[2] < -0.999999 * norm:
+        return (0.0, 0.0, 0.0, 1.0) if norm == 0.0 else (1.0, 0.0, 0.0, 0.0)
+    x, y, w = force[1] / norm, -force[0] / norm, 1.0 + force[2] / norm
+    length = math.sqrt(x * x + y * y + w * w)
+    return x / length, y / length, 0.0, w / length
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _set_up(s: Any, r: Any, step: Any, pause_s: float) -> None:
     """Begin before the first increment of a stretch: anew, or after a pause with the bias found so far."""
-    walk = limits[BIAS_WALK] * limits[BIAS_WALK] * pause_s
-    for i in range(p.shape[0]):
-        for j in range(p.shape[0]):
-            if s[RUNNING] == 0.0 or not (3 <= i < 6 and 3 <= j < 6):
-                p[i, j] = fresh[i, j]
-        if 3 <= i < 6 and s[RUNNING] > 0.0:
-            p[i, i] += walk
-    s[RUNNING] = s[STARTING] = 1.0
-    s[REST_KNOWN] = s[STILL] = s[START_S] = 0.0
-    for i in range(3):
-        s[REST_FORCE + i] = s[START_FORCE + i] = s[SPEED + i] = 0.0
-    _upright(step[FORCE : FORCE + 3], s[LEVEL : LEVEL + 9])
-    for i in range(9):  # in level axes: those of a sensor upside down would turn with every reading
-        s[START_TURN + i] = s[LEVEL + i]
+    kept = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
+    s.p[:] = np.diag(s.fresh)
+    if s.running:
+        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = kept + r.bias_walk_rad_s_sqrt_s**2 * pause_s * np.eye(3)
+    s.running = s.starting = True
+    s.resting = s.rest_known = False
+    s.still_s = s.start_s = 0.0
+    s.start_force[:], s.speed[:] = 0.0, 0.0
+    s.level[:] = _upright(step.force)
+    s.start_turn[:] = s.level  # in level axes: those of a sensor upside down would turn with every reading
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _rest(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray) -> None:
+def _begin(s: Any, step: Any) -> None:
+    """Set up from the mean force since the start."""
+    turn = quaternion(s.start_turn)
+    x, y, z = rotated(turn, _three(step.force))
+    s.start_force[0] += x
+    s.start_force[1] += y
+    s.start_force[2] += z
+    turn = product(turn, quaternion(step.turn))
+    s.start_turn[:] = turn
+    s.start_s += step.duration_s
+    s.level[:] = product(_upright(s.start_force), turn)
+    s.speed[:] = 0.0
+    s.starting = s.start_s < (_START_S if s.still_s > 0.5 * _START_S else _MOVING_START_S)
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _rest(s: Any, r: Any, step: Any) -> None:
     """Note whether the sensor rests."""
-    duration = step[DURATION]
-    share = duration / (limits[REST_MEMORY_S] + duration)
-    rate_off = force_off = bias_off = 0.0
-    for i in range(3):
-        if s[REST_KNOWN] == 0.0:
-            s[REST_RATE + i], s[REST_FORCE + i] = step[RATE + i], step[FORCE + i] / duration
-        off = step[RATE + i] - s[REST_RATE + i]
-        rate_off += off * off
-        s[REST_RATE + i] += share * off
-        off = step[FORCE + i] / duration - s[REST_FORCE + i]
-        force_off += off * off
-        s[REST_FORCE + i] += share * off
-        off = s[REST_RATE + i] - s[BIAS + i]
-        bias_off += off * off
-    s[REST_KNOWN] = 1.0
-    bias_sd = math.sqrt(max(p[3, 3], p[4, 4], p[5, 5], 0.0))
+    force = step.force / step.duration_s
+    if not s.rest_known:
+        s.rest_rate[:], s.rest_force[:], s.rest_known = step.rate, force, True
+    rate_off, force_off = step.rate - s.rest_rate, force - s.rest_force
+    share = step.duration_s / (_REST_MEMORY_S + step.duration_s)
+    s.rest_rate[:] = s.rest_rate + share * rate_off
+    s.rest_force[:] = s.rest_force + share * force_off
+    bias_sd = math.sqrt(max(s.p[3, 3], s.p[4, 4], s.p[5, 5], 0.0))
     still = (
-        math.sqrt(rate_off) < limits[STILL_RATE]
-        and math.sqrt(force_off) < limits[STILL_FORCE]
-        and math.sqrt(bias_off) < limits[STILL_BIAS] + 3.0 * bias_sd
+        _norm(rate_off) < r.rest_rate_rad_s
+        and _norm(force_off) < r.rest_force_m_s2
+        and _norm(s.rest_rate - s.bias) < r.rest_bias_rad_s + 3.0 * bias_sd
     )
-    s[STILL] = s[STILL] + duration if still else 0.0
-    s[RESTING] = 1.0 if s[STILL] > limits[STILL_S] else 0.0
+    s.still_s = s.still_s + step.duration_s if still else 0.0
+    s.resting = s.still_s > r.rest_after_s
+
+
+# -- the Kalman filter
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _rate(s: FloatArray, step: FloatArray) -> float:
-    x, y, z = step[RATE] - s[BIAS], step[RATE + 1] - s[BIAS + 1], step[RATE + 2] - s[BIAS + 2]
-    return math.sqrt(x * x + y * y + z * z)
+def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
+    """Predict over one increment; fill its transition."""
+    _rest(s, r, step)
+    level, duration = quaternion(s.level), step.duration_s
+    f[:] = np.eye(SIZE)
+    vx, vy, vz = _three(s.speed)
+    for j in range(3):
+        axis = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+        x, y, z = rotated(level, axis)
+        span = 0.0 if s.resting else duration
+        f[0, BIAS + j], f[1, BIAS + j], f[2, BIAS + j] = -span * x, -span * y, -span * z
+        f[6, BIAS + j] = span * (vz * y - vy * z)
+        f[7, BIAS + j] = span * (vx * z - vz * x)
+        f[8, BIAS + j] = span * (vy * x - vx * y)
+    f[6, 1], f[7, 0] = r.gravity_m_s2 * duration, -r.gravity_m_s2 * duration
+    shock = max(_norm(step.force) - _SHOCK_M_S2 * duration, 0.0)  # a knock, whose reading may be cut off
+    noise = r.gyro_noise_rad_sqrt_s**2 + (r.gyro_scale_noise_sqrt_s * _norm(step.rate - s.bias)) ** 2
+    if s.resting:
+        noise = (_REST_NOISE * r.gyro_noise_rad_sqrt_s) ** 2
+    step.noise[:3] = noise * duration + step.lost_rad2
+    step.noise[3:6] = r.bias_walk_rad_s_sqrt_s**2 * duration
+    step.noise[6:] = r.force_noise_m_s_sqrt_s**2 * duration + shock**2
+    s.p[:] = f @ s.p @ f.T
+    for i in range(SIZE):
+        s.p[i, i] += step.noise[i]
+    x, y, z = rotated(level, _three(step.force))
+    s.speed[0] += x
+    s.speed[1] += y
+    s.speed[2] += z - r.gravity_m_s2 * duration
+    if not s.resting:
+        s.level[:] = product(level, quaternion(step.turn))
+    step.predicted[:], step.predicted_speed[:] = s.level, s.speed
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _shock(limits: FloatArray, step: FloatArray) -> float:
-    """Variance of the velocity by a force that no hand gives: a knock, whose reading may be cut off."""
-    x, y, z = step[FORCE], step[FORCE + 1], step[FORCE + 2]
-    beyond = math.sqrt(x * x + y * y + z * z) - SHOCK_M_S2 * step[DURATION]
-    return beyond * beyond if beyond > 0.0 else 0.0
+def _correct_by_speed(s: Any, r: Any, step: Any) -> None:
+    """Correct by a velocity of zero, whose error is a hand's, or smaller at rest, and persists.
+
+    A velocity tells nothing of turning about up: its own direction turns as likely. So neither heading nor
+    the bias about up is corrected by it, and their errors count as noise (Schmidt).
+    """
+    speed, time_s = (_REST_SPEED_M_S, _REST_TIME_S) if s.resting else (r.speed_m_s, r.speed_time_s)
+    up = np.array(rotated(inverted(quaternion(s.level)), (0.0, 0.0, 1.0)))
+    gain = _correct(s.p, SPEED, 2.0 * speed**2 * time_s / step.duration_s, up)
+    _inject(s, -gain @ s.speed)
+
+
+_LEVEL = np.zeros(3)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _predict(s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray, work: FloatArray) -> None:
-    """Predict over one increment."""
-    _rest(s, p, limits, step)
-    f, level = work[TRANSITION : TRANSITION + SIZE], s[LEVEL : LEVEL + 9]
-    duration, resting = step[DURATION], s[RESTING] > 0.0
-    for i in range(p.shape[0]):
-        for j in range(p.shape[0]):
-            f[i, j] = 1.0 if i == j else 0.0
-    if not resting:
-        vx, vy, vz = s[SPEED], s[SPEED + 1], s[SPEED + 2]
-        for j in range(3):
-            x, y, z = level[j] * duration, level[3 + j] * duration, level[6 + j] * duration
-            f[0, 3 + j], f[1, 3 + j], f[2, 3 + j] = -x, -y, -z
-            f[6, 3 + j], f[7, 3 + j], f[8, 3 + j] = vz * y - vy * z, vx * z - vz * x, vy * x - vx * y
-    f[6, 1], f[7, 0] = limits[GRAVITY] * duration, -limits[GRAVITY] * duration
-    shock = _shock(limits, step)
-    predict_covariance(p, _rate(s, step), step[BRIDGED], shock, resting, limits, duration, work)
-    for i in range(3):
-        x, y, z = step[FORCE], step[FORCE + 1], step[FORCE + 2]
-        s[SPEED + i] += level[3 * i] * x + level[3 * i + 1] * y + level[3 * i + 2] * z
-    s[SPEED + 2] -= limits[GRAVITY] * duration
-    if not resting:
-        turn = step[PREDICTED : PREDICTED + 9]
-        product_into(level, step[TURN : TURN + 9], level)
-        x, y, z = rate_beyond(step, s[BIAS : BIAS + 3])
-        turn_into(x * duration, y * duration, z * duration, turn)
-        product_into(level, turn, level)
-    for i in range(9):
-        step[PREDICTED + i] = level[i]
-    for i in range(3):
-        step[PREDICTED_SPEED + i] = s[SPEED + i]
+def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> FloatArray:
+    """Correct a covariance by an observation of three states; return the gain, shape (9, 3).
+
+    The heading is found elsewhere, and corrected by nothing; nor is the bias about `up`.
+    """
+    cross = p[first : first + 3].copy()
+    total = cross[:, first : first + 3] + variance * np.eye(3)
+    gain = cross.T.copy() @ inverse(total)[0]
+    gain[2] = 0.0
+    for j in range(3):
+        about_up = up[0] * gain[3, j] + up[1] * gain[4, j] + up[2] * gain[5, j]
+        for i in range(3):
+            gain[3 + i, j] -= about_up * up[i]
+    rest = p - gain @ cross
+    p[:] = rest - (rest[:, first : first + 3] - variance * gain) @ gain.T
+    return gain
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _begin(s: FloatArray, limits: FloatArray, step: FloatArray, up: FloatArray) -> None:
-    """Set up from the mean force since the start; `up` is a buffer."""
-    turn = s[START_TURN : START_TURN + 9]
-    for i in range(3):
-        for j in range(3):
-            s[START_FORCE + i] += turn[3 * i + j] * step[FORCE + j]
-    product_into(turn, step[TURN : TURN + 9], turn)
-    s[START_S] += step[DURATION]
-    _upright(s[START_FORCE : START_FORCE + 3], up)
-    product_into(up, turn, s[LEVEL : LEVEL + 9])
-    for i in range(3):
-        s[SPEED + i] = 0.0
-    enough = limits[FIRST_S] if s[STILL] > 0.5 * limits[FIRST_S] else limits[FIRST_MOVING_S]
-    s[STARTING] = 0.0 if s[START_S] >= enough else 1.0
+def _inject(s: Any, error: FloatArray) -> None:
+    """Apply the estimated error to the state."""
+    turn = quaternion_of(error[0], error[1], error[2])
+    s.level[:] = product(turn, quaternion(s.level))
+    s.speed[:] = rotated(turn, _three(s.speed))
+    s.speed[:] = s.speed + error[SPEED:]
+    s.bias[:] = s.bias + error[BIAS:SPEED]
+
+
+# -- backward
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _speed_is_zero(
-    s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray, work: FloatArray
+def smooth_steps(
+    steps: Any,
+    covariance: FloatArray,
+    transition: FloatArray,
+    first: int,
+    levels: FloatArray,
+    biases: FloatArray,
 ) -> None:
-    """Correct by a velocity of zero, whose error is a hand's, or smaller at rest, and persists."""
-    variance = limits[REST_SPEED_VARIANCE] if s[RESTING] > 0.0 else limits[SPEED_VARIANCE]
-    for i in range(3):
-        for j in range(SIZE):
-            work[SHOWS + i, j] = 1.0 if j == 6 + i else 0.0
-        work[RESIDUAL, i] = -s[SPEED + i]
-    update(variance / step[DURATION], s, p, True, limits[HEADING_APART] > 0.0, work)
+    """Smooth the steps from `first` on [5]_; before it, go back by the gyroscope.
 
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _rest_shows_bias(
-    s: FloatArray, p: FloatArray, limits: FloatArray, step: FloatArray, work: FloatArray
-) -> None:
-    """Correct by the gyroscope's reading at rest."""
-    if s[RESTING] == 0.0:
-        return
-    for i in range(3):
-        for j in range(SIZE):
-            work[SHOWS + i, j] = 1.0 if j == 3 + i else 0.0
-        work[RESIDUAL, i] = step[RATE + i] - s[BIAS + i]
-    update(limits[REST_BIAS_VARIANCE] / step[DURATION], s, p, False, limits[HEADING_APART] > 0.0, work)
+    Parameters
+    ----------
+    steps : structured ndarray, shape (n,), of `STEP`
+    covariance, transition : ndarray, shape (n, 9, 9)
+        The covariances become the smoothed ones.
+    first : int
+        The step at whose end the filter had started.
+    levels, biases : ndarray, shapes (n + 1, 4) and (n + 1, 3)
+        Filled, at the start of the stretch and at the end of each step.
+    """
+    n = steps.shape[0]
+    levels[n], biases[n] = steps[n - 1].level, steps[n - 1].bias
+    speed, off = steps[n - 1].speed.copy(), np.empty(SIZE)
+    for k in range(n - 2, first - 1, -1):
+        step, after, f, p = steps[k], steps[k + 1], transition[k + 1], covariance[k]
+        ahead = f @ p
+        predicted = ahead @ f.T + np.diag(after.noise)
+        gain = np.linalg.solve(predicted, ahead).T
+        covariance[k] = p + gain @ (covariance[k + 1] - predicted) @ gain.T
+        turn = product(quaternion(levels[k + 2]), inverted(quaternion(after.predicted)))
+        off[:3] = vector_of(turn)
+        off[3:6] = biases[k + 2] - step.bias
+        off[6:] = speed
+        off[6:] -= np.array(rotated(turn, _three(after.predicted_speed)))
+        error = gain @ off
+        turn = quaternion_of(error[0], error[1], error[2])
+        levels[k + 1] = product(turn, quaternion(step.level))
+        biases[k + 1] = step.bias + error[BIAS:SPEED]
+        speed[:] = rotated(turn, _three(step.speed))
+        speed += error[SPEED:]
+    for k in range(first, -1, -1):
+        step = steps[k]
+        biases[k], levels[k] = biases[k + 1], levels[k + 1]
+        if not step.resting:
+            turn = product(quaternion(step.turn), _turn(step.start_bias, biases[k], step.duration_s))
+            levels[k] = product(quaternion(levels[k + 1]), inverted(turn))
