@@ -118,14 +118,15 @@ class HeadingFilter:
         bins["bias_change"] = np.diff(bias_rad_s, axis=0, prepend=before)
         self._bias = bias_rad_s[-1].copy()
         found = self._run(self._scaled(bins, 1), self._filters)
-        weights = np.empty(found.shape)
-        for k in np.arange(len(bins)):
-            if not bins["resting"][k]:  # a sensor at rest repeats itself and proves nothing
-                keep = math.exp(-bins["span_s"][k] / _MEMORY_S)
-                self._evidence = keep * self._evidence + found["evidence"][k]
-                self._doubt = self._doubt + found["doubt"][k]
-            weights[k] = _weights(self._evidence, self._doubt)
-        return _mean(found, weights, bins)
+        moving = ~bins["resting"][:, None]  # a sensor at rest repeats itself and proves nothing
+        keep = np.where(moving, np.exp(-bins["span_s"][:, None] / _MEMORY_S), 1.0)
+        evidence = found["evidence"] * moving
+        for now, share in zip(evidence, keep, strict=True):
+            now += share * self._evidence
+            self._evidence = now
+        doubt = self._doubt + np.cumsum(found["doubt"] * moving, axis=0)
+        self._evidence, self._doubt = evidence[-1].copy(), doubt[-1]
+        return _mean(found, _weights(evidence, doubt), bins)
 
     def smooth(self, bins: Any) -> Headings:
         """North over a whole stretch, smoothed backward; the stray at first is the recording's."""
@@ -176,11 +177,12 @@ def _sums(found: Any, moving: BoolArray) -> tuple[FloatArray, FloatArray]:
 
 def _weights(evidence: FloatArray, doubt: FloatArray) -> FloatArray:
     """Weights of the filters: iron on the sensor by its evidence over the better one of the other two."""
-    against = _ODDS - [0.0, 0.0, evidence[_IRON] - evidence[:_IRON].max()]
-    against[:_IRON] += doubt[:_IRON]
-    against[:_IRON] -= against[:_IRON].min()
-    likely = np.exp(against.min() - against)
-    return np.asarray(likely / likely.sum())
+    against = np.tile(_ODDS, (*evidence.shape[:-1], 1))
+    against[..., _IRON] -= evidence[..., _IRON] - evidence[..., :_IRON].max(axis=-1)
+    against[..., :_IRON] += doubt[..., :_IRON]
+    against[..., :_IRON] -= against[..., :_IRON].min(axis=-1, keepdims=True)
+    likely = np.exp(against.min(axis=-1, keepdims=True) - against)
+    return np.asarray(likely / likely.sum(axis=-1, keepdims=True))
 
 
 def _mean(found: Any, weights: FloatArray, bins: Any) -> Headings:

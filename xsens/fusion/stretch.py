@@ -71,9 +71,10 @@ def _each_sample(
 ) -> Estimate:
     """Give every sample what was found for its step."""
     count = len(steps.last)
-    each = np.repeat(np.arange(count), np.diff(steps.last, prepend=0))
-    disturbed, stray, iron = np.zeros(count, dtype=bool), np.full(count, np.nan), np.full(count, np.nan)
+    each = np.diff(steps.last, prepend=0)
+    field = (np.zeros(count, dtype=bool), np.full(count, np.nan), np.full(count, np.nan))
     if headings is not None:
-        disturbed, stray, iron = headings.disturbed, headings.stray, headings.iron
-    found = (xyzw, sd_rad[each], bias_rad_s[each], disturbed[each], steps.rows["resting"][each])
-    return Estimate(*found, stray[each], iron[each])
+        field = headings.disturbed, headings.stray, headings.iron
+    disturbed, stray, iron = field
+    found = (sd_rad, bias_rad_s, disturbed, steps.rows["resting"], stray, iron)
+    return Estimate(xyzw, *(np.repeat(values, each, axis=0) for values in found))

@@ -73,152 +73,148 @@ def measured(log: ImuLog) -> ImuLog:
     InvalidInputError
         If its rows are of several sensors in turn.
     """
-    log = _without_damage(log)
-    _require_one_sensor(log)
-    readings: dict[str, FloatArray | None] = {name: getattr(log, name) for name in VECTORS}
-    dead = np.zeros(len(log), dtype=bool)
+    rows: dict[str, FloatArray] = {}
     notes: list[str] = []
-    for name in VECTORS:
-        rows = readings[name]
-        if rows is None or not _every(np.isfinite(rows)).any():
-            readings[name] = None
-            continue
-        bad = _bad(name, rows, dead, log)
-        if name == VECTORS[0]:
-            dead = bad["zero"] | ~_every(np.isfinite(rows))
-        counts = {why: int(mask.sum()) for why, mask in bad.items() if mask.any()}
-        if not counts:
-            continue
-        wrong = np.logical_or.reduce(list(bad.values()))
-        told = ", ".join(f"{count} {_WORDS[why]}" for why, count in counts.items())
+
+    def leave_out(name: str, wrong: BoolArray, told: str) -> None:
+        rows[name] = np.where(wrong[:, None], np.nan, rows[name])
         notes.append(f"{name.split('_')[0]}: {told}: taken as missing")
-        left = ~wrong & np.isfinite(rows).all(axis=1)
-        readings[name] = np.where(wrong[:, None], np.nan, rows) if left.any() else None
-    changed: dict[str, Any] = {k: v for k, v in readings.items() if v is not getattr(log, k)}
-    stuck = _stuck(log)
-    if stuck.any():
+
+    for name in VECTORS:
+        if (readings := getattr(log, name)) is not None:
+            rows[name] = readings
+            if np.abs(readings).max(initial=0.0) >= _ABSURD or np.isinf(readings).any():
+                wild = (np.abs(readings) >= _ABSURD).any(axis=1)
+                leave_out(name, wild, f"{int(wild.sum())} out of range")
+    _require_one_sensor(log, rows)
+    force, rate = rows.get(VECTORS[0]), rows.get(VECTORS[1])
+    dead = np.zeros(len(log), dtype=bool)
+    for name in rows:
+        bad = _bad(name, rows[name], dead, force, rate)
+        if name == VECTORS[0]:
+            dead = bad["readings of zero"] | ~_finite(rows[name])
+        told = ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any())
+        if told:
+            leave_out(name, np.logical_or.reduce(list(bad.values())), told)
+    changed: dict[str, Any] = {
+        name: readings if _finite(readings).any() else None
+        for name, readings in rows.items()
+        if readings is not getattr(log, name) or not _finite(readings).any()
+    }
+    if (stuck := _stuck(log)).any():
         notes.append(f"own orientation: {int(stuck.sum())} repeated: taken as missing")
         changed["oriented"] = log.oriented & ~stuck
     return replace(log, **changed, notes=(*log.notes, *notes)) if changed else log
 
 
-_WORDS = {
-    "zero": "readings of zero",
-    "range": "out of range",
-    "repeat": "repeated",
-    "end": "at the end of the range",
-    "spike": "single spikes",
-}
+def _finite(rows: FloatArray) -> BoolArray:
+    """Rows of finite numbers; many times faster than a reduction over a few columns."""
+    return np.asarray(np.isfinite(rows[:, 0]) & np.isfinite(rows[:, 1]) & np.isfinite(rows[:, 2]))
 
 
-def _without_damage(log: ImuLog) -> ImuLog:
-    """The log without numbers that are damage in any unit, counted in its notes."""
-    changed: dict[str, Any] = {}
-    notes = []
-    for name in VECTORS:
-        rows = getattr(log, name)
-        if rows is not None and (np.abs(rows) >= _ABSURD).any():
-            wild = (np.abs(rows) >= _ABSURD).any(axis=1)
-            changed[name] = np.where(wild[:, None], np.nan, rows)
-            notes.append(f"{name.split('_')[0]}: {int(wild.sum())} out of range: taken as missing")
-    return replace(log, **changed, notes=(*log.notes, *notes)) if changed else log
+def _norm(rows: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
 
 
-def _bad(name: str, rows: FloatArray, dead: BoolArray, log: ImuLog) -> dict[str, BoolArray]:
+class _Runs(NamedTuple):
+    """First rows and lengths of runs of one value."""
+
+    start: IntArray
+    length: IntArray
+
+    @classmethod
+    def of(cls, rows: FloatArray) -> _Runs:
+        changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
+        start = np.flatnonzero(np.append(True, changes))
+        return cls(start, np.diff(np.append(start, len(rows))))
+
+    @property
+    def usual(self) -> int:
+        return int(np.median(self.length))
+
+    @property
+    def long(self) -> BoolArray:
+        """Longer than two samples of the sensor's rate."""
+        return np.asarray(self.length > max(2, 2 * self.usual))
+
+    def marked(self, which: BoolArray, but_first: int = 0) -> BoolArray:
+        """The rows of some runs, each but its first."""
+        place = np.arange(self.length.sum()) - np.repeat(self.start, self.length)
+        return np.asarray(np.repeat(which, self.length) & (place >= but_first))
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(values, self.start) / self.length)
+
+
+def _bad(
+    name: str, rows: FloatArray, dead: BoolArray, force: FloatArray | None, rate: FloatArray | None
+) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
-    limits, finite = _LIMITS[name], _every(np.isfinite(rows))
-    rows = rows if finite.all() else np.where(finite[:, None], rows, np.nan)
-    size = np.fmax.reduce([np.abs(np.where(finite, axis, 0.0)) for axis in rows.T])
+    limits, finite = _LIMITS[name], _finite(rows)
+    size = np.where(finite, _norm(rows), 0.0)
     zero, unit = finite & (size == 0.0), 1.0
     if name == VECTORS[2]:
         zero |= finite & (size < 1e-12)
-        some = finite & ~zero
-        unit = float(np.median(np.linalg.norm(rows[some], axis=1))) if some.any() else 1.0
-    beyond = finite & (size > limits.largest * unit)
+        some = size[finite & ~zero]
+        unit = float(np.median(some)) if some.size else 1.0
+    beyond = finite & (np.abs(rows).max(axis=1) > limits.largest * unit)
     if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
         beyond[:] = False
-    rows = np.where(beyond[:, None], np.nan, rows) if beyond.any() else rows
-    start, length = _runs(rows)
-    usual, (before, after) = int(np.median(length)), _jumps(rows, start, length)
-    repeat = (length > max(2, 2 * usual)) & ((after > limits.change * unit) | (np.isnan(after) & (start > 0)))
+    rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
+    runs = _Runs.of(rows)
+    step = np.concatenate([[np.nan], _norm(np.diff(rows, axis=0)), [np.nan]])
+    before, after = step[runs.start], step[runs.start + runs.length]
+    moves = (after > limits.change * unit) | (np.isnan(after) & (runs.start > 0))
+    repeat, turning = runs.long & moves, _turning(rate, runs)
     if name == VECTORS[1]:
-        slow = np.linalg.norm(rows[start], axis=1) < _SLOW_RAD_S
         begun = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
-        still = slow & begun & _steady(log.accelerometer_m_s2, start, length)
+        still = (size[runs.start] < _SLOW_RAD_S) & begun & _steady(force, runs)
         repeat &= ~still
-        dropped = (np.fmax(before, after) > _DROP_RAD_S) & ~still
-        zero &= dead | _spread(start, length, repeat | dropped, 0, len(rows))
+        zero &= dead | runs.marked(repeat | ((np.fmax(before, after) > _DROP_RAD_S) & ~still))
     else:  # what is repeated to the log's end was left while the sensor turned
-        repeat &= ~np.isnan(after) | _turning(log.gyroscope_rad_s, start, length)
-    repeated = _spread(start, length, repeat, usual, len(rows)) & finite & ~zero
-    clipped = _clipped(rows) & ~repeated & ~zero
-    spike = _spikes(rows, limits.spike * unit) & ~beyond & ~zero
-    return {"zero": zero, "range": beyond, "repeat": repeated, "end": clipped, "spike": spike}
+        repeat &= ~np.isnan(after) | turning
+    repeated = runs.marked(repeat, runs.usual) & finite & ~zero
+    return {
+        "readings of zero": zero,
+        "out of range": beyond,
+        "repeated": repeated,
+        "at the end of the range": _clipped(rows) & ~repeated & ~zero,
+        "single spikes": _spikes(rows, limits.spike * unit) & ~zero,
+    }
 
 
-def _steady(force: FloatArray | None, start: IntArray, length: IntArray) -> BoolArray:
-    """Runs of one sensor in which the accelerometer shows no turning."""
+def _steady(force: FloatArray | None, runs: _Runs) -> BoolArray:
+    """Runs in which the accelerometer shows no turning."""
     if force is None:
-        return np.ones(len(start), dtype=bool)
-    spread = [np.fmax.reduceat(axis, start) - np.fmin.reduceat(axis, start) for axis in force.T]
+        return np.ones(len(runs.start), dtype=bool)
+    spread = [np.fmax.reduceat(axis, runs.start) - np.fmin.reduceat(axis, runs.start) for axis in force.T]
     return np.asarray(~(np.fmax.reduce(spread) > _STEADY_M_S2))
 
 
-def _turning(rate: FloatArray | None, start: IntArray, length: IntArray) -> BoolArray:
-    """Runs of one sensor in which the gyroscope turns."""
+def _turning(rate: FloatArray | None, runs: _Runs) -> BoolArray:
+    """Runs in which the gyroscope turns."""
     if rate is None:
-        return np.zeros(len(start), dtype=bool)
-    total = np.append(0.0, np.cumsum(np.nan_to_num(np.linalg.norm(rate, axis=1))))
-    return np.asarray((total[start + length] - total[start]) / length > _TURNING_RAD_S)
-
-
-def _every(marks: BoolArray) -> BoolArray:
-    """Rows of which each number is marked; many times faster than a reduction over a few columns."""
-    return np.asarray(np.logical_and.reduce(list(marks.T)))
-
-
-def _runs(rows: FloatArray) -> tuple[IntArray, IntArray]:
-    """First rows and lengths of runs of one value."""
-    same = _every(rows[1:] == rows[:-1])
-    start = np.flatnonzero(np.append(True, ~same))
-    return start, np.diff(np.append(start, len(rows)))
-
-
-def _jumps(rows: FloatArray, start: IntArray, length: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Change into each run and out of it; NaN where the log begins or ends."""
-    before = np.linalg.norm(rows[start] - rows[np.maximum(start - 1, 0)], axis=1)
-    end = start + length
-    after = np.linalg.norm(rows[start] - rows[np.minimum(end, len(rows) - 1)], axis=1)
-    return np.where(start > 0, before, np.nan), np.where(end < len(rows), after, np.nan)
-
-
-def _spread(start: IntArray, length: IntArray, which: BoolArray, skip: int, size: int) -> BoolArray:
-    """Mark the rows of some runs but their first `skip`."""
-    mask = np.zeros(size + 1)
-    np.add.at(mask, start[which] + np.minimum(skip, length[which]), 1.0)
-    np.add.at(mask, (start + length)[which], -1.0)
-    return np.asarray(np.cumsum(mask)[:size] > 0.5)
+        return np.zeros(len(runs.start), dtype=bool)
+    return np.asarray(runs.mean(np.nan_to_num(_norm(rate))) > _TURNING_RAD_S)
 
 
 def _clipped(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
     bad = np.zeros(len(rows), dtype=bool)
-    changes = np.append(0, np.cumsum(~_every(rows[1:] == rows[:-1])))
+    changes = np.append(0, np.cumsum(np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])))
     for axis in rows.T:
-        if np.isnan(axis).all():
-            continue
-        if max((axis == np.nanmax(axis)).sum(), (axis == np.nanmin(axis)).sum()) < 3:
+        ends = (np.fmax.reduce(axis), np.fmin.reduce(axis))
+        if max(np.count_nonzero(axis == end) for end in ends) < 3:
             continue
         steps = np.abs(np.diff(axis))
         digit = np.min(steps[steps > 0.0], initial=np.inf)
-        start, length = _runs(axis[:, None])
-        readings = changes[start + length - 1] - changes[start] + 1
-        padded = np.pad(axis, 2, mode="edge")
-        into = np.abs(padded[start + 1] - padded[start])
-        out = np.abs(padded[np.minimum(start + length + 3, len(padded) - 1)] - padded[start + length + 2])
-        top = (axis[start] == np.nanmax(axis)) | (axis[start] == np.nanmin(axis))
-        flat = top & (readings > 2) & (np.minimum(into, out) > 3.0 * digit) & (axis[start] != 0.0)
-        bad |= _spread(start, length, flat, 0, len(rows))
+        runs = _Runs.of(axis[:, None])
+        first, last = runs.start, runs.start + runs.length - 1
+        slopes = np.pad(steps, 2)  # into each sample from the second before it, and out of it
+        slope = np.minimum(slopes[first], slopes[last + 3])
+        value = axis[first]
+        top = ((value == ends[0]) | (value == ends[1])) & (value != 0.0)
+        bad |= runs.marked(top & (changes[last] - changes[first] > 1) & (slope > 3.0 * digit))
     return bad
 
 
@@ -227,8 +223,8 @@ def _spikes(rows: FloatArray, height: float) -> BoolArray:
     if len(rows) < 3 or not np.isfinite(height):
         return np.zeros(len(rows), dtype=bool)
     padded = np.concatenate([rows[1:2], rows, rows[-2:-1]])
-    away = np.linalg.norm(rows - 0.5 * (padded[:-2] + padded[2:]), axis=1)
-    return np.asarray((away > height) & (np.linalg.norm(padded[2:] - padded[:-2], axis=1) < 0.2 * away))
+    away = _norm(rows - 0.5 * (padded[:-2] + padded[2:]))
+    return np.asarray((away > height) & (_norm(padded[2:] - padded[:-2]) < 0.2 * away))
 
 
 def _stuck(log: ImuLog) -> BoolArray:
@@ -237,27 +233,22 @@ def _stuck(log: ImuLog) -> BoolArray:
     if log.world_from_sensor is None or log.oriented.sum() < 2:
         return stuck
     at = np.flatnonzero(log.oriented)
-    rows = log.world_from_sensor[at].as_quat()
-    start, length = _runs(rows)
-    end = np.minimum(start + length, len(rows) - 1)
-    turn = (Rotation.from_quat(rows[start]).inv() * Rotation.from_quat(rows[end])).magnitude()
-    usual = int(np.median(length))
-    goes_on = start + length == len(rows)
-    rate = log.gyroscope_rad_s
-    behind = (turn > _STUCK_RAD) | (goes_on & _turning(None if rate is None else rate[at], start, length))
-    long = (length > max(2, 2 * usual)) & behind
-    stuck[at] = _spread(start, length, long, usual, len(rows))
+    rows, rate = log.world_from_sensor[at].as_quat(), log.gyroscope_rad_s
+    runs = _Runs.of(rows)
+    end = np.minimum(runs.start + runs.length, len(rows) - 1)
+    turn = (Rotation.from_quat(rows[runs.start]).inv() * Rotation.from_quat(rows[end])).magnitude()
+    goes_on = runs.start + runs.length == len(rows)
+    behind = (turn > _STUCK_RAD) | (goes_on & _turning(None if rate is None else rate[at], runs))
+    stuck[at] = runs.marked(runs.long & behind, runs.usual)
     return stuck
 
 
-def _require_one_sensor(log: ImuLog) -> None:
+def _require_one_sensor(log: ImuLog, readings: dict[str, FloatArray]) -> None:
     """Raise if every second, third... row is alike and neighbours are not: sensors that take turns."""
-    quaternions = None
+    kinds = [readings[name] for name in (VECTORS[0], VECTORS[2]) if name in readings]
     if log.world_from_sensor is not None and log.oriented.all():
-        quaternions = np.abs(log.world_from_sensor.as_quat())
-    for rows in (log.accelerometer_m_s2, log.magnetometer_au, quaternions):
-        if rows is None or len(rows) < _ENOUGH:
-            continue
+        kinds.append(np.abs(log.world_from_sensor.as_quat()))
+    for rows in kinds if len(log) >= _ENOUGH else ():
         middle = len(rows) // 2
         rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
         rows = np.where((rows != 0.0).any(axis=1)[:, None], rows, np.nan)
@@ -272,7 +263,7 @@ def _require_one_sensor(log: ImuLog) -> None:
 
 def _median_norm(rows: FloatArray) -> float:
     """Median length of the rows that have one; NaN if none has."""
-    norms = np.linalg.norm(rows, axis=1)
+    norms = _norm(rows)
     norms = norms[np.isfinite(norms)]
     return float(np.median(norms)) if norms.size else float("nan")
 
@@ -286,29 +277,25 @@ class LiveFaults:
 
     def __init__(self) -> None:
         self._last = np.full((3, 3), np.nan)
-        self._run = np.zeros(3, dtype=int)
-        self._lengths: tuple[deque[int], ...] = tuple(deque(maxlen=_RUNS) for _ in VECTORS)
+        self._run = [0, 0, 0]
+        self._lengths = [deque[int](maxlen=_RUNS) for _ in VECTORS]
 
-    def measured(self, *readings: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def measured(self, *readings: FloatArray) -> list[FloatArray]:
         """Rate, force and field of a sample, each NaN if it is no measurement."""
         rate, force, field = readings
         dead = np.isnan(force).any() or not force.any()
         moves = float(np.linalg.norm(rate)) > _SLOW_RAD_S
         bad = [bool(dead and not rate.any()), bool(dead), not field.any()]
-        for i, (reading, limits) in enumerate(zip(readings, _LIVE, strict=True)):
+        for i, reading in enumerate(readings):
             if (reading == self._last[i]).all():
                 self._run[i] += 1
             else:
-                if self._run[i]:
-                    self._lengths[i].append(int(self._run[i]))
+                self._lengths[i].append(self._run[i] or 1)
                 self._last[i], self._run[i] = reading, 1
-            known = len(self._lengths[i]) == _RUNS
-            bad[i] |= moves and known and self._run[i] > max(2, 2 * int(np.median(self._lengths[i])))
-            bad[i] |= bool((np.abs(reading) > limits).any())
-        rate, force, field = (
-            np.full(3, np.nan) if wrong else row for wrong, row in zip(bad, readings, strict=True)
-        )
-        return rate, force, field
+            long = self._run[i] > max(2, 2 * int(np.median(self._lengths[i])))
+            bad[i] |= moves and len(self._lengths[i]) == _RUNS and long
+            bad[i] |= bool((np.abs(reading) > _LIVE[i]).any())
+        return [np.full(3, np.nan) if wrong else row for wrong, row in zip(bad, readings, strict=True)]
 
 
 _LIVE = (_LIMITS[VECTORS[1]].largest, _LIMITS[VECTORS[0]].largest, 1e12)
