@@ -101,9 +101,8 @@ def orient(
     Notes
     -----
     How the sensor turned in a pause of more than 0.125 s is not known: up and north are found again after it.
-    The filter keeps the bias, the field of iron on the sensor and the magnetometer's lag; on-line VQF the
-    bias and the field's reference; off-line VQF the bias. In a shorter hole the readings are taken for the
-    mean of those around it.
+    The filter keeps the bias, the field of iron on the sensor and the magnetometer's lag; VQF nothing. In a
+    shorter hole the readings are taken for the mean of those around it.
 
     VQF claims no errors of the orientation. So its variance about each of the world's axes is that of the
     smoother beside off-line VQF, or of the filter beside on-line VQF, plus the squared distance between the
@@ -188,7 +187,7 @@ def _stretches(
             stretch = replace(stretch, step_s=np.concatenate([[step_s], stretch.step_s[1:]]))
         offline = method.offline and float(stretch.step_s.sum()) > _SHORTEST_S
         own = smoothed(stretch, settings) if offline else kept.run(stretch, pause_s)
-        results.append(own if engine is None else engine.run(stretch, own, offline, pause_s))
+        results.append(own if engine is None else engine.run(stretch, own, offline))
     if engine is not None:
         notes += engine.notes
     return results

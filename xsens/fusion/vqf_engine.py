@@ -8,7 +8,7 @@ this package's own engine, and what that engine claims, and how far VQF is from 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -21,9 +21,6 @@ from xsens.fusion.samples import Estimate, Samples
 from xsens.fusion.settings import BRIDGED_S
 from xsens.logs.worlds import nwu_from, turned
 
-if TYPE_CHECKING:
-    from vqf import VQF
-
 _EVEN = 0.05
 """Largest distance of a sample from its place on an even clock, in steps, that is left as it is: at 5 rad/s
 and 100 samples/s it is 0.15 degrees, and does not add up."""
@@ -34,9 +31,6 @@ _COMPARED_S = 1.0 / 32.0
 _AVERAGED_S = 5.0
 """Time over which their squared distance is averaged, so that it is not zero where the two cross."""
 
-_WANDERS_DEG_S = 0.1
-"""By so much a bias wanders in 100 s, as VQF has it; at the start it is 0.5."""
-
 
 class _Even(NamedTuple):
     """Rate, force and field on an even clock; if it is another, where the samples lie on it, in steps."""
@@ -46,22 +40,8 @@ class _Even(NamedTuple):
     place: FloatArray | None
 
 
-class _Bias(NamedTuple):
-    """A gyroscope's bias at the end of a stretch, and its standard deviation."""
-
-    rad_s: FloatArray
-    sd_rad_s: float
-
-    def sd_after(self, pause_s: float) -> float:
-        """Standard deviation after a pause, as VQF lets it grow to what it takes it for at first."""
-        grown = math.hypot(self.sd_rad_s, math.radians(_WANDERS_DEG_S) * math.sqrt(pause_s / 100.0))
-        return min(grown, math.radians(0.5))
-
-
 class VqfEngine:
-    """VQF over the stretches of a log, in order.
-
-    The gyroscope's bias and, on line, the reference of the magnetic field are kept from stretch to stretch.
+    """VQF over the stretches of a log, each by itself.
 
     Parameters
     ----------
@@ -84,8 +64,6 @@ class VqfEngine:
             ) from error
         self._vqf = vqf
         self._magnetic = magnetic
-        self._last: VQF | None = None
-        self._bias: _Bias | None = None
         self._uneven = 0
         self._fields: list[bool] = []
 
@@ -104,7 +82,7 @@ class VqfEngine:
             )
         return notes
 
-    def run(self, stretch: Samples, own: Estimate, offline: bool, pause_s: float = 0.0) -> Estimate:
+    def run(self, stretch: Samples, own: Estimate, offline: bool) -> Estimate:
         """Find the orientation of a stretch.
 
         Parameters
@@ -115,22 +93,25 @@ class VqfEngine:
             each of the world's axes, averaged over some seconds, are VQF's variances.
         offline : bool
             Use later readings as well.
-        pause_s : float
-            Time since the stretch before.
         """
         magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
         field = [_field_carried(stretch, own.xyzw, offline)] if magnetic else []
-        even = _even_clock([stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s)
-        find = self._offline if offline else self._online
-        found = find(even.vectors, even.step_s, pause_s)
-        wxyz = found.pop("quat9D" if magnetic else "quat6D")
+        (rate, force, *fields), step_s, place = _even_clock(
+            [stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s
+        )
+        readings = (rate, force, fields[0] if fields else None)
+        if offline:
+            found = self._vqf.offlineVQF(*readings, step_s)
+        else:
+            found = self._vqf.VQF(step_s).updateBatch(*readings)
+        wxyz = found["quat9D" if magnetic else "quat6D"]
         start = Rotation.from_quat(own.xyzw[0]) * Rotation.from_quat(wxyz[0], scalar_first=True).inv()
         xyzw = turned(nwu_from("ENU") if magnetic else _about_up(start), wxyz)
         at: IntArray | slice = slice(None)
-        if even.place is not None:
+        if place is not None:
             self._uneven += len(stretch)
-            xyzw = Slerp(np.arange(len(xyzw)), Rotation.from_quat(xyzw))(even.place).as_quat()
-            at = np.rint(even.place).astype(np.int64)
+            xyzw = Slerp(np.arange(len(xyzw)), Rotation.from_quat(xyzw))(place).as_quat()
+            at = np.rint(place).astype(np.int64)
         disturbed = np.zeros(len(stretch), dtype=bool)
         if magnetic:
             disturbed = found["magDistDetected"][at]
@@ -139,36 +120,6 @@ class VqfEngine:
         sd = np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi)
         resting = found["restDetected"][at]
         return Estimate(xyzw, sd, found["bias"][at], disturbed, resting, own.field_stray, own.field_iron)
-
-    def _offline(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
-        """A prior of the bias cannot be given: what is known is taken off the rate and put back after."""
-        params: dict[str, float] = {}
-        if self._bias is not None:
-            vectors = [vectors[0] - self._bias.rad_s, *vectors[1:]]
-            # VQF never takes the bias for less certain than at the start: leave it room to wander.
-            params["biasSigmaInit"] = max(np.rad2deg(self._bias.sd_after(pause_s)), _WANDERS_DEG_S)
-        field = vectors[2] if len(vectors) == 3 else None
-        found = _wanted(self._vqf.offlineVQF(vectors[0], vectors[1], field, step_s, params))
-        if self._bias is not None:
-            found["bias"] += self._bias.rad_s
-        self._bias = _Bias(found["bias"][-1].copy(), float(found["biasSigma"][-1]))
-        return found
-
-    def _online(self, vectors: list[FloatArray], step_s: float, pause_s: float) -> dict[str, Any]:
-        now, before = self._vqf.VQF(step_s), self._last
-        if self._bias is not None:
-            now.setBiasEstimate(self._bias.rad_s, self._bias.sd_after(pause_s))
-        if before is not None:
-            now.setMagRef(before.getMagRefNorm(), before.getMagRefDip())
-        found = _wanted(now.updateBatch(*vectors))
-        self._last, self._bias = now, _Bias(*now.getBiasEstimate())
-        return found
-
-
-def _wanted(found: dict[str, Any]) -> dict[str, Any]:
-    """What VQF found, without what nobody asks for: half of it."""
-    unwanted = ("delta", "quat6D") if "quat9D" in found else ()
-    return {name: values for name, values in found.items() if name not in unwanted}
 
 
 def _about_up(turn: Rotation) -> Rotation:
