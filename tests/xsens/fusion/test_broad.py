@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from broad import OFFLINE, ONLINE, Estimate, coverage, errors_deg, errors_rad, estimate, read_trial, trials_in
+from broad import OFFLINE, ONLINE, coverage, errors_deg, errors_rad, estimate, read_trial, trials_in
 from field_scenes import recorded, scene
 from scipy.spatial.transform import Rotation
 
@@ -67,12 +67,6 @@ def coverages(folder, name, method):
 def ratios(folder, name, methods):
     theirs, ours = ([error for error, _ in scores(folder, name)[method]] for method in methods)
     return np.divide(ours, theirs)
-
-
-@pytest.mark.realdata
-@kinds
-def test_beside_a_magnet_the_error_is_less_than_vqfs(folder, methods):
-    assert (ratios(folder, "28_disturbed_stationary_magnet_A", methods) <= 1.0).all()
 
 
 @pytest.mark.realdata
@@ -138,20 +132,6 @@ def test_errors_are_told_apart_by_axis():
     steady = errors_rad(wxyz(found), wxyz(true), np.ones(len(true), dtype=bool), steady=True)
     np.testing.assert_allclose(steady.heading, 0.0, atol=1e-9)
     np.testing.assert_allclose(steady.total, np.hypot(0.02, 0.01))
-
-
-def test_coverage_of_normal_errors_is_that_of_a_normal_distribution():
-    true = attitudes()
-    sigma = np.tile([0.01, 0.02, 0.05], (len(true), 1))
-    turned = sigma * np.random.default_rng(8).standard_normal((len(true), 3))
-    found = Estimate(wxyz(Rotation.from_rotvec(turned) * true), sigma)
-    every = np.ones(len(true), dtype=bool)
-    honest = coverage(found, wxyz(true), every)
-    # Four thousand draws: a share of 0.683 to 0.007, an RMS to one part in ninety.
-    np.testing.assert_allclose(honest, [0.683, 1.0, 0.683, 1.0], atol=0.035)
-    bold = coverage(found._replace(sigma_rad=sigma / 3.0), wxyz(true), every)
-    assert bold.heading_share < 0.3
-    assert bold.inclination_ratio > 2.8
 
 
 def test_the_benchmark_finds_the_packages(project):

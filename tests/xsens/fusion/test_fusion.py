@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.orient import orient
 from xsens.fusion.settings import FusionSettings
 from xsens.logs.samples import ImuLog
-from xsens.logs.textlogs import parse_text
 
 RATE_HZ = 100.0
 FIELD = np.array([0.5, 0.0, -0.86])
@@ -66,15 +65,6 @@ def test_a_step_of_the_field_moves_the_heading_little(method):
     assert np.ptp(heading[part]) < 1.0
 
 
-def test_iron_cannot_tilt_the_answer():
-    _, clean = static(30.0)
-    _, spoilt = static(30.0, field=lambda t: np.tile([0.1, 0.7, 0.9], (t.size, 1)))
-    one, other = (orient(log).rotations.world_from_sensor for log in (clean, spoilt))
-    up = [r.inv().apply([0.0, 0.0, 1.0]) for r in (one, other)]
-    apart = np.rad2deg(np.arccos(np.clip(np.sum(up[0] * up[1], axis=1), -1, 1)))
-    assert apart[500:].max() < 0.05
-
-
 def test_without_a_magnetometer_the_heading_starts_at_zero():
     truth, log = static(30.0)
     found = orient(log, FusionSettings(use_magnetometer=False))
@@ -125,22 +115,6 @@ def test_readings_in_other_units_are_refused():
         orient(ImuLog(log.time_s, log.accelerometer_m_s2 / 9.81, log.gyroscope_rad_s))
 
 
-def test_what_is_missing_is_named():
-    _, log = static(5.0)
-    with pytest.raises(InsufficientDataError, match=r"no gyroscope$"):
-        orient(ImuLog(log.time_s, log.accelerometer_m_s2))
-    with pytest.raises(InsufficientDataError, match=r"no accelerometer$"):
-        orient(ImuLog(log.time_s, None, log.gyroscope_rad_s))
-    with pytest.raises(InvalidInputError, match=r"ImuLog.*str"):
-        orient("log.csv")
-
-
-def test_columns_that_were_not_understood_are_named_where_they_are_missed():
-    text = "time_s,gyr_x,gyr_y,gyr_z,accelerometer_x_feet\n0,0,0,0,1\n0.01,0,0,0,1\n"
-    with pytest.raises(InsufficientDataError, match=r"accelerometer_x_feet.*accelerometer_x_m_s2"):
-        orient(parse_text(text))
-
-
 def swung(seconds=20.0):
     """A sensor upside down, still for two seconds, then swung; exact readings, and its truth."""
     time_s = np.arange(1, round(100.0 * seconds) + 1) / 100.0
@@ -154,14 +128,6 @@ def swung(seconds=20.0):
 
 def worst_deg(truth, found):
     return float(np.rad2deg((found.rotations.world_from_sensor * truth.inv()).magnitude().max()))
-
-
-def test_a_sensor_upside_down_starts_like_any_other():
-    truth, log = swung(4.0)
-    noise = np.random.default_rng(0).normal(scale=0.05, size=(len(log), 3))
-    shaky = replace(log, accelerometer_m_s2=log.accelerometer_m_s2 + noise)
-    # By the mean of 31 ms alone up is 0.2 degrees wrong, and north, the field dipping by 66, twice that.
-    assert worst_deg(truth, orient(shaky, method="filter")) < 2.0
 
 
 @pytest.mark.parametrize("peak_m_s2", [500.0, 1e9])
@@ -181,14 +147,3 @@ def test_an_accelerometer_that_pauses_is_not_made_up():
     there = np.isin(log.time_s, found.rotations.time_s)
     assert there.sum() == len(log) - 400
     assert worst_deg(truth[there], found) < 10.0
-
-
-@pytest.mark.parametrize("what", ["gyroscope_rad_s", "magnetometer_au"])
-@pytest.mark.parametrize("value", [1e30, 1e-30])
-def test_a_reading_beyond_all_units_is_none(what, value):
-    truth, log = swung(8.0)
-    readings = getattr(log, what).copy()
-    readings[[0, 500]] = value
-    found = orient(replace(log, **{what: readings}))
-    there = np.isin(log.time_s, found.rotations.time_s)
-    assert worst_deg(truth[there], found) < 2.0

@@ -56,13 +56,6 @@ def test_ends_where_the_filter_over_the_whole_log_ends():
     assert not state.resting
 
 
-def test_the_pieces_do_not_matter():
-    _, log = moving(5.0)
-    states = [pushed(log, pieces) for pieces in (1, 7, len(log))]
-    for other in states[1:]:
-        assert apart_deg(states[0].world_from_sensor, other.world_from_sensor) == 0.0
-
-
 def test_the_orientation_is_that_of_the_last_sample_between_increments_too():
     # Turning at 1 rad/s about up: 0.57 degrees a sample, while increments are of three samples.
     truth, log = moving(6.0)
@@ -105,42 +98,6 @@ def test_missing_readings_are_bridged_and_bad_ones_refused():
         online.push(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])
 
 
-def resting(samples, **changed):
-    readings = {"gyroscope": [0.0, 0.0, 0.0], "force": [0.0, 0.0, 9.80665], "field": [0.5, 0.0, -0.86]}
-    readings |= changed
-    return [np.full(samples, 0.01), *(np.tile(each, (samples, 1)) for each in readings.values())]
-
-
-def test_other_units_are_refused_as_over_a_whole_log():
-    with pytest.raises(InvalidInputError, match="accelerometer"):
-        OnlineFilter().push(*resting(120, force=[0.0, 0.0, 1.0]))
-    with pytest.raises(InvalidInputError, match="rad/s"):
-        OnlineFilter().push(*resting(1, gyroscope=[0.0, 90.0, 0.0]))
-
-
-@pytest.mark.parametrize("field", [[0.0, 0.0, 0.0], [np.inf, 0.0, 0.0]])
-def test_a_field_that_is_none_tells_no_heading(field):
-    online = OnlineFilter()
-    online.push(*resting(300, field=field))
-    assert np.rad2deg(online.state.standard_deviation_rad[2]) > 45.0
-    assert apart_deg(online.state.world_from_sensor, Rotation.identity()) < 1e-6
-
-
-def test_the_heading_is_not_claimed_before_it_is_found_again():
-    truth, log = moving(6.0)
-    online = OnlineFilter()
-    online.push(
-        np.full(400, 0.01),
-        *(a[:400] for a in (log.gyroscope_rad_s, log.accelerometer_m_s2, log.magnetometer_au)),
-    )
-    assert online.state.standard_deviation_rad[2] < 0.1
-    for k in range(500, 510):  # a tenth of a second after a pause of one
-        step_s = 1.0 if k == 500 else 0.01
-        online.push(step_s, log.gyroscope_rad_s[k], log.accelerometer_m_s2[k], log.magnetometer_au[k])
-    assert apart_deg(online.state.world_from_sensor, truth[509]) > 20.0
-    assert np.rad2deg(online.state.standard_deviation_rad[2]) > 90.0
-
-
 def test_samples_in_bursts_turn_it_by_all_of_them():
     # Four samples a millisecond apart, then 37 ms: an increment's samples are unlike in length.
     truth, log = moving(8.0)
@@ -157,18 +114,3 @@ def test_samples_in_bursts_turn_it_by_all_of_them():
     errors = [apart_deg(a, b) for a, b in zip(found[600:], turns[601:], strict=True)]
     # The longest step turns by up to 3 degrees; what is left is a magnetometer's lag that is looked for.
     assert max(errors) < 1.0
-
-
-def test_ten_samples_a_second_are_no_pauses():
-    truth, log = moving(30.0)
-    at = np.arange(9, len(log), 10)
-    rate = (truth[at[:-1]].inv() * truth[at[1:]]).as_rotvec() * 10.0
-    some = ImuLog(
-        log.time_s[at[1:]] + np.where(np.arange(len(rate)) % 2, 0.004, 0.0),
-        log.accelerometer_m_s2[at[1:]],
-        rate,
-        log.magnetometer_au[at[1:]],
-    )
-    found = orient(some, method="filter")
-    assert not any("pauses" in note for note in found.notes)
-    assert apart_deg(found.rotations.world_from_sensor[-1], truth[at[-1]]) < 2.0

@@ -2,16 +2,14 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from datetime import UTC, datetime, timedelta
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import FileError, InvalidInputError
-from xsens.live.device import Device, DeviceError, DeviceSettings
+from speckle3d.core.errors import FileError
+from xsens.live.device import DeviceSettings
 from xsens.live.recording import RawFile, Recorder, record
 from xsens.logs.read import read_log
 from xsens.messages.control import MessageId
@@ -123,18 +121,6 @@ class TestRecording:
         ]
         assert 0.3 < (stamps[1] - stamps[0]).total_seconds() < 8.0
 
-    def test_a_sensor_that_lost_its_power_is_set_again(self, sensor, path):
-        with Recorder(str(sensor.path), path, FAST) as recorder:
-            wait_until(lambda: len(sensor.run) > 20)
-            sensor.settle()
-            sensor.power_cycle()
-            runs = len(sensor.runs)
-            sensor.resume()
-            wait_until(lambda: len(sensor.runs) > runs and len(sensor.run) > 20)
-            state = recorder.state()
-        assert (state.connected, state.interruptions) == (True, 1)
-        assert counters(path) == sensor.runs[-2] + sensor.run
-
     def test_silence_is_noticed_and_asked_about(self, sensor, path, monkeypatch):
         monkeypatch.setattr("xsens.live.recording.SILENCE_S", 0.3)
         with Recorder(str(sensor.path), path, FAST) as recorder:
@@ -144,58 +130,6 @@ class TestRecording:
             sensor.mute = False
             wait_until(lambda: recorder.state().connected)
             assert recorder.state().interruptions == 1
-
-    def test_a_thread_that_has_to_wait_takes_it_for_no_silence(self, sensor, path, monkeypatch):
-        monkeypatch.setattr("xsens.live.recording.SILENCE_S", 0.6)
-        stalls, receive = threading.Event(), Device.receive
-
-        def stalled(device):
-            messages = receive(device)
-            if stalls.is_set() and not messages:
-                stalls.clear()
-                sensor.resume()
-                time.sleep(0.8)
-            return messages
-
-        monkeypatch.setattr(Device, "receive", stalled)
-        with Recorder(str(sensor.path), path, FAST) as recorder:
-            wait_until(lambda: len(sensor.run) > 5)
-            sensor.settle()
-            stalls.set()
-            wait_until(lambda: not stalls.is_set() and recorder.state().samples > 100)
-            assert recorder.state().interruptions == 0
-
-    @of_kind(*KINDS)
-    def test_the_filter_is_loaded_before_measuring_begins(self, sensor, path, monkeypatch):
-        told = []
-        monkeypatch.setattr(
-            "xsens.live.recording.warm_up", lambda: told.append((sensor.state, path.exists()))
-        )
-        Recorder(str(sensor.path), path, FAST).close()
-        assert told == [("configuration", False)]
-
-    def test_another_sensor_is_not_recorded_into_the_same_file(self, sensor, path):
-        with Recorder(str(sensor.path), path, FAST) as recorder:
-            wait_until(lambda: len(sensor.run) > 20)
-            sensor.unplug()
-            sent = list(sensor.run)
-            sensor.device_id += 1
-            sensor.plug()
-            wait_until(lambda: "expected sensor" in recorder.state().note)
-            assert not recorder.state().connected
-        assert counters(path) == sent
-
-    def test_a_slow_display_costs_no_samples(self, sensor, path):
-        for state in record(str(sensor.path), path, FAST, interval_s=0.05, duration_s=0.6):
-            if not state.samples:
-                time.sleep(0.45)
-        assert counters(path) == sensor.run
-
-    def test_leaving_the_iteration_ends_the_recording(self, sensor, path):
-        for _ in record(str(sensor.path), path, FAST, interval_s=0.1):
-            break
-        wait_until(lambda: sensor.state == "configuration")
-        assert counters(path) == sensor.run
 
     def test_a_file_that_is_there_is_left_alone(self, sensor, path):
         path.write_bytes(b"precious")
@@ -210,58 +144,9 @@ class TestRecording:
             with pytest.raises(FileError, match="No space left"):
                 wait_until(lambda: recorder.state() is None)
 
-    def test_an_answer_of_another_length_is_refused_by_the_ports_name(self, sensor, path, monkeypatch):
-        monkeypatch.setattr(sensor, "_configuration", lambda: b"odd")
-        with pytest.raises(InvalidInputError, match=r"port: configuration: .*got 3$"):
-            Recorder(str(sensor.path), path, FAST)
-        assert not path.exists()
-
-    def test_without_a_sensor_there_is_no_file(self, tmp_path, path):
-        with pytest.raises(DeviceError, match="none"):
-            Recorder(str(tmp_path / "none"), path, FAST)
-        assert not path.exists()
-
 
 def full(self, data):
     raise FileError(f"{self.path}: cannot be written: No space left on device")
-
-
-class TestGaps:
-    @of_kind(*KINDS)
-    def test_lost_samples_and_the_time_without_a_plug_are_gaps(self, sensor, path):
-        sensor.drop, sensor.corrupt = {5, 6}, {9}
-        with Recorder(str(sensor.path), path, FAST) as recorder:
-            wait_until(lambda: len(sensor.run) > 20)
-            sensor.unplug()
-            sensor.drop, sensor.corrupt = set(), set()
-            first = len(sensor.run)
-            time.sleep(0.5)
-            sensor.plug()
-            wait_until(lambda: recorder.state().interruptions == 1 and recorder.state().connected)
-            wait_until(lambda: len(sensor.run) > 20)
-            assert recorder.state().lost == 3
-        log = read_log(path)
-        assert [(gap.after_index, gap.lost) for gap in log.gaps[:2]] == [(4, 2), (6, 1)]
-        away = log.gaps[2]
-        assert (len(log.gaps), away.after_index) == (3, first - 1)
-        # Half a second, and what it takes to be found, told and started again on a busy computer.
-        assert 0.5 < away.duration_s < 5.0
-
-
-class TestRawFile:
-    def test_a_short_write_is_continued(self, path, monkeypatch):
-        file = RawFile(path)
-        whole = file._file.write
-        monkeypatch.setattr(file, "_file", SimpleNamespace(write=lambda data: whole(data[:3])))
-        file.append(b"0123456789")
-        monkeypatch.undo()
-        file.close()
-        file.close()
-        assert path.read_bytes() == b"0123456789"
-
-    def test_a_folder_that_is_not_there_is_named(self, tmp_path):
-        with pytest.raises(FileError, match=r"none/x.mtb.*No such file"):
-            RawFile(tmp_path / "none" / "x.mtb")
 
 
 def read_utc(payload: bytes) -> datetime:

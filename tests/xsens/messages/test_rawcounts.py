@@ -1,11 +1,5 @@
 import numpy as np
-import pytest
-from imu_logs import calibration
-from imu_messages import calibration_message
 
-from speckle3d.core.errors import InvalidInputError
-from xsens.messages.control import MessageId
-from xsens.messages.framing import Message
 from xsens.messages.rawcounts import RawCalibration
 
 REAL = RawCalibration(
@@ -24,31 +18,3 @@ def test_counts_of_a_real_unit():
     np.testing.assert_allclose(acceleration, [[-0.121, 0.592, 9.742]], atol=0.1)
     np.testing.assert_allclose(rate, [[-0.0169, 0.0171, 0.0064]], atol=0.002)
     np.testing.assert_allclose(field, [[-0.558, 0.216, -0.353]], atol=0.03)
-
-
-def test_the_formula_is_the_one_in_the_docstring():
-    unit = calibration(3)
-    counts = np.random.default_rng(0).integers(0, 65536, (7, 3, 3))
-    for k, values in enumerate(unit.to_units(counts)):
-        for u, s in zip(counts[:, k], values, strict=True):
-            np.testing.assert_allclose(
-                unit.misalignments[k] @ s, (u - unit.offsets[k]) / unit.gains[k], rtol=0, atol=1e-9
-            )
-
-
-def test_blocks_come_back():
-    unit = calibration(1)
-    back = RawCalibration.from_message(calibration_message(unit))
-    for name in ("rate_hz", "offsets", "gains", "misalignments"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(unit, name))
-
-
-def test_blocks_of_other_sensors_and_nonsense_are_refused():
-    with pytest.raises(InvalidInputError, match=r"168.*1320"):
-        RawCalibration.from_message(Message(MessageId.EMTS, bytes(1320)))
-    with pytest.raises(InvalidInputError, match="gains"):
-        RawCalibration.from_message(Message(MessageId.EMTS, bytes(168)))
-    payload = bytearray(calibration_message(calibration()).payload)
-    payload[8:26] = bytes(18)
-    with pytest.raises(InvalidInputError, match="determinant 0"):
-        RawCalibration.from_message(Message(MessageId.EMTS, bytes(payload)))
