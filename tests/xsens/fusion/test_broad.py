@@ -10,23 +10,23 @@ from broad import OFFLINE, ONLINE, coverage, errors_deg, errors_rad, estimate, r
 from field_scenes import recorded, scene
 from scipy.spatial.transform import Rotation
 
-GAIN = 0.9
-"""Mean error over VQF's: a tenth less than the best there is."""
+GAIN = 0.8
+"""Mean error over VQF's, the best there is: measured 0.73 on line, 0.71 off line (0.74 both without a constant)."""
 
-WORSE = 1.25
-"""Error in any one trial over VQF's: none pays for the mean of the others. Measured 1.20 off line (trial 15,
-where north by the field is 3 degrees off the cameras'), 1.18 on line (trial 35, a magnet on the sensor)."""
+WORSE = 1.2
+"""Error in any one trial over VQF's: none pays for the mean of the others. Measured 1.16 off line (trial 15, where
+north by the field is 3 degrees off the cameras'), 1.00 on line."""
 
 SHARES = (0.60, 0.95)
 """Of errors within one sigma. Sigma is about north, which iron turns in two trials of twelve: so in the
 others more of heading's errors are within it than the 0.68 of a normal distribution."""
 
 WIDEST = 2.5
-"""RMS error over RMS sigma in the worst of a dozen trials: measured 2.37, where a phone on the sensor turns
+"""RMS error over RMS sigma in the worst of a dozen trials: measured 2.40, where a phone on the sensor turns
 the field by 4.5 degrees before it moves."""
 
-MOVED_ALREADY = {"15_undisturbed_fast_translation_A": 1.6}
-"""Begun amid fast translation, inclination takes seconds to be found: measured 1.52 off line."""
+MOVED_ALREADY = {"15_undisturbed_fast_translation_A": 1.55}
+"""Begun amid fast translation, inclination takes seconds to be found: measured 1.51 off line."""
 
 EVERY = 4
 """Samples are scored at 71 Hz: the RMS is the same to 0.001 degrees."""
@@ -70,9 +70,16 @@ def ratios(folder, name, methods):
 
 
 @pytest.mark.realdata
+@kinds
+def test_beside_a_magnet_the_error_is_less_than_vqfs(folder, methods):
+    # Measured 0.47 on line, 0.60 off line.
+    assert (ratios(folder, "28_disturbed_stationary_magnet_A", methods) <= 0.8).all()
+
+
+@pytest.mark.realdata
 @pytest.mark.slow
 @kinds
-def test_mean_error_is_a_tenth_less_than_vqfs(folder, methods):
+def test_mean_error_is_a_fifth_less_than_vqfs(folder, methods):
     theirs, ours = (errors_of(folder, method).mean(axis=0) for method in methods)
     assert (ours <= GAIN * theirs).all(), (ours, theirs)
 

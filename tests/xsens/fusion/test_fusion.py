@@ -49,8 +49,8 @@ def test_heading_of_a_static_sensor_stays(seconds, method):
     truth, log = static(seconds)
     heading = heading_deg(truth, orient(log, method=method))
     settled = heading[int(30 * RATE_HZ) :]
-    # The target: 0.2 degrees over ten minutes after initialisation.
-    assert np.abs(settled - settled[0]).max() < 0.2
+    # Measured 0.04 over 90 s; the target is 0.2 degrees over ten minutes after initialisation.
+    assert np.abs(settled - settled[0]).max() < (0.07 if seconds < 100.0 else 0.2)
 
 
 @pytest.mark.parametrize("method", ["filter", "smoother"])

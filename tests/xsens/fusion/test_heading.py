@@ -35,19 +35,19 @@ def heading_deg(found, truth):
     return np.rad2deg(np.abs((found.rotations.world_from_sensor * truth.inv()).as_rotvec()[:, 2]))
 
 
-@pytest.mark.parametrize(("method", "after"), [("smoother", 0), ("filter", 2000)])
-def test_iron_on_the_sensor_from_the_start_is_found_by_turning_it(method, after):
+@pytest.mark.parametrize(("method", "after", "most_deg"), [("smoother", 0, 0.5), ("filter", 2000, 1.1)])
+def test_iron_on_the_sensor_from_the_start_is_found_by_turning_it(method, after, most_deg):
     # A third of the field's norm, more than half of its horizontal part.
     log, truth = turned(iron=[12.0, -9.0, 5.0])
     found = orient(log, method=method)
-    assert heading_deg(found, truth)[after:].max() < 1.5
+    assert heading_deg(found, truth)[after:].max() < most_deg
     assert found.field_iron[-1] > 0.9
 
 
-@pytest.mark.parametrize("method", ["smoother", "filter"])
-def test_a_late_magnetometer_costs_little(method):
+@pytest.mark.parametrize(("method", "most_deg"), [("smoother", 0.35), ("filter", 1.5)])
+def test_a_late_magnetometer_costs_little(method, most_deg):
     log, truth = turned(lag_s=0.02)  # half a degree per 0.4 rad/s
-    assert heading_deg(orient(log, method=method), truth)[500:].max() < 1.5
+    assert heading_deg(orient(log, method=method), truth)[500:].max() < most_deg
 
 
 def test_the_fields_unit_does_not_matter():
@@ -60,7 +60,7 @@ def test_the_fields_unit_does_not_matter():
     assert apart.magnitude().max() < 1e-9
 
 
-@pytest.mark.parametrize(("method", "most_deg"), [("smoother", 3.0), ("filter", 10.0)])
+@pytest.mark.parametrize(("method", "most_deg"), [("smoother", 1.1), ("filter", 10.0)])
 def test_a_field_that_changes_for_a_while_does_not_turn_the_heading(method, most_deg):
     log, truth = turned()
     there = (log.time_s > 20.0) & (log.time_s < 30.0)
