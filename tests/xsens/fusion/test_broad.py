@@ -11,7 +11,7 @@ from field_scenes import recorded, scene
 from scipy.spatial.transform import Rotation
 
 GAIN = 0.8
-"""Mean error over VQF's, the best there is: measured 0.73 on line, 0.71 off line (0.74 both without a constant)."""
+"""Mean error over VQF's, the best there is: measured 0.73 on line, 0.71 off line; the same without a constant."""
 
 WORSE = 1.2
 """Error in any one trial over VQF's: none pays for the mean of the others. Measured 1.16 off line (trial 15, where
