@@ -47,8 +47,10 @@ class Stamps:
     ----------
     counter, ticks : ndarray of int, shape (m,), optional
         As sent, wrapping round: the counter at `counter_span`, the ticks, of `tick_s` each, at 2**32.
+    time_s : ndarray, shape (m,), optional
+        Times, in place of ticks.
     period_s : float
-        Sampling period as configured; NaN if not known.
+        Sampling period as configured or stated; NaN if not known.
     others : ndarray of int, shape (m,), optional
         Number of messages before each sample that the sensor counted, but that were no samples.
     starts : ndarray of bool, shape (m,), optional
@@ -65,6 +67,7 @@ class Stamps:
     others: IntArray | None = None
     starts: BoolArray | None = None
     computer_s: FloatArray | None = None
+    time_s: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -88,83 +91,6 @@ def require_rate(rate_hz: float, what: str) -> None:
         raise InvalidInputError(f"{what}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
 
 
-def timeline(stamps: Stamps) -> Timeline:
-    """Rebuild the times of samples from their stamps.
-
-    Raises
-    ------
-    InvalidInputError
-        If there is neither a clock nor a counter with a known and possible period.
-    """
-    if stamps.period_s > 0.0:
-        require_rate(1.0 / stamps.period_s, "sampling rate")
-    elif stamps.ticks is None:
-        got = "neither" if stamps.counter is None else "a counter, but no rate"
-        raise InvalidInputError(
-            f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
-        )
-    order = _order_of(stamps)
-    stamps = stamps if order is None else _taken(stamps, order)
-    same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
-    if stamps.starts is not None:
-        same.append(~stamps.starts[1:])
-    kept = np.concatenate(([True], ~np.logical_and.reduce(same)))
-    if not kept.all():
-        stamps = _taken(stamps, kept)
-    steps, counts = _steps(stamps)
-    told = (*_order_notes(order), *steps.notes(int((~kept).sum()), "came twice; the second was"))
-    time_s = _risen(0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s, steps.seconds)
-    gaps = steps.gaps()
-    del steps  # a large log's arrays, of which few may be held at once
-    first = 0 if stamps.counter is None else int(stamps.counter[0])
-    rows = None if order is None and kept.all() else (np.arange(kept.size) if order is None else order)[kept]
-    return Timeline(rows, time_s, None if counts is None else _risen(first, counts), gaps, told)
-
-
-def _taken(stamps: Stamps, which: Any) -> Stamps:
-    arrays: dict[str, Any] = {k: v[which] for k, v in vars(stamps).items() if isinstance(v, np.ndarray)}
-    return replace(stamps, **arrays)
-
-
-def _order_of(stamps: Stamps) -> IntArray | None:
-    """Indices that put samples which came late, by counter or else clock, in order; None if none did."""
-    values, span = stamps.counter, stamps.counter_span
-    late = _LATE
-    if values is None:
-        assert stamps.ticks is not None  # one of the two is there
-        values, span = stamps.ticks, _TICK_SPAN
-        steps = np.diff(values) % span
-        usual = np.median(steps[steps < span // 2]) if (steps < span // 2).any() else 0
-        late = int(_LATE * usual)
-    signed = (np.diff(values) + span // 2) % span - span // 2
-    back = (signed < 0) & (signed >= -late)
-    if stamps.starts is not None:
-        back &= ~stamps.starts[1:]
-    if not back.any():
-        return None
-    signed[(signed < -late) | (signed > span // 4)] = late  # a new start
-    if stamps.starts is not None:
-        signed[stamps.starts[1:]] = late
-    return np.asarray(np.argsort(np.append(0, np.cumsum(signed)), kind="stable"))
-
-
-def _order_notes(order: IntArray | None) -> tuple[str, ...]:
-    if order is None:
-        return ()
-    rank = np.argsort(order)
-    late = int((rank < np.maximum.accumulate(rank)).sum())
-    return (f"{late} samples came out of order and were sorted",)
-
-
-def _risen(first: float, steps: Any) -> Any:
-    """Running sum of steps from `first` on, shape (steps + 1,)."""
-    sums = np.empty(steps.size + 1, dtype=steps.dtype)
-    sums[0] = 0
-    np.cumsum(steps, out=sums[1:])
-    sums += steps.dtype.type(first)
-    return sums
-
-
 def timeline_of_times(
     time_s: FloatArray, counter: IntArray | None = None, stated_hz: float = float("nan")
 ) -> Timeline:
@@ -177,27 +103,137 @@ def timeline_of_times(
     InvalidInputError
         If the times contradict a stated sampling rate.
     """
-    order = None if (np.diff(time_s) >= 0.0).all() else np.argsort(time_s, kind="stable")
-    time_s = time_s if order is None else time_s[order]
-    kept = np.append(True, np.diff(time_s) > 0.0)
+    return timeline(Stamps(counter, time_s=time_s, period_s=1.0 / stated_hz if stated_hz else np.nan))
+
+
+def timeline(stamps: Stamps) -> Timeline:
+    """Rebuild the times of samples from their stamps.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is neither a clock nor a counter with a known and possible period, or the times contradict
+        the period.
+    """
+    if stamps.time_s is None and stamps.period_s > 0.0:
+        require_rate(1.0 / stamps.period_s, "sampling rate")
+    elif stamps.time_s is None and stamps.ticks is None:
+        got = "neither" if stamps.counter is None else "a counter, but no rate"
+        raise InvalidInputError(
+            f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
+        )
+    order = _order_of(stamps)
+    stamps = stamps if order is None else _taken(stamps, order)
+    kept = np.append(True, ~_repeats(stamps))
+    if not kept.all():
+        stamps = _taken(stamps, kept)
+    notes = []
+    if order is not None:
+        rank = np.argsort(order)
+        late = int((rank < np.maximum.accumulate(rank)).sum())
+        notes.append(f"{late} samples came out of order and were sorted")
+    if left_out := int((~kept).sum()):
+        why = "came twice; the second was" if stamps.time_s is None else "at the time of another were"
+        notes.append(f"{left_out} samples {why} left out")
     rows = None if order is None and kept.all() else (np.arange(kept.size) if order is None else order)[kept]
-    time_s = time_s[kept]
-    counter = counter if counter is None or rows is None else counter[rows]
-    seconds = np.diff(time_s)
-    never = np.zeros(seconds.size, dtype=bool)
-    period_s = float(np.median(seconds)) if seconds.size else float("nan")
-    if counter is None:
-        taken, irregular = _by_clock(seconds, never)
+    seconds, counts, gaps, told = _steps(stamps)
+    if (time_s := stamps.time_s) is None:
+        first_s = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
+        time_s = _risen(first_s, seconds)
+    counter = None if stamps.counter is None else _risen(int(stamps.counter[0]), counts)
+    return Timeline(rows, time_s, counter, gaps, (*notes, *told))
+
+
+def _taken(stamps: Stamps, which: Any) -> Stamps:
+    arrays: dict[str, Any] = {k: v[which] for k, v in vars(stamps).items() if isinstance(v, np.ndarray)}
+    return replace(stamps, **arrays)
+
+
+def _repeats(stamps: Stamps) -> BoolArray:
+    """Steps from a sample to the same one."""
+    if stamps.time_s is not None:
+        return np.asarray(np.diff(stamps.time_s) == 0.0)
+    same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
+    if stamps.starts is not None:
+        same.append(~stamps.starts[1:])
+    return np.asarray(np.logical_and.reduce(same))
+
+
+def _order_of(stamps: Stamps) -> IntArray | None:
+    """Indices that put samples which came late, by time, counter or clock, in order; None if none did."""
+    if stamps.time_s is not None:
+        rises = bool((np.diff(stamps.time_s) >= 0.0).all())
+        return None if rises else np.argsort(stamps.time_s, kind="stable")
+    values, span = stamps.counter, stamps.counter_span
+    late = _LATE
+    if values is None:
+        assert stamps.ticks is not None  # one of the two is there
+        values, span = stamps.ticks, _TICK_SPAN
+        steps = np.diff(values) % span
+        usual = np.median(steps[steps < span // 2]) if (steps < span // 2).any() else 0
+        late = int(_LATE * usual)
+    signed = (np.diff(values) + span // 2) % span - span // 2
+    anew = np.zeros(signed.size, dtype=bool) if stamps.starts is None else stamps.starts[1:]
+    if not ((signed < 0) & (signed >= -late) & ~anew).any():
+        return None
+    signed[(signed < -late) | (signed > span // 4) | anew] = late  # a new start
+    return np.asarray(np.argsort(np.append(0, np.cumsum(signed)), kind="stable"))
+
+
+def _risen(first: float, steps: Any) -> Any:
+    """Running sum of steps from `first` on, shape (steps + 1,)."""
+    sums = np.empty(steps.size + 1, dtype=steps.dtype)
+    sums[0] = 0
+    np.cumsum(steps, out=sums[1:])
+    sums += steps.dtype.type(first)
+    return sums
+
+
+def _steps(stamps: Stamps) -> tuple[FloatArray, Any, tuple[Gap, ...], list[str]]:
+    """Steps from each sample to the next: seconds, rise of the counter, gaps, and notes."""
+    span, period_s, irregular, notes = stamps.counter_span, stamps.period_s, False, []
+    counts = None if stamps.counter is None else np.diff(stamps.counter)
+    if counts is not None and (counts < 0).any():
+        counts %= span
+    ticks = None if stamps.ticks is None else np.diff(stamps.ticks) % _TICK_SPAN
+    seconds = np.asarray(ticks * stamps.tick_s) if ticks is not None else None
+    anew = _starts_anew(stamps, counts, ticks)
+    if stamps.time_s is not None:
+        seconds, period_s = np.diff(stamps.time_s), np.nan
+    if seconds is not None and not period_s > 0.0:
+        period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
+    if counts is None:
+        assert seconds is not None  # one of the two is there
+        taken, irregular = _by_clock(seconds, anew)
     else:
-        counts = np.diff(counter)
-        if (counts < 0).any():
-            counts %= _WORD
-            counter = _risen(int(counter[0]), counts)
-        taken, irregular = _by_counter(counts, never), False
-        _require_agreement(seconds, counts, stated_hz)
-    steps = _Steps(seconds, taken, never, never, period_s, irregular)
-    notes = (*_order_notes(order), *steps.notes(int((~kept).sum()), "at the time of another were"))
-    return Timeline(rows, time_s, counter, steps.gaps(), notes)
+        taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
+        if seconds is None:
+            seconds = taken * period_s
+        else:
+            _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
+        if (
+            ticks is not None and period_s > 0.0
+        ):  # the clock tells how often the counter went all the way round
+            rounds = np.maximum(np.round((seconds / period_s - taken) / span), 0.0)
+            counts, taken = counts + rounds.astype(np.int64) * span, taken + rounds * span
+    if irregular:
+        shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
+        notes.append(
+            f"irregular clock, steps of {shortest:.3g} to {longest:.3g} ms: single losses cannot be told"
+        )
+    if anew.any():
+        pauses = _pauses(stamps, anew, seconds)
+        told = anew & np.isfinite(pauses)
+        seconds = np.where(anew, np.where(told, pauses, UNKNOWN_PAUSE_S), seconds)
+        notes.append(
+            f"the sensor started anew {anew.sum()} times; the pause is by the computer's clock "
+            f"{told.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
+        )
+    long = (seconds > _LONGER * period_s) & (not irregular)
+    at = np.flatnonzero((taken > 1.5) | anew | long)
+    missing = np.where(anew[at], 0, np.round(np.minimum(taken[at], _MOST_PERIODS)) - 1)
+    gaps = tuple(Gap(int(i), int(lost), float(seconds[i])) for i, lost in zip(at, missing, strict=True))
+    return seconds, counts, gaps, notes
 
 
 def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) -> None:
@@ -212,78 +248,10 @@ def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) 
         )
 
 
-@dataclass(frozen=True)
-class _Steps:
-    """Steps from each kept sample to the next: seconds, sampling periods, and new starts.
-
-    `unknown` marks new starts after a pause of unknown length; `irregular` is true if the clock's steps vary
-    too much to tell single losses.
-    """
-
-    seconds: FloatArray
-    taken: FloatArray
-    anew: BoolArray
-    unknown: BoolArray
-    period_s: float
-    irregular: bool = False
-
-    def gaps(self) -> tuple[Gap, ...]:
-        """Steps in which samples are missing, and pauses."""
-        long = (self.seconds > _LONGER * self.period_s) & (not self.irregular)
-        at = np.flatnonzero((self.taken > 1.5) | self.anew | long)
-        missing = np.where(self.anew[at], 0, np.round(np.minimum(self.taken[at], _MOST_PERIODS)) - 1)
-        return tuple(
-            Gap(int(i), int(lost), float(self.seconds[i])) for i, lost in zip(at, missing, strict=True)
-        )
-
-    def notes(self, left_out: int, why: str) -> tuple[str, ...]:
-        """How many were left out and why, an irregular clock, and new starts."""
-        notes = [f"{left_out} samples {why} left out"] if left_out else []
-        if self.irregular:
-            shortest, longest = 1e3 * self.seconds.min(), 1e3 * self.seconds.max()
-            notes.append(
-                f"irregular clock, steps of {shortest:.3g} to {longest:.3g} ms: single losses cannot be told"
-            )
-        if self.anew.any():
-            told = int((self.anew & ~self.unknown).sum())
-            notes.append(
-                f"the sensor started anew {self.anew.sum()} times; the pause is by the computer's clock "
-                f"{told} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
-            )
-        return tuple(notes)
-
-
-def _steps(stamps: Stamps) -> tuple[_Steps, IntArray | None]:
-    """Steps, and the rise of the counter in each."""
-    span, period_s, irregular = stamps.counter_span, stamps.period_s, False
-    counts = None if stamps.counter is None else np.diff(stamps.counter) % span
-    ticks = None if stamps.ticks is None else np.diff(stamps.ticks) % _TICK_SPAN
-    anew = _starts_anew(stamps, counts, ticks)
-    seconds = None if ticks is None else np.asarray(ticks * stamps.tick_s)
-    if seconds is not None and not period_s > 0.0:
-        period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
-    if counts is None:
-        assert seconds is not None  # one of the two is there
-        taken, irregular = _by_clock(seconds, anew)
-    else:
-        taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
-        if seconds is not None and stamps.period_s > 0.0:
-            _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
-        if seconds is None:
-            seconds = taken * period_s
-        elif period_s > 0.0:  # the clock tells how often the counter went all the way round
-            rounds = np.maximum(np.round((seconds / period_s - taken) / span), 0.0)
-            counts, taken = counts + rounds.astype(np.int64) * span, taken + rounds * span
-    unknown = anew
-    if anew.any():
-        pauses = _pauses(stamps, anew, seconds)
-        unknown = anew & np.isnan(pauses)
-        seconds = np.where(anew, np.where(unknown, UNKNOWN_PAUSE_S, pauses), seconds)
-    return _Steps(seconds, taken, anew, unknown, period_s, irregular), counts
-
-
 def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None) -> BoolArray:
     """Mark steps over which the sensor's clock, or else its counter, went back or was reset."""
+    if stamps.time_s is not None:
+        return np.zeros(stamps.time_s.size - 1, dtype=bool)
     if ticks is not None:
         anew = (ticks > _TICK_SPAN // 2) | (ticks == 0)
         known = None if stamps.computer_s is None else np.isfinite(stamps.computer_s)

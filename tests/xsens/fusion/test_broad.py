@@ -11,11 +11,11 @@ from field_scenes import recorded, scene
 from scipy.spatial.transform import Rotation
 
 GAIN = 0.8
-"""Mean error over VQF's, the best there is: measured 0.73 on line, 0.71 off line; the same without a constant."""
+"""Mean error over VQF's, the best there is: measured 0.73 on line, 0.71 off line, 0.74 without a constant."""
 
 WORSE = 1.2
-"""Error in any one trial over VQF's: none pays for the mean of the others. Measured 1.16 off line (trial 15, where
-north by the field is 3 degrees off the cameras'), 1.00 on line."""
+"""Error in any one trial over VQF's: none pays for the mean of the others. Measured 1.16 off line (trial 15,
+where north by the field is 3 degrees off the cameras'), 1.00 on line."""
 
 SHARES = (0.60, 0.95)
 """Of errors within one sigma. Sigma is about north, which iron turns in two trials of twelve: so in the
