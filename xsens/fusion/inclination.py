@@ -82,10 +82,25 @@ def forward(
     limits["longest_s"] = LOST * (usual_s or float(np.median(samples.step_s)))
     wide = (n if covariances else 0, kernel.SIZE, kernel.SIZE)
     steps = FilterSteps(last, np.zeros(n, kernel.STEP), np.empty(wide), np.empty(wide))
-    readings = (samples.step_s, samples.rate_rad_s, samples.force_m_s2, samples.field_au)
-    readings = tuple(np.ascontiguousarray(each, dtype=float) for each in readings)
-    kernel.run_filter(*readings, last, pause_s, kept, limits, steps.rows, steps.covariance, steps.transition)
+    kernel.run_filter(
+        _plain(samples.step_s),
+        _plain(samples.rate_rad_s),
+        _plain(samples.force_m_s2),
+        _plain(samples.field_au),
+        last,
+        pause_s,
+        kept,
+        limits,
+        steps.rows,
+        steps.covariance,
+        steps.transition,
+    )
     return steps
+
+
+def _plain(values: FloatArray) -> FloatArray:
+    """Values as kernels are compiled for."""
+    return np.ascontiguousarray(values)
 
 
 def within_steps(
@@ -107,9 +122,8 @@ def within_steps(
         At the end of each step; the gyroscope's error there is spread over the step.
     """
     xyzw, there = np.empty((len(samples), 4)), np.empty((0, 4)) if ends is None else ends
-    readings = (np.ascontiguousarray(each) for each in (samples.step_s, samples.rate_rad_s))
-    still, biases = np.ascontiguousarray(steps.rows["resting"]), np.ascontiguousarray(biases_rad_s)
-    kernel.orient_samples(*readings, steps.last, still, starts, biases, there, xyzw)
+    step_s, rate, still = map(_plain, (samples.step_s, samples.rate_rad_s, steps.rows["resting"]))
+    kernel.orient_samples(step_s, rate, steps.last, still, starts, _plain(biases_rad_s), there, xyzw)
     return xyzw
 
 
