@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.reconstruction import Reconstruction
+from speckle3d.core.reconstruction import Reconstruction, Trust
 from speckle3d.examine.disagreements import differing_lengths
-from speckle3d.scoring.lengths import accumulated
+from speckle3d.scoring.lengths import travelled_mm
 
 
-def length_claims(reconstruction: Reconstruction) -> dict[str, tuple[float, float]]:
-    """Length of each mode that claims an error of it, and its standard deviation, mm."""
-    trust, centre_mm = reconstruction.trust, reconstruction.grid.centre_mm
-    if trust is None:
-        return {}
-    z = reconstruction.poses["image"].apply(centre_mm)[:, 2]
+def relative_claims(
+    poses: Mapping[str, RigidTransform], trust: Trust, centre_mm: FloatArray
+) -> dict[str, float]:
+    """Relative standard deviation of the length that each mode claims, of those that do."""
+    z = poses["image"].apply(centre_mm)[:, 2]
     farthest = int(np.argmax(np.abs(z - z[0])))
     travelled = max(abs(float(z[farthest] - z[0])), 1e-9)
-    relative = {"image": float(np.sqrt(trust.covariance[farthest, 2, 2])) / travelled}
-    relative |= {mode: errors.length_sigma for mode, errors in trust.modes.items()}
-    lengths = {
-        mode: abs(float(accumulated(reconstruction.poses[mode], centre_mm).length_mm[-1]))
-        for mode in relative
-        if mode in reconstruction.poses
-    }
-    return {mode: (length, length * relative[mode]) for mode, length in lengths.items()}
+    claims = {"image": float(np.sqrt(trust.covariance[farthest, 2, 2])) / travelled}
+    claims |= {mode: errors.length_sigma for mode, errors in trust.modes.items()}
+    return {mode: claim for mode, claim in claims.items() if mode in poses}
+
+
+def length_claims(
+    poses: Mapping[str, RigidTransform], trust: Trust, centre_mm: FloatArray
+) -> dict[str, tuple[float, float]]:
+    """Length of each mode that claims an error of it, and its standard deviation, mm."""
+    claims = relative_claims(poses, trust, centre_mm)
+    lengths = {mode: abs(travelled_mm(mode, poses[mode], centre_mm)) for mode in claims}
+    return {mode: (lengths[mode], lengths[mode] * claim) for mode, claim in claims.items()}
 
 
 def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
@@ -36,7 +43,8 @@ def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
     MismatchError
         If modes differ by more than three joint claims: there is no best one.
     """
-    claims = length_claims(reconstruction)
+    trust, poses = reconstruction.trust, reconstruction.poses
+    claims = {} if trust is None else length_claims(poses, trust, reconstruction.grid.centre_mm)
     if doubts := differing_lengths(claims):
         raise MismatchError(f"{doubts[0].evidence}: expected --mode to say which to take, got none")
     if len(claims) < 2:

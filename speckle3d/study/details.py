@@ -7,9 +7,6 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Trust
 from speckle3d.core.sweep import Sweep
@@ -84,17 +81,6 @@ def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
         "mean_gain": float(coherence.gain.mean()),
         "scale_sigma": coherence.scale_sigma,
     }
-
-
-def claims_of(
-    tracked: Tracked, centre_mm: FloatArray, corrections: Mapping[str, Correction]
-) -> dict[str, float]:
-    """Relative standard deviation of the length that each mode claims."""
-    centre = tracked.image.apply(centre_mm)[:, 2]
-    farthest = int(np.argmax(np.abs(centre - centre[0])))
-    travelled = max(abs(float(centre[farthest] - centre[0])), 1e-9)
-    claims = {"image": float(np.sqrt(tracked.covariance[farthest, 2, 2])) / travelled}
-    return claims | {mode: correction.length_sigma for mode, correction in corrections.items()}
 
 
 def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:

@@ -10,7 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
@@ -36,9 +35,10 @@ from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.pipeline import Tracked, track
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
+from speckle3d.scoring.modes import length_claims, relative_claims
 from speckle3d.scoring.references import Reference, error_rows, sweep_curves, tracker_alone
 from speckle3d.study.crossed import Companion
-from speckle3d.study.details import claims_of, details_of, doubted_modes, trust_of
+from speckle3d.study.details import details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.images import Strip
 from speckle3d.study.request import SUBSET, require_possible
@@ -165,7 +165,8 @@ def run_job(
                 second_file,
                 import_record(source),
             )
-            writer.finish(poses, provenance, settings.to_toml(), trust_of(tracked, corrections))
+            trust = trust_of(tracked, corrections)
+            writer.finish(poses, provenance, settings.to_toml(), trust)
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
         alone = tracker_alone(believed(sweep, tracked.doubts))
         if reference is None and compared is not None and compared.name == TRACKER:
@@ -174,10 +175,8 @@ def run_job(
         centre = sweep.grid.centre_mm
         drawn = poses if compared is None or compared.name == TRACKER else every
         moved = sweep_curves(drawn, centre, compared, tracked.covariance)
-        claims = claims_of(tracked, centre, corrections)
-        lengths = {mode: float(np.abs(curve[0, -1])) for mode, curve in moved.modes.items()}
-        claimed = {m: (lengths[m], lengths[m] * sigma) for m, sigma in claims.items() if m in lengths}
-        doubts = (*tracked.doubts, *differing_lengths(claimed))
+        claims = relative_claims(poses, trust, centre)
+        doubts = (*tracked.doubts, *differing_lengths(length_claims(poses, trust, centre)))
         rows = [
             replace(row, sigma_mm=claims[row.mode] * abs(row.estimate_mm)) if row.mode in claims else row
             for row in error_rows(every, compared, centre)
