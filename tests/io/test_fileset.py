@@ -55,15 +55,6 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path, error):
     assert held(tmp_path) == WHOLE["old"]
 
 
-def test_a_link_is_written_through(tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "store").write_text("old")
-    (tmp_path / "out" / "main.h5").symlink_to(tmp_path / "store")
-    write(tmp_path / "out", "new")
-    assert (tmp_path / "out" / "main.h5").is_symlink()
-    assert (tmp_path / "store").read_text() == "new"
-
-
 HOLDER = """
 import sys, time
 from pathlib import Path

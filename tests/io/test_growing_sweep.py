@@ -99,14 +99,6 @@ def assert_begins_a_usual_file(folder, sweep):
     np.testing.assert_array_equal(load_sweep(folder / "copy.h5").frames[1], sweep.frames[1])
 
 
-def test_without_a_frame_there_is_no_sweep_and_no_file(tmp_path):
-    with growing(tmp_path / "s.h5", SWEEPS["rf"]) as target:
-        target.append_pose(0.0, np.eye(4))
-        with pytest.raises(InvalidInputError, match="got none so far"):
-            load_sweep(tmp_path / "s.h5")
-    assert not (tmp_path / "s.h5").exists()
-
-
 def test_calibration_probe_and_offset_are_kept(tmp_path):
     sweep = SWEEPS["rf"]
     for name, mounting in (

@@ -127,14 +127,6 @@ def test_one_bad_row_is_left_out_and_counted(tmp_path, change, images, poses, wo
     assert all("the longest gap is 0.1 s, after 100.200 s" in note for note in notes)
 
 
-def test_repeats_are_dropped_at_any_share(tmp_path):
-    true, frames = path_of(12)
-    twice = [frame for frame in frames for _ in range(3)]
-    sweep = opened(tmp_path, twice).sweep
-    np.testing.assert_allclose(sweep.frame_time_s, 100 + 0.05 * np.arange(12))
-    np.testing.assert_allclose(placed(sweep), true.as_matrix(), atol=1e-9)
-
-
 IDENTITY = text_of(np.eye(4))
 
 
@@ -189,31 +181,8 @@ def test_transforms_are_chosen_by_name(tmp_path):
         read_poses(path, ImportSettings(tracker_transform="StylusToTracker"))
 
 
-def renamed(frames, old, new, change=lambda text: text):
-    return [
-        {
-            name.replace(old, new): change(text) if name == f"{old}Transform" else text
-            for name, text in frame.items()
-        }
-        for frame in frames
-    ]
-
-
 def inverted(text):
     return text_of(np.linalg.inv(np.reshape([float(x) for x in text.split()], (4, 4))))
-
-
-def test_poses_of_any_name_are_found_with_the_reference_of_their_own_world(tmp_path):
-    probe, reference, frames = tracked(3)
-    asked = ImportSettings(tracker_transform="ToolToTracker")
-    turned = renamed(frames, "ProbeToTracker", "TrackerToTool", inverted)
-    for tool in (renamed(frames, "ProbeToTracker", "ToolToTracker"), turned):
-        path = write_mha(tmp_path / "tool.mha", grey(), frames=tool)
-        got = read_poses(path, asked).readings.world_from_sensor.as_matrix()
-        np.testing.assert_allclose(got, (reference.inv() * probe).as_matrix(), atol=5e-3)
-    bed = write_mha(tmp_path / "bed.mha", grey(), frames=renamed(frames, "ProbeToTracker", "ToolToBed"))
-    got = read_poses(bed, ImportSettings(tracker_transform="ToolToBed")).readings.world_from_sensor
-    np.testing.assert_allclose(got.as_matrix(), probe.as_matrix(), atol=1e-3)
 
 
 def test_poses_both_ways_round_are_inverses_or_left_out(tmp_path):

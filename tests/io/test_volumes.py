@@ -69,20 +69,6 @@ def test_a_voxel_is_at_the_same_place_in_itk_and_here(tmp_path_factory, suffix, 
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_slabs_and_byte_order_do_not_show_in_the_file(tmp_path, suffix):
-    volume = volume_of(3, "int16", (40, 30, 20))
-    write_volume(tmp_path / f"whole{suffix}", volume)
-    place = volume.shape, volume.spacing_mm, volume.world_from_grid
-    with VolumeWriter(tmp_path / f"slabs{suffix}", *place, "int16") as writer:
-        for first, stop in itertools.pairwise((0, 1, 7, 20)):
-            planes = np.asfortranarray(volume.voxels.T[first:stop]).astype(">i2")
-            writer.append(planes)
-            planes[:] = -1  # the writer holds no view of it
-    for name in ("whole", "slabs"):
-        np.testing.assert_array_equal(by_itk(tmp_path / f"{name}{suffix}")[1], volume.voxels)
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_fields_come_back_and_take_nobodys_place(tmp_path, suffix):
     path = tmp_path / f"v{suffix}"
     volume = volume_of(5, fields=FIELDS)

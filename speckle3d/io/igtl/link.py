@@ -40,8 +40,6 @@ class LinkState:
         Times the connection was lost and found again; for a server, clients beyond the first.
     dropped : int
         Messages to the peer that it was too slow for.
-    waiting : int
-        Messages received and not yet taken.
     silent_s : float
         Time since the last byte came.
     last_failure : str
@@ -54,7 +52,6 @@ class LinkState:
     last_refused: str = ""
     reconnections: int = 0
     dropped: int = 0
-    waiting: int = 0
     silent_s: float = 0.0
     last_failure: str = ""
 
@@ -124,7 +121,7 @@ class End:
         dropped = self._dropped + sum(link.dropped for link in list(self._links))
         return LinkState(
             bool(self._links), self.messages, self.refused, self.last_refused, max(self._made - 1, 0),
-            dropped, self._inbox.qsize(), time.monotonic() - self.heard_s, self.last_failure,
+            dropped, time.monotonic() - self.heard_s, self.last_failure,
         )  # fmt: skip
 
     def put(self, message: Received, over: threading.Event) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
@@ -102,13 +102,10 @@ def clock_shift_s(sweep: Sweep) -> float:
 def _readings(
     sensor: Tracker | OrientationSensor, name: str, first_s: float, later_s: float
 ) -> Iterator[Played]:
-    times, poses = sensor.readings.time_s, sensor.readings.world_from_sensor
-    for k, time_s in enumerate(times):
-        matrix = np.eye(4)
-        if isinstance(poses, RigidTransform):
-            matrix = poses[k].as_matrix()
-        else:
-            matrix[:3, :3] = poses[k].as_matrix()
+    poses = sensor.readings.world_from_sensor
+    if isinstance(poses, Rotation):
+        poses = RigidTransform.from_rotation(poses)
+    for time_s, matrix in zip(sensor.readings.time_s, poses.as_matrix(), strict=True):
         # Sent when the image of the same moment is; it tells its own clock.
         at_s = float(time_s) + sensor.time_offset_s - first_s
         yield Played(at_s, packed_transform(name, time_s + later_s, matrix), False)
@@ -127,10 +124,7 @@ def _pixels(frames: Frames, i: int, upright: bool) -> tuple[npt.NDArray[Any], in
 
 def _place(sweep: Sweep, grid: ImageGrid, upright: bool, i: int) -> FloatArray:
     """Where the pixels of a frame lie, (4, 4): in the world of a calibrated tracker, else in the image."""
-    image_from_pixel = np.eye(4)
-    image_from_pixel[:, :2] = grid.image_from_sample[:, :2]
-    image_from_pixel[:, 3] = grid.image_from_sample[:, 2]
-    image_from_pixel[2, 2] = _SLICE_MM
+    image_from_pixel = np.insert(grid.image_from_sample, 2, [0.0, 0.0, _SLICE_MM, 0.0], axis=1)
     if not upright:
         # Columns are samples; slices turn round so that the axes stay right-handed.
         image_from_pixel = image_from_pixel[:, [1, 0, 2, 3]] @ np.diag([1.0, 1.0, -1.0, 1.0])
