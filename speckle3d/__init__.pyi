@@ -27,9 +27,9 @@ from .io.shapes.surfaces import write_surface as write_surface
 from .io.shapes.transforms import write_transform as write_transform
 from .io.sweep_writer import write_sweep as write_sweep
 from .io.voxels.volume_writer import VolumeWriter as VolumeWriter
+from .io.voxels.volume_writer import write_volume as write_volume
 from .io.voxels.volumes import load_volume as load_volume
 from .io.voxels.volumes import read_volume as read_volume
-from .io.voxels.volumes import write_volume as write_volume
 from .phantom_curves import calibrate_curves as calibrate_curves
 from .pipeline import Tracked as Tracked
 from .pipeline import track as track

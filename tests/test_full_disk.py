@@ -23,7 +23,7 @@ from speckle3d.io.points import PickedPoints, write_points
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.shapes.polylines import write_polylines
 from speckle3d.io.sweep_writer import attach_orientation, write_sweep
-from speckle3d.io.voxels.volumes import write_volume
+from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.study.figures import new_figure, save_figure
 from speckle3d.study.results import write_texts
 from xsens.live.recording import RawFile

@@ -1,8 +1,8 @@
 """Pixels of MetaImage and NRRD files as one array, mapped from the disk or unpacked.
 
-They are read here and not by pynrrd, which reads all of a raw sequence into memory, drops letters beyond ASCII
-(names of segments, micrometres) and stops at the first member of packed pixels; nor by SimpleITK, for which
-frames have no fields.
+They are read here and not by pynrrd, which reads all of a raw sequence into memory, drops letters beyond
+ASCII (names of segments, micrometres) and stops at the first member of packed pixels; nor by SimpleITK,
+for which frames have no fields.
 """
 
 from __future__ import annotations

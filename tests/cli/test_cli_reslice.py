@@ -7,7 +7,8 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.volume import Volume
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.voxels.volumes import read_volume, write_volume
+from speckle3d.io.voxels.volume_writer import write_volume
+from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane, require_same_poses
 
 PNG = b"\x89PNG\r\n\x1a\n"

@@ -12,7 +12,7 @@ from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.shapes.surfaces import read_surface
-from speckle3d.io.voxels.volumes import write_volume
+from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
 from speckle3d.study.reslices.cut_geometry import anchors_of
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut

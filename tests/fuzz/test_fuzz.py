@@ -54,8 +54,7 @@ def write_volumes(folder):
 
     from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
     from speckle3d.core.volume import Volume
-    from speckle3d.io.voxels.volume_writer import SUFFIXES
-    from speckle3d.io.voxels.volumes import write_volume
+    from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
 
     voxels = np.arange(120, dtype=np.uint8).reshape(4, 5, 6)
     volume = Volume(voxels, (0.5, 0.25, 1.0), POSES[1], {"levels": "linear"})

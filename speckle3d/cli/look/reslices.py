@@ -113,8 +113,8 @@ def reslice(
     --------
     $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
     """
-    from speckle3d.io.voxels.volume_writer import SUFFIXES
-    from speckle3d.io.voxels.volumes import may_be_volume, write_volume
+    from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
+    from speckle3d.io.voxels.volumes import may_be_volume
     from speckle3d.study.figures import RANGE_DB
     from speckle3d.study.reslices.cuts import cut_as_volume, cut_posed, cut_voxels, open_modes
     from speckle3d.study.reslices.places import Place

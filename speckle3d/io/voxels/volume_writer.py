@@ -1,4 +1,4 @@
-"""Volumes written plane by plane, as NRRD, MetaImage or NIfTI files, in memory that stays as it is.
+"""Volumes written plane by plane as NRRD, MetaImage or NIfTI files.
 
 World axes are written as left, posterior, superior (LPS), mm.
 
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -21,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import LabelMap, Segment
@@ -46,8 +44,55 @@ PREFIX = "Speckle3D_"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 
 
+def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
+    """Write a volume whole or not at all; the suffix chooses the format.
+
+    As `VolumeWriter` does it, with what the labels of a `LabelMap` mean.
+
+    Parameters
+    ----------
+    path : path
+        Ends in .nrrd, .mha, .nii.gz or .nii.
+    volume : Volume
+    compress : bool
+        Whether voxels are packed, where the format can.
+
+    Raises
+    ------
+    InvalidInputError
+        If the suffix is none of `volume_writer.SUFFIXES`.
+    FileError
+        If the file cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from speckle3d.io.voxels.volumes import read_volume
+    >>> volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_volume(f"{folder}/v.nrrd", volume)
+    ...     read_volume(f"{folder}/v.nrrd").shape
+    (4, 3, 2)
+    """
+    suffix = require_suffix(Path(path), isinstance(volume, LabelMap))
+    is_packed = suffix == ".nii.gz" or (compress and suffix != ".nii")
+    with naming(str(path)):
+        header = _header(suffix, volume, is_packed)
+    dtype = volume.voxels.dtype.newbyteorder("<")
+    pack = packer(ZLIB if suffix == ".mha" else GZIP) if is_packed else None
+    with atomic_path(path) as part, part.open("wb") as file:
+        file.write(header if pack is None or suffix != ".nii.gz" else pack.compress(header))
+        for plane in volume.voxels.T:
+            content = np.ascontiguousarray(plane, dtype).data.cast("B")
+            file.write(content if pack is None else pack.compress(content))
+        if pack is not None:
+            file.write(pack.flush())
+            if suffix == ".mha":
+                put_packed_size(file, header, file.tell() - len(header))
+
+
 class VolumeWriter:
-    """Writes a volume in a block; the file appears whole when the block ends, or not at all.
+    """Takes the planes of a volume in a block and writes it as `write_volume` does when the block ends.
 
     World axes are written as left, posterior, superior, in mm: NRRD says so, MetaImage means it, and NIfTI
     has the first two reversed (right, anterior, superior). Numbers are little-endian.
@@ -102,122 +147,93 @@ class VolumeWriter:
         compress: bool = True,
         segments: Sequence[Segment] | None = None,
     ) -> None:
-        self._path, self._fields = Path(path), dict(fields or {})
-        self._suffix = require_suffix(self._path, segments is not None)
-        self._packs = self._suffix == ".nii.gz" or (compress and self._suffix != ".nii")
+        self._path, self._compress, self._planes = Path(path), compress, 0
+        require_suffix(self._path, segments is not None)
         with naming(str(path)):
-            # Checked by the container, whose voxels are all one here.
-            voxels = np.broadcast_to(np.zeros((), np.dtype(dtype).newbyteorder("=")), shape)
-            place = voxels, spacing_mm, world_from_grid, self._fields
-            volume = Volume(*place) if segments is None else LabelMap(*place, tuple(segments))
-            if not np.isfinite(volume.world_from_index).all():
-                raise InvalidInputError("world_from_grid: expected a finite pose, got another")
-            for name in self._fields:
-                if not _NAME.fullmatch(name):
-                    raise InvalidInputError(
-                        f"fields: expected names of letters, digits and '_.-' after a letter, got {name!r}"
-                    )
-            self._volume = volume
-            self._header = self._made_header(volume, segments)
-        self._planes = 0
+            voxels = np.zeros(shape, np.dtype(dtype).newbyteorder("="), order="F")
+            place = voxels, spacing_mm, world_from_grid, dict(fields or {})
+            self._volume = Volume(*place) if segments is None else LabelMap(*place, tuple(segments))
 
     def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            part = stack.enter_context(atomic_path(self._path))
-            self._file = stack.enter_context(part.open("wb"))
-            stack.push(self._finish_unless)
-            self._packer = packer(ZLIB if self._suffix == ".mha" else GZIP) if self._packs else None
-            self._file.write(self._packed(self._header) if self._suffix == ".nii.gz" else self._header)
-            self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stack.__exit__(kind, error, trace)
+        if error is None:
+            if self._planes != self._volume.shape[2]:
+                raise MismatchError(
+                    f"{self._path}: expected {self._volume.shape[2]} planes, got {self._planes}"
+                )
+            write_volume(self._path, self._volume, self._compress)
 
     def append(self, planes: npt.NDArray[Any]) -> None:
-        """Write the next planes along k.
-
-        Parameters
-        ----------
-        planes : ndarray, shape (k, j, i)
-            Of the volume's type, in any order in memory.
+        """Take the next planes along k, shape (k, j, i), of the volume's type.
 
         Raises
         ------
         MismatchError
             If they are of another shape or type, or more than are left.
-        FileError
-            If the file cannot be written.
         """
-        (n_i, n_j, n_k), dtype = self._volume.shape, self._volume.voxels.dtype
-        left = n_k - self._planes
-        if planes.ndim != 3 or planes.shape[1:] != (n_j, n_i) or len(planes) > left:
-            expected = f"at most {left} planes of {n_j} x {n_i} voxels (j x i)"
-            raise MismatchError(f"{self._path}: expected {expected}, got shape {planes.shape}")
-        if planes.dtype.newbyteorder("=") != dtype:
-            raise MismatchError(f"{self._path}: expected voxels of type {dtype}, got {planes.dtype}")
-        for plane in planes:
-            content = np.ascontiguousarray(plane, dtype.newbyteorder("<"))
-            self._file.write(self._packed(content.data.cast("B")))
-        self._planes += len(planes)
+        after = self._planes + len(planes)
+        target = self._volume.voxels.T[self._planes : after]
+        if planes.shape != target.shape or planes.dtype.newbyteorder("=") != target.dtype:
+            expected = f"planes of shape {target.shape}, {target.dtype}"
+            raise MismatchError(f"{self._path}: expected {expected}, got {planes.shape}, {planes.dtype}")
+        target[:] = planes
+        self._planes = after
 
-    def _packed(self, content: bytes | memoryview) -> Any:
-        return content if self._packer is None else self._packer.compress(content)
 
-    def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
-        if error is not None:
-            return
-        if self._planes != self._volume.shape[2]:
-            raise MismatchError(f"{self._path}: expected {self._volume.shape[2]} planes, got {self._planes}")
-        if self._packer is not None:
-            self._file.write(self._packer.flush())
-            if self._suffix == ".mha":
-                put_packed_size(self._file, self._header, self._file.tell() - len(self._header))
-
-    def _made_header(self, volume: Volume, segments: Sequence[Segment] | None) -> bytes:
-        plain = {} if segments is None else segment_fields(segments, volume.shape)
-        if ".nii" in self._suffix:
-            return nifti_header(volume, {**self._fields, **plain}, segments is not None)
-        fields = {f"{PREFIX}{name}": value for name, value in self._fields.items()} | plain
-        escaped = {name: _escaped(value) for name, value in fields.items()}
-        matrix = volume.world_from_index + 0.0  # no negative zeros
-        return header_bytes((self._nrrd if self._suffix == ".nrrd" else self._meta)(matrix, escaped))
-
-    def _nrrd(self, matrix: FloatArray, fields: Mapping[str, str]) -> list[str]:
+def _header(suffix: str, volume: Volume, is_packed: bool) -> bytes:
+    """Header of a file up to its voxels."""
+    if not np.isfinite(volume.world_from_index).all():
+        raise InvalidInputError("world_from_grid: expected a finite pose, got another")
+    for name in volume.fields:
+        if not _NAME.fullmatch(name):
+            raise InvalidInputError(
+                f"fields: expected names of letters, digits and '_.-' after a letter, got {name!r}"
+            )
+    plain = segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
+    if ".nii" in suffix:
+        return nifti_header(volume, {**volume.fields, **plain}, isinstance(volume, LabelMap))
+    matrix, shape, dtype = (
+        volume.world_from_index + 0.0,
+        volume.shape,
+        volume.voxels.dtype,
+    )  # no negative zeros
+    fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
+    if suffix == ".nrrd":
         *steps, origin = (f"({_texts(column, ',')})" for column in matrix[:3].T)
-        return [
+        lines = [
             "NRRD0005",
-            f"type: {nrrd_type(self._volume.voxels.dtype)}",
+            f"type: {nrrd_type(dtype)}",
             "dimension: 3",
             "space: left-posterior-superior",
-            f"sizes: {_texts(self._volume.shape)}",
+            f"sizes: {_texts(shape)}",
             f"space directions: {' '.join(steps)}",
             "kinds: domain domain domain",
             "endian: little",
-            f"encoding: {'gzip' if self._packs else 'raw'}",
+            f"encoding: {'gzip' if is_packed else 'raw'}",
             'space units: "mm" "mm" "mm"',
             f"space origin: {origin}",
-            *(f"{name}:={value}" for name, value in fields.items()),
+            *(f"{name}:={_escaped(value)}" for name, value in fields.items()),
             "",
         ]
-
-    def _meta(self, matrix: FloatArray, fields: Mapping[str, str]) -> list[str]:
-        spacing = np.linalg.norm(matrix[:3, :3], axis=0)
-        return [
-            *meta_start(3, 0 if self._packs else None),
-            f"TransformMatrix = {_texts((matrix[:3, :3] / spacing).T.ravel())}",
-            f"Offset = {_texts(matrix[:3, 3])}",
-            "CenterOfRotation = 0 0 0",
-            f"ElementSpacing = {_texts(spacing)}",
-            f"DimSize = {_texts(self._volume.shape)}",
-            # As PLUS tells a volume from a sequence of frames.
-            "Kinds = domain domain domain",
-            *(f"{name} = {value}" for name, value in fields.items()),
-            f"ElementType = MET_{meta_type(self._volume.voxels.dtype)}",
-            "ElementDataFile = LOCAL",
-        ]
+        return header_bytes(lines)
+    lines = [
+        *meta_start(3, 0 if is_packed else None),
+        f"TransformMatrix = {_texts((matrix[:3, :3] / volume.spacing_mm).T.ravel())}",
+        f"Offset = {_texts(matrix[:3, 3])}",
+        "CenterOfRotation = 0 0 0",
+        f"ElementSpacing = {_texts(volume.spacing_mm)}",
+        f"DimSize = {_texts(shape)}",
+        # As PLUS tells a volume from a sequence of frames.
+        "Kinds = domain domain domain",
+        *(f"{name} = {_escaped(value)}" for name, value in fields.items()),
+        f"ElementType = MET_{meta_type(dtype)}",
+        "ElementDataFile = LOCAL",
+    ]
+    return header_bytes(lines)
 
 
 def require_suffix(path: Path, is_labels: bool = False) -> str:

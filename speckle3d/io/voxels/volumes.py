@@ -29,47 +29,12 @@ from speckle3d.io.pixels import map_pixels
 from speckle3d.io.text import numbers
 from speckle3d.io.voxels.nifti import is_nifti, read_nifti
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
-from speckle3d.io.voxels.volume_writer import VolumeWriter, own_fields
+from speckle3d.io.voxels.volume_writer import own_fields
 
 _SNIFFED_BYTES = 4096
 
 _SAME_PLACE_MM = 1e-3
 """Two grids are one if they differ by less: NIfTI keeps places to single precision."""
-
-
-def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
-    """Write a volume whole or not at all; the suffix chooses the format.
-
-    As `VolumeWriter` does it, with what the labels of a `LabelMap` mean.
-
-    Parameters
-    ----------
-    path : path
-        Ends in .nrrd, .mha, .nii.gz or .nii.
-    volume : Volume
-    compress : bool
-        Whether voxels are packed, where the format can.
-
-    Raises
-    ------
-    InvalidInputError
-        If the suffix is none of `volume_writer.SUFFIXES`.
-    FileError
-        If the file cannot be written.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> volume = Volume(np.zeros((4, 3, 2), np.uint8), (0.5, 0.5, 1.0), RigidTransform.identity())
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_volume(f"{folder}/v.nrrd", volume)
-    ...     read_volume(f"{folder}/v.nrrd").shape
-    (4, 3, 2)
-    """
-    segments = volume.segments if isinstance(volume, LabelMap) else None
-    place = volume.shape, volume.spacing_mm, volume.world_from_grid
-    with VolumeWriter(path, *place, volume.voxels.dtype, volume.fields, compress, segments) as writer:
-        writer.append(volume.voxels.T)
 
 
 def is_volume(path: PathLike) -> bool:

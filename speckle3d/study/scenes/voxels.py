@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -14,17 +13,18 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, LabelMap
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.progress import Progress
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.measures.uncertainty import deviation_volume
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, grid_like, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.volume import compound_onto
-from speckle3d.io.voxels.volume_writer import VolumeWriter
+from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.pose_errors import posed_errors_of
 from speckle3d.study.posed import MARK, PosedSweep, pose_mark
@@ -205,20 +205,18 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
     fields = fields_of(posed, request, meaning)
     volume = compound_onto(grid, source, settings, weights, mask)
-    state, labels = volume.state.T, {"segments": STATE_SEGMENTS}
-    made: dict[Path | None, tuple[str, Any, dict[str, str], dict[str, Any]]] = {
-        request.path: (settings.voxel_type, volume.voxels.T, fields, {}),
-        request.state_path: ("uint8", state, fields, labels),
+    place, state = (grid.spacing_mm, grid.world_from_grid), volume.state.T
+    made: dict[Path | None, Volume] = {
+        request.path: Volume(volume.voxels, *place, fields),
+        request.state_path: LabelMap(volume.state, *place, fields, STATE_SEGMENTS),
     }
     if request.deviation_path is not None:
         errors = _errors(posed, "the deviation of position")
         deviation, words = deviation_volume(errors, source.grid, grid, state), fields | {"levels": _DEVIATION}
-        made[request.deviation_path] = ("float32", deviation, words, {})
-    with ExitStack() as files:
-        for path, (kind, voxels, words, more) in made.items():
-            if path is not None:
-                place = grid.shape, grid.spacing_mm, grid.world_from_grid
-                files.enter_context(VolumeWriter(path, *place, kind, words, **more)).append(voxels)
+        made[request.deviation_path] = Volume(deviation.T, *place, words)
+    for path, voxels in made.items():
+        if path is not None:
+            write_volume(path, voxels)
     if progress is not None:
         progress(grid.shape[2], grid.shape[2])
     counts, seconds = np.bincount(state.ravel(), minlength=3), time.perf_counter() - began
