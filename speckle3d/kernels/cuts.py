@@ -129,17 +129,22 @@ def blend_nearest(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _neighbours(at: float, last: int) -> tuple[int, int, float]:
+def _neighbours(at: float, last: int) -> tuple[np.uint64, np.uint64, float]:
     """Lower and upper neighbour along an axis, and weight of the upper one."""
     at = min(max(at, 0.0), float(last))
     lower = int(at)
     share = at - lower
     # On a voxel but for rounding, its neighbours do not count: they may be outside, or hold nothing.
-    if share < EDGE_TOLERANCE:
-        return lower, lower, 0.0
     if share > 1.0 - EDGE_TOLERANCE:
-        return lower + 1, lower + 1, 0.0
-    return lower, lower + 1, share
+        lower, share = lower + 1, 0.0
+    upper = lower + (share >= EDGE_TOLERANCE)
+    # Unsigned, which no compiler takes for an index from the end.
+    return np.uint64(lower), np.uint64(upper), share if share >= EDGE_TOLERANCE else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def _between(near: float, far: float, share: float) -> float:
+    return near + share * (far - near)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -154,9 +159,9 @@ def cut_voxels(
 
     Parameters
     ----------
-    voxels : ndarray, shape (n_i, n_j, n_k)
-        In any order in memory.
-    state : ndarray, shape (n_i, n_j, n_k) or (0, 0, 0)
+    voxels : ndarray, shape (n_k, n_j, n_i)
+        In any order in memory, fastest in C order.
+    state : ndarray, shape (n_k, n_j, n_i) or (0, 0, 0)
         `EMPTY` where a voxel holds nothing; without it, those hold nothing that are NaN.
     index_from_world : ndarray, shape (3, 4)
     lines : ndarray, shape (n, 2, 3)
@@ -164,7 +169,7 @@ def cut_voxels(
     out : ndarray, shape (n, points), filled
     """
     stated = state.size > 0
-    last_i, last_j, last_k = voxels.shape[0] - 1, voxels.shape[1] - 1, voxels.shape[2] - 1
+    last_i, last_j, last_k = voxels.shape[2] - 1, voxels.shape[1] - 1, voxels.shape[0] - 1
     for line in range(lines.shape[0]):
         u, du = _mapped(index_from_world, 0, lines[line])
         v, dv = _mapped(index_from_world, 1, lines[line])
@@ -180,19 +185,20 @@ def cut_voxels(
             j, far_j, b = _neighbours(v + dv * point, last_j)
             k, far_k, c = _neighbours(w + dw * point, last_k)
             if not stated:
-                near = (1.0 - a) * voxels[i, j, k] + a * voxels[far_i, j, k]
-                near += b * ((1.0 - a) * voxels[i, far_j, k] + a * voxels[far_i, far_j, k] - near)
-                far = (1.0 - a) * voxels[i, j, far_k] + a * voxels[far_i, j, far_k]
-                far += b * ((1.0 - a) * voxels[i, far_j, far_k] + a * voxels[far_i, far_j, far_k] - far)
-                out[line, point] = near + c * (far - near)
-                if not math.isnan(out[line, point]):
+                near = _between(voxels[k, j, i], voxels[k, j, far_i], a)
+                near = _between(near, _between(voxels[k, far_j, i], voxels[k, far_j, far_i], a), b)
+                far = _between(voxels[far_k, j, i], voxels[far_k, j, far_i], a)
+                far = _between(far, _between(voxels[far_k, far_j, i], voxels[far_k, far_j, far_i], a), b)
+                level = _between(near, far, c)
+                if not math.isnan(level):
+                    out[line, point] = level
                     continue
             total, weights = 0.0, 0.0
             for corner in range(8):
                 weight = a if corner & 1 else 1.0 - a
                 weight *= b if corner & 2 else 1.0 - b
                 weight *= c if corner & 4 else 1.0 - c
-                place = far_i if corner & 1 else i, far_j if corner & 2 else j, far_k if corner & 4 else k
+                place = far_k if corner & 4 else k, far_j if corner & 2 else j, far_i if corner & 1 else i
                 level = float(voxels[place])
                 if not math.isnan(level) and not (stated and state[place] == EMPTY):
                     total += weight * level

@@ -28,7 +28,6 @@ from corpus import CURVES, good_sweep
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Helix, Phantom, curved_path
-from scipy.optimize import least_squares
 
 import speckle3d
 from speckle3d.config import Config
@@ -96,7 +95,7 @@ def at_known_poses() -> None:
             away = np.abs(body.depth(own.vertices_mm)) / STEP_MM
             size = f"{away.max():22.2f}{np.sqrt((away**2).mean()):5.2f}"
             if isinstance(body, Helix):
-                print(f"{way:16}{'helix':>9}{'':30}{size}; {_helix_errors(own, body)}")
+                print(f"{way:16}{'helix':>9}{'':30}{size}")
                 continue
             sizes = [_voxel_volume(volume, body), own.volume_mm3]
             of_voxels, of_mesh = (100 * (size / body.volume_mm3 - 1) for size in sizes)
@@ -116,30 +115,6 @@ def _voxel_volume(volume: Volume, ball: Ball) -> float:
     near = ball.depth(volume.world_from_grid.apply(index.reshape(-1, 3) * volume.spacing_mm)) > -3 * STEP_MM
     share = (volume.voxels.reshape(-1)[near] - OUTSIDE) / (INSIDE - OUTSIDE)
     return float(np.nansum(share) * np.prod(volume.spacing_mm))
-
-
-def _helix_errors(surface: Surface, helix: Helix) -> str:
-    """Radius, pitch and length of the helix that lies one tube's radius inside the surface, fitted."""
-    places = surface.vertices_mm[:: max(len(surface.vertices_mm) // 4000, 1)]
-    angle = helix.nearest_angle(places)
-    places = places[(angle > 0.5) & (angle < 2 * np.pi * helix.turns - 0.5)]
-
-    def off(values):
-        x, y, z, radius, pitch, tube = values
-        return replace(helix, centre_mm=(x, y, z), radius_mm=radius, pitch_mm=pitch, tube_mm=tube).depth(
-            places
-        )
-
-    start = np.array([*helix.centre_mm, 1.05 * helix.radius_mm, 0.97 * helix.pitch_mm, 0.9 * helix.tube_mm])
-    *_, radius, pitch, tube = least_squares(off, start).x
-    length = helix.turns * np.hypot(2 * np.pi * radius, pitch)
-    pairs = (
-        ("radius", radius, helix.radius_mm),
-        ("pitch", pitch, helix.pitch_mm),
-        ("length", length, helix.length_mm),
-        ("tube", tube, helix.tube_mm),
-    )
-    return ", ".join(f"{name} {100 * (found / true - 1):+.2f} %" for name, found, true in pairs)
 
 
 def reconstructed(number: int, first_seed: int, folder: Path) -> Path | None:

@@ -1,15 +1,11 @@
-"""Speed of making voxels of frames, beside others in the same process, and memory of a sweep of 2 GB.
+"""Speed of making voxels of frames, beside others in the same process.
 
-Run: ``python tests/benchmarks/bench_volume.py [--runs 5] [--large]`` on a quiet machine. Needs the extra
-``bench``, SimpleITK and VTK. 300 frames of 640 x 480 pixels of 0.1 mm, 8 bits each, of a sweep that wavers go
-into 273 x 193 x 240 voxels of 0.25 mm. A ``!`` marks a target that is missed.
+Run: ``python tests/benchmarks/bench_volume.py [--runs 5]`` on a quiet machine. Needs SimpleITK. 300 frames of
+640 x 480 pixels of 0.1 mm, 8 bits each, of a sweep that wavers go into 273 x 193 x 240 voxels of 0.25 mm. A ``!`` marks a target that is missed.
 
 Beside it, on the same frames and voxels or on fewer of the frames where they are slow:
 
-- NumPy: ``add.at``, and ``bincount`` over all voxels for each batch of frames, of sums and counts.
-- VTK's ``vtkGaussianSplatter`` of points, made constant: each sample into the voxel whose centre is within
-  half a voxel of it, if there is one, by summing; it does not count, so that a mean would take two of them.
-  Samples outside are left out before.
+- NumPy: ``bincount`` over all voxels, of sums and counts.
 - SimpleITK: the frames taken for one stack of parallel planes, which they are not, resampled to the voxels,
   linearly; backward, so that it looks at each voxel and not at each pixel.
 - IGSIO, the reconstruction inside PLUS and 3D Slicer, was built and timed elsewhere, on a machine of two
@@ -19,7 +15,6 @@ Beside it, on the same frames and voxels or on fewer of the frames where they ar
 import argparse
 import os
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -29,18 +24,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import SimpleITK as sitk
-import vtk
 from scipy.spatial.transform import RigidTransform, Rotation
 from speed.rows import Row, print_table, timed
-from vtk.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 
 from speckle3d.core.labels import MEASURED
-from speckle3d.core.sweep import BModeSettings, ImageGrid
+from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import cores, on_one_thread
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.holes import fill_holes
 from speckle3d.imaging.voxels.volume import compound
-from speckle3d.io.sweep_writer import SweepWriter
 
 GRID = ImageGrid(640, 480, 0.1, 0.1)
 VOXELS = VoxelGrid((273, 193, 240), (0.25, 0.25, 0.25), RigidTransform.identity())
@@ -50,7 +42,6 @@ FEW = 12
 TARGETS = {"nearest": 400, "linear": 120}
 IGSIO = {("nearest", 1): 172, ("nearest", 2): 207, ("linear", 1): 15, ("linear", 2): 28}
 """Million pixels per second, with the mean, by threads: IGSIO of 2024, measured elsewhere."""
-LARGE_FRAMES, LARGE_MM, LARGE_VOXEL_MM, LARGE_GB = 6600, 82.0, 0.05, 3.0
 
 
 def sweep(frames: int, length_mm: float) -> RigidTransform:
@@ -96,9 +87,7 @@ def others(images: np.ndarray, poses: RigidTransform, runs: int) -> list[Row]:
     value = images.size / best.seconds / 1e6
     rows = []
     for name, function, frames in (
-        ("NumPy add.at", by_add_at, FEW),
         ("NumPy bincount", by_bincount, FEW),
-        ("vtkGaussianSplatter", by_vtk, FEW),
         ("SimpleITK resample of a stack", by_simpleitk, FRAMES),
     ):
         some = np.linspace(0, FRAMES - 1, frames).astype(int)
@@ -122,47 +111,12 @@ def flat_of(pose: RigidTransform) -> np.ndarray:
     return np.where(((index >= 0) & (index < VOXELS.shape)).all(axis=1), flat, np.prod(VOXELS.shape))
 
 
-def by_add_at(images: np.ndarray, poses: RigidTransform) -> float:
-    total, count = np.zeros((2, np.prod(VOXELS.shape) + 1))
-    began = time.perf_counter()
-    for image, pose in zip(images, poses, strict=True):
-        flat = flat_of(pose)
-        np.add.at(total, flat, image.ravel())
-        np.add.at(count, flat, 1.0)
-    total /= np.maximum(count, 1)
-    return time.perf_counter() - began
-
-
 def by_bincount(images: np.ndarray, poses: RigidTransform) -> float:
     size = int(np.prod(VOXELS.shape)) + 1
     began = time.perf_counter()
     flat = np.concatenate([flat_of(pose) for pose in poses])
     total, count = np.bincount(flat, images.ravel(), size), np.bincount(flat, minlength=size)
     total /= np.maximum(count, 1)
-    return time.perf_counter() - began
-
-
-def by_vtk(images: np.ndarray, poses: RigidTransform) -> float:
-    began = time.perf_counter()
-    index = np.concatenate([index_of(pose) for pose in poses]).astype(np.float32)
-    inside = ((index > -0.49) & (index < np.array(VOXELS.shape) - 0.51)).all(axis=1)
-    index, levels = np.clip(index[inside], 0, np.array(VOXELS.shape) - 1), images.ravel()[inside]
-    points, data = vtk.vtkPoints(), vtk.vtkPolyData()
-    points.SetData(numpy_to_vtk(index))
-    data.SetPoints(points)
-    data.GetPointData().SetScalars(numpy_to_vtk(levels))
-    splatter = vtk.vtkGaussianSplatter()
-    splatter.SetInputData(data)
-    splatter.SetSampleDimensions(*VOXELS.shape)
-    splatter.SetModelBounds(*(edge for n in VOXELS.shape for edge in (0, n - 1)))
-    splatter.SetRadius(0.5 / (max(VOXELS.shape) - 1))
-    splatter.SetExponentFactor(0.0)
-    splatter.NormalWarpingOff()
-    splatter.SetAccumulationModeToSum()
-    splatter.Update()
-    total = vtk_to_numpy(splatter.GetOutput().GetPointData().GetScalars()).sum()
-    # A ball of half a voxel is 52 % of it.
-    assert 0.4 < total / levels.sum() < 0.7, f"vtkGaussianSplatter: sum {total:g} of {levels.sum():g}"
     return time.perf_counter() - began
 
 
@@ -186,38 +140,9 @@ def filling(images: np.ndarray, poses: RigidTransform, runs: int) -> Row:
     return Row(f"{holes / 1e6:.1f} million holes filled within 3 voxels", holes / seconds / 1e6, "Mvoxel/s")
 
 
-def large(folder: Path) -> Row:
-    """Peak memory of the whole command on a sweep of 2 GB into a volume of 2 GB."""
-    path, out = folder / "large.h5", folder / "large.nrrd"
-    rng = np.random.default_rng(0)
-    u, v = np.linspace(0, 9, GRID.vectors)[:, None], np.linspace(0, 7, GRID.samples)
-    with SweepWriter(path, GRID, BModeSettings(60.0), np.uint8, compression=None) as writer:
-        for frame in range(LARGE_FRAMES):
-            noise = rng.integers(-20, 20, GRID.samples)
-            image = 127 + 100 * np.sin(u + 0.01 * frame) * np.cos(v) + noise
-            writer.append(image.astype(np.uint8), 0.04 * frame)
-        writer.write_truth(sweep(LARGE_FRAMES, LARGE_MM))
-    command = [sys.executable, "-m", "speckle3d.cli", "volume", str(path), "-o", str(out)]
-    began = time.perf_counter()
-    pid = os.posix_spawn(sys.executable, [*command, "--voxel-mm", str(LARGE_VOXEL_MM)], os.environ)
-    _, status, usage = os.wait4(pid, 0)
-    spent = time.perf_counter() - began
-    assert status == 0, f"status {status}"
-    what = f"volume, {path.stat().st_size / 1e9:.2f} GB into {out.stat().st_size / 1e9:.2f} GB packed"
-    return Row(
-        f"{what}, in {spent:.0f} s: peak memory",
-        usage.ru_maxrss * 1024 / 1e9,
-        "GB",
-        target=LARGE_GB,
-        falling=True,
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--large", action="store_true", help="also a sweep of 2 GB into a volume of 2 GB")
-    parser.add_argument("--folder", type=Path, help="for the files of --large (temporary)")
     options = parser.parse_args()
     images = np.random.default_rng(1).integers(0, 256, (FRAMES, GRID.vectors, GRID.samples), dtype=np.uint8)
     poses = sweep(FRAMES, 56.0)
@@ -226,9 +151,6 @@ def main() -> None:
         *others(images, poses, options.runs),
         filling(images, poses, options.runs),
     ]
-    if options.large:
-        with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-            rows.append(large(Path(folder)))
     print_table(rows)
 
 

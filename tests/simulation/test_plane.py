@@ -177,14 +177,3 @@ def test_crossing_threads_echo_where_the_truth_says():
         # Only threads seen along their length come near the crossing's echo, where two of them add up.
         assert near.max() > 0.5 * echo.max()
         assert near.max() > 30.0 * np.median(echo)
-
-
-def test_the_beam_is_as_thick_as_its_aperture_makes_it(beam):
-    width = oracles.elevational_width_mm(beam)
-    # Two-way amplitude of a uniform aperture a at its focus F is sinc(a z / (wavelength F))^2, at half height
-    # 0.886 wavelength F / a across; the pulse is broad and the lens weak, hence a tenth.
-    wavelength, probe = 1.54 / 7.5, beam.probe
-    theory = 0.886 * wavelength * probe.elevation_focus_mm / probe.elevation_aperture_mm
-    assert np.interp(20.0, beam.depth_mm, width) == pytest.approx(theory, rel=0.15)
-    # Far beyond the focus it spreads in proportion to the distance from about the focus.
-    assert np.interp(40.0, beam.depth_mm, width) > 2.0 * theory

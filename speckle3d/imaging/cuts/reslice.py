@@ -130,7 +130,7 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
 
     def fill(first: int, stop: int) -> None:
         band = slice(first, stop)
-        cut_voxels(volume.voxels, held, index_from_world, lines[band], out[band])
+        cut_voxels(volume.voxels.T, held.T, index_from_world, lines[band], out[band])
 
     in_parallel(fill, len(lines), _GRAIN)
     return np.ascontiguousarray(out.T)

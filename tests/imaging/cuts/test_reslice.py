@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.cuts.planes import ReslicePlane, depth_line, lateral_line, planes_from_first_frame
+from speckle3d.imaging.cuts.planes import ReslicePlane, lateral_line, planes_from_first_frame
 from speckle3d.imaging.cuts.reslice import reslice_frames
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
@@ -63,17 +63,6 @@ def test_matches_brute_force_for_any_plane(seed, max_distance_mm, moderate):
     np.testing.assert_allclose(got, expected, atol=1e-3)
 
 
-def test_plane_of_an_image_returns_that_image():
-    rng = np.random.default_rng(3)
-    grid = ImageGrid(9, 14, 0.3, 0.3, 0.7)
-    poses = shaky_sweep(rng, 5, 0.5)
-    images = rng.normal(size=(5, 9, 14)).astype(np.float32)
-    corner = RigidTransform.from_translation([0.0, 0.7, 0.0])
-    plane = ReslicePlane(poses[2] * corner, grid.width_mm, grid.depth_mm - 0.7, 0.3)
-    got = reslice_frames(images, grid, poses, plane, 1e-3)
-    np.testing.assert_allclose(got, images[2].T, atol=1e-5)
-
-
 def test_tilted_bright_plane_appears_where_it_is():
     """A bright sheet through an irregular sweep: its crest in the reslice against its equation."""
     poses = shaky_sweep(np.random.default_rng(0), 80, 0.25)
@@ -93,16 +82,6 @@ def test_tilted_bright_plane_appears_where_it_is():
     assert np.abs(crest_mm).max() < 0.05
 
 
-def test_probe_turned_round_still_brackets():
-    """The second image faces the other way: the pixel midway is the mean of both, not the nearer one."""
-    turned = RigidTransform.from_components([4.0, 0.0, 1.0], Rotation.from_rotvec([0, np.pi, 0]))
-    there = RigidTransform.from_translation([0.0, 0.0, 0.0])
-    poses = RigidTransform.concatenate([there, there, turned])
-    images = [np.full((9, 14), level) for level in (1.0, 1.0, 3.0)]
-    plane = ReslicePlane(RigidTransform.from_translation([1.0, 2.0, 0.5]), 1.0, 1.0, 0.5)
-    np.testing.assert_allclose(reslice_frames(images, GRID, poses, plane, 0.9), 2.0, atol=1e-6)
-
-
 def test_reads_only_frames_that_matter_and_one_at_a_time():
     asked = []
 
@@ -115,20 +94,6 @@ def test_reads_only_frames_that_matter_and_one_at_a_time():
     cut = reslice_frames(read, GRID, poses, plane, 1.0)
     assert asked == [20, 21]
     np.testing.assert_allclose(cut, 20.25, atol=1e-5)
-
-
-def test_sweep_planes_cover_the_sweep_and_keep_its_length():
-    z = np.concatenate([np.arange(0, 20, 0.5), np.arange(20, 0, -0.5)])
-    turned = Rotation.from_euler("ZYX", [0.4, -0.7, 1.0])
-    world = RigidTransform.from_components([30.0, -5.0, 12.0], turned)
-    poses = world * RigidTransform.from_translation(np.outer(z, [0, 0, 1]))
-    side, top = plane_along(poses, lateral_line(GRID, 1.5)), plane_along(poses, depth_line(GRID, 2.0))
-    assert (side.width_mm, side.height_mm) == pytest.approx((20.0, GRID.depth_mm - 0.7))
-    assert (top.width_mm, top.height_mm) == pytest.approx((20.0, GRID.width_mm))
-    axes = (world.inv() * side.world_from_plane).rotation.as_matrix()
-    np.testing.assert_allclose(axes[:, :2], [[0, 0], [0, 1], [1, 0]], atol=1e-12)
-    origin = (world.inv() * top.world_from_plane).translation
-    np.testing.assert_allclose(origin, [0.0, 2.0, 0.0], atol=1e-12)
 
 
 def test_sphere_has_its_centre_and_diameter():

@@ -62,28 +62,6 @@ def test_standard_errors_are_those_of_repeated_draws():
     np.testing.assert_allclose(np.std(values, axis=0), claimed, rtol=0.05)
 
 
-def test_an_error_of_scale_makes_lengths_along_the_sweep_as_uncertain():
-    poses = WORLD * RigidTransform.from_translation(np.column_stack([np.zeros((11, 2)), np.arange(11.0)]))
-    factors = np.zeros((1, 11, 6))
-    factors[0, :, 2] = 0.03 * np.arange(11)
-    errors = PosedErrors(PoseErrors(factors), poses, GRID.centre_mm)
-    # Between frames 2 and 3, and on frame 8.
-    points = poses[0].apply([[5.0, 10.0, 2.4], [5.0, 10.0, 8.0]])
-    (row,) = measured(points, belonging_of(points, GRID, poses), errors, 0.0)
-    assert row.pose_sigma == pytest.approx(0.03 * 5.6)
-    assert row.interval == pytest.approx((5.6 - 1.959964 * 0.168, 5.6 + 1.959964 * 0.168))
-
-
-@pytest.mark.parametrize("of", [length, angle])
-def test_derivatives_are_those_of_small_steps(of):
-    points = np.random.default_rng(3).normal(size=(3, 3)) * 10
-    _, gradient = of(points)
-    for k in np.ndindex(3, 3):
-        step = np.zeros((3, 3))
-        step[k] = 1e-6
-        assert gradient[k] == pytest.approx((of(points + step)[0] - of(points - step)[0]) / 2e-6, abs=1e-7)
-
-
 def test_points_outside_the_sweep_are_refused_by_number():
     poses = swept()
     centre = poses[10].apply(GRID.centre_mm)

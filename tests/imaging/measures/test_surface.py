@@ -133,16 +133,6 @@ def test_errors_of_volume_and_area_are_those_of_repeated_draws():
     np.testing.assert_allclose(np.std(sizes, axis=0), claimed, rtol=0.1)
 
 
-def test_a_stretched_sweep_has_its_volumes_stretched_alike():
-    grid = ImageGrid(51, 51, 0.2, 0.2)
-    poses = RigidTransform.from_translation(np.column_stack([np.zeros((41, 2)), 0.25 * np.arange(41)]))
-    factors = np.zeros((1, 41, 6))
-    factors[0, :, 2] = 0.05 * 0.25 * np.arange(41)
-    surface = surface_of(ball(3.0, (41, 41, 41), placed=RigidTransform.identity())[0], 0.0)
-    told = measures_of(surface, PosedErrors(PoseErrors(factors), poses, grid.centre_mm), grid)
-    assert told.volume_sigma_mm3 == pytest.approx(0.05 * told.volume_mm3, rel=1e-6)
-
-
 def test_levels_and_volumes_that_have_no_surface_are_refused():
     volume, _ = ball()
     with pytest.raises(InvalidInputError):

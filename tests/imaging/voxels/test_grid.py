@@ -58,18 +58,6 @@ def test_what_is_asked_for_is_had_to_the_last_bit(seed, spacing, origin, shape):
     assert grid_around(GRID, poses, spacing, origin_mm=origin, size_mm=size).shape == shape
 
 
-def test_what_is_not_asked_for_holds_the_images():
-    poses, axes = sweep(np.random.default_rng(3), 20)
-    around = grid_around(GRID, poses, 0.5, axes)
-    sized = grid_around(GRID, poses, 0.5, world_from_axes=axes, size_mm=(10.1, 20.0, 0.2))
-    assert sized.shape == (21, 40, 1)
-    np.testing.assert_array_equal(sized.world_from_grid.translation, around.world_from_grid.translation)
-    # From an origin 7 voxels in, the far side stays where it was.
-    inside = around.world_from_grid.apply([3.5, 3.5, 3.5])
-    placed = grid_around(GRID, poses, 0.5, world_from_axes=axes, origin_mm=inside)
-    assert placed.shape == tuple(n - 7 for n in around.shape)
-
-
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), gigabytes=st.floats(1e-7, 10.0))
 def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):

@@ -5,16 +5,10 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core import threads
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
-from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.voxels.grid import grid_around
 from speckle3d.imaging.voxels.holes import boxes_within, fill_holes
-from speckle3d.imaging.voxels.settings import CompoundingSettings
-from speckle3d.imaging.voxels.volume import compound_onto
 
 
 def some_voxels(rng, shape, share_measured):
@@ -73,22 +67,6 @@ def test_boxes_in_mm_are_those_of_brute_force(seed, spacing, radius_mm):
     fill_holes(voxels, state, boxes)
     np.testing.assert_array_equal(state, expected[1])
     np.testing.assert_array_equal(voxels[state == FILLED], expected[0][state == FILLED])
-
-
-def test_compounding_fills_as_far_in_mm_along_each_axis():
-    # Two images, 2 mm apart, of voxels much longer along the sweep than across; then the other way round.
-    grid = ImageGrid(11, 11, 0.2, 0.2)
-    poses = RigidTransform.from_translation([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
-    for spacing in ((0.2, 0.2, 0.5), (0.5, 0.2, 0.2)):
-        voxels = grid_around(grid, poses, spacing, origin_mm=(-1.0, -1.0, -1.0), size_mm=(4.0, 4.0, 4.0))
-        settings = CompoundingSettings(fill_mm=0.6, voxel_type="float32")
-        state = compound_onto(voxels, PosedImages(np.ones((2, 11, 11)), grid, poses), settings).state.T
-        for axis, step in zip((2, 1, 0), spacing, strict=True):
-            at = np.moveaxis(np.indices(state.shape), 0, -1)[state == MEASURED][:, axis] * step
-            filled = np.moveaxis(np.indices(state.shape), 0, -1)[state == FILLED][:, axis] * step
-            # From the outermost measured voxels on, as far as whole voxels within 0.6 mm go.
-            assert at.min() - filled.min() == pytest.approx(step * np.floor(0.6 / step + 1e-9))
-            assert filled.max() - at.max() == pytest.approx(step * np.floor(0.6 / step + 1e-9))
 
 
 def test_any_number_of_threads_gives_the_same(many_threads):

@@ -6,7 +6,6 @@ import pytest
 from igsio_twin import Clip
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.volume import compound
@@ -63,32 +62,3 @@ def test_the_rule_plus_is_the_twin(splat, seed):
         ours = stack.ours(**how)
         np.testing.assert_array_equal(ours.state > 0, weight > 0)
         np.testing.assert_array_equal(ours.voxels, np.where(weight > 0, volume, 0))
-
-
-def in_one_voxel(levels, splat="nearest"):
-    """Level of a voxel whose centre all pixels of a row lie at, one after another."""
-    levels = np.asarray(levels, np.uint8)
-    voxels = VoxelGrid((2, 2, 2), (1.0, 1.0, 1.0), RigidTransform.identity())
-    volume = compound(
-        levels[None, :, None], ImageGrid(levels.size, 1, 1e-9, 1e-9), RigidTransform.identity(1),
-        voxel_grid=voxels, fill_radius=0, splat=splat, rule="plus", voxel_type="uint8",
-    )  # fmt: skip
-    assert (volume.state > 0).sum() == 1
-    linear, clip = splat == "linear", Clip((0, levels.size), (0, 1))
-    twin, _ = igsio_twin.paste(levels[None, None], np.zeros((1, 3, 4)), (2, 2, 2), clip, linear)
-    assert twin[0, 0, 0] == volume.voxels[0, 0, 0]
-    return volume.voxels[0, 0, 0]
-
-
-@pytest.mark.parametrize("splat", ["nearest", "linear"])
-def test_weights_end_where_sixteen_bits_do(splat):
-    in_one_voxel(np.random.default_rng(2).integers(0, 256, 600), splat)
-
-
-def test_only_bytes_as_stored_can_be_kept_in_whole_levels():
-    stack = Stack(5 / 16, 1)
-    with pytest.raises(InvalidInputError, match=r"rule plus: expected voxels of type uint8, .* got float32"):
-        stack.ours(rule="plus")
-    stack.images = stack.images.astype(np.float32)
-    with pytest.raises(InvalidInputError, match=r"rule plus: expected images of type uint8, .* got float32"):
-        stack.ours(rule="plus", voxel_type="uint8")

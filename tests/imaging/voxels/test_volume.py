@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.voxels.volume import compound
 
@@ -24,15 +24,6 @@ def voxel_centres(volume):
     return volume.world_from_grid.apply(index * volume.spacing_mm).reshape(*volume.shape, 3)
 
 
-def test_axes_are_lateral_axial_elevational_of_the_first_frame():
-    poses = RigidTransform.from_translation(np.outer(np.arange(4.0), [0, 0, 1]))
-    images = [np.full((9, 14), level) for level in range(4)]
-    volume = compound(images, GRID, poses, 0.5, fill_radius=0)
-    assert volume.shape == (9, 9, 7)
-    np.testing.assert_allclose(volume.world_from_grid.translation, [0.0, 0.7, 0.0])
-    np.testing.assert_array_equal(volume.voxels[4, 4], [0, np.nan, 1, np.nan, 2, np.nan, 3])
-
-
 def test_sphere_has_its_centre_and_volume():
     rng = np.random.default_rng(2)
     grid = ImageGrid(41, 121, 0.3, 0.1, 1.0)
@@ -47,11 +38,6 @@ def test_sphere_has_its_centre_and_volume():
     np.testing.assert_allclose(voxel_centres(volume)[inside].mean(axis=0), centre, atol=0.05)
     expected_mm3, skin_mm3 = 4 / 3 * np.pi * radius**3, 4 * np.pi * radius**2 * 0.05
     assert inside.sum() * 0.25**3 == pytest.approx(expected_mm3, abs=skin_mm3)
-
-
-def test_no_values_is_an_error():
-    with pytest.raises(InsufficientDataError):
-        compound(np.full((1, 9, 14), np.nan), GRID, RigidTransform.identity(1), 0.5)
 
 
 def test_absurd_sizes_are_refused_before_a_frame_is_read():

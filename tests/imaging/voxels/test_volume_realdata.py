@@ -20,9 +20,8 @@ from speckle3d.core.labels import MEASURED
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.voxels.grid import VoxelGrid, grid_like
+from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.splatting import splat_images
-from speckle3d.imaging.voxels.volume import compound
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.posed import open_posed
@@ -118,19 +117,6 @@ def opened(folder):
     return source
 
 
-@pytest.fixture(scope="module")
-def by_default(case, realdata):
-    """Makes our own volume of the same images on the same grid."""
-    source = opened(realdata / "plus")
-    how = {
-        "voxel_grid": grid_like(read_volume(reference_path(realdata / "plus", case.name))),
-        "splat": case.splat,
-        "region": case.clip.mask(WIDTH, HEIGHT).T,
-    }
-    images = source.images, source.grid, source.world_from_image
-    return lambda radius: compound(*images, fill_radius=radius, **how)
-
-
 def share_within(levels, ours, theirs, where):
     return (np.abs(ours[where].astype(float) - theirs[where]) <= levels).mean()
 
@@ -176,16 +162,3 @@ def region_of(clip, grid):
     text = "polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in placed)
     np.testing.assert_array_equal(Region.from_text(text).mask(grid), clip.mask(WIDTH, HEIGHT).T)
     return text
-
-
-def test_ours_by_default_beside_plus(case, by_default):
-    """What a user finds who compares them: the same image, PLUS's means in whole grey levels."""
-    ours = by_default(0)
-    both = (ours.state == MEASURED) & case.pasted[1]
-    levels = np.rint(ours.voxels)
-    assert np.corrcoef(levels[both], case.reference[both])[0, 1] > 0.997
-    expected = 0.610 if case.splat == "linear" else 0.686
-    assert share_within(2, levels, case.reference, both) == pytest.approx(expected, abs=0.01)
-    if case.splat == "nearest":
-        lit = both & (levels > 0) & (case.reference > 0)
-        assert share_within(2, levels, case.reference, lit) == pytest.approx(0.341, abs=0.01)
