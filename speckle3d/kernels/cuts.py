@@ -144,7 +144,7 @@ def _neighbours(at: float, last: int) -> tuple[np.uint64, np.uint64, float]:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _between(near: float, far: float, share: float) -> float:
-    return near + share * (far - near)
+    return (1.0 - share) * near + share * far
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)

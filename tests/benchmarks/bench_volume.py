@@ -1,7 +1,8 @@
 """Speed of making voxels of frames, beside others in the same process.
 
 Run: ``python tests/benchmarks/bench_volume.py [--runs 5]`` on a quiet machine. Needs SimpleITK. 300 frames of
-640 x 480 pixels of 0.1 mm, 8 bits each, of a sweep that wavers go into 273 x 193 x 240 voxels of 0.25 mm. A ``!`` marks a target that is missed.
+640 x 480 pixels of 0.1 mm, 8 bits each, of a sweep that wavers go into 273 x 193 x 240 voxels of 0.25 mm.
+A ``!`` marks a target that is missed.
 
 Beside it, on the same frames and voxels or on fewer of the frames where they are slow:
 
