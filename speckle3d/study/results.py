@@ -20,7 +20,6 @@ from pydantic_core import to_json
 
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.printable import printable
 from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
@@ -264,9 +263,7 @@ def require_own(directory: Path, files: FileSet, is_own: bool, what: str) -> Non
 
 
 def json_text(value: Any) -> str:
-    """Dataclasses, arrays and numbers as strict JSON: a value that is not finite becomes null.
-
-    Characters that could drive a terminal are escaped.
+    """Dataclasses, arrays and numbers as strict JSON in ASCII: a value that is not finite becomes null.
 
     Raises
     ------
@@ -274,11 +271,10 @@ def json_text(value: Any) -> str:
         If there is anything else in it.
     """
     try:
-        text = to_json(value, indent=2, inf_nan_mode="null", fallback=_listed).decode()
+        text = to_json(value, inf_nan_mode="null", fallback=_listed)
     except ValueError as error:
         raise InvalidInputError(f"summary: expected what JSON can hold: {error}") from error
-    plain = (c if c == "\n" or printable(c) == c else json.dumps(c)[1:-1] for c in text)
-    return f"{text if text.isascii() else ''.join(plain)}\n"
+    return f"{json.dumps(json.loads(text), indent=2)}\n"
 
 
 def read_summary(folder: Path, name: str) -> Summary:

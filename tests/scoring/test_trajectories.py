@@ -68,8 +68,6 @@ def test_a_reconstruction_is_scored_against_a_sweep(tmp_path):
     )
     # Its provenance names other bytes.
     assert found["same_sweep"] is False
-    exact = compare_trajectories(load_estimate(tmp_path / "r.h5", "pose"), reference)
-    assert (exact["GPE_mm"], exact["APE"].max_mm) == pytest.approx((0.0, 0.0), abs=1e-9)
     # A reconstruction may be the reference, too.
     twice = compare_trajectories(
         load_estimate(tmp_path / "r.h5"), load_reference(tmp_path / "r.h5", mode="pose")

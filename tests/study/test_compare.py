@@ -17,7 +17,7 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.scoring.displacements import point_errors
-from speckle3d.study.compare import StudyProgress, compare_sweeps, named, plan_sweep, run_sweep
+from speckle3d.study.compare import StudyProgress, compare_sweeps, named
 from speckle3d.study.results import SweepOutcome
 from speckle3d.study.schedulers import Scheduler
 
@@ -109,14 +109,6 @@ def test_a_mode_that_a_sweep_has_no_sensor_for_is_its_reason(sweeps, tmp_path):
     asked = compare_sweeps([bare], tmp_path / "asked", ["pose"])
     assert re.search("bare.*tracker", asked.outcomes[0].reason)
     assert stored(compare_sweeps([bare], tmp_path / "all").directory)["modes"] == ["image"]
-
-
-def test_a_file_that_changed_under_the_study_is_its_reason(sweeps, tmp_path):
-    for name in ("s5.h5", "curves.h5"):
-        shutil.copy(sweeps[0].parent / name, tmp_path)
-    job = plan_sweep("s5", tmp_path / "s5.h5", tmp_path, None, Config().to_toml(), None, None, ())
-    shutil.copy(sweeps[2], tmp_path / "s5.h5")
-    assert run_sweep(job).reason.startswith(str(tmp_path / "s5.h5"))
 
 
 def test_a_bug_in_one_sweep_is_its_reason_and_leaves_nothing(sweeps, tmp_path, monkeypatch):
