@@ -59,8 +59,6 @@ class JobResult:
         Errors by part and mode, and details of the reconstruction.
     table : str
         The same errors as text.
-    files : tuple of path
-        What was written.
     seconds : float
         It took.
     curves : DecorrelationCurves or None
@@ -70,7 +68,6 @@ class JobResult:
     directory: Path
     summary: Summary
     table: str
-    files: tuple[Path, ...]
     seconds: float
     curves: DecorrelationCurves | None = None
 
@@ -199,8 +196,7 @@ def run_job(
         draw_strip(strip, every, compared, sweep.name, rows, (part / PICTURES[1], part / PICTURES[2]))
         details["seconds"] = time.perf_counter() - began
         write_summary(part, summary)
-    files = tuple(directory / name for name in (RESULTS.primary, *RESULTS.others))
-    return JobResult(directory, summary, summary_text([summary]), files, details["seconds"], corrected)
+    return JobResult(directory, summary, summary_text([summary]), details["seconds"], corrected)
 
 
 def require_own_results(directory: Path) -> None:

@@ -18,6 +18,7 @@ from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.scoring.displacements import point_errors
 from speckle3d.study.compare import StudyProgress, compare_sweeps, named
+from speckle3d.study.reslices.cut_geometry import read_plane
 from speckle3d.study.results import SweepOutcome
 from speckle3d.study.schedulers import Scheduler
 
@@ -77,6 +78,14 @@ def test_one_number_for_a_length_in_every_output(study):
         (line,) = [x for x in table.read_text().splitlines() if re.match("s5 +f +pose ", x)]
         assert line.split()[3] == f"{row['estimate_mm']:.2f}"
         assert line.split()[4] == f"{1.96 * row['sigma_mm']:.2f}"
+
+
+def test_the_enlarged_part_lies_where_it_does_in_the_whole_cut(study):
+    folder = study.directory / stored(study.directory)["sweeps"][0]["folder"]
+    whole, part = (read_plane(folder / name, "pose").cut for name in ("reslice.png", "enlarged.png"))
+    x, y = part.first_mm
+    there = whole.world_from_mm([x, x + 1.0], [y, y + 2.0])
+    np.testing.assert_allclose(part.world_from_mm([x, x + 1.0], [y, y + 2.0]), there, atol=1e-9)
 
 
 def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tmp_path):

@@ -4,14 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import sweep_examples
 from image_examples import grey, text_of, tracked, write_mha
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.reconstruction import CalibrationFile, Provenance, Reconstruction
 from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.load import recording_sha256
+from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.study.images import sweep_of
 from speckle3d.study.posed import MARK, open_posed, pose_mark, posed_by_itself, require_made_at
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
@@ -88,6 +93,22 @@ def test_a_calibration_of_ours_takes_the_place_of_all_of_it(tmp_path):
     given = ImportSettings(column_pitch_mm=0.3)
     kept = open_posed(tmp_path / "a.mha", settings=given, calibrations=[tmp_path / "c.h5"])
     assert (kept.sweep.grid.vector_pitch_mm, kept.sweep.grid.sample_spacing_mm) == (0.3, 0.21)
+
+
+def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_path):
+    sweep, mounting = sweep_examples.rf_sweep(), RigidTransform.from_translation([1.0, 2.0, 3.0])
+    write_sweep(tmp_path / "s.h5", sweep)
+    calibration = Calibration(
+        "plane", "tracker", mounting.rotation, mounting.translation, None, 1e-6 * np.eye(6), (), 0.1, "mm",
+        9.0, FramesUsed(3, (0, 1, 2)),
+    )  # fmt: skip
+    write_calibration(tmp_path / "c.h5", calibration)
+    used = tuple(CalibrationFile("tracker", str(tmp_path / name), "") for name in ("c.h5", "gone.h5"))
+    made = Provenance("", recording_sha256(tmp_path / "s.h5"), "1", used)
+    opened = sweep_of(
+        Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, made), tmp_path / "s.h5"
+    )
+    np.testing.assert_allclose(opened.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())
 
 
 def test_a_volume_made_at_other_poses_is_told_apart():
