@@ -46,9 +46,6 @@ FORMAT = "speckle3d.reconstruction"
 _PAIR_ROWS = ("first", "second", "first_from_second", "covariance", "distance_mm", "sigma_mm", "used")
 """Data sets of /pairs with a row for each pair."""
 
-_EARLIER = {"consistent-subset": "image+subset"}
-"""Names of modes in older files."""
-
 
 class ReconstructionWriter(HDF5Writer):
     """Write a reconstruction file: open it before the work, append pairs as they come, finish it.
@@ -194,10 +191,7 @@ def _read_provenance(file: h5py.File) -> Provenance:
 
 def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
     group = require_group(file, "poses")
-    names = {mode: mode if has_member(group, mode) else _EARLIER.get(mode, mode) for mode in MODES}
-    return {
-        mode: read_transforms(group, name, frames) for mode, name in names.items() if has_member(group, name)
-    }
+    return {mode: read_transforms(group, mode, frames) for mode in MODES if has_member(group, mode)}
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:

@@ -179,22 +179,25 @@ def test_nifti_is_in_its_own_unit(tmp_path, kind, unit, factor):
     )
 
 
-@pytest.mark.parametrize(
-    ("line", "spacing"),
-    [('spacings: 0.02 0.03 0.04\nunits: "cm" "cm" "cm"', (0.2, 0.3, 0.4)), (
-        'space: left-posterior-superior\nspace directions: (0.0002,0,0) (0,0.0003,0) (0,0,0.0004)\n'
-        'space units: "m" "m" "m"', (0.2, 0.3, 0.4)),
-        ("spacings: 0.2 0.3 0.4", (0.2, 0.3, 0.4))],
-)  # fmt: skip
-def test_nrrd_is_in_its_own_unit(tmp_path, line, spacing):
+NRRD = "NRRD0005\ntype: uint8\ndimension: 3\nsizes: 2 3 4\nkinds: domain domain domain\n{}\nencoding: raw\n\n"
+
+
+@pytest.mark.parametrize("space", ["left-posterior-superior", "right-anterior-superior"])
+def test_a_volume_of_nrrd_is_where_itk_finds_it(tmp_path, space):
+    axes = "space directions: (0.2,0,0) (0,0.3,0) (0,0,0.4)\nspace origin: (1,2,3)"
+    (tmp_path / "v.nrrd").write_bytes(NRRD.format(f"space: {space}\n{axes}").encode() + bytes(range(24)))
+    affine, _ = by_itk(tmp_path / "v.nrrd")
+    np.testing.assert_allclose(read_volume(tmp_path / "v.nrrd").world_from_index, affine)
+
+
+@pytest.mark.parametrize("axes", [
+    'spacings: 0.02 0.03 0.04\nunits: "cm" "cm" "cm"',
+    'space: LPS\nspace directions: (0.02,0,0) (0,0.03,0) (0,0,0.04)\nspace units: "cm" "cm" "cm"',
+])  # fmt: skip
+def test_nrrd_is_in_its_own_unit(tmp_path, axes):
     path = tmp_path / "v.nrrd"
-    header = (
-        "NRRD0005\ntype: uint8\ndimension: 3\nsizes: 2 3 4\nkinds: domain domain domain\n"
-        f"{line}\nencoding: raw\n\n"
-    )
-    path.write_bytes(header.encode() + bytes(range(24)))
-    np.testing.assert_allclose(read_volume(path).spacing_mm, spacing)
-    path.write_bytes(header.replace('"cm"', '"furlong"').replace('"m"', '"furlong"').encode() + bytes(24))
-    if "units" in line:
-        with pytest.raises(InvalidInputError, match="furlong"):
-            read_volume(path)
+    path.write_bytes(NRRD.format(axes).encode() + bytes(24))
+    np.testing.assert_allclose(read_volume(path).spacing_mm, (0.2, 0.3, 0.4))
+    path.write_bytes(NRRD.format(axes.replace("cm", "furlong")).encode() + bytes(24))
+    with pytest.raises(InvalidInputError, match="furlong"):
+        read_volume(path)
