@@ -23,7 +23,7 @@ from calibration.plane import Equations, Solution, least_squares
 from calibration.points import ImagePoints
 from calibration.settings import Registration, WireFit
 from calibration.wires import calibrate_wires
-from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.wires import WirePhantom
 
@@ -84,8 +84,7 @@ def calibrate_registered(
             refusals.append(error)
     if not whole:
         raise refusals[0]
-    blocks = _blocks(points)
-    choice = choose({name: _missed_mm(solution, blocks) for name, solution in whole.items()})
+    choice = choose({name: _missed_mm(solution) for name, solution in whole.items()})
     return whole[choice.registration], choice
 
 
@@ -107,15 +106,11 @@ def choose(missed_mm: Mapping[Registration, FloatArray]) -> Choice:
     return Choice(simplest, means, worse)
 
 
-def _blocks(points: ImagePoints) -> list[BoolArray]:
-    """The points of each block of successive frames."""
-    return [np.isin(points.frame, frames) for frames in np.array_split(points.frames, FOLDS)]
-
-
-def _missed_mm(solution: Solution, blocks: list[BoolArray]) -> FloatArray:
-    """Mean distance of the dots of each block from their wires, by the other blocks' calibration."""
+def _missed_mm(solution: Solution) -> FloatArray:
+    """Mean distance of the dots of each block of frames from their wires, by what the others say."""
     points, phantom, missed = solution.points, solution.phantom, []
-    for out in blocks:
+    for frames in np.array_split(points.frames, FOLDS):
+        out = np.isin(points.frame, frames)
         kept = Equations.of(points[solution.used & ~out], phantom)
         chain = least_squares(kept, solution.chain, solution.free)
         left = Equations.of(points[out], phantom).residuals(chain)

@@ -75,7 +75,10 @@ def repeatability(
     sd = np.sqrt(np.sum(angles**2, axis=0) / (len(calibrations) - 1))
     if size_px is None or any(one.translation_mm is None for one in calibrations):
         return Repeatability(len(calibrations), sd, None, None, None)
-    places = np.stack([_centre_and_corners(one, size_px) for one in calibrations])
+    # The image's centre and its corners in the sensor's frame.
+    shares = np.array([[0.5, 0.5], [0, 0], [1, 0], [1, 1], [0, 1]])
+    flat = np.column_stack([shares * (np.array(size_px) - 1), np.zeros(5), np.ones(5)])
+    places = np.stack([(flat @ one.pixel_matrix().T)[:, :3] for one in calibrations])
     apart = np.linalg.norm(places - places.mean(axis=0), axis=2)
     scatter = np.sqrt(np.sum(apart**2, axis=0) / (len(calibrations) - 1))
     shift = np.linalg.norm(places[1:, 0] - places[0, 0], axis=1)
@@ -87,14 +90,6 @@ def rotation_errors(rotations: Sequence[Rotation]) -> FloatArray:
     """Deviations from the mean rotation as roll, yaw and tilt, rad, shape (n, 3)."""
     every = Rotation.concatenate(rotations)
     return np.asarray((every.mean().inv() * every).as_rotvec()[:, ::-1])
-
-
-def _centre_and_corners(calibration: Calibration, size_px: tuple[int, int]) -> FloatArray:
-    columns, rows = size_px
-    shares = np.array([[0.5, 0.5], [0, 0], [1, 0], [1, 1], [0, 1]])
-    pixels = shares * [columns - 1, rows - 1]
-    flat = np.column_stack([pixels, np.zeros(5), np.ones(5)])
-    return np.asarray((flat @ calibration.pixel_matrix().T)[:, :3])
 
 
 def validate(solution: Solution, points: ImagePoints) -> FloatArray:

@@ -68,7 +68,11 @@ def as_calibration(
         With the frames in which nothing was found or that no sensor reading covers. Those that the solver
         left out are added.
     """
-    angular = solution.angular
+    angular, dropped = solution.angular, dict(frames.dropped)
+    for number in np.unique(solution.points.frame[~solution.used]):
+        worst = float(np.abs(solution.residuals[solution.points.frame == number]).max())
+        size = f"{np.rad2deg(worst):.1f} degrees" if angular else f"{worst:.1f} mm"
+        dropped[int(number)] = f"contradicts the other frames by {size}"
     chain, pose = solution.chain, IMAGE_POSE[:3] if angular else IMAGE_POSE
     return Calibration(
         method=method,
@@ -81,7 +85,7 @@ def as_calibration(
         rms=solution.rms,
         rms_unit="rad" if angular else "mm",
         condition_number=solution.condition_number,
-        frames=_frames_used(solution, frames),
+        frames=FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), dropped),
         time_offset_s=time_offset_s,
         verdict=solution.adequacy.verdict,
     )
@@ -100,25 +104,10 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
     turn[8:11, 13:10:-1] = -skew(np.asarray(solution.chain.target_from_world.translation)[None])[0]
     covariance = turn @ solution.full_covariance @ turn.T
     errors = dict(zip(CHAIN, np.sqrt(np.diag(covariance)), strict=True))
+    units = {name: "mm/pixel" if name in SCALES else "mm" if name[0] in "xyz" else "rad" for name in CHAIN}
     return tuple(
-        Parameter(name, float(values[name]), float(errors[name]), _unit(name)) for name in solution.free
+        Parameter(name, float(values[name]), float(errors[name]), units[name]) for name in solution.free
     )
-
-
-def _unit(name: str) -> str:
-    if name in SCALES:
-        return "mm/pixel"
-    return "mm" if name[0] in "xyz" else "rad"
-
-
-def _frames_used(solution: Solution, frames: FramesUsed) -> FramesUsed:
-    """Add the frames that contradict the others, with their residuals."""
-    dropped = dict(frames.dropped)
-    for number in np.unique(solution.points.frame[~solution.used]):
-        worst = float(np.abs(solution.residuals[solution.points.frame == number]).max())
-        size = f"{np.rad2deg(worst):.1f} degrees" if solution.angular else f"{worst:.1f} mm"
-        dropped[int(number)] = f"contradicts the other frames by {size}"
-    return FramesUsed(frames.given, tuple(solution.points_used.frames.tolist()), dropped)
 
 
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
@@ -132,11 +121,9 @@ def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
         for name, angle, error in zip(ANGLES_IN_WORDS, angles, errors, strict=True)
     ]
     used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
+    left = "RMS residual" if calibration.rms_unit else "correlation lost"
     rows += [
-        (
-            "RMS residual" if calibration.rms_unit else "correlation lost",
-            *readable(calibration.rms, calibration.rms_unit),
-        ),
+        (left, *readable(calibration.rms, calibration.rms_unit)),
         ("condition number", f"{calibration.condition_number:.1f}", ""),
         ("frames used", used, ""),
     ]
@@ -149,7 +136,12 @@ def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: Sequence[str] = ()) -> str:
     """Aligned table, the matrix in PLUS's form, and what a thick beam would do."""
-    lines = text_rows(rows_of(calibration)).splitlines() + _left_out(calibration)
+    lines = text_rows(rows_of(calibration)).splitlines()
+    if dropped := sorted(calibration.frames.dropped.items()):
+        named = [f"  {number}: {reason}" for number, reason in dropped[:_MOST_NAMED]]
+        more = len(dropped) - _MOST_NAMED
+        lines += ["", "Frames left out:", *named]
+        lines += [f"  and {more} more, which the calibration file names"] if more > 0 else []
     if calibration.translation_mm is not None and calibration.pixel_mm is not None:
         lines += ["", "ImageToProbe (pixels to mm, as PLUS and 3D Slicer have it):"]
         lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in calibration.pixel_matrix()]
@@ -165,16 +157,6 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
             "a thin bar that stays in the middle of the beam has none.",
         ]
     return "\n".join([*lines, *(["", *notes] if notes else [])]) + "\n"
-
-
-def _left_out(calibration: Calibration) -> list[str]:
-    """The numbers of the frames left out, with the reason of each."""
-    dropped = sorted(calibration.frames.dropped.items())
-    if not dropped:
-        return []
-    lines = ["", "Frames left out:", *(f"  {number}: {reason}" for number, reason in dropped[:_MOST_NAMED])]
-    more = len(dropped) - _MOST_NAMED
-    return [*lines, f"  and {more} more, which the calibration file names"] if more > 0 else lines
 
 
 def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict[str, Any]:
@@ -208,90 +190,47 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
     figure = Figure(figsize=(12.0, 7.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
-    # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
-    aspect = float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0])
-    for axes, shot in zip(panels[0], [*shots, None, None, None][:3], strict=True):
-        _draw_shot(axes, shot, aspect)
-    _draw_residuals(panels[1, 0], solution)
-    _draw_against_tilt(panels[1, 1], solution)
-    _draw_motion(panels[1, 2], solution)
+    for axes in panels[0]:
+        axes.set_axis_off()
+    for axes, shot in zip(panels[0], shots, strict=False):
+        # For an orientation sensor, only the ratio of the pixel sizes is known; no more is needed.
+        _draw_shot(axes, shot, float(solution.chain.pixel_mm[1] / solution.chain.pixel_mm[0]))
+    worst = np.abs(solution.residuals).argmax(axis=1)
+    values = solution.residuals[np.arange(len(worst)), worst]
+    values, unit = (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
+    turns = solution.chain.target_from_image(solution.points).rotation
+    tilt, yaw, roll = np.rad2deg((turns.mean().inv() * turns).as_rotvec()).T
+    used, (by_frame, by_tilt, motion) = solution.used, panels[1]
+    by_frame.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
+    by_frame.plot(solution.points.frame[~used], values[~used], "x", color=DROPPED, ms=4)
+    size = float(np.abs(values[used]).std() + 1e-12)
+    reach = np.clip(1.1 * float(np.abs(values).max()), 8.0 * size, 30.0 * size)
+    by_frame.set(xlabel="frame", ylabel=f"largest residual of a point / {unit}", ylim=(-reach, reach))
+    # Here a thick beam shows as a V.
+    by_tilt.plot(tilt[used], values[used], ".", color=USED, ms=3)
+    by_tilt.set(xlabel="tilt / deg", ylabel=f"largest residual / {unit}")
+    drawn = motion.scatter(tilt[used], roll[used], c=yaw[used], s=6)
+    figure.colorbar(drawn, ax=motion, label="yaw / deg")
+    motion.set(xlabel="tilt / deg", ylabel="roll / deg")
+    motion.set_title("\n".join(["how the probe was turned", *filter(None, [solution.assumed])]), fontsize=9)
     for axes in panels[1]:
         axes.grid(alpha=0.3)
     figure.suptitle(fill(calibration.verdict, 150), fontsize=9)
-    figure.supxlabel(_colours(shots), fontsize=8)
+    figure.supxlabel(
+        "blue: found in the image, and used; red: left out (residuals: x); red +: where lines may cross",
+        fontsize=8,
+    )
     return figure
 
 
-def _colours(shots: Sequence[Shot]) -> str:
-    """What the colours and marks of the page mean."""
-    told = ["blue: found in the image, and used", "red: left out (x in the residuals)"]
-    if any(len(shot.candidates_px) for shot in shots):
-        told.append("red +: other places where lines may cross")
-    return "; ".join(told)
-
-
-def _draw_shot(axes: Axes, shot: Shot | None, aspect: float) -> None:
-    axes.set_xticks([])
-    axes.set_yticks([])
-    if shot is None:
-        axes.set_axis_off()
-        return
+def _draw_shot(axes: Axes, shot: Shot, aspect: float) -> None:
+    """An image, with the line or the dots found in it."""
     axes.imshow(np.asarray(shot.image).T, cmap="gray", aspect=aspect)
     colour = DROPPED if shot.note else USED
     axes.plot(*shot.candidates_px.T, "+", color=DROPPED, ms=5, mew=0.7)
-    if len(shot.marks_px):
-        columns, rows = shot.marks_px.T
-        if shot.as_line:
-            slope = (rows[-1] - rows[0]) / (columns[-1] - columns[0])
-            across = np.array([0.0, shot.image.shape[0] - 1.0])
-            axes.plot(across, rows[0] + slope * (across - columns[0]), color=colour, lw=1.0)
-        else:
-            axes.plot(columns, rows, "o", mfc="none", color=colour, ms=8)
-        axes.set_xlim(0, shot.image.shape[0] - 1)
-        axes.set_ylim(shot.image.shape[1] - 1, 0)
+    if shot.as_line and len(shot.marks_px):
+        axes.axline(shot.marks_px[0], shot.marks_px[-1], color=colour, lw=1.0)
+    else:
+        axes.plot(*shot.marks_px.T, "o", mfc="none", color=colour, ms=8)
+    axes.set(xlim=(0, shot.image.shape[0] - 1), ylim=(shot.image.shape[1] - 1, 0))
     axes.set_title(f"frame {shot.frame}" + (f"\n{shot.note[:60]}" if shot.note else ""), fontsize=8)
-
-
-def _draw_residuals(axes: Axes, solution: Solution) -> None:
-    values, unit = _shown(solution)
-    used = solution.used
-    axes.plot(solution.points.frame[used], values[used], ".", color=USED, ms=3)
-    axes.plot(solution.points.frame[~used], values[~used], "x", color=DROPPED, ms=4)
-    if used.any():
-        size = float(np.abs(values[used]).std() + 1e-12)
-        reach = np.clip(1.1 * float(np.abs(values).max()), 8.0 * size, 30.0 * size)
-        axes.set_ylim(-reach, reach)
-    axes.set(
-        xlabel="frame", ylabel=f"largest residual of a point / {unit}", title="what is left over, by frame"
-    )
-
-
-def _draw_against_tilt(axes: Axes, solution: Solution) -> None:
-    """Residuals against tilt, where a thick beam shows as a V."""
-    values, unit = _shown(solution)
-    turns = _turns_deg(solution)
-    used = solution.used
-    axes.plot(turns[used, 0], values[used], ".", color=USED, ms=3)
-    axes.set(xlabel="tilt / deg", ylabel=f"largest residual / {unit}", title="and by tilt")
-
-
-def _draw_motion(axes: Axes, solution: Solution) -> None:
-    turns = _turns_deg(solution)[solution.used]
-    drawn = axes.scatter(turns[:, 0], turns[:, 2], c=turns[:, 1], s=6, cmap="viridis")
-    axes.figure.colorbar(drawn, ax=axes, label="yaw / deg")
-    title = "\n".join(["how the probe was turned", *filter(None, [solution.assumed])])
-    axes.set(xlabel="tilt / deg", ylabel="roll / deg")
-    axes.set_title(title, fontsize=9)
-
-
-def _shown(solution: Solution) -> tuple[FloatArray, str]:
-    """The largest residual of each point, with its sign, and its unit."""
-    worst = np.abs(solution.residuals).argmax(axis=1)
-    values = solution.residuals[np.arange(len(worst)), worst]
-    return (np.rad2deg(values), "deg") if solution.angular else (values, "mm")
-
-
-def _turns_deg(solution: Solution) -> FloatArray:
-    """Tilt, yaw and roll of every point's image about the mean orientation, shape (n, 3)."""
-    turns = solution.chain.target_from_image(solution.points).rotation
-    return np.asarray(np.rad2deg((turns.mean().inv() * turns).as_rotvec()))
