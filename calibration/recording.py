@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -83,9 +84,8 @@ def calibrate_recording(
     seen: Seen,
     method: str,
     calibrate: Callable[[ImagePoints], Solution],
-    estimate_clock: bool = False,
-    clock_known: bool = False,
-    settle: Callable[[ImagePoints], Solution] | None = None,
+    time_offset_s: float | Literal["estimate"] | None = None,
+    with_clock: Callable[[ImagePoints], Solution] | None = None,
 ) -> Outcome:
     """Calibrate with what was seen in a recording.
 
@@ -93,11 +93,9 @@ def calibrate_recording(
     ----------
     calibrate : callable
         Calibrates with points; called again and again where the clock's offset is estimated.
-    estimate_clock : bool
-        Find the clock offset that explains the images best, near the recording's own.
-    clock_known : bool
-        The recording's offset was stated: it is saved with the calibration even if zero.
-    settle : callable, optional
+    time_offset_s : float or "estimate", optional
+        In place of the recording's own; or the one that explains the images best, near the recording's.
+    with_clock : callable, optional
         Calibrates once the offset is known; by default `calibrate`.
 
     Raises
@@ -108,17 +106,17 @@ def calibrate_recording(
     if len(seen.frame) == 0:
         reasons = sorted(set(seen.dropped.values())) or ["no frames"]
         raise InsufficientDataError(f"expected the phantom in the images, got it in none: {reasons[0]}")
-    offset_s, offset = recording.time_offset_s, None
-    points, dropped = paired(recording, seen, offset_s)
-    if estimate_clock:
+    offset_s = time_offset_s if isinstance(time_offset_s, float) else recording.time_offset_s
+    offset, (points, dropped) = None, paired(recording, seen, offset_s)
+    if time_offset_s == "estimate":
         offset = estimate_offset(calibrate, points, recording.readings, offset_s, SEARCH_S)
         offset_s = offset.seconds
         points, dropped = paired(recording, seen, offset_s)
-    solution = (settle or calibrate)(points)
+    solution = (with_clock or calibrate)(points)
     if offset is not None:
         solution = with_uncertain_offset(solution, recording.readings, offset_s)
     frames = FramesUsed(recording.images.shape[0], (), dropped)
-    stated = offset is not None or clock_known or offset_s != 0.0
+    stated = time_offset_s is not None or offset_s != 0.0
     calibration = as_calibration(solution, method, frames, offset_s if stated else None)
     return Outcome(solution, calibration, seen, _shots(recording, seen, calibration), offset=offset)
 

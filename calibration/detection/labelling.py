@@ -88,7 +88,8 @@ def label_dots(dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> See
             chosen = _label(dots.pixels[here] * size, dots.score[here], layers, phantom)
             found[int(frame)] = dots.pixels[here][chosen]
         except InsufficientDataError as error:
-            dropped[int(frame)] = str(error)
+            few = here.sum() < wires.size
+            dropped[int(frame)] = f"{error}" + (f" ({here.sum()} dots for {wires.size} wires)" if few else "")
     return Seen(
         frame=np.repeat(np.array(list(found), dtype=np.int64), wires.size),
         pixels=np.concatenate([np.zeros((0, 2)), *found.values()]),
@@ -173,17 +174,8 @@ def _label(dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom
         Saying which rule failed, and by how much.
     """
     wires = np.concatenate([layer.wires for layer in layers])
-    few = f" ({len(dots_mm)} dots for {wires.size} wires)" if len(dots_mm) < wires.size else ""
     triples = [_triples(dots_mm, layer, phantom) for layer in layers]
-    for number, (layer, (found, nearest)) in enumerate(zip(layers, triples, strict=True)):
-        if len(found) == 0:
-            names = "-".join(phantom.names[k] for k in layer.wires)
-            raise InsufficientDataError(
-                f"no three dots in a line for layer {number} ({names}): {nearest}{few}"
-            )
-    chosen, nearest = _combined([found for found, _ in triples], dots_mm, score, layers)
-    if len(chosen) == 0:
-        raise InsufficientDataError(f"no parallel lines of dots at the layers' distances: {nearest}{few}")
+    chosen = _combined(triples, dots_mm, score, layers)
     chosen = chosen[np.argsort(misfits_mm(dots_mm[chosen], wires, phantom, 0))[:_REFINED]]
     rms_mm = misfits_mm(dots_mm[chosen], wires, phantom)
     best = float(rms_mm.min())
@@ -204,30 +196,27 @@ def _unusual(labelled_mm: FloatArray) -> int:
     return int(layers[0, 0, 0] < layers[0, 2, 0]) + int(layers[0, :, 1].mean() > layers[-1, :, 1].mean())
 
 
-def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> tuple[IntArray, str]:
-    """Dots that may be a layer's first, middle and last wire, shape (t, 3); and how near others come."""
-    between = dots_mm[None, :] - dots_mm[:, None]
-    length = np.linalg.norm(between, axis=2)
+def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> IntArray:
+    """Dots that may be a layer's first, middle and last wire, shape (t, 3)."""
+    place = dots_mm @ [1.0, 1j]
+    between = place[None] - place[:, None]
+    length = np.abs(between)
     # Axes: first, last and middle dot.
-    x, y = np.moveaxis(between / np.where(length > 0, length, np.inf)[..., None], 2, 0)
-    to_middle = between[:, None]
-    reach = x[..., None] * to_middle[..., 0] + y[..., None] * to_middle[..., 1]
-    off = np.abs(x[..., None] * to_middle[..., 1] - y[..., None] * to_middle[..., 0])
-    ratio = length / layer.width_mm
-    long = (ratio > _WIDTHS[0]) & (ratio < _WIDTHS[1])
-    between_them = (reach > _LEAST_MM) & (reach < length[..., None] - _LEAST_MM)
-    first, last, middle = np.nonzero(long[..., None] & between_them & (off < _COLLINEAR_MM))
+    seen = np.conj(between / np.where(length > 0, length, np.inf))[..., None] * between[:, None]
+    reach, off, ratio = seen.real, np.abs(seen.imag), length / layer.width_mm
+    long = ((ratio > _WIDTHS[0]) & (ratio < _WIDTHS[1]))[..., None]
+    inner, straight = (reach > _LEAST_MM) & (reach < length[..., None] - _LEAST_MM), off < _COLLINEAR_MM
+    first, last, middle = np.nonzero(long & inner & straight)
     inside = _within_ends(reach[first, last, middle] / length[first, last], layer, phantom)
-    triples = np.stack([first, middle, last], axis=1)[inside]
-    if len(triples):
-        return triples, ""
-    if len(first):
-        return triples, "the middle one is beyond the ends of its wire"
-    if (long[..., None] & between_them).any():
-        nearest = off[long[..., None] & between_them].min()
-        return triples, f"the middle one is {nearest:.1f} mm off it, {_COLLINEAR_MM:g} allowed"
-    straight = between_them & (off < _COLLINEAR_MM)
-    return triples, _off_by(np.broadcast_to(ratio[..., None], straight.shape)[straight], _WIDTHS)
+    if inside.any():
+        return np.stack([first, middle, last], axis=1)[inside]
+    why = "the middle one is beyond the ends of its wire"
+    if not len(first) and (long & inner).any():
+        why = f"the middle one is {off[long & inner].min():.1f} mm off it, {_COLLINEAR_MM:g} allowed"
+    elif not len(first):
+        why = _off_by(np.broadcast_to(ratio[..., None], inner.shape)[inner & straight], _WIDTHS)
+    names = "-".join(phantom.names[k] for k in layer.wires)
+    raise InsufficientDataError(f"no three dots in a line for a layer ({names}): {why}")
 
 
 def _off_by(ratio: FloatArray, limits: tuple[float, float]) -> str:
@@ -252,12 +241,16 @@ def _within_ends(share: FloatArray, layer: _Layer, phantom: WirePhantom) -> npt.
 
 def _combined(
     triples: list[IntArray], dots_mm: FloatArray, score: FloatArray, layers: list[_Layer]
-) -> tuple[IntArray, str]:
-    """Hypotheses: parallel triples at the layers' distances, shape (h, 3 layers); else what fails."""
-    chosen = triples[0]
-    for layer, found in zip(layers[1:], triples[1:], strict=True):
-        cosine, ratio = _side_by_side(chosen[:, :3], found, dots_mm, layers[0], layer)
-        shared = (chosen[:, None, :, None] == found[None, :, None, :]).any(axis=(2, 3))
+) -> IntArray:
+    """Hypotheses: parallel triples at the layers' distances, shape (h, 3 layers)."""
+    chosen, place = triples[0], dots_mm @ [1.0, 1j]
+    for layer, below in zip(layers[1:], triples[1:], strict=True):
+        ours, theirs = (place[one[:, 2]] - place[one[:, 0]] for one in (chosen, below))
+        away = place[below[:, [0, 2]]].mean(axis=1) - place[chosen[:, [0, 2]]].mean(axis=1)[:, None]
+        ours = np.conj(ours / np.abs(ours))[:, None]
+        cosine = np.clip((ours * theirs / np.abs(theirs)).real * layers[0].turned * layer.turned, -1.0, 1.0)
+        ratio = np.abs((ours * away).imag) / abs(layer.height_mm - layers[0].height_mm)
+        shared = (chosen[:, None, :, None] == below[None, :, None, :]).any(axis=(2, 3))
         parallel = (cosine > _PARALLEL_COSINE) & ~shared
         one, other = np.nonzero(parallel & (ratio > _GAPS[0]) & (ratio < _GAPS[1]))
         if len(one) == 0:
@@ -265,27 +258,13 @@ def _combined(
             if parallel.any():
                 why = _off_by(ratio[parallel], _GAPS)
             elif not shared.all():
-                turn = np.rad2deg(np.arccos(cosine[~shared].max()))
-                allowed = np.rad2deg(np.arccos(_PARALLEL_COSINE))
+                turn, allowed = np.rad2deg(np.arccos([cosine[~shared].max(), _PARALLEL_COSINE]))
                 why = f"the nearest are turned by {turn:.0f} degrees, {allowed:.0f} allowed"
-            return np.zeros((0, 3), np.int64), why
-        chosen = np.concatenate([chosen[one], found[other]], axis=1)
+            raise InsufficientDataError(f"no parallel lines of dots at the layers' distances: {why}")
+        chosen = np.concatenate([chosen[one], below[other]], axis=1)
         strongest = np.argsort(-score[chosen].sum(axis=1), kind="stable")
         chosen = chosen[strongest[:_MOST_HYPOTHESES]]
-    return chosen, ""
-
-
-def _side_by_side(
-    first: IntArray, other: IntArray, dots_mm: FloatArray, layer: _Layer, below: _Layer
-) -> tuple[FloatArray, FloatArray]:
-    """Cosine between triples of two layers, (a, 3) and (b, 3), and their distance over the layers'."""
-    along = [dots_mm[t[:, 2]] - dots_mm[t[:, 0]] for t in (first, other)]
-    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in along]
-    cosine = np.clip((unit[0] @ unit[1].T) * layer.turned * below.turned, -1.0, 1.0)
-    middle = [dots_mm[t[:, [0, 2]]].mean(axis=1) for t in (first, other)]
-    apart = middle[1][None] - middle[0][:, None]
-    distance = np.abs(unit[0][:, None, 0] * apart[..., 1] - unit[0][:, None, 1] * apart[..., 0])
-    return np.asarray(cosine), np.asarray(distance / abs(below.height_mm - layer.height_mm))
+    return chosen
 
 
 def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom, steps: int = _STEPS) -> FloatArray:

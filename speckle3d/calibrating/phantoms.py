@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -147,53 +147,44 @@ def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -
 
 def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
     """Calibrate with what was found; for errors see `calibrate_recording`."""
-    given, size = settings.time_offset_s, recording.pixel_mm
-    recording, clock = _timed(recording, settings), (given == "estimate", isinstance(given, float))
+    size = recording.pixel_mm
+
+    def with_(method: str, calibrate: Callable[[ImagePoints], Solution]) -> Outcome:
+        return calibrate_recording(recording, seen, method, calibrate, settings.time_offset_s)
+
     if isinstance(settings, OrientationSettings):
-        return calibrate_recording(
-            recording,
-            seen,
-            "orientation",
-            lambda points: calibrate_orientation(points, size, settings),
-            *clock,
-        )
+        return with_("orientation", lambda points: calibrate_orientation(points, size, settings))
     if not isinstance(recording.readings, TimedPoses):
         raise InvalidInputError(
             "expected a position sensor (tracker), got an orientation sensor: speckle3d calibrate orientation"
         )
     if isinstance(settings, PlaneSettings):
-        outcome = calibrate_recording(
-            recording, seen, "plane", lambda points: calibrate_plane(points, size, settings), *clock
-        )
+        outcome = with_("plane", lambda points: calibrate_plane(points, size, settings))
         widths = () if settings.reflector == "bar" else settings.beam_mm or _BEAM_MM
         return replace(outcome, beam=tuple(predict_bias(outcome.solution, width) for width in widths))
     assert isinstance(settings, WireSettings)
     phantom = Wired.of(settings.phantom).phantom
     if phantom is None:
-        return _with_crossings(recording, seen, settings, clock)
-    return _with_wires(recording, seen, settings, phantom, clock)
+        return _with_crossings(recording, seen, settings)
+    return _with_wires(recording, seen, settings, phantom)
 
 
-def _with_crossings(
-    recording: Recording, seen: Seen, settings: WireSettings, clock: tuple[bool, bool]
-) -> Outcome:
+def _with_crossings(recording: Recording, seen: Seen, settings: WireSettings) -> Outcome:
     """Choose among the candidates of each frame, and calibrate."""
-    around, size = recording.time_offset_s, recording.pixel_mm
-    offsets = delays_around(around, SEARCH_S, CHOICE_STEP_S).tolist() if clock[0] else [around]
+    clock, size = settings.time_offset_s, recording.pixel_mm
+    around = clock if isinstance(clock, float) else recording.time_offset_s
+    offsets = delays_around(around, SEARCH_S, CHOICE_STEP_S).tolist() if clock == "estimate" else [around]
     chosen = choose_crossings(recording, seen, offsets) if len(seen) else seen
     outcome = calibrate_recording(
-        recording, chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), *clock
+        recording, chosen, "cross-wire", lambda points: calibrate_cross_wire(points, size, settings), clock
     )
     shots = [replace(s, candidates_px=seen.pixels[seen.frame == s.frame]) for s in outcome.shots]
     return replace(outcome, shots=tuple(shots))
 
 
-def _with_wires(
-    recording: Recording, seen: Seen, settings: WireSettings, phantom: WirePhantom, clock: tuple[bool, bool]
-) -> Outcome:
+def _with_wires(recording: Recording, seen: Seen, settings: WireSettings, phantom: WirePhantom) -> Outcome:
     """Calibrate, and choose how much of the phantom's stated place to believe."""
     size, stated, choices = recording.pixel_mm, settings.registration, list[Choice]()
-    method = "n-wire" if phantom.n_shapes else "three-wire"
 
     def calibrate(points: ImagePoints) -> Solution:
         # The clock is sought with what depends least on the place and yet is determined.
@@ -204,8 +195,9 @@ def _with_wires(
         choices.append(choice)
         return solution
 
-    settle = choose if stated == "auto" and phantom.world_from_phantom is not None else None
-    outcome = calibrate_recording(recording, seen, method, calibrate, *clock, settle)
+    chosen = choose if stated == "auto" and phantom.world_from_phantom is not None else None
+    method = "n-wire" if phantom.n_shapes else "three-wire"
+    outcome = calibrate_recording(recording, seen, method, calibrate, settings.time_offset_s, chosen)
     return replace(outcome, choice=choices[-1] if choices else None)
 
 
@@ -224,7 +216,7 @@ def validated(outcome: Outcome, settings: ScanSettings, progress: Progress | Non
     if path is None:
         return []
     settings = settings.model_copy(update={"leave_out": ()})
-    other = _timed(opened(path, settings, None), settings)
+    other = opened(path, settings, None)
     with naming(str(path)):
         seen = found(other, settings, getattr(settings, "validation_points", None), progress)
         seconds = outcome.calibration.time_offset_s
@@ -263,12 +255,6 @@ def write_outcome(
         None if dots.are_lines else write_dots,
         settings.model_dump_json(exclude_defaults=True),
     )
-
-
-def _timed(recording: Recording, settings: ScanSettings) -> Recording:
-    """The recording with the clock offset that was given, if one was."""
-    given = settings.time_offset_s
-    return replace(recording, time_offset_s=given) if isinstance(given, float) else recording
 
 
 def _seen_wires(

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
-from pydantic.fields import FieldInfo
 
 from calibration.settings import LineSettings, OrientationFit, PlaneFit, WireFit
 from speckle3d.core.errors import InvalidInputError
@@ -24,12 +22,10 @@ _MOST_FRAMES = 2**31
 _MOST_LEFT_OUT = 10**6
 
 
-@dataclass(frozen=True)
-class AsText:
-    """How a setting is written as one word of a command."""
+class AsText(NamedTuple):
+    """How a setting is written that is one word of a command."""
 
     write: Callable[[Any], str]
-    metavar: str = "TEXT"
 
 
 def region_of(text: str) -> Corners | None:
@@ -139,7 +135,7 @@ class ScanSettings(BaseModel):
     region: Annotated[Corners | None, _parsed(region_of), AsText(region_text)] = Field(
         None, description='Polygon "column,row column,row ..." outside which nothing counts.'
     )
-    leave_out: Annotated[tuple[int, ...], _parsed(frames_of), AsText(frames_text, "FRAMES")] = Field(
+    leave_out: Annotated[tuple[int, ...], _parsed(frames_of), AsText(frames_text)] = Field(
         (), description="Frames to leave out, from 0, as 3,17-20."
     )
     validation: Path | None = Field(
@@ -200,24 +196,20 @@ def with_values(settings: Model, values: Mapping[str, Any]) -> Model:
     return validated(settings.model_dump() | dict(values), settings.method, type(settings))
 
 
-def written_as(field: FieldInfo) -> AsText | None:
-    """How a setting is written as one word, if it has a way of its own."""
-    return next((one for one in field.metadata if isinstance(one, AsText)), None)
-
-
 def command_line(settings: ScanSettings, images: Path, out: Path) -> str:
     """The command that calibrates with these settings, as a shell takes it."""
     words = ["speckle3d", "calibrate", settings.method, str(images), "-o", str(out)]
     for name, field in type(settings).model_fields.items():
-        value, option, text = getattr(settings, name), f"--{name.replace('_', '-')}", written_as(field)
+        value, option = getattr(settings, name), f"--{name.replace('_', '-')}"
         if value == field.default and name != "phantom":
             continue
-        if value is True:
-            words.append(option)
-        elif text is not None:
-            words += [option, text.write(value)]
-        elif isinstance(value, list):
+        if isinstance(value, list):
             words += [word for one in value for word in (option, number_text(one))]
+        elif texts := [one for one in field.metadata if isinstance(one, AsText)]:
+            words += [option, texts[0].write(value)]
         else:
-            words += [option, *map(number_text, value if isinstance(value, tuple) else (value,))]
+            words += [
+                option,
+                *map(number_text, value if isinstance(value, tuple) else () if value is True else (value,)),
+            ]
     return shlex.join(words)

@@ -7,7 +7,6 @@ from calibration_examples import PIXEL_MM, TRIAL_1, scan_plane
 from calibration.beam import bias_along_beam_mm, predict_bias
 from calibration.plane import calibrate_plane
 from calibration.settings import PlaneFit
-from speckle3d.core.errors import InvalidInputError
 
 
 def tilted(angles_rad):
@@ -61,12 +60,3 @@ def test_what_is_predicted_is_what_a_thick_beam_does():
         assert predicted.width_mm == width_mm
     assert happened[1] < 0
     assert abs(happened[1]) > 0.99 * size
-
-
-def test_no_thickness_no_bias():
-    solution = calibrate_plane(scan_plane(np.random.default_rng(0), 100, line_noise_mm=0.2).lines)
-    predicted = predict_bias(solution, 0.0)
-    np.testing.assert_allclose(predicted.simulated_mm, 0.0, atol=1e-9)
-    assert predicted.closed_form_mm == 0.0
-    with pytest.raises(InvalidInputError, match="width_mm"):
-        predict_bias(solution, -1.0)

@@ -81,21 +81,6 @@ def test_a_plane_seen_from_below_is_the_mirror_unless_said():
 
 
 @pytest.mark.parametrize("level", [True, False])
-def test_wrong_lines_in_a_tenth_of_the_frames_hardly_move_the_answer(level):
-    rng = np.random.default_rng(0)
-    directions, readings, _ = line_directions(rng, 100, noise_deg=0.1)
-    wrong = rng.choice(100, 10, replace=False)
-    angle = rng.uniform(-0.6, 0.6, 10)
-    spoilt = directions.copy()
-    spoilt[wrong] = np.column_stack([np.cos(angle), np.sin(angle)])
-    clean = calibrate(directions, readings, level=level)
-    found = calibrate(spoilt, readings, level=level)
-    errors = np.rad2deg(np.sqrt(np.diag(clean.image_covariance(("gamma", "beta", "alpha")))))
-    moved = tilt_yaw_roll_deg(found, clean.chain.sensor_from_image.rotation)
-    assert (np.abs(moved) < errors).all()
-
-
-@pytest.mark.parametrize("level", [True, False])
 @pytest.mark.parametrize(
     "missing", [{"tilt_deg": 0.0}, {"roll_deg": 0.0}, {"tilt_deg": 3.0, "roll_deg": 3.0}]
 )
@@ -113,9 +98,3 @@ def test_beams_that_are_level_on_average_cannot_be_told_from_their_mirror():
     readings = Rotation.concatenate([above[1], below[1]])
     with pytest.raises(InsufficientDataError, match="mirror"):
         calibrate(directions, readings, level=True)
-
-
-def test_too_few_lines_are_refused():
-    directions, readings, _ = line_directions(np.random.default_rng(0), 5)
-    with pytest.raises(InsufficientDataError, match="6"):
-        calibrate(directions, readings)

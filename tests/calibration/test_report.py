@@ -2,17 +2,15 @@
 
 import numpy as np
 import pytest
-from calibration_examples import PIXEL_MM, TRIAL_1, line_directions, scan_plane, scan_wires
+from calibration_examples import PIXEL_MM, TRIAL_1, scan_plane, scan_wires
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.orientation import calibrate_orientation
 from calibration.plane import calibrate_plane
 from calibration.points import PROBE, ImagePoints
 from calibration.report import as_calibration, rows_of
 from calibration.settings import PlaneFit, WireFit
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.calibration import FramesUsed
-from speckle3d.core.errors import InsufficientDataError
 
 ALL = FramesUsed(300, ())
 TRUTH = dict(zip(PROBE, [*PIXEL_MM, *TRIAL_1.translation, *np.deg2rad([-0.55, 44.22, -90.37])], strict=True))
@@ -33,16 +31,6 @@ def of_crossing(seed=0, count=80, noise_mm=0.3):
         ImagePoints(pixels, np.arange(count), RigidTransform.from_components(shift, turn)),
         settings=WireFit(beside_mm=0.0),
     )
-
-
-def directed(directions, readings):
-    poses = RigidTransform.from_rotation(readings)
-    return ImagePoints(directions, np.arange(len(directions)), poses)
-
-
-def of_orientation(seed=0):
-    directions, readings, mounting = line_directions(np.random.default_rng(seed), 100)
-    return calibrate_orientation(directed(directions, readings), PIXEL_MM / PIXEL_MM[1]), mounting
 
 
 @pytest.mark.parametrize(("solve", "trials"), [(of_plane, 30), (of_crossing, 50)])
@@ -86,19 +74,6 @@ def test_values_are_those_of_the_pose_and_in_the_units_that_they_name():
     told = [row for row in rows_of(found) if row[0].startswith(("roll", "yaw", "tilt", "alpha"))]
     errors = np.rad2deg(np.sqrt(np.diag(found.covariance)[2::-1]))
     assert [float(row[1].split("+- ")[1]) for row in told] == pytest.approx(errors, abs=6e-4)
-
-
-def test_an_orientation_sensors_calibration_is_a_rotation():
-    solution, mounting = of_orientation()
-    found = as_calibration(solution, "orientation", ALL)
-    assert (found.sensor, found.rms_unit) == ("orientation", "rad")
-    assert found.translation_mm is None
-    assert found.pixel_mm is None
-    assert found.covariance.shape == (3, 3)
-    assert {one.unit for one in found.parameters} == {"rad"}
-    assert (found.rotation.inv() * mounting).magnitude() < 5 * np.sqrt(found.covariance.trace())
-    with pytest.raises(InsufficientDataError, match="translation"):
-        _ = found.sensor_from_image
 
 
 def test_every_frame_is_used_or_has_a_reason():
