@@ -1,10 +1,10 @@
 """Commands made of functions: an option for each parameter and each field of settings, help from docstrings.
 
 A command is a function with a numpydoc docstring. Options under *Parameters* are common and shown by
-``--help`` in that order, those under *Other Parameters* by ``--help-all``. A help that begins "With
---frame:", "With --origin or --curve:" or "Not with --paper:" is a rule that is checked. A parameter annotated
-with `Fields` of a pydantic model becomes an option for each field, with the field's description as help; the
-function gets the values that were given as a dict.
+``--help`` in that order, those under *Other Parameters* by ``--help-all``. "With --origin or --curve:" and
+"Not with --paper." in a help are rules that are checked. A parameter annotated with `Fields` of a pydantic
+model becomes an option for each field, with the field's description as help; the function gets the values
+that were given as a dict.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from typing import (
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from speckle3d.cli.common import shared
 from speckle3d.core.errors import FileError, InvalidInputError
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ Command = Callable[..., None]
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 _SECTION = re.compile(r"^(Parameters|Other Parameters|Examples)\n-+\n", re.MULTILINE)
 _ENTRY = re.compile(r"^(\S.*)\n?((?:[ \t]+.*\n?|\n)*)", re.MULTILINE)
-_RULE = re.compile(r"(With|Not with) (--[^:]+):")
+_RULE = re.compile(r"\b(With|Not with) (--[\w-]+(?: or --[\w-]+)*)[:.]")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
 _FUSED = "`fused` takes any sensor there is, `crossed` a second sweep"
 _REMOVED = {
@@ -130,6 +131,9 @@ def command_of(name: str, function: Command) -> TyperCommand:
     return command
 
 
+_SHARED = Words.of(shared).options
+
+
 def _flag(name: str) -> str:
     return f"--{name.removesuffix('_file').replace('_', '-')}"
 
@@ -137,7 +141,7 @@ def _flag(name: str) -> str:
 def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> None:
     """Refuse an option against the rule that its help begins with, and an input that is not there."""
     (info,) = option.annotation.__metadata__
-    if rule := _RULE.match(info.help or ""):
+    if rule := _RULE.search(info.help or ""):
         others = [other for other in rule[2].split(" or ") if other in flags]
         if rule[1] == "With" and not others:
             raise InvalidInputError(f"{flag}: expected {rule[2]} with it, got none")
@@ -153,7 +157,7 @@ def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> insp
     """A parameter as typer takes it: an argument without a default, unless its annotation says otherwise."""
     flag, only = _flag(name), inspect.Parameter.KEYWORD_ONLY
     info = info or (typer.Argument() if default is inspect.Parameter.empty else typer.Option())
-    info.help = words.options.get(name) or info.help
+    info.help = words.options.get(name) or info.help or _SHARED.get(name)
     if isinstance(info, typer.models.ArgumentInfo):
         info.metavar = info.metavar or flag.strip("-").upper()
     elif info.default is ... and not info.param_decls:

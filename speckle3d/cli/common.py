@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -35,59 +35,60 @@ class Drift(StrEnum):
 
 
 Reference = Literal["tracker", "truth"]
+MaybePath = Path | None
+MaybeText = str | None
+MaybeNumber = float | None
+Paths = list[Path] | None
 Out = Annotated[Path, typer.Option("-o", "--output", writable=True)]
-OptionalOut = Annotated[Path | None, typer.Option("-o", "--output", writable=True)]
+OptionalOut = Annotated[MaybePath, typer.Option("-o", "--output", writable=True)]
 OutArgument = Annotated[Path, typer.Argument(writable=True)]
-Written = Annotated[Path | None, typer.Option(writable=True)]
-Json = Annotated[bool, typer.Option("--json", help="Print machine-readable results on stdout.")]
-ConfigFile = Annotated[
-    Path | None, typer.Option(help="TOML with settings to change; see `speckle3d config`.")
-]
-CalibrationFiles = Annotated[
-    list[Path] | None,
-    typer.Option(help="Calibration to use for its sensor in place of the file's; may be repeated."),
-]
-Curves = Annotated[
-    Path | None, typer.Option("--curves", help="Decorrelation curves; by default curves.h5 beside SWEEP.")
-]
-Images = Annotated[
-    Path,
-    typer.Argument(metavar="IMAGES", help="Recording: a sweep file, an image sequence, a scanner's package."),
-]
-Poses = Annotated[Path | None, typer.Option(help="File with the sensor's readings, if not in IMAGES.")]
-Transform = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="Poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).",
-    ),
-]
-PixelMm = Annotated[
-    tuple[float, float] | None,
-    typer.Option(help="Distance between columns and rows, mm, if IMAGES does not say."),
-]
-ReconstructionFile = Annotated[
-    Path, typer.Argument(metavar="RECONSTRUCTION", help="reconstruction.h5 of a results folder.")
-]
-PosedFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="INPUT",
-        help="reconstruction.h5 of a results folder, or a recording with a calibrated tracker or true poses.",
-    ),
-]
-_MODE_HELP = (
-    "Which poses to use: image, orientation, pose, crossed, fused of a reconstruction (by default that which "
-    "claims the smallest error of length); tracker, truth of a recording."
-)
-Mode = Annotated[str | None, typer.Option(help=_MODE_HELP)]
-Modes = Annotated[list[str] | None, typer.Option(help=f"{_MODE_HELP} May be repeated.")]
-SweepFile = Annotated[Path | None, typer.Option(help="The sweep, if it moved since the reconstruction.")]
+Written = Annotated[MaybePath, typer.Option(writable=True)]
+PixelMm = tuple[float, float] | None
+Json = Annotated[bool, typer.Option("--json")]
+
+
+def shared() -> None:
+    """Options that mean the same in every command that has them.
+
+    Parameters
+    ----------
+    as_json
+        Print machine-readable results on stdout.
+    config_file
+        TOML with settings to change; see `speckle3d config`.
+    calibration
+        Calibration to use for its sensor in place of the file's; may be repeated.
+    curves_file
+        Decorrelation curves; by default curves.h5 beside SWEEP.
+    images
+        Recording: a sweep file, an image sequence, a scanner's package.
+    input_file
+        reconstruction.h5 of a results folder, or a recording with a calibrated tracker or true poses.
+    reconstruction_file
+        reconstruction.h5 of a results folder.
+    mode
+        Which poses to use: image, orientation, pose, crossed, fused of a reconstruction (by default that
+        which claims the smallest error of length); tracker, truth of a recording.
+    pixel_mm
+        Distance between columns and rows, mm, if IMAGES does not say.
+    poses
+        File with the sensor's readings, if not in IMAGES.
+    sweep_file
+        The sweep, if it moved since the reconstruction.
+    transform
+        Poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).
+    """
 
 
 def note(text: str) -> None:
     """Print a remark of one line on stderr, apart from the results; what it quotes is shown escaped."""
     sys.stderr.write(f"{_encodable(printable(text), sys.stderr.encoding)}\n")
+
+
+def notes(lines: Iterable[str]) -> None:
+    """Print remarks on stderr, a line each."""
+    for line in lines:
+        note(line)
 
 
 def emit(text: str) -> None:

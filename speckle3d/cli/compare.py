@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from speckle3d.cli.common import (
-    CalibrationFiles,
-    ConfigFile,
-    Curves,
     Drift,
     Json,
+    MaybePath,
+    MaybeText,
     Out,
+    Paths,
     Reference,
     emit,
     load_settings,
@@ -32,10 +32,10 @@ def compare(
     sweeps: Annotated[list[Path] | None, typer.Argument(metavar="SWEEP...")] = None,
     drift: list[Drift] | None = None,
     reference: Reference | None = None,
-    curves_file: Curves = None,
-    calibration: CalibrationFiles = None,
-    config_file: ConfigFile = None,
-    scheduler: str | None = None,
+    curves_file: MaybePath = None,
+    calibration: Paths = None,
+    config_file: MaybePath = None,
+    scheduler: MaybeText = None,
     workers: int | None = None,
     paper: bool = False,
     as_json: Json = False,
@@ -60,8 +60,8 @@ def compare(
     Other Parameters
     ----------------
     paper
-        Not with --drift or --reference or --calibration or --config: the eleven sweeps of Housden 2008,
-        simulated; tables beside theirs.
+        The eleven sweeps of Housden 2008, simulated; tables beside theirs. Not with --drift or --reference
+        or --calibration or --config.
     workers
         Run in so many processes on this machine, instead of in one.
     scheduler

@@ -9,17 +9,7 @@ import typer
 
 from speckle3d.cli.calibrations import files_of, given_settings, mount
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import (
-    CalibrationFiles,
-    Json,
-    Mode,
-    OutArgument,
-    SweepFile,
-    Transform,
-    emit,
-    emit_rows,
-    note,
-)
+from speckle3d.cli.common import Json, MaybePath, MaybeText, OutArgument, Paths, emit, emit_rows, note, notes
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
@@ -65,13 +55,13 @@ def convert(
             without=("tracker_transform", "image_to_probe", "arrays"),
         ),
     ],
-    transform: Transform = None,
-    calibration: CalibrationFiles = None,
+    transform: MaybeText = None,
+    calibration: Paths = None,
     compression: Annotated[
         Literal["gzip", "lzf", "none"] | None, typer.Option("--compression", "--compress")
     ] = None,
-    mode: Mode = None,
-    sweep_file: SweepFile = None,
+    mode: MaybeText = None,
+    sweep_file: MaybePath = None,
 ) -> None:
     """Turn any recording into a sweep file, or into a sequence of PLUS; options give what it lacks.
 
@@ -121,8 +111,7 @@ def convert(
         range_db = options.pop("dynamic_range_db", 60.0)
         _require_none(options, "recordings, got a reconstruction")
         posed = open_posed(source, mode, sweep_file)
-        for line in posed.notes():
-            note(line)
+        notes(posed.notes())
         with progress_bar(f"writing {out.name}") as progress:
             sequence, poses = slicer_sequence(posed, range_db)
             write_sequence(out, sequence, progress, packs, poses)
@@ -132,8 +121,7 @@ def convert(
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
     recording = open_recording(source, given.model_copy(update=fitted))
     sweep = mount(resized(recording.sweep, fitted), calibration or ())
-    for line in recording.notes:
-        note(line)
+    notes(recording.notes)
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
             write_sweep(out, sweep, progress, COMPRESSIONS[compression or "none"])

@@ -9,17 +9,18 @@ import typer
 
 from speckle3d.cli.calibrations import mount
 from speckle3d.cli.common import (
-    CalibrationFiles,
-    ConfigFile,
-    Curves,
     Drift,
     Json,
+    MaybePath,
+    MaybeText,
     Out,
+    Paths,
     Reference,
     Written,
     emit,
     load_settings,
     note,
+    notes,
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, MismatchError
@@ -34,12 +35,12 @@ if TYPE_CHECKING:
 def reconstruct(
     sweep_file: Path,
     out: Out,
-    curves_file: Curves = None,
+    curves_file: MaybePath = None,
     drift: list[Drift] | None = None,
-    crossing_file: Path | None = None,
+    crossing_file: MaybePath = None,
     save_curves: Written = None,
-    frames: str | None = None,
-    crossing_frames: str | None = None,
+    frames: MaybeText = None,
+    crossing_frames: MaybeText = None,
     reference: Reference | None = None,
     region: str | None = None,
     consistent_subset: Annotated[
@@ -47,9 +48,9 @@ def reconstruct(
     ] = None,
     drift_curves: Literal["published", "distance"] | None = None,
     volume: Written = None,
-    volume_mode: str | None = None,
-    calibration: CalibrationFiles = None,
-    config_file: ConfigFile = None,
+    volume_mode: MaybeText = None,
+    calibration: Paths = None,
+    config_file: MaybePath = None,
     as_json: Json = False,
 ) -> None:
     """Reconstruct a sweep: trajectory, drift-corrected trajectories, table, figures.
@@ -138,8 +139,7 @@ def reconstruct(
         )
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
-        for line in result.summary.doubt_lines:
-            note(line)
+        notes(result.summary.doubt_lines)
     else:
         emit(result.table)
     _tell(result)
@@ -161,8 +161,7 @@ def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | No
     from speckle3d.study.scenes.voxels import VolumeRequest, write_voxels
 
     posed = open_posed(result.directory / "reconstruction.h5", mode, sweep_file)
-    for line in posed.notes():
-        note(line)
+    notes(posed.notes())
     with progress_bar(f"compounding {out.name}") as progress:
         note(write_voxels(posed, VolumeRequest(out, settings.volume), progress).line)
 

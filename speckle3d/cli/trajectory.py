@@ -7,33 +7,19 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.common import Json, Mode, Out, ReconstructionFile, Reference, emit, note
+from speckle3d.cli.common import Json, MaybeText, Out, Reference, emit, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 LengthUnit = Literal["m", "mm"]
 
-_LABELS = (
-    ("FDR_percent", "final drift rate (FDR)", "{:.2f} %"),
-    ("ADR_percent", "average drift rate (ADR)", "{:.2f} %"),
-    ("MD_mm", "maximum drift (MD)", "{:.4f} mm"),
-    ("SD_mm", "sum of drift (SD)", "{:.3f} mm"),
-    ("HD_mm", "Hausdorff distance (HD)", "{:.4f} mm"),
-    ("EA_deg", "error of angle (EA)", "{:.4f} deg"),
-    ("GPE_mm", "global pixel error (GPE)", "{:.4f} mm"),
-    ("GLE_mm", "global landmark error (GLE)", "{:.4f} mm"),
-    ("LPE_mm", "local pixel error (LPE)", "{:.4f} mm"),
-    ("LLE_mm", "local landmark error (LLE)", "{:.4f} mm"),
-    ("score", "TUS-REC score, 2025", "{:.3f}"),
-)
-
 
 def export(
-    reconstruction_file: ReconstructionFile,
+    reconstruction_file: Path,
     out: Out,
-    mode: Mode = None,
+    mode: MaybeText = None,
     length_unit: LengthUnit = "m",
-    frame: str | None = None,
+    frame: MaybeText = None,
 ) -> None:
     """Write the poses of one mode as TUM text (time_s x y z qx qy qz qw, image to world), or ITK transforms.
 
@@ -84,7 +70,7 @@ def export(
 def score(
     estimate: Path,
     of: Annotated[Path, typer.Argument(metavar="REFERENCE")],
-    mode: Mode = None,
+    mode: MaybeText = None,
     reference: Reference | None = None,
     length_unit: LengthUnit | None = None,
     as_json: Json = False,
@@ -141,15 +127,17 @@ def score(
 
 
 def _table(found: dict[str, Any]) -> str:
-    from speckle3d.core.tables import text_table
+    from speckle3d.core.tables import text_rows
+    from speckle3d.core.units import unit_of
+    from speckle3d.scoring.displacements import MEANINGS
 
-    rows = [("estimate", found["estimate"]), ("poses", str(found["poses"]))]
-    rows += [("matched", found["association"]), ("aligned", found["alignment"])]
+    rows = [(name, str(found[name]), "") for name in ("estimate", "poses", "association", "alignment")]
     for name, words in (("APE", "absolute pose error (APE)"), ("RPE", "relative pose error (RPE)")):
         error = found[name]
-        rows += [
-            (f"{words}, RMS", f"{error.rmse_mm:.4f} mm, {error.rmse_deg:.4f} deg"),
-            (f"{words}, largest", f"{error.max_mm:.4f} mm, {error.max_deg:.4f} deg"),
-        ]
-    rows += [(words, form.format(found[key])) for key, words, form in _LABELS if found[key] is not None]
-    return text_table(rows, (0, 1), heading=False)
+        rows.append((f"{words}, RMS", f"{error.rmse_mm:.4f} mm, {error.rmse_deg:.4f}", "deg"))
+        rows.append((f"{words}, largest", f"{error.max_mm:.4f} mm, {error.max_deg:.4f}", "deg"))
+    for name, meaning in {**MEANINGS, "score": "TUS-REC score, 2025"}.items():
+        if found[name] is not None:
+            words = f"{meaning.split(':')[0]} ({name.split('_')[0]})"
+            rows.append((words, f"{found[name]:.4f}", unit_of(name) or "%" * name.endswith("percent")))
+    return text_rows(rows)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from speckle3d.cli.calibrations import require_free
-from speckle3d.cli.common import Images, Json, OptionalOut, PixelMm, Poses, Transform, emit, note
+from speckle3d.cli.common import Json, MaybePath, MaybeText, OptionalOut, PixelMm, emit, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 from speckle3d.core.progress import progress_bar
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 
 def clock(
-    images: Images,
-    poses: Poses = None,
-    transform: Transform = None,
+    images: Path,
+    poses: MaybePath = None,
+    transform: MaybeText = None,
     pixel_mm: PixelMm = None,
     by: Literal["line", "images"] = "line",
     sensor: Literal["tracker", "orientation"] = "tracker",
-    region: str | None = None,
+    region: MaybeText = None,
     search_s: Annotated[float, typer.Option(min=0.02)] = 0.5,
-    calibration: Path | None = None,
+    calibration: MaybePath = None,
     out: OptionalOut = None,
     as_json: Json = False,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import ConfigFile, Json, Out, emit, emit_json, load_settings, note
+from speckle3d.cli.common import Json, MaybePath, Out, emit, emit_json, load_settings, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 def curves(
     out: Out,
     sweeps: Annotated[list[Path] | None, typer.Argument(metavar="SWEEP...")] = None,
-    probe: Path | None = None,
-    like: Path | None = None,
-    start: Path | None = None,
-    region: str | None = None,
-    config_file: ConfigFile = None,
+    probe: MaybePath = None,
+    like: MaybePath = None,
+    start: MaybePath = None,
+    region: MaybeText = None,
+    config_file: MaybePath = None,
     as_json: Json = False,
 ) -> None:
     """Measure decorrelation curves on sweeps with known positions, or calculate them from a data sheet.
@@ -38,7 +38,7 @@ def curves(
     out
         Curves file to write.
     start
-        Not with --probe: rough curves to correct by the sweeps' tracker; then they may be over tissue, too.
+        Rough curves to correct by the sweeps' tracker; then they may be over tissue, too. Not with --probe.
     probe
         TOML with a probe's data sheet: elevation_aperture_mm, elevation_focus_mm, band_mhz.
     like
@@ -114,9 +114,3 @@ def _show(curves: DecorrelationCurves, as_json: bool) -> None:
     emit(f"lengths read with them on sweeps of a probe like this: +- {196 * curves.scale_sigma:.1f} % (95 %)")
     if curves.tilt is None:
         note("the phantom sweeps hardly turned: tilt will be taken to be about the image's centre")
-    else:
-        pivots = curves.depth_mm - curves.tilt.pivot_mm
-        note(
-            f"tilted frames decorrelate as if they turned about a point {pivots[0]:.0f} to "
-            f"{pivots[-1]:.0f} mm deep"
-        )

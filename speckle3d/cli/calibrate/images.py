@@ -10,7 +10,18 @@ import typer
 
 from speckle3d.cli.calibrations import report_written, require_free
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import Json, Out, PixelMm, Transform, from_options, note, require_finite
+from speckle3d.cli.common import (
+    Json,
+    MaybeNumber,
+    MaybePath,
+    MaybeText,
+    Out,
+    Paths,
+    PixelMm,
+    from_options,
+    note,
+    require_finite,
+)
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
@@ -30,15 +41,15 @@ def images(
     second: Annotated[Path, typer.Argument(metavar="B")],
     out: Out,
     *,
-    start: Path | None = None,
+    start: MaybePath = None,
     start_mm: Triple | None = None,
     start_deg: Triple | None = None,
-    poses: list[Path] | None = None,
-    transform: Transform = None,
+    poses: Paths = None,
+    transform: MaybeText = None,
     pixel_mm: PixelMm = None,
     settings: Annotated[dict[str, Any], Fields("calibration.settings:ImageFit")],
-    clock: Path | None = None,
-    time_offset_s: float | None = None,
+    clock: MaybePath = None,
+    time_offset_s: MaybeNumber = None,
     as_json: Json = False,
 ) -> None:
     """Calibrate a position sensor from two crossing sweeps of anything with visible structure.
@@ -52,7 +63,7 @@ def images(
     out
         Calibration file to write; .txt and .png beside it.
     start
-        Not with --start-mm: calibration to start from; by default A's own, if it has one.
+        Calibration to start from; by default A's own, if it has one. Not with --start-mm.
     start_mm
         With --start-deg: start by ruler, the image's top left corner seen from the sensor, x y z.
     start_deg

@@ -9,7 +9,7 @@ import typer
 
 from speckle3d.cli.calibrations import report_written, require_free
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import Images, Json, Out, emit, emit_json, from_options, note
+from speckle3d.cli.common import Json, Out, emit, emit_json, from_options, note
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def plane(
-    images: Images,
+    images: Path,
     out: Out,
     settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:PlaneSettings")],
     as_json: Json = False,
@@ -42,7 +42,7 @@ def plane(
 
 
 def orientation(
-    images: Images,
+    images: Path,
     out: Out,
     settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:OrientationSettings")],
     as_json: Json = False,
@@ -66,7 +66,7 @@ def orientation(
 
 
 def wires(
-    images: Images,
+    images: Path,
     out: Out,
     phantom: Annotated[str, typer.Option()],
     settings: Annotated[dict[str, Any], Fields("speckle3d.calibrating.settings:WireSettings")],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from speckle3d.cli.calibrations import given_settings
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import from_options, load_settings, note
+from speckle3d.cli.common import from_options, load_settings, notes
 
 if TYPE_CHECKING:
     from speckle3d.imaging.voxels.settings import CompoundingSettings
@@ -52,8 +52,7 @@ def open_sweep_at(modes: Sequence[str | None], source: Path, stated: Statement) 
 
     opened = [open_posed(source, mode, *stated) for mode in modes]
     recorded = [] if opened[0].reconstruction is not None else recording_notes(source, stated[1])
-    for line in (*recorded, *opened[0].notes()):
-        note(line)
+    notes((*recorded, *opened[0].notes()))
     return opened
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from speckle3d.cli.common import Json, Mode, ReconstructionFile, emit, emit_json, note
+from speckle3d.cli.common import Json, MaybeNumber, MaybePath, MaybeText, emit, emit_json, note
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def measure(
-    source: ReconstructionFile,
+    reconstruction_file: Path,
     point: list[str] | None = None,
-    points: Path | None = None,
-    on: Path | None = None,
-    mode: Mode = None,
-    pick_mm: float | None = None,
+    points: MaybePath = None,
+    on: MaybePath = None,
+    mode: MaybeText = None,
+    pick_mm: MaybeNumber = None,
     as_json: Json = False,
 ) -> None:
     """Say how long it is between points, and how sure that is: distances, the line's length, angles.
@@ -28,7 +28,7 @@ def measure(
 
     Parameters
     ----------
-    source
+    reconstruction_file
     point
         A point X,Y,Z of the world, mm; repeat it, in order.
     points
@@ -61,7 +61,7 @@ def measure(
     if pick_mm is not None and not 0.0 <= pick_mm < float("inf"):
         raise InvalidInputError(f"--pick-mm: expected zero or more, got {pick_mm}")
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
-    made, why = read_reconstruction(source, with_pairs=False), ""
+    made, why = read_reconstruction(reconstruction_file, with_pairs=False), ""
     if on is not None:
         shown = read_plane(on, mode)
         require_same_poses(shown, poses_of(made, shown.mode), str(on))

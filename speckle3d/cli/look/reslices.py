@@ -8,15 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from speckle3d.cli.calibrations import files_of
-from speckle3d.cli.common import (
-    CalibrationFiles,
-    Modes,
-    Out,
-    PosedFile,
-    SweepFile,
-    Transform,
-    note,
-)
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Paths, notes
 from speckle3d.cli.look.compounding import Imported, statement
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
@@ -31,51 +23,51 @@ Triple = tuple[float, float, float]
 
 
 def reslice(
-    source: PosedFile,
+    input_file: Path,
     out: Out,
     *,
-    mode: Modes = None,
-    difference_to: str | None = None,
-    lateral_mm: float | None = None,
-    depth_mm: float | None = None,
+    mode: list[str] | None = None,
+    difference_to: MaybeText = None,
+    lateral_mm: MaybeNumber = None,
+    depth_mm: MaybeNumber = None,
     frame: int | None = None,
     angle_deg: float = 0.0,
-    points: str | None = None,
+    points: MaybeText = None,
     origin: Triple | None = None,
     right: Triple | None = None,
     down: Triple | None = None,
-    curve: Path | None = None,
-    on: Path | None = None,
+    curve: MaybePath = None,
+    on: MaybePath = None,
     straight: bool = False,
     outlines: bool = False,
-    volume: Path | None = None,
-    state: Path | None = None,
+    volume: MaybePath = None,
+    state: MaybePath = None,
     pixel_mm: float = 0.2,
     reach_mm: float = 0.5,
-    sweep_file: SweepFile = None,
-    dynamic_range_db: float | None = None,
-    calibration: CalibrationFiles = None,
-    transform: Transform = None,
+    sweep_file: MaybePath = None,
+    dynamic_range_db: MaybeNumber = None,
+    calibration: Paths = None,
+    transform: MaybeText = None,
     imported: Imported,
 ) -> None:
     """Cut a plane or along a curve, straight from the frames at the poses of one or more modes.
 
     Parameters
     ----------
-    source
+    input_file
     out
         PNG to write; or .nrrd, .mha, .nii.gz: the cut at its place.
     mode
         Which poses to use, as in `volume`; repeated, modes stand side by side.
     lateral_mm
-        Not with --depth-mm or --points or --origin or --curve: cut along the sweep at this lateral position
-        (middle).
+        Cut along the sweep at this lateral position (middle). Not with --depth-mm or --points or --origin
+        or --curve.
     depth_mm
-        Not with --frame or --points or --origin or --curve: cut parallel to the skin at this depth.
+        Cut parallel to the skin at this depth. Not with --frame or --points or --origin or --curve.
     frame
-        Not with --points or --origin or --curve: cut in the plane of this frame, from 0.
+        Cut in the plane of this frame, from 0. Not with --points or --origin or --curve.
     points
-        Not with --origin or --curve: cut through three points of the world, 'X,Y,Z X,Y,Z X,Y,Z' in mm.
+        Cut through three points of the world, 'X,Y,Z X,Y,Z X,Y,Z' in mm. Not with --origin or --curve.
     curve
         CSV of a curve's points x_mm,y_mm,z_mm in the world: cut along it and into the depth.
     on
@@ -88,7 +80,7 @@ def reslice(
     angle_deg
         With --frame: turn out of it about its depth line; 90 is along the sweep.
     origin
-        Not with --curve: cut through this point of the world, mm.
+        Cut through this point of the world, mm. Not with --curve.
     right
         With --origin: direction of the picture's rows.
     down
@@ -121,7 +113,7 @@ def reslice(
     from speckle3d.study.reslices.reslice_figures import save_outlines, save_reslices
 
     as_volume = out.name.lower().endswith(SUFFIXES)
-    read = (source, sweep_file, curve, on, volume, state, *files_of(imported, calibration))
+    read = (input_file, sweep_file, curve, on, volume, state, *files_of(imported, calibration))
     require_own_place(out, "volume" if as_volume else "picture", *read)
     place = Place(
         lateral_mm, depth_mm, frame, angle_deg, _points(points), _vector(origin), _vector(right),
@@ -131,7 +123,7 @@ def reslice(
     def located(opened: OpenedModes | None) -> Place:
         return place if curve is None else replace(place, curve_mm=_curve(curve, on, opened))
 
-    if source.is_file() and may_be_volume(source) and not outlines:
+    if input_file.is_file() and may_be_volume(input_file) and not outlines:
         of_sweeps = {
             **imported,
             "mode": mode,
@@ -142,16 +134,17 @@ def reslice(
         for name, value in of_sweeps.items():
             if value:
                 flag = name.replace("_", "-")
-                raise InvalidInputError(f"--{flag}: expected a sweep with it, got the volume {source.name}")
-        voxels, states = _voxels(source, state)
-        picture = cut_voxels(voxels, located(None), source.name, states)
+                raise InvalidInputError(
+                    f"--{flag}: expected a sweep with it, got the volume {input_file.name}"
+                )
+        voxels, states = _voxels(input_file, state)
+        picture = cut_voxels(voxels, located(None), input_file.name, states)
     else:
         read_voxels = None if volume is None else _voxels(volume, state)
         modes = _modes_of(None if read_voxels is None else read_voxels[0], mode or ())
-        stated = statement(source, sweep_file, imported, transform, calibration, dynamic_range_db)
-        opened = open_modes(source, modes, difference_to, *stated)
-        for line in opened.posed.notes():
-            note(line)
+        stated = statement(input_file, sweep_file, imported, transform, calibration, dynamic_range_db)
+        opened = open_modes(input_file, modes, difference_to, *stated)
+        notes(opened.posed.notes())
         if outlines:
             save_outlines(opened, out)
             return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, Out, emit, emit_json, note
+from speckle3d.cli.common import Json, MaybeNumber, MaybePath, MaybeText, Out, emit, emit_json, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 def surface(
     volume_file: Path,
     out: Out,
-    level: float | None = None,
+    level: MaybeNumber = None,
     below: bool = False,
     labels: bool = False,
     smooth: Annotated[int, typer.Option(min=0)] = 0,
     largest: bool = False,
-    reconstruction: Path | None = None,
-    mode: str | None = None,
-    state: Path | None = None,
+    reconstruction: MaybePath = None,
+    mode: MaybeText = None,
+    state: MaybePath = None,
     as_json: Json = False,
 ) -> None:
     """Find the surface where a volume crosses a grey level, or those of its labels, and measure them.

@@ -9,28 +9,22 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from speckle3d.cli.common import (
-    PixelMm,
-    SweepFile,
-    Written,
-    from_options,
-    note,
-)
+from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, PixelMm, Written, from_options, note
 from speckle3d.core.extras import require_extra
 
 
 def view(
     file: Path,
-    reconstruction: Path | None = None,
-    sweep_file: SweepFile = None,
+    reconstruction: MaybePath = None,
+    sweep_file: MaybePath = None,
     record: Written = None,
     calibrate: Literal["plane", "orientation", "wires"] | None = None,
-    phantom: str | None = None,
-    points: Path | None = None,
-    poses: Path | None = None,
-    transform: str | None = None,
+    phantom: MaybeText = None,
+    points: MaybePath = None,
+    poses: MaybePath = None,
+    transform: MaybeText = None,
     pixel_mm: PixelMm = None,
-    dynamic_range_db: float | None = None,
+    dynamic_range_db: MaybeNumber = None,
     sensor: Literal["orientation", "tracker"] | None = None,
     level: bool = False,
     port: Annotated[int, typer.Option(min=0, max=65535)] = 0,
@@ -46,8 +40,8 @@ def view(
     reconstruction
         Reconstruction of the recording, to see with it.
     calibrate
-        Not with --record or --reconstruction or --sweep: FILE shows a phantom: tune what is found in it and
-        calibrate, as the command would.
+        FILE shows a phantom: tune what is found in it and calibrate, as the command would. Not with
+        --record or --reconstruction or --sweep.
     record
         Of a sensor on a port: new file for its bytes; else none is kept.
     port

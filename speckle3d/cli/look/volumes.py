@@ -7,19 +7,7 @@ from typing import Annotated, Any, Literal
 
 from speckle3d.cli.calibrations import files_of
 from speckle3d.cli.commands import Fields
-from speckle3d.cli.common import (
-    CalibrationFiles,
-    ConfigFile,
-    Json,
-    Mode,
-    Out,
-    PosedFile,
-    SweepFile,
-    Transform,
-    Written,
-    emit_json,
-    note,
-)
+from speckle3d.cli.common import Json, MaybeNumber, MaybePath, MaybeText, Out, Paths, Written, emit_json, note
 from speckle3d.cli.look.compounding import (
     Imported,
     clip_of,
@@ -34,10 +22,10 @@ Three = tuple[float, float, float]
 
 
 def volume(
-    source: PosedFile,
+    input_file: Path,
     out: Out,
     *,
-    mode: Mode = None,
+    mode: MaybeText = None,
     settings: Annotated[
         dict[str, Any],
         Fields("speckle3d.imaging.voxels.settings:CompoundingSettings", without=("max_file_gb",)),
@@ -47,23 +35,23 @@ def volume(
     origin_mm: Three | None = None,
     shape: tuple[int, int, int] | None = None,
     size_mm: Three | None = None,
-    within_gb: float | None = None,
-    like: Path | None = None,
-    region: str | None = None,
+    within_gb: MaybeNumber = None,
+    like: MaybePath = None,
+    region: MaybeText = None,
     state: Written = None,
     deviation: Written = None,
-    sweep_file: SweepFile = None,
-    calibration: CalibrationFiles = None,
-    transform: Transform = None,
+    sweep_file: MaybePath = None,
+    calibration: Paths = None,
+    transform: MaybeText = None,
     imported: Imported,
-    config_file: ConfigFile = None,
+    config_file: MaybePath = None,
     as_json: Json = False,
 ) -> None:
     """Compound the frames into voxels, at the poses of one mode or of the recording itself.
 
     Parameters
     ----------
-    source
+    input_file
     out
         VOLUME.nrrd, .mha, .nii.gz or .nii to write.
     mode, voxel_mm
@@ -78,22 +66,22 @@ def volume(
     ----------------
     splat, fill_mm, voxel_type, levels
     backward_mm
-        Not with --splat or --rule or --fill-radius or --fill-mm: for sparse sweeps, voxels between the
-        nearest images, at most so far away.
+        For sparse sweeps, voxels between the nearest images, at most so far away. Not with --splat or
+        --rule or --fill-radius or --fill-mm.
     axes
         Of the voxels: sweep (mean of the images), world, principal (smallest box).
     spacing_mm
-        Not with --voxel-mm: voxels' sides along each axis.
+        Voxels' sides along each axis. Not with --voxel-mm.
     origin_mm
         Centre of the first voxel in the world.
     shape
         Number of voxels along each axis.
     size_mm
-        Not with --shape: size along each axis, mm.
+        Size along each axis, mm. Not with --shape.
     within_gb
-        Not with --voxel-mm or --spacing-mm: the finest round one of a volume no larger than this.
+        The finest round one of a volume no larger than this. Not with --voxel-mm or --spacing-mm.
     like
-        Not with --voxel-mm: a volume whose grid to take.
+        A volume whose grid to take. Not with --voxel-mm.
     region
         What counts of an image, in mm and degrees: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or
         'fan x,y angle,angle radius,radius'; several joined by ' and '.
@@ -111,12 +99,14 @@ def volume(
     from speckle3d.study.pose_errors import caution
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
-    inputs = (source, sweep_file, like, *files_of(imported, calibration))
+    inputs = (input_file, sweep_file, like, *files_of(imported, calibration))
     require_own_places({"--output": out, "--state": state, "--deviation": deviation}, "volume", *inputs)
     checked = compounding_settings(config_file, settings)
-    stated = statement(source, sweep_file, imported, transform, calibration, settings.get("dynamic_range_db"))
-    (posed,) = open_sweep_at([mode], source, stated)
-    region = region or clip_of(source, stated, posed)
+    stated = statement(
+        input_file, sweep_file, imported, transform, calibration, settings.get("dynamic_range_db")
+    )
+    (posed,) = open_sweep_at([mode], input_file, stated)
+    region = region or clip_of(input_file, stated, posed)
     request = VolumeRequest(
         out,
         checked,

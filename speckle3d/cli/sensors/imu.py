@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, OptionalOut, OutArgument, emit_json, emit_rows, note, require_finite
+from speckle3d.cli.common import (
+    Json,
+    MaybeNumber,
+    MaybePath,
+    OptionalOut,
+    OutArgument,
+    emit_json,
+    emit_rows,
+    note,
+    require_finite,
+)
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.cli.sensors.imu_logs import (
     Log,
@@ -90,12 +99,12 @@ def convert(log_file: Log, out: OutArgument, rate_hz: RateHz = None, world: Worl
 
 def orient(
     log_file: Log,
-    into: Path | None = None,
+    into: MaybePath = None,
     out: OptionalOut = None,
     method: MethodOption = "smoother",
     magnetometer: Magnetometer = True,
-    time_offset_s: float | None = None,
-    calibration: Path | None = None,
+    time_offset_s: MaybeNumber = None,
+    calibration: MaybePath = None,
     replace_stream: Annotated[bool, typer.Option("--replace")] = False,
     rate_hz: RateHz = None,
     world: WorldOption = None,
@@ -168,9 +177,9 @@ def record(
     port: str,
     out: OutArgument,
     content: str = "orientation",
-    rate_hz: float | None = None,
+    rate_hz: MaybeNumber = None,
     baud: int | None = None,
-    duration_s: float | None = None,
+    duration_s: MaybeNumber = None,
     append: bool = False,
 ) -> None:
     """Record a sensor on a serial port; every byte is in the file as soon as it has come.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, Written, emit, emit_rows, note, require_finite
+from speckle3d.cli.common import Json, MaybePath, Paths, Written, emit, emit_rows, note, require_finite
 from speckle3d.cli.sensors.imu_logs import (
     Log,
     Magnetometer,
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 def accuracy(
     log_file: Log,
-    reference: Path | None = None,
-    optical: Path | None = None,
-    calibration: list[Path] | None = None,
+    reference: MaybePath = None,
+    optical: MaybePath = None,
+    calibration: Paths = None,
     turns: str = "roll, yaw, tilt",
     fit_mounting: Annotated[bool, typer.Option("--fit-mounting/--aligned")] = True,
     time_offset_s: float = 0.0,

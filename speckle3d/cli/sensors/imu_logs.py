@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from speckle3d.cli.common import note
+from speckle3d.cli.common import note, notes
 
 if TYPE_CHECKING:
     from speckle3d.core.streams import TimedRotations
@@ -60,8 +60,7 @@ def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> 
 
 def tell(log: ImuLog) -> None:
     """Report on stderr what a log lacks, and what was assumed in its place."""
-    for text in log.notes:
-        note(text)
+    notes(log.notes)
     if log.gaps:
         longest = max(gap.duration_s for gap in log.gaps)
         lost = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
@@ -78,6 +77,5 @@ def orientation_of(
     from xsens.fusion.settings import FusionSettings
 
     found = orient(log, FusionSettings(use_magnetometer=magnetometer), method)
-    for text in found.notes:
-        note(text)
+    notes(found.notes)
     return found.rotations, found

@@ -14,10 +14,11 @@ import typer
 
 from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
-    CalibrationFiles,
-    ConfigFile,
     Drift,
+    MaybePath,
+    MaybeText,
     Out,
+    Paths,
     emit,
     from_options,
     load_settings,
@@ -70,19 +71,19 @@ def live(
     out: Out,
     *,
     curves_file: Annotated[Path, typer.Option()],
-    image: str | None = None,
-    transform: str | None = None,
-    orientation: str | None = None,
-    calibration: CalibrationFiles = None,
+    image: MaybeText = None,
+    transform: MaybeText = None,
+    orientation: MaybeText = None,
+    calibration: Paths = None,
     imported: Annotated[dict[str, Any], Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)],
     serve: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     volume: bool = True,
     check: bool = False,
-    crossing_file: Path | None = None,
+    crossing_file: MaybePath = None,
     drift: list[Drift] | None = None,
     compression: Literal["none", "gzip"] = "none",
     duration_s: Annotated[float | None, typer.Option(min=0.0)] = None,
-    config_file: ConfigFile = None,
+    config_file: MaybePath = None,
 ) -> None:
     """Reconstruct a sweep while it is made: receive, record, place each frame, send its pose back.
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from speckle3d.cli.common import Images, note
+from speckle3d.cli.common import note
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 
@@ -23,7 +24,7 @@ _LAST_S = 5.0
 
 
 def play(
-    sweep: Images,
+    images: Path,
     port: Annotated[int, typer.Option(min=0, max=65535)] = 18944,
     address: str = "127.0.0.1",
     rate: Annotated[float, typer.Option(min=1e-3, max=1e3)] = 1.0,
@@ -41,7 +42,7 @@ def play(
 
     Parameters
     ----------
-    sweep
+    images
     port
         0: any free one.
     kind
@@ -71,7 +72,7 @@ def play(
     from speckle3d.io.igtl.server import Server
     from speckle3d.io.load import load_sweep
 
-    read = load_sweep(sweep)
+    read = load_sweep(images)
     frames, grid, upright = _frames(read, kind)
     names = Names(image, transform, orientation)
     times, shift_s = read.frame_time_s, clock_shift_s(read)
