@@ -42,16 +42,6 @@ def test_the_errors_against_truth_are_in_every_table(reconstructed):
     ]
 
 
-def test_curves_as_json(run, bench, tmp_path):
-    code, out, _ = run("calibrate", "curves", bench / "stepped.h5", "-o", tmp_path / "c.h5", "--json")
-    table = json.loads(out)
-    assert code == 0
-    assert table["pairs"] > 50
-    # Half the correlation is gone within the beam's width everywhere.
-    assert all(0.05 < half < 1.0 for half in table["half_mm"])
-    assert (tmp_path / "c.h5").is_file()
-
-
 def test_a_reference_can_be_chosen(run, bench, tmp_path):
     code, out, _ = run("reconstruct", bench / "sweep.h5", "-o", tmp_path, "--reference", "tracker", "--json")
     assert code == 0
@@ -206,12 +196,3 @@ def test_folders_that_cannot_be_written(refused, bench, tmp_path):
     assert "file" in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "file" / "o")
     assert "file" in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "file")
     assert "folder" in refused("simulate", tmp_path / "none" / "s.h5", *SMALL)
-
-
-def test_a_volume_of_a_sweep_that_is_gone_or_another(refused, reconstructed, bench, tmp_path):
-    path, out = reconstructed / "reconstruction.h5", tmp_path / "v.nrrd"
-    assert "SHA-256" in refused("volume", path, "-o", out, "--sweep", bench / "stepped.h5")
-    assert "--sweep" in refused("volume", path, "-o", out, "--sweep", tmp_path / "none.h5")
-    assert "got 'crossed'" in refused("volume", path, "-o", out, "--mode", "crossed")
-    both = ("--lateral-mm", "2", "--depth-mm", "3")
-    assert "--depth-mm" in refused("reslice", path, "-o", tmp_path / "r.png", *both)

@@ -147,15 +147,6 @@ def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_
     assert np.rad2deg(((plain * about_z).inv() * first).magnitude()) < 2.0
 
 
-def test_pixels_that_were_found_and_differ_are_said(run, sweep, bench, saved, tmp_path):
-    for share, parameters, said in ((1.02, FOUND, True), (1.005, FOUND, False), (1.02, (), False)):
-        pixel_mm = pixels_of(sweep) * [1.0, share]
-        path = saved(of_sweep(sweep, "tracker", pixel_mm=pixel_mm, parameters=parameters))
-        code, _, err = run("convert", bench / "sweep.h5", tmp_path / "out.h5", "--calibration", path)
-        assert code == 0
-        assert ("found pixels of" in err) == said
-
-
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])
 def test_convert_puts_a_calibration_into_a_sweep(run, uncalibrated, saved, tmp_path, sensor):
     path = saved(made(sensor))
@@ -213,12 +204,3 @@ def test_calibrations_that_do_not_fit_are_refused(refused, bench, saved, sequenc
         message = refused(*names, "--calibration", with_nothing)
         assert "short.h5" in message
         assert "translation" in message
-
-
-def test_a_calibration_for_a_sensor_that_the_sweep_lacks(refused, changed, saved, tmp_path):
-    def forget(file):
-        del file["tracker"]
-
-    message = refused("reconstruct", changed(forget), "-o", tmp_path / "o", "--calibration", saved(made()))
-    assert "cal.h5" in message
-    assert "tracker" in message

@@ -46,17 +46,6 @@ def test_the_suffix_of_out_says_what_is_written(done, sequence, tmp_path):
     assert not (tmp_path / "d.zraw").exists()  # of the header that was replaced
 
 
-def test_what_a_sequence_does_not_hold_is_said(done, tmp_path):
-    write_sweep(tmp_path / "a.h5", sweep_examples.bmode_sweep())
-    _, err = done("convert", tmp_path / "a.h5", tmp_path / "b.mha")
-    told = [line for line in err.splitlines() if "does not hold" in line]
-    assert [line.split(": ", 1)[1].split("'s")[0] for line in told] == [
-        "does not hold the tracker",
-        "does not hold the orientation sensor",
-        "does not hold the true poses",
-    ]
-
-
 def test_options_reach_the_sweep(done, tmp_path):
     pixels = np.random.default_rng(0).integers(-900, 900, (3, 4, 30)).astype(np.int16)
     path = write_mha(tmp_path / "rf.mha", pixels, frames=tracked(3)[2])

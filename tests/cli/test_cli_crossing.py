@@ -79,11 +79,3 @@ def test_what_is_missing_or_cannot_tell_is_said(refused, sequences, tmp_path):
     assert "--start-mm" in refused(*command, *bad)
     assert "--time-offset-s" in refused(*command, *start_of(truth), "--time-offset-s", "nan")
     assert not (tmp_path / "cal.h5").exists()
-
-
-def test_a_pixel_size_beside_a_sweeps_own_is_refused(run, shipped, tmp_path):
-    sweep = shipped / "phantom.h5"
-    code, _, err = run("calibrate", "images", sweep, sweep, "-o", tmp_path / "cal.h5", *PIXELS)
-    assert code == 2
-    assert "--pixel-mm" in err
-    assert str(sweep) in err

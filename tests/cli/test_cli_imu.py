@@ -3,7 +3,6 @@
 import json
 import re
 
-import h5py
 import numpy as np
 import pytest
 import sweep_examples
@@ -11,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
-from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
 
@@ -50,29 +48,6 @@ def test_a_log_is_told(run, log_file):
     assert told["lost"] == "0"
 
 
-@pytest.mark.parametrize("command", ["info", "convert"])
-def test_the_world_that_is_given_is_beside_what_the_log_shows(run, refused, tmp_path, command):
-    """Text that does not name its world, NWU; taken for ENU, its orientation is turned by 90 degrees."""
-    truth, log = turning(5.0)
-    heads = [f"{name}_{axis}" for name in ("Acc", "Gyr", "Mag") for axis in "XYZ"]
-    heads = "\t".join([*heads, *(f"Quat_q{i}" for i in range(4))])
-    vectors = (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au)
-    rows = np.column_stack([*vectors, truth.as_quat(scalar_first=True)])
-    np.savetxt(tmp_path / "log.txt", rows, "%.6f", "\t", header=heads, comments="// Update Rate: 100.0Hz\n")
-    out = tmp_path / "out.csv"
-    given = {"info": (), "convert": (out,)}[command]
-    for world, said in ((None, "orientation: NWU by its own"), ("enu", "ENU, as given; by its own")):
-        asked = () if world is None else ("--world", world)
-        code, printed, err = run("imu", command, tmp_path / "log.txt", *given, *asked)
-        assert code == 0, err
-        assert said in " ".join((printed + err).split())
-        if out.exists():
-            turned = read_log(out).world_from_sensor * truth.inv()
-            expected = 0.0 if world is None else 90.0
-            np.testing.assert_allclose(np.rad2deg(turned.magnitude()), expected, atol=1e-3)
-    assert "--world" in refused("imu", command, tmp_path / "log.txt", *given, "--world", "EDN")
-
-
 @pytest.mark.parametrize("method", ["filter", "sensor"])
 def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path, method):
     sweep_file = tmp_path / "sweep.h5"
@@ -91,37 +66,12 @@ def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_pa
     assert np.rad2deg(error.max()) < 2.0
 
 
-def test_the_orientation_found_is_compared_with_the_sensors_own(run, log_file, tmp_path):
-    code, out, err = run("imu", "orient", log_file, "-o", tmp_path / "o.csv", "--json")
-    assert code == 0, err
-    told = json.loads(out)
-    # The log's own orientation is the truth, its readings are exact; see the test above. Degrees.
-    assert 0.0 < told["inclination, RMS difference from the sensor's own"] < 1.0
-    code, out, _ = run("imu", "orient", log_file, "-o", tmp_path / "o.csv", "--method", "sensor")
-    assert "sensor's own" not in out
-
-
 def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, tmp_path):
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
     assert run("imu", "orient", log_file, "--into", sweep_file, "--replace")[0] == 0
     assert "--replace" in refused("imu", "orient", log_file, "--into", sweep_file)
     assert "--into" in refused("imu", "orient", log_file)
-
-
-def test_accuracy_against_a_mechanism(run, log_file, tmp_path):
-    truth, log = turning()
-    times = np.arange(4.0, 18.0, 0.5)
-    tilt = np.rad2deg(truth[np.searchsorted(log.time_s, times)].as_rotvec()[:, 0])
-    rows = [f"{angle},0,0,{time}" for angle, time in zip(tilt, times, strict=True)]
-    reference = tmp_path / "mechanism.csv"
-    reference.write_text("\n".join(["tilt,yaw,roll,time_s", *rows]) + "\n")
-    code, out, err = run("imu", "accuracy", log_file, "--reference", reference, "--json")
-    assert code == 0, err
-    assert "no --calibration" in err
-    told = {row["description"]: row["value"] for row in json.loads(out)}
-    # Exact readings and settings; what the filter itself makes of them is left. Degrees.
-    assert 0.0 <= told["log: tilt error, standard deviation"] < 1.0
 
 
 def optical(path, truth, time_s):
@@ -188,20 +138,3 @@ def test_without_a_magnetometer_the_heading_is_said_to_be_relative(run, tmp_path
     assert "no magnetometer" in err
     assert "heading relative to the start" in out
     assert "magnetic field" not in out
-
-
-def test_one_sample_has_no_rate(run, tmp_path):
-    write_csv(tmp_path / "log.csv", ImuLog(np.zeros(1), np.array([[0.0, 0.0, 9.8]])))
-    code, out, _ = run("imu", "info", tmp_path / "log.csv")
-    assert code == 0
-    assert re.search(r"rate +unknown$", out, re.MULTILINE)
-    assert "nan" not in out
-
-
-def test_a_stream_that_cannot_be_read_can_be_replaced(run, refused, log_file, sweep_file):
-    assert run("imu", "orient", log_file, "--into", sweep_file, "--replace")[0] == 0
-    with h5py.File(sweep_file, "r+") as file:
-        file["orientation"].attrs["time_offset_s"] = np.nan
-    code, _, err = run("imu", "orient", log_file, "--into", sweep_file, "--replace")
-    assert code == 0, err
-    assert load_sweep(sweep_file).orientation.time_offset_s == 0.0

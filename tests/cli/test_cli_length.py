@@ -40,16 +40,6 @@ def test_sweeps_that_do_not_cross_leave_the_mode_out_and_keep_the_others(run, pa
     assert found.frame_time_s.tolist() == read_sweep(sweep).frame_time_s[:12].tolist()
 
 
-def test_a_volume_of_a_part_is_made_of_its_frames(run, parts):
-    sweep, folder = parts
-    code, _, err = run("reconstruct", sweep, "--frames", "6-23", "-o", folder / "part")
-    assert code == 0, err
-    code, _, err = run(
-        *("volume", folder / "part" / "reconstruction.h5", "-o", folder / "part.nrrd", "--voxel-mm", "0.5")
-    )
-    assert code == 0, err
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -92,20 +92,6 @@ def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player,
 
 
 @pytest.mark.slow
-def test_a_killed_session_leaves_a_readable_sweep(player, shipped, tmp_path):
-    out = tmp_path / "out"
-    running = started(
-        "live", f"127.0.0.1:{player}", "-o", out, "--curves", shipped / "curves.h5", "--no-volume", *RF
-    )
-    waited_for(out / "sweep.h5", 20)
-    running.kill()
-    running.communicate()
-    kept = s3.load_sweep(out / "sweep.h5")
-    assert len(kept) >= 20
-    np.testing.assert_array_equal(kept.frames[19], s3.load_sweep(shipped / "phantom.h5").frames[19])
-
-
-@pytest.mark.slow
 def test_told_to_end_it_closes_the_recording_first(player, shipped, tmp_path):
     out = tmp_path / "out"
     running = started(

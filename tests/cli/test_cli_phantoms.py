@@ -77,17 +77,6 @@ def test_a_plane_calibrates_a_tracker(run, scans, tmp_path):
     assert out.with_suffix(".png").stat().st_size > 20_000
 
 
-def test_a_bare_wall_is_told_what_a_thick_beam_does(run, scans, tmp_path):
-    code, text, _ = run(
-        "calibrate", "plane", scans / "bar.h5", "-o", tmp_path / "c.h5", "--beam-mm", "2", "--json"
-    )
-    assert code == 0
-    beam = json.loads(text)["beam"]
-    assert [one["width_mm"] for one in beam] == [2.0]
-    # Two millimetres of beam at up to 25 degrees: 4.2 mm, less where the motion covers less.
-    assert -6.0 < beam[0]["shift_mm"][1] < -2.0
-
-
 # Exact sensors; tilt is the weak one, as in the paper. Measured 0.1, 0.02 and 0.01 degrees.
 @pytest.mark.parametrize(
     ("sensor", "limits_deg"), [("orientation", [1.0, 0.2, 0.1]), ("tracker", [1.0, 1.0, 1.0])]
@@ -206,16 +195,6 @@ def test_picked_points_calibrate_with_wires(run, tmp_path, kind):
     assert 0.05 < validated < 0.15
 
 
-def test_points_of_another_recording_are_refused(refused, tmp_path):
-    sweep, picked = scan_of_wires(tmp_path, "cross", 5)
-    command = ("calibrate", "wires", sweep, "-o", tmp_path / "c.h5", "--phantom", "cross", "--points")
-    picked.write_text(picked.read_text() + "90,10,10\n")
-    assert "picked-5.csv: expected frames from 0 to 89, got frame 90" in refused(*command, picked)
-    picked.write_text("frame,column_px,row_px\n0,10,400\n")
-    assert "got column 10, row 400 in frame 0" in refused(*command, picked)
-    assert "--validation-points" in refused(*command, picked, "--validation-points", picked)
-
-
 @pytest.mark.slow
 @pytest.mark.realdata
 def test_real_n_wires_calibrate_better_than_published(run, realdata, tmp_path):
@@ -236,19 +215,3 @@ def test_real_n_wires_calibrate_better_than_published(run, realdata, tmp_path):
     # PLUS: 0.479 mm on the calibration frames and 0.540 mm on the others. Measured 0.445 and 0.469.
     assert mean["calibration"] <= 0.479
     assert mean["validation"] <= 0.540
-
-
-@pytest.mark.slow
-def test_repeated_calibrations_are_compared(run, refused, scans, tmp_path):
-    files = [tmp_path / name for name in ("a.h5", "b.h5")]
-    for scan, out in zip(("bar.h5", "noisy.h5"), files, strict=True):
-        assert run("calibrate", "plane", scans / scan, "-o", out)[0] == 0
-    code, text, _ = run("calibrate", "repeatability", *files, "--size-px", "40", "1000", "--json")
-    assert code == 0
-    found = json.loads(text)
-    assert found["trials"] == 2
-    assert len(found["centre_shift_mm"]) == 1
-    # Two trials: the scatter about their mean is the shift over the square root of two.
-    assert found["centre_sd_mm"] == pytest.approx(found["centre_shift_mm"][0] / np.sqrt(2))
-    assert "at least two" in refused("calibrate", "repeatability", files[0])
-    assert "above zero" in refused("calibrate", "repeatability", *files, "--size-px", "40", "0")

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.volume import Volume
 from speckle3d.io.load import load_sweep
-from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.io.voxels.volumes import read_volume
-from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane, require_same_poses
+from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -110,50 +108,6 @@ def test_a_volume_is_cut_in_the_world_of_its_own_poses(run, refused, reconstruct
     assert "--mode: expected orientation, at whose poses" in told
 
 
-def test_empty_voxels_are_not_shown_where_their_states_are_given(run, refused, bench, tmp_path):
-    placed = load_sweep(bench / "sweep.h5").truth[0]
-    states = np.ones((30, 40, 3), np.uint8)
-    states[:15] = 0
-    volume = Volume(np.full(states.shape, 7, np.uint8), (0.5, 0.5, 0.5), placed)
-    write_volume(tmp_path / "v.nrrd", volume)
-    write_volume(tmp_path / "s.nrrd", Volume(states, volume.spacing_mm, placed))
-    out = tmp_path / "cut.nrrd"
-    code, _, err = run(
-        "reslice", tmp_path / "v.nrrd", "-o", out, "--state", tmp_path / "s.nrrd", "--pixel-mm", 0.5
-    )
-    assert code == 0, err
-    cut = read_volume(out).voxels[:, :, 0]
-    assert np.isnan(cut[:15]).all()
-    np.testing.assert_allclose(cut[15:], 7.0)
-    write_volume(tmp_path / "other.nrrd", Volume(states[:20], volume.spacing_mm, placed))
-    told = refused("reslice", tmp_path / "v.nrrd", "-o", out, "--state", tmp_path / "other.nrrd")
-    assert "other.nrrd: expected states" in told
-
-
-def test_the_picture_of_a_reconstruction_says_where_its_cuts_lie(reconstructed, bench):
-    cuts = {each.mode: each for each in read_cuts(reconstructed / "reslice.png")}
-    assert list(cuts) == ["image", "orientation", "pose", "tracker", "truth"]
-    # All begin with the first frame's line down the middle vector, each in its own world.
-    truth = load_sweep(bench / "sweep.h5").truth
-    first = truth[0].inv().apply(cuts["truth"].cut.world_from_mm([0.0, 0.0], [5.0, 15.0]))
-    # Of the depth a part in a thousand, as the plane may be tilted in the frame by two degrees.
-    np.testing.assert_allclose(first[:, 1:], [[5.0, 0.0], [15.0, 0.0]], rtol=1e-3, atol=1e-9)
-    found = cuts["image"].cut.world_from_mm(0.0, 5.0)
-    np.testing.assert_allclose(found[1:], [5.0, 0.0], rtol=1e-3, atol=1e-9)
-    # It may be measured in: its strip of the images hides nothing of whose poses they are.
-    poses = read_reconstruction(reconstructed / "reconstruction.h5", with_pairs=False).poses
-    require_same_poses(cuts["image"], poses["image"], "reslice.png")
-    with pytest.raises(InvalidInputError, match="another reconstruction"):
-        require_same_poses(cuts["image"], poses["pose"], "reslice.png")
-
-
-def test_outlines_are_a_picture(run, reconstructed, tmp_path):
-    out = tmp_path / "o.png"
-    modes = ("--mode", "image", "--mode", "pose", "--outlines")
-    assert run("reslice", reconstructed / "reconstruction.h5", "-o", out, *modes)[0] == 0
-    assert out.read_bytes().startswith(PNG)
-
-
 def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp_path):
     sweep, out = bench / "sweep.h5", tmp_path / "r.png"
 
@@ -174,10 +128,3 @@ def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp
     )
     assert "--mode" in told("--mode", "image", source=tmp_path / "v.nrrd")
     assert not out.exists()
-
-
-def test_several_modes_need_a_picture(refused, reconstructed, tmp_path):
-    both = ("--mode", "image", "--mode", "pose")
-    path = reconstructed / "reconstruction.h5"
-    assert "one mode" in refused("reslice", path, "-o", tmp_path / "r.mha", *both)
-    assert "got 'crossed'" in refused("reslice", path, "-o", tmp_path / "r.png", "--difference-to", "crossed")

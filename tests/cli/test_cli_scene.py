@@ -1,6 +1,5 @@
 """What a reconstruction gives 3D Slicer: transforms, a sequence, a scene."""
 
-import json
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -29,12 +28,6 @@ def test_the_pose_of_a_frame_becomes_a_transform(run, made, tmp_path):
     pose = read_reconstruction(made).poses["pose"][7]
     found = SimpleITK.ReadTransform(str(tmp_path / name)).TransformPoint(pose.apply([1.0, 2.0, 3.0]).tolist())
     np.testing.assert_allclose(found, [1.0, 2.0, 3.0], atol=1e-9)
-
-
-def test_every_pose_becomes_a_transform(run, made, tmp_path):
-    code, _, err = run("trajectory", "export", made, "-o", tmp_path / "t.tfm", "--frame", "all")
-    assert code == 0, err
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"t-{i:04d}.tfm" for i in range(24)]
 
 
 @pytest.mark.parametrize(
@@ -89,17 +82,3 @@ def test_a_scene_of_two_modes(run, refused, made, tmp_path):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").write_text("precious")
     assert "another folder" in refused("scene", made, "-o", tmp_path / "other")
-
-
-def test_info_tells_of_the_volume_and_its_labels(run, made, tmp_path):
-    out, state = tmp_path / "v.nii.gz", tmp_path / "state.seg.nrrd"
-    code, _, err = run("volume", made, "-o", out, "--voxel-mm", 0.5, "--state", state)
-    assert code == 0, err
-    told = []
-    for path in (out, state):
-        code, text, err = run("info", path, "--json")
-        assert code == 0, err
-        told.append({row["description"]: row["value"] for row in json.loads(text)})
-    assert told[0]["voxels"] == told[1]["voxels"]
-    assert told[0]["levels"].startswith("log-compressed, 0 to 255 over 60 dB")
-    assert told[1]["label 1"].startswith("measured: ")

@@ -14,7 +14,6 @@ from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.shapes.surfaces import read_surface
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.reslices.cut_geometry import anchors_of
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
 from speckle3d.study.reslices.reslice_figures import save_reslices
 
@@ -83,19 +82,6 @@ def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
     assert told["mode"] == "fused"
     assert told["measurements"][0]["value"] == pytest.approx(6.0)
     assert told["measurements"][0]["by_poses"] == pytest.approx(0.05 * 6.0, rel=1e-3)
-
-
-def test_a_picture_of_other_poses_is_refused(run, refused, rec, tmp_path):
-    picks = ("--point", "0,5", "--point", "6,5")
-    longer = RigidTransform.from_translation(1.01 * POSES.translation)
-    plane = ReslicePlane(POSES[0], 8.0, 10.0, 0.2)
-    for poses, name in ((POSES, "own.png"), (longer, "longer.png"), (POSES[:9], "shorter.png")):
-        picture_of(tmp_path / name, "image", plane, anchors_of(poses))
-    code, _, err = run("measure", rec, "--on", tmp_path / "own.png", *picks)
-    assert code == 0, err
-    assert "frame 20 lies elsewhere" in refused("measure", rec, "--on", tmp_path / "longer.png", *picks)
-    # The same frames as far as they go: of these poses.
-    assert run("measure", rec, "--on", tmp_path / "shorter.png", *picks)[0] == 0
 
 
 @pytest.mark.parametrize(

@@ -62,29 +62,6 @@ def test_the_whole_calibration_places_levels_as_they_are_stored(run, recording, 
     assert (count == 0).any()
 
 
-def test_other_levels_need_the_dynamic_range(run, refused, recording, tmp_path):
-    command = (
-        "volume",
-        recording[0],
-        "--plus-config",
-        tmp_path / "set.xml",
-        *GRID,
-        "-o",
-        tmp_path / "v.nrrd",
-    )
-    assert "--dynamic-range-db" in refused(*command, "--levels", "linear")
-    # Amplitudes of B-mode end at 1: of whole numbers nothing would be left.
-    assert "--levels: expected voxel type float32" in refused(
-        *command, "--levels", "linear", "--voxel-type", "uint16"
-    )
-    code, _, told = run(*command, "--levels", "linear", "--dynamic-range-db", 40)
-    assert code == 0, told
-    volume = read_volume(tmp_path / "v.nrrd")
-    assert volume.fields["levels"] == "echo amplitude, linear, of B-mode over 40 dB; 1 is full scale"
-    assert volume.voxels.dtype == np.float32  # whole numbers hold no amplitude below 1
-    assert 0 < np.nanmin(volume.voxels) < np.nanmax(volume.voxels) < 1
-
-
 def test_a_cut_takes_the_same_options_and_shows_levels_where_decibels_are_not_known(run, recording, tmp_path):
     path, pixels = recording
     options = "--plus-config", tmp_path / "set.xml", "--frame", 2, "--pixel-mm", 0.5

@@ -1,13 +1,9 @@
 import json
-import shutil
 
-import challenge_examples as examples
 import numpy as np
 import pytest
-from drifting import drifted
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.tum import read_tum, write_tum
 
@@ -23,21 +19,6 @@ def test_what_is_exported_is_read_back(run, reconstructed, tmp_path):
         np.testing.assert_array_equal(back.time_s, held.frame_time_s)
         expected = held.poses["pose"].as_matrix()
         np.testing.assert_allclose(back.world_from_sensor.as_matrix(), expected, rtol=0, atol=1e-9)
-
-
-def test_an_export_takes_the_place_of_text_alone(run, refused, bench, reconstructed, tmp_path):
-    held, link, other = tmp_path / "reconstruction.h5", tmp_path / "link.tum", tmp_path / "notes.txt"
-    shutil.copy(reconstructed / "reconstruction.h5", held)
-    link.symlink_to(held)
-    other.write_text("not to be lost")
-    before = held.read_bytes()
-    for out in (held, link, other):
-        assert out.name in refused("trajectory", "export", held, "-o", out)
-    assert held.read_bytes() == before
-    assert other.read_text() == "not to be lost"
-    for _ in range(2):
-        code, _, err = run("trajectory", "export", held, "-o", tmp_path / "a.tum")
-        assert code == 0, err
 
 
 def test_a_reconstruction_is_scored_as_its_exported_text_is(run, bench, reconstructed, tmp_path):
@@ -75,19 +56,6 @@ def test_a_sweep_that_was_not_reconstructed_is_said_to_be_another(run, changed, 
         assert code == 0, err
         assert json.loads(out)["same_sweep"] is same
         assert ("sweep.h5 (SHA-256)" in err) is not same
-
-
-def test_a_scan_of_the_challenge_is_scored(run, tmp_path):
-    path, *_ = examples.write_data_set(tmp_path)
-    sweep = load_sweep(path)
-    true = sweep.tracker.world_from_image(sweep.frame_time_s)
-    write_tum(tmp_path / "e.tum", sweep.frame_time_s, drifted(true, np.random.default_rng(1)))
-    code, out, err = run("trajectory", "score", tmp_path / "e.tum", path)
-    assert code == 0, err
-    assert "local landmark error (LLE)" in out
-    assert "TUS-REC score, 2025" in out
-    code, out, err = run("info", path)
-    assert (code, "TUS-REC scan" in out) == (0, True), err
 
 
 @pytest.mark.parametrize(
