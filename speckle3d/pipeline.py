@@ -6,6 +6,7 @@ RF -> intensity -> in-plane motion -> patch correlation -> |distance| and sigma 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +19,7 @@ from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import InsufficientDataError, naming
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.handover.plots import plot_poses
@@ -32,6 +33,7 @@ from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_images
 from speckle3d.examine.recording import examine_recording
 from speckle3d.examine.sensors import examined_sensors
+from speckle3d.io.curves import curves_beside, read_curves, trust_words
 from speckle3d.matching.frames import ImageSink, MatchedSweep, match_chosen, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
@@ -167,7 +169,7 @@ class Tracked:
 
 def track(
     sweep: Sweep,
-    curves: DecorrelationCurves,
+    curves: DecorrelationCurves | None = None,
     config: Config | None = None,
     progress: Progress | None = None,
     sink: PairSink | None = None,
@@ -182,8 +184,9 @@ def track(
     ----------
     sweep : Sweep
         n frames, read one at a time.
-    curves : DecorrelationCurves
-        Of the sweep's probe and settings.
+    curves : DecorrelationCurves, optional
+        Of the sweep's probe and settings; by default curves.h5 beside its recording, as the
+        commands have it, and a warning says how far to trust them.
     config : Config, optional
     progress : callable, optional
         Called with frames done and frames in all; `speckle3d.progress_bar` makes one.
@@ -214,6 +217,7 @@ def track(
     (32, 'tracker', False)
     """
     require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
+    curves = _curves_beside(sweep) if curves is None else curves
     require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
     if len(sweep) < 2:
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
@@ -250,6 +254,16 @@ def track(
         sensors.trusted, tracked.image, tracked.covariance, tracked.scale_sigma
     )
     return replace(tracked, doubts=doubts, grid=sweep.grid, frame_time_s=sweep.frame_time_s)
+
+
+def _curves_beside(sweep: Sweep) -> DecorrelationCurves:
+    """Read the curves that lie beside a sweep's recording."""
+    if sweep.path is None:
+        raise InvalidInputError(f"{sweep.name}: expected curves of its probe (load_curves(path)), got none")
+    path = curves_beside(sweep.path)
+    curves = read_curves(path)
+    warnings.warn(trust_words(path, curves), stacklevel=3)
+    return curves
 
 
 def matcher_for(sweep: Sweep, curves: DecorrelationCurves, config: Config) -> FrameMatcher:

@@ -13,6 +13,8 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor
 from speckle3d.corrections import correct
+from speckle3d.io.curves import read_curves
+from speckle3d.io.load import load_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.motion.direction import SensorSettings, settle_direction, smooth_rotations
@@ -218,3 +220,13 @@ def test_curves_of_intensity_do_not_serve_echoes(sweep, curves):
     config = Config.model_validate({"matching": {"correlate": "intensity"}})
     with pytest.raises(MismatchError, match="echo and intensity"):
         track(sweep, curves, config)
+
+
+def test_curves_beside_a_recording_are_taken_and_said(shipped):
+    sweep = load_sweep(shipped / "phantom.h5").part(0, 12)
+    with pytest.warns(UserWarning, match=r"curves\.h5, by phantom; .* % \(95 %\)"):
+        found = track(sweep)
+    expected = track(sweep, read_curves(shipped / "curves.h5"))
+    np.testing.assert_array_equal(found.image.as_matrix(), expected.image.as_matrix())
+    with pytest.raises(InvalidInputError, match="load_curves"):
+        track(replace(sweep, path=None))

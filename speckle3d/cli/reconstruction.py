@@ -98,7 +98,7 @@ def reconstruct(
     --------
     $ speckle3d reconstruct data/phantom.h5 -o out --drift orientation --drift pose
     """
-    from speckle3d.io.curves import read_curves, write_curves
+    from speckle3d.io.curves import curves_beside, read_curves, trust_words, write_curves
     from speckle3d.io.load import load_sweep
     from speckle3d.io.sweeps import unfinished_note
     from speckle3d.io.voxels.volume_writer import require_suffix
@@ -111,8 +111,10 @@ def reconstruct(
     sweep = load_sweep(sweep_file)
     if (unfinished := unfinished_note(sweep_file)) is not None:
         note(unfinished)
-    used = _find_curves(curves_file, sweep_file)
+    used = curves_file or curves_beside(sweep_file)
     curves = read_curves(used)
+    if curves_file is None:
+        note(trust_words(used, curves))
     mount(sweep, calibrations)
     crossing = None
     if crossing_file is not None or crossing_frames is not None:
@@ -191,13 +193,3 @@ def _tell(result: JobResult) -> None:
         note(
             "nothing tells the sign of the elevational motion: taken as positive (setting sensors.direction)"
         )
-
-
-def _find_curves(given: Path | None, sweep_file: Path) -> Path:
-    from speckle3d.io.curves import curves_beside
-
-    if given is not None:
-        return given
-    beside = curves_beside(sweep_file)
-    note(f"curves: {beside}")
-    return beside

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol
 
 import numpy as np
@@ -326,6 +327,8 @@ class Sweep:
         Readings of a position sensor.
     name : str
         For messages and files.
+    path : Path, optional
+        Of the recording that it was read from.
 
     Examples
     --------
@@ -345,6 +348,7 @@ class Sweep:
     truth: RigidTransform | None = None
     name: str = "sweep"
     probe: str = ""
+    path: Path | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         times = require_increasing(self.frame_time_s, f"{self.name}: frame_time_s")

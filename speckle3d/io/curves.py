@@ -34,6 +34,12 @@ def curves_beside(sweep_file: Path) -> Path:
     return beside
 
 
+def trust_words(path: Path, curves: DecorrelationCurves) -> str:
+    """Say which curves were taken that nobody named, and how far to trust them."""
+    percent = 196.0 * curves.mismatch(True)
+    return f"curves: {path}, by {curves.origin}; lengths by them are right to {percent:.0f} % (95 %)"
+
+
 def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     """Write decorrelation curves; the file appears whole or not at all.
 

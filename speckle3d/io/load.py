@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError, naming
@@ -58,7 +59,7 @@ def load_sweep(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
     >>> sweep.grid.centre_mm.round(1).tolist()
     [7.0, 22.0, 0.0]
     """
-    return open_recording(path, settings).sweep
+    return replace(open_recording(path, settings).sweep, path=Path(path))
 
 
 def open_recording(path: PathLike, settings: ImportSettings | None = None) -> Recording:

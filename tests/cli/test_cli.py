@@ -81,13 +81,22 @@ def test_of_a_tracker_that_the_images_contradict_both_lengths_are_told(run, chan
     summary = json.loads((out / "summary.json").read_text())["sweeps"][0]
     assert "images and tracker" in {doubt["about"] for doubt in summary["doubts"]}
     assert {row["mode"] for row in summary["rows"]} == {"image", "orientation", "pose", "tracker"}
+    # There is no best mode: a command that needs one asks for it.
+    made = out / "reconstruction.h5"
+    code, _, err = run("volume", made, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5")
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "mm in mode image" in err
+    assert "in pose (95 %): expected --mode" in err
+    assert run("volume", made, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5", "--mode", "image")[0] == 0
 
 
 def test_volume(run, reconstructed, tmp_path):
     name = "v.nii.gz"
-    options = ("--mode", "pose", "--voxel-mm", "0.5")
-    code, _, err = run("volume", reconstructed / "reconstruction.h5", "-o", tmp_path / name, *options)
+    code, _, err = run(
+        "volume", reconstructed / "reconstruction.h5", "-o", tmp_path / name, "--voxel-mm", 0.5
+    )
     assert code == 0, err
+    assert "claims the smallest error of length" in err
     voxels = read_volume(tmp_path / name).voxels
     # 7.5 x 3 x 21 mm of frames, which are filled: a good part of the box is not zero.
     assert sorted(voxels.shape)[0] >= 6
