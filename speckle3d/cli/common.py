@@ -73,6 +73,9 @@ def shared() -> None:
         Distance between columns and rows, mm, if IMAGES does not say.
     poses
         File with the sensor's readings, if not in IMAGES.
+    region
+        Part of the images that counts, in mm and degrees: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or
+        'fan x,y angle,angle radius,radius'; several joined by ' and '.
     sweep_file
         The sweep, if it moved since the reconstruction.
     transform

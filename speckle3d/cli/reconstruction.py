@@ -42,7 +42,7 @@ def reconstruct(
     frames: MaybeText = None,
     crossing_frames: MaybeText = None,
     reference: Reference | None = None,
-    region: str | None = None,
+    region: MaybeText = None,
     consistent_subset: Annotated[
         bool | None, typer.Option("--consistent-subset/--no-consistent-subset")
     ] = None,
@@ -74,8 +74,6 @@ def reconstruct(
     reference
         What to compare with.
     region
-        Part of the image to look at, in mm: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or 'fan x,y
-        angle,angle radius,radius'; several joined by ' and '.
     as_json
 
     Other Parameters

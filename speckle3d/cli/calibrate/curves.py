@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from speckle3d.cli.common import Json, MaybePath, Out, emit, emit_json, load_settings, note
+from speckle3d.cli.common import Json, MaybePath, MaybeText, Out, emit, emit_json, load_settings, note
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
@@ -44,8 +44,6 @@ def curves(
     like
         With --probe: sweep whose signal, depths and echoes to calculate for.
     region
-        Part of the image to look at, in mm: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or 'fan x,y
-        angle,angle radius,radius'; several joined by ' and '.
     as_json
 
     Other Parameters

@@ -83,8 +83,6 @@ def volume(
     like
         A volume whose grid to take. Not with --voxel-mm.
     region
-        What counts of an image, in mm and degrees: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or
-        'fan x,y angle,angle radius,radius'; several joined by ' and '.
     state
         Write which voxels are measured and filled, as labels.
     deviation
