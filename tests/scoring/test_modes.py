@@ -37,7 +37,8 @@ def test_the_smallest_claim_wins_and_its_length_is_told_with_95_percent():
 
 
 def test_claims_are_standard_deviations_of_the_lengths():
-    claims = length_claims(made({"pose": (9.0, 0.02)}))
+    found = made({"pose": (9.0, 0.02)})
+    claims = length_claims(found.poses, found.trust, GRID.centre_mm)
     assert claims["image"] == pytest.approx((10.0, 0.5))
     assert claims["pose"] == pytest.approx((9.0, 0.18))
 
