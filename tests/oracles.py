@@ -162,7 +162,7 @@ def scatter_echoes(position_mm, amplitude, vector_mm, field, reach, curvature, g
 
 
 def patch_correlations(fixed, moving, first, size, shift, least_overlap, radius):
-    """Twin of `speckle3d.kernels.correlation.patch_correlations`: `numpy.corrcoef` sample by sample.
+    """Twin of `patch_kernels.patch_correlations`: `numpy.corrcoef` sample by sample.
 
     radius: (lateral, axial). Returns (p, 2 * lateral + 1, 2 * axial + 1).
     """
@@ -213,7 +213,7 @@ def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
 
 
 def patch_coherences(fixed, moving, first, size, shift, ramp_rad, least_overlap, radius):
-    """Twin of `speckle3d.kernels.correlation.patch_coherences`: complex sums sample by sample.
+    """Twin of `patch_kernels.patch_coherences`: complex sums sample by sample.
 
     fixed, moving: complex (vector, sample); radius: (lateral, axial). The ramp is undone on `moving`.
     Returns (p, 2 * lateral + 1, 2 * axial + 1).

@@ -79,16 +79,6 @@ def skew(vectors: FloatArray) -> FloatArray:
     return np.asarray(matrices - np.swapaxes(matrices, -1, -2))
 
 
-def adjoint(poses: RigidTransform) -> FloatArray:
-    """Matrices that carry (rotation, translation) twists through poses, shape (e, 6, 6)."""
-    matrix = poses.as_matrix()
-    r = matrix[:, :3, :3]
-    carried = np.zeros((len(r), 6, 6))
-    carried[:, :3, :3] = carried[:, 3:, 3:] = r
-    carried[:, 3:, :3] = skew(matrix[:, :3, 3]) @ r
-    return carried
-
-
 def components(poses: RigidTransform | Rotation) -> tuple[FloatArray, FloatArray]:
     """Quaternions, scalar last, and translations, zero for rotations alone: shapes (..., 4) and (..., 3)."""
     if isinstance(poses, RigidTransform):

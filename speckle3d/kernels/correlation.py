@@ -159,7 +159,24 @@ def correlate_patch(
     room: Buffers,
     out: FloatArray,
 ) -> None:
-    """Fill ``out[i, j]`` for one patch as `patch_correlations` does, in `buffers`."""
+    """Fill ``out[i, j]`` with Pearson's coefficient of one patch at lag ``shift + (i, j) - radius``.
+
+    Parameters
+    ----------
+    fixed, moving : float32, shape (vector, sample)
+    first, size : int64, shape (2,)
+        First vector and sample of the patch in `fixed`, and how many it has.
+    shift : int64, shape (2,)
+        Lag, in vectors and samples, about which to look in `moving`.
+    least_overlap : float
+        Share of the patch that must have a partner in `moving` at every lag; below it all is NaN.
+    corners : bool
+        Whether to fill lags that are off the centre both ways; else they are NaN, for half the work.
+    room : tuple of ndarray
+        From `buffers`.
+    out : float64, shape (2 * lateral radius + 1, 2 * axial radius + 1)
+        NaN also where either patch is flat.
+    """
     lateral, axial = out.shape[0] // 2, out.shape[1] // 2
     v0, v1 = _common(first[0], size[0], fixed.shape[0], lateral, shift[0])
     s0, s1 = _common(first[1], size[1], fixed.shape[1], axial, shift[1])
@@ -231,7 +248,17 @@ def cohere_patch(
     room: Buffers,
     out: FloatArray,
 ) -> None:
-    """Fill ``out[i, j]`` for one patch as `patch_coherences` does, in `buffers`, with a ramp's `turns`."""
+    """Fill ``out[i, j]`` with the squared coherence of one patch at lag ``shift + (i, j) - radius``.
+
+    Parameters
+    ----------
+    fixed, moving : float32, shape (2, vector, sample)
+        Real and imaginary parts of the echo.
+    turn : float32
+        From `turns`: what the ramp of `moving` is undone by.
+    first, size, shift, least_overlap, corners, room, out
+        As for `correlate_patch`.
+    """
     lateral, axial = out.shape[0] // 2, out.shape[1] // 2
     v0, v1 = _common(first[0], size[0], fixed.shape[1], lateral, shift[0])
     s0, s1 = _common(first[1], size[1], fixed.shape[2], axial, shift[1])
@@ -260,66 +287,3 @@ def cohere_patch(
                 other += powers[v, j]
             if power * other > 0.0:
                 out[i, j] = (in_phase**2 + quadrature**2) / (power * other)
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def patch_correlations(
-    fixed: Float32Array,
-    moving: Float32Array,
-    first: IntArray,
-    size: IntArray,
-    shift: IntArray,
-    least_overlap: float,
-    out: FloatArray,
-    corners: bool = True,
-) -> None:
-    """Fill ``out[p, i, j]`` with Pearson's coefficient of patch p at lag ``shift[p] + (i, j) - radius``.
-
-    Parameters
-    ----------
-    fixed, moving : float32, shape (vector, sample)
-    first : int64, shape (p, 2)
-        First vector and sample of each patch in `fixed`.
-    size : int64, shape (2,)
-        Vectors and samples in a patch.
-    shift : int64, shape (p, 2)
-        Lag, in vectors and samples, about which to look in `moving`.
-    least_overlap : float
-        Share of a patch that must have a partner in `moving` at every lag; below it the patch is NaN.
-    out : float64, shape (p, 2 * lateral radius + 1, 2 * axial radius + 1)
-        NaN also where either patch is flat.
-    corners : bool
-        Whether to fill lags that are off the centre both ways; else they are NaN, for half the work.
-    """
-    room = buffers(size, out.shape[1] // 2, out.shape[2] // 2)
-    for p in range(first.shape[0]):
-        correlate_patch(fixed, moving, first[p], size, shift[p], least_overlap, corners, room, out[p])
-
-
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def patch_coherences(
-    fixed: Float32Array,
-    moving: Float32Array,
-    first: IntArray,
-    size: IntArray,
-    shift: IntArray,
-    ramp_rad: FloatArray,
-    least_overlap: float,
-    out: FloatArray,
-    corners: bool = True,
-) -> None:
-    """Fill ``out[p, i, j]`` with the squared coherence of patch p at lag ``shift[p] + (i, j) - radius``.
-
-    Parameters
-    ----------
-    fixed, moving : float32, shape (2, vector, sample)
-        Real and imaginary parts of the echo.
-    ramp_rad : float64, shape (2,)
-        By how much the phase of `moving` falls behind from vector to vector and from sample to sample.
-    first, size, shift, least_overlap, out, corners
-        As for `patch_correlations`.
-    """
-    room = buffers(size, out.shape[1] // 2, out.shape[2] // 2)
-    turn = turns(size, out.shape[2] // 2, ramp_rad)
-    for p in range(first.shape[0]):
-        cohere_patch(fixed, moving, first[p], size, shift[p], turn, least_overlap, corners, room, out[p])

@@ -26,12 +26,12 @@ import numpy as np
 from bench_accuracy import CURVE_SEEDS, STEPPED, VECTORS
 from cache import simulated
 from numpy.polynomial import Polynomial
+from patch_kernels import patch_correlations
 from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from speckle3d.config import Config
 from speckle3d.io.load import load_sweep
-from speckle3d.kernels.correlation import patch_correlations
 from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.matcher import Echo, FrameMatcher, MatchingSettings
 from speckle3d.simulation.presets import SimulationSettings

@@ -3,8 +3,7 @@ import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from speckle3d.kernels.correlation import patch_coherences, patch_correlations
+from patch_kernels import patch_coherences, patch_correlations
 
 SHAPE, SIZE = (14, 30), np.array([5, 8])
 # Row sums in float32 are right to 1e-7 of the energy; nothing is subtracted from them.

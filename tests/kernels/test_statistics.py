@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 import speckle
+from patch_kernels import patch_coherences, patch_correlations
 
-from speckle3d.kernels.correlation import patch_coherences, patch_correlations
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.patches import lay_patches
 

@@ -8,9 +8,9 @@ import inplane_twin
 import numpy as np
 import pytest
 import speckle
+from patch_kernels import patch_correlations
 
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.kernels.correlation import patch_correlations
 from speckle3d.matching.inplane import (
     CoarseMatcher,
     InPlaneMotion,

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from patch_kernels import patch_correlations
 from scipy.signal import correlate
 
 from speckle3d.config import Config
 from speckle3d.core.threads import on_one_thread
 from speckle3d.io.load import load_sweep
-from speckle3d.kernels.correlation import patch_correlations
 from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
 from speckle3d.matching.patches import PatchGrid
 from speed.rows import Row, timed
