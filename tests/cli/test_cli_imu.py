@@ -66,6 +66,15 @@ def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_pa
     assert np.rad2deg(error.max()) < 2.0
 
 
+def test_a_log_of_quaternions_alone_has_the_sensors_own_orientation(run, tmp_path):
+    time_s, turns = np.arange(50) / 50.0, Rotation.from_euler("z", np.linspace(0.0, 1.0, 50)[:, None])
+    write_csv(tmp_path / "log.csv", ImuLog(time_s, world_from_sensor=turns))
+    code, out, err = run("imu", "orient", tmp_path / "log.csv", "-o", tmp_path / "o.csv", "--json")
+    assert (code, json.loads(out)["method"]) == (0, "sensor"), err
+    found = read_log(tmp_path / "o.csv").world_from_sensor
+    assert (found * turns.inv()).magnitude().max() < 1e-9
+
+
 def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, tmp_path):
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())

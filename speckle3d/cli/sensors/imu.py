@@ -166,7 +166,7 @@ def orient(
     if out is not None:
         write_csv(out, with_orientation(log, rotations))
     tell(log)
-    rows = _orientation_rows(log, method, rotations, found)
+    rows = _orientation_rows(log, "sensor" if found is None else method, rotations, found)
     if as_json:
         emit_json({name: value for name, value, _ in rows})
         return

@@ -71,6 +71,10 @@ def orientation_of(
     log: ImuLog, method: Method, magnetometer: bool
 ) -> tuple[TimedRotations, Orientation | None]:
     """Find the orientation of a log; the second result is None for the sensor's own orientation."""
+    readings = log.gyroscope_rad_s is not None or log.accelerometer_m_s2 is not None
+    if method != "sensor" and log.oriented.any() and not readings:
+        note("no gyroscope and no accelerometer: the orientation is the sensor's own")
+        method = "sensor"
     if method == "sensor":
         return log.rotations(), None
     from xsens.fusion.orient import orient
