@@ -6,6 +6,7 @@ So iron cannot tilt the orientation; `heading` then turns it to north.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,13 @@ def fresh_filter(settings: FusionSettings) -> Any:
     fresh["fresh"], fresh["level"] = np.square(deviations), [0.0, 0.0, 0.0, 1.0]
     fresh["p"] = np.diag(fresh["fresh"][0])
     return fresh
+
+
+@lru_cache(maxsize=8)
+def _limits(settings: FusionSettings) -> Any:
+    """Settings that the filter uses, as its kernel takes them."""
+    values = tuple(getattr(settings, name, np.nan) for name in kernel.LIMITS.names or ())
+    return np.array([values], kernel.LIMITS)
 
 
 @dataclass(frozen=True)
@@ -76,9 +84,7 @@ def forward(
     per_block = max(1, round(settings.block_s / float(np.mean(samples.step_s))))
     last = np.arange(per_block, len(samples), per_block)
     last = np.append([] if usual_s is not None else last, len(samples)).astype(np.int64)
-    limits, n = np.zeros(1, kernel.LIMITS), len(last)
-    for name in kernel.LIMITS.names or ():
-        limits[name] = getattr(settings, name, np.nan)
+    limits, n = _limits(settings).copy(), len(last)
     limits["longest_s"] = LOST * (usual_s or float(np.median(samples.step_s)))
     wide = (n if covariances else 0, kernel.SIZE, kernel.SIZE)
     steps = FilterSteps(last, np.zeros(n, kernel.STEP), np.empty(wide), np.empty(wide))

@@ -292,8 +292,8 @@ class LiveFaults:
             else:
                 self._lengths[i].append(self._run[i] or 1)
                 self._last[i], self._run[i] = reading, 1
-            long = self._run[i] > max(2, 2 * int(np.median(self._lengths[i])))
-            bad[i] |= moves and len(self._lengths[i]) == _RUNS and long
+            if moves and self._run[i] > 2 and len(self._lengths[i]) == _RUNS:
+                bad[i] |= self._run[i] > 2 * sorted(self._lengths[i])[_RUNS // 2]
             bad[i] |= bool((np.abs(reading) > _LIVE[i]).any())
         return [np.full(3, np.nan) if wrong else row for wrong, row in zip(bad, readings, strict=True)]
 
