@@ -8,15 +8,13 @@ off-line; a star marks where ours is more than 15 % worse than VQF.
 --inclination        the errors of inclination instead
 --coverage           how often errors are within one claimed sigma
 --scenes tune|judge  the trials' motion in invented magnetic fields, or with a worse gyroscope
---north              where magnetic north is for the cameras, at first, at last and in movement
 --leave-one-out      engine and settings as chosen on all trials but one, scored on that one
---sensitivity        each setting halved and doubled
 """
 
 import subprocess
 import sys
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -38,7 +36,7 @@ from broad import (
     rms_deg,
     trials_in,
 )
-from field_scenes import recorded, scenes
+from field_scenes import scenes
 from vqf import VQF
 
 from xsens.fusion.methods import Method
@@ -53,7 +51,6 @@ SINGLY = 5000
 
 GRID = {
     "field_place": (0.5, 1.0, 2.0),
-    "gyro_scale_noise_sqrt_s": (0.5, 1.0, 2.0),
     "moving_bias_rad_s": (0.5, 1.0, 2.0),
 }
 """Candidates of --leave-one-out: the settings with each of these fields times each factor."""
@@ -80,14 +77,10 @@ def main():
         print(timed(estimate, read_trial(folder, trials_in(folder)[0])[0], options[1]))
     elif "--coverage" in options:
         claims(folder)
-    elif "--north" in options:
-        norths(folder)
     elif "--scenes" in options:
         in_fields(folder, options[options.index("--scenes") + 1])
     elif "--leave-one-out" in options:
         leave_one_out(folder)
-    elif "--sensitivity" in options:
-        sensitivity(folder)
     else:
         table(folder, 2 if "--inclination" in options else 0)
 
@@ -191,21 +184,6 @@ def shares(cells):
     return "".join(f"{100 * s:8.0f} %{r:5.2f}" for s, r in zip(cells[::2], cells[1::2], strict=True))
 
 
-# -- north
-
-
-def norths(folder):
-    """Mean heading of the field's horizontal part in the cameras' world: what no compass can know better."""
-    print(f"{'magnetic north, degrees':42}{'first rest':>12}{'movement':>12}{'last rest':>12}")
-    for name in trials_in(folder):
-        motion = recorded(folder, name)
-        east, north, _ = motion.turns[motion.known].apply(motion.log.magnetometer_au[motion.known]).T
-        moved = np.flatnonzero(motion.moving[motion.known])
-        parts = (slice(0, moved[0]), moved, slice(moved[-1], None))
-        means = [np.rad2deg(np.arctan2(-east[part].mean(), north[part].mean())) for part in parts]
-        print(f"{name:42}" + "".join(f"{mean:12.2f}" for mean in means))
-
-
 # -- invented fields
 
 
@@ -279,23 +257,6 @@ def leave_one_out(folder):
 
 def pair(both):
     return f"{both[0]:.2f} ({both[1]:.2f})"
-
-
-def sensitivity(folder):
-    """Mean total error of filter and smoother with each setting halved and doubled."""
-    one = FusionSettings()
-    changes = {"as it is": one}
-    for entry in fields(FusionSettings):
-        value = getattr(one, entry.name)
-        if isinstance(value, float) and entry.name != "gravity_m_s2":
-            for factor in (0.5, 2.0):
-                changes[f"{entry.name} x {factor:g}"] = replace(one, **{entry.name: factor * value})
-    for label, settings in changes.items():
-        means = [
-            np.mean([scores(folder, n, m, settings)[:, 0] for n in trials_in(folder)], axis=0)
-            for m in (ONLINE[1], OFFLINE[1])
-        ]
-        print(f"{label:36}{pair(means[0])} | {pair(means[1])}", flush=True)
 
 
 if __name__ == "__main__":
