@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation, Slerp
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.samples import Estimate, Samples
-from xsens.fusion.settings import BRIDGED_S
 from xsens.logs.worlds import nwu_from, turned
 
 _EVEN = 0.05
@@ -95,7 +94,7 @@ class VqfEngine:
             Use later readings as well.
         """
         magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
-        field = [_field_carried(stretch, own.xyzw, offline)] if magnetic else []
+        field = [_field_carried(stretch, own.xyzw)] if magnetic else []
         (rate, force, *fields), step_s, place = _even_clock(
             [stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s
         )
@@ -130,27 +129,14 @@ def _about_up(turn: Rotation) -> Rotation:
 # -- what VQF wants
 
 
-def _field_carried(stretch: Samples, xyzw: FloatArray, offline: bool) -> FloatArray:
-    """The field with its holes filled, shape (m, 3); zero, which VQF skips, where nothing tells it.
-
-    Off line it goes in the world from the reading before a hole to the one after; on line the last reading
-    stays in the world for as long as a pause is bridged, so that a slower magnetometer counts in full.
-    """
+def _field_carried(stretch: Samples, xyzw: FloatArray) -> FloatArray:
+    """The field, each hole filled with the reading before it, or the first, which stays in the world."""
     there = np.isfinite(stretch.field_au).all(axis=1)
     if there.all():
         return stretch.field_au
-    time_s = np.cumsum(stretch.step_s)
-    known, holes = np.flatnonzero(there), np.flatnonzero(~there)
-    world = Rotation.from_quat(xyzw[known]).apply(stretch.field_au[known])
-    if offline:
-        carried = np.column_stack([np.interp(time_s[holes], time_s[known], axis) for axis in world.T])
-    else:
-        last = np.searchsorted(known, holes) - 1
-        late = (last < 0) | (time_s[holes] - time_s[known[last]] > BRIDGED_S)
-        carried = np.where(late[:, None], 0.0, world[last])
-    field = stretch.field_au.copy()
-    field[holes] = Rotation.from_quat(xyzw[holes]).inv().apply(carried)
-    return field
+    last = np.maximum.accumulate(np.where(there, np.arange(len(there)), np.argmax(there)))
+    turns = Rotation.from_quat(xyzw)
+    return np.asarray(turns.inv().apply(turns[last].apply(stretch.field_au[last])))
 
 
 def _even_clock(vectors: list[FloatArray], steps_s: FloatArray) -> _Even:
