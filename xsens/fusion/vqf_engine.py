@@ -131,7 +131,7 @@ def _about_up(turn: Rotation) -> Rotation:
 
 def _field_carried(stretch: Samples, xyzw: FloatArray) -> FloatArray:
     """The field, each hole filled with the reading before it, or the first, which stays in the world."""
-    there = np.isfinite(stretch.field_au).all(axis=1)
+    there = np.asarray(np.isfinite(stretch.field_au).all(axis=1))
     if there.all():
         return stretch.field_au
     last = np.maximum.accumulate(np.where(there, np.arange(len(there)), np.argmax(there)))
