@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
+from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
 

@@ -83,9 +83,10 @@ def measured(log: ImuLog) -> ImuLog:
     for name in VECTORS:
         if (readings := getattr(log, name)) is not None:
             rows[name] = readings
-            if np.abs(readings).max(initial=0.0) >= _ABSURD or np.isinf(readings).any():
+            if not (readings.min() > -_ABSURD and readings.max() < _ABSURD):  # or NaN
                 wild = (np.abs(readings) >= _ABSURD).any(axis=1)
-                leave_out(name, wild, f"{int(wild.sum())} out of range")
+                if wild.any():
+                    leave_out(name, wild, f"{int(wild.sum())} out of range")
     _require_one_sensor(log, rows)
     force, rate = rows.get(VECTORS[0]), rows.get(VECTORS[1])
     dead = np.zeros(len(log), dtype=bool)
@@ -157,10 +158,13 @@ def _bad(
         zero |= finite & (size < 1e-12)
         some = size[finite & ~zero]
         unit = float(np.median(some)) if some.size else 1.0
-    beyond = finite & (np.abs(rows).max(axis=1) > limits.largest * unit)
+    beyond = size > limits.largest * unit
+    if beyond.any():
+        beyond = finite & (np.abs(rows).max(axis=1) > limits.largest * unit)
     if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
         beyond[:] = False
-    rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
+    if beyond.any() or not finite.all():
+        rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
     runs = _Runs.of(rows)
     step = np.concatenate([[np.nan], _norm(np.diff(rows, axis=0)), [np.nan]])
     before, after = step[runs.start], step[runs.start + runs.length]
