@@ -37,7 +37,7 @@ from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
-from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset
+from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, text_attribute
 from speckle3d.io.hdf5 import SIGNATURE, find_member, one_line, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
@@ -49,7 +49,7 @@ USER_BLOCK = 512
 
 _DATA = (("rf",), ("iq",), ("i", "q"), ("bmode",))
 _POSITIONS = ("x_mm", "z_mm", "time_s")
-_SCALED = re.compile(r"(?P<name>[^*/]+?)\s*(?:(?P<sign>[*/])\s*(?P<factor>[-+.\deE]+))?")
+_SCALED = re.compile(r"(?P<name>[^*/]+?)\s*(?:(?P<sign>[*/])\s*(?P<factor>[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?))?")
 _MOST_SHOWN, _MOST_LEVELS, _MOST_ELEMENTS = 12, 4, 8
 """Arrays that are listed; structs within each other, and elements of each, in which they are looked for."""
 _MARK, _ORDERS = b"MATLAB", {b"\0\1IM": "<", b"\1\0MI": ">"}
@@ -99,9 +99,8 @@ class _Variables:
         plain = name.replace(" ", "")
         with reading(self.path):
             for wanted in (plain, re.sub(r"[({]1[)}]", "", plain)):
-                for label, node in self.arrays(wanted):
-                    if label == wanted:
-                        return node
+                if (node := dict(self.arrays(wanted)).get(wanted)) is not None:
+                    return node
         known = ", ".join(printable(label) for label, _ in self.arrays()) or "none"
         raise InvalidInputError(f"{self.path}: expected an array {printable(name)}, got {known}")
 
@@ -135,13 +134,12 @@ class _Variables:
         elif _is_list(node):
             yield from ((f"{{{k + 1}}}", self._followed(node, k)) for k in range(node.size))
         elif isinstance(node, h5py.Group):
-            before = "" if node.name == "/" else "."
             fields = {name: find_member(node, name) for name in map(str, node) if not name.startswith("#")}
             lists = [value for value in fields.values() if _is_list(value) and not _class(value)]
-            if lists and before:
+            if lists and node.name != "/":
                 yield from ((f"({k + 1})", _Element(node, k)) for k in range(lists[0].size))
             else:
-                yield from ((before + name, value) for name, value in fields.items())
+                yield from ((name if node.name == "/" else f".{name}", fields[name]) for name in fields)
 
     def _followed(self, node: h5py.Dataset, k: int) -> Any:
         return self.root[node[()].ravel()[k]]
@@ -155,16 +153,16 @@ def _loaded(path: Path, order: str) -> dict[str, Any]:
     with warnings.catch_warnings(), reading(path):
         warnings.simplefilter("ignore")
         try:
-            _require_sound(memoryview(path.read_bytes())[128:], order)
+            _require_sound(path.read_bytes()[128:], order)
             variables = loadmat(path)
         except damage as error:
             raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
-def _require_sound(content: memoryview | bytes, order: str, is_matrix: bool = False) -> None:
+def _require_sound(content: bytes, order: str, is_matrix: bool = False) -> None:
     """Refuse matrices whose flags do not fit their parts: SciPy would read past them, and crash."""
-    at, parts = 0, list[tuple[int, memoryview | bytes]]()
+    at, parts = 0, list[tuple[int, bytes]]()
     while at + 8 <= len(content):
         kind, size = struct.unpack_from(f"{order}II", content, at)
         is_short = bool(kind >> 16)  # few bytes lie where the size stands
@@ -175,10 +173,9 @@ def _require_sound(content: memoryview | bytes, order: str, is_matrix: bool = Fa
         if kind in (_MATRIX, _COMPRESSED):
             _require_sound(zlib.decompress(part) if kind == _COMPRESSED else part, order, kind == _MATRIX)
     if is_matrix and parts:
-        (flags,) = struct.unpack_from(f"{order}I", parts[0][1])
-        is_complex = bool(flags & _COMPLEX_FLAG)
-        kinds = [kind for kind, _ in parts[3:]]
-        if flags & 0xFF in _NUMERIC and (_MATRIX in kinds or (is_complex and len(kinds) != 2)):
+        (flags,), kinds = struct.unpack_from(f"{order}I", parts[0][1]), [kind for kind, _ in parts[3:]]
+        is_short = bool(flags & _COMPLEX_FLAG) and len(kinds) != 2
+        if flags & 0xFF in _NUMERIC and (_MATRIX in kinds or is_short):
             raise ValueError(f"expected a real part and an imaginary one, got {len(kinds)} part(s)")
 
 
@@ -187,8 +184,7 @@ def _is_numeric(node: Any) -> bool:
         return node.dtype.kind in "fiuc"
     if not isinstance(node, h5py.Dataset) or node.shape is None or "MATLAB_empty" in node.attrs:
         return False
-    is_pair = (node.dtype.names or ()) == ("real", "imag")
-    return _class(node) != "char" and (node.dtype.kind in "fiu" or is_pair)
+    return _class(node) != "char" and (node.dtype.kind in "fiu" or node.dtype.names == ("real", "imag"))
 
 
 def _is_list(node: Any) -> bool:
@@ -196,45 +192,7 @@ def _is_list(node: Any) -> bool:
 
 
 def _class(node: h5py.Dataset) -> str:
-    value = node.attrs.get("MATLAB_class", b"")
-    return value.decode("ascii", "replace") if isinstance(value, bytes) else str(value)
-
-
-@dataclass(frozen=True)
-class _Axes:
-    """Axes of an array in MATLAB's order, with those of length 1 that MATLAB leaves out at its end."""
-
-    size: tuple[int, ...]
-    names: tuple[str, ...]
-
-    @classmethod
-    def read(cls, text: str, node: Any) -> _Axes:
-        names = tuple(name.strip() for name in text.split(","))
-        named = sorted(name for name in names if name != "-")
-        if named not in (["frame", "sample", "vector"], ["sample", "vector"]):
-            raise InvalidInputError(
-                f"axes: expected sample, vector, frame and -, once each, got {printable(text)}"
-            )
-        size = node.shape[::-1] + (1,) * (len(names) - node.ndim)
-        others = [length for name, length in zip(names, size, strict=False) if name == "-"]
-        if len(names) < len(size) or set(others) > {1}:
-            raise InvalidInputError(
-                f"axes: expected {len(size)} of {_size(node)}, - for those of length 1, got {printable(text)}"
-            )
-        return cls(size, names)
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Frames, vectors, samples."""
-        length = {"frame": 1} | dict(zip(self.names, self.size, strict=True))
-        return length["frame"], length["vector"], length["sample"]
-
-    @property
-    def grid(self) -> Grid:
-        """How a frame's numbers, whose axes are in reverse, become (vector, sample)."""
-        rest = [i for i, name in enumerate(self.names) if name != "frame"][::-1]
-        places = (rest.index(self.names.index("vector")), rest.index(self.names.index("sample")))
-        return Grid(tuple(self.size[i] for i in rest), places)
+    return text_attribute(node, "MATLAB_class")
 
 
 @dataclass(frozen=True)
@@ -246,7 +204,7 @@ class _Greys:
     def __call__(self, parts: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
         """Make a frame."""
         made = self.grid(parts).astype(np.float64)
-        if not ((made >= 0) & (made <= 255) & (made == np.rint(made))).all():
+        if not np.array_equal(made, np.rint(np.clip(made, 0, 255))):
             raise InvalidInputError("bmode: expected grey levels, whole numbers from 0 to 255, got others")
         return made.astype(np.uint8)
 
@@ -255,11 +213,9 @@ def _recording(variables: _Variables, settings: ImportSettings, rows: list[Row])
     path, arrays = variables.path, settings.arrays
     where = f"{path}: arrays"
     roles = {role for data in _DATA for role in data}
-    numbers = {name for name in ImportSettings.model_fields if name.endswith(("_hz", "_mm", "_s"))}
-    known = {*roles, *numbers, *_POSITIONS, "dynamic_range_db", "axes"}
-    if unknown := sorted(set(arrays) - known):
+    if unknown := sorted({*arrays} - {*roles, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
         raise InvalidInputError(f"{where}: expected {', '.join(sorted(roles))}, axes, got {unknown[0]}")
-    data = next((data for data in _DATA if set(data) == roles & set(arrays)), None)
+    data = next((data for data in _DATA if {*data} == roles & {*arrays}), None)
     if data is None:
         listed = ", ".join(f"{name.removeprefix('array ')} {size} {kind}" for name, size, kind in rows)
         raise InvalidInputError(
@@ -271,42 +227,58 @@ def _recording(variables: _Variables, settings: ImportSettings, rows: list[Row])
     with naming(where):
         if len({node.shape for node in nodes}) > 1:
             raise InvalidInputError(f"expected arrays of one size, got {' and '.join(map(_size, nodes))}")
-        if "axes" not in arrays:
-            raise InvalidInputError(
-                f"{printable(arrays[data[0]])} is {_size(nodes[0])}: say which of its axes is which by axes "
-                f'= "sample, vector, frame" in {path.name}.toml'
-            )
-        axes = _Axes.read(arrays["axes"], nodes[0])
         if _kind(nodes[0]).startswith("complex") != (data == ("iq",)):
             raise InvalidInputError(f"{data[0]}: expected complex numbers as iq alone, got {_kind(nodes[0])}")
-    frames = _frames(variables, nodes, axes, data)
-    values, spacing, times = _numbers(variables, arrays, axes.shape)
-    rows += [
-        ("read", f"{role}: {arrays[role]} {_size(node)}", _kind(node))
-        for role, node in zip(data, nodes, strict=True)
-    ]
+        axes = _axes(arrays.get("axes", ""), nodes[0])
+    lengths = {"frame": 1} | {name: length for name, length in axes if name != "-"}
+    shape = lengths["frame"], lengths["vector"], lengths["sample"]
+    frames = _frames(variables, nodes, [name for name, _ in axes], shape, data)
+    values, spacing, times = _numbers(variables, arrays, shape)
+    rows += [("read", f"{role}: {arrays[role]} {_size(nodes[0])}", _kind(nodes[0])) for role in data]
     rows.append(("axes", arrays["axes"], ""))
     if not variables.is_new:
         rows.append(("frames", "held in memory: MATLAB 7.3 files are read one by one", ""))
     return Recording(path, settings, frames, values, sample_spacing_mm=spacing, time_s=times)
 
 
-def _frames(variables: _Variables, nodes: list[Any], axes: _Axes, data: tuple[str, ...]) -> Frames:
-    dtype: Any = np.float32
-    if data == ("bmode",):
-        dtype = np.uint8
-    elif data != ("rf",):
-        dtype = np.complex64
-    elif nodes[0].dtype in (np.int8, np.uint8, np.int16):
+def _axes(text: str, node: Any) -> list[tuple[str, int]]:
+    """Names and lengths of axes in MATLAB's order, with those of length 1 that MATLAB leaves out at its end."""
+    names = [name.strip() for name in text.split(",")]
+    sizes = [*node.shape[::-1], *(1,) * (len(names) - node.ndim)]
+    axes = list(zip(names, sizes, strict=False))
+    named = sorted({*names} - {"-"})
+    is_each = named in (["frame", "sample", "vector"], ["sample", "vector"])
+    is_once = all(names.count(name) == 1 for name in named)
+    is_flat = all(length == 1 for name, length in axes if name == "-")
+    if not (is_each and is_once and is_flat) or len(names) < len(sizes):
+        raise InvalidInputError(
+            f"axes: expected sample, vector, frame once each, and - for axes of length 1, of {_size(node)}, "
+            f"got {printable(text) or 'none'}"
+        )
+    return axes
+
+
+def _frames(
+    variables: _Variables,
+    nodes: list[Any],
+    names: list[str],
+    shape: tuple[int, int, int],
+    data: tuple[str, ...],
+) -> Frames:
+    dtype: Any = {("rf",): np.float32, ("bmode",): np.uint8}.get(data, np.complex64)
+    if data == ("rf",) and nodes[0].dtype in (np.int8, np.uint8, np.int16):
         dtype = np.int16
-    turn = _Greys(axes.grid) if data == ("bmode",) else axes.grid
-    place = axes.names.index("frame") if "frame" in axes.names else len(axes.names)
-    axis = nodes[0].ndim - 1 - place if place < nodes[0].ndim else None
+    rest = [name for name in names if name != "frame"][::-1]
+    lengths = {"-": 1, "vector": shape[1], "sample": shape[2]}
+    grid = Grid(tuple(lengths[name] for name in rest), (rest.index("vector"), rest.index("sample")))
+    turn = _Greys(grid) if data == ("bmode",) else grid
+    place = nodes[0].ndim - 1 - names.index("frame") if "frame" in names else -1
+    axis = place if place >= 0 else None
     if variables.is_new:
-        names = tuple(dataset(variables.root, node.name).name for node in nodes)
-        return HDF5File(variables.path, names, axis, turn).frames(axes.shape, dtype)
-    made = np.empty(axes.shape, dtype)
-    for i in range(axes.shape[0]):
+        stored = tuple(dataset(variables.root, node.name).name for node in nodes)
+        return HDF5File(variables.path, stored, axis, turn).frames(shape, dtype)
+    made = np.empty(shape, dtype)
+    for i in range(shape[0]):
         made[i] = turn([node if axis is None else node.take(i, axis) for node in nodes])
     if made.dtype.kind in "fc":
         require_finite(made, f"{variables.path}: {data[0]}")
@@ -317,48 +289,41 @@ def _numbers(
     variables: _Variables, arrays: Mapping[str, str], shape: tuple[int, int, int]
 ) -> tuple[dict[str, Value], float | None, FloatArray | None]:
     """Numbers that arrays give, the distance between samples if z_mm gives it, and times."""
-    values: dict[str, Value] = {}
-    placed: dict[str, FloatArray] = {}
+    values, times, spacing = dict[str, Value](), None, None
     lengths = {"x_mm": shape[1], "z_mm": shape[2], "time_s": shape[0], "bandwidth_hz": 2}
-    for name in sorted(set(arrays) & {*_POSITIONS, *ImportSettings.model_fields}):
-        numbers, where = _scaled(variables, name, arrays[name]), f"{variables.path}: {name} = {arrays[name]}"
+    for name in sorted({*arrays} & {*_POSITIONS, *ImportSettings.model_fields}):
+        numbers, where = _scaled(variables, name, arrays[name]), f"{variables.path}: {name}"
         if name not in lengths and np.ptp(numbers) == 0:
             numbers = numbers[:1]
         if numbers.size != lengths.get(name, 1):
-            are = f": are axes = {arrays['axes']} in this order?" if name in _POSITIONS else ""
             raise InvalidInputError(
-                f"{where}: expected {lengths.get(name, 1)} number(s), got {numbers.size}{are}"
+                f"{where} = {arrays[name]}: expected {lengths.get(name, 1)} number(s), got {numbers.size}: "
+                f"are axes = {arrays['axes']} in this order?"
             )
-        if name in _POSITIONS:
-            placed[name] = numbers
+        said = f"in {arrays[name]}"
+        if name == "time_s":
+            times = numbers
+        elif name == "x_mm":
+            values["vector_pitch_mm"] = values["column_pitch_mm"] = Value(step_of(numbers, where), said)
+        elif name == "z_mm":
+            spacing = step_of(numbers, where)
+            values["row_spacing_mm"] = Value(spacing, said)
+            values["first_sample_depth_mm"] = Value(float(numbers[0]), said)
         else:
-            value = tuple(numbers.tolist()) if name in lengths else float(numbers[0])
-            values[name] = Value(value, f"in {arrays[name]}")
-    spacing = None
-    if "x_mm" in placed:
-        pitch = Value(step_of(placed["x_mm"], f"{variables.path}: x_mm"), f"in {arrays['x_mm']}")
-        values |= {"vector_pitch_mm": pitch, "column_pitch_mm": pitch}
-    if "z_mm" in placed:
-        spacing = step_of(placed["z_mm"], f"{variables.path}: z_mm")
-        values["row_spacing_mm"] = Value(spacing, f"in {arrays['z_mm']}")
-        values["first_sample_depth_mm"] = Value(float(placed["z_mm"][0]), f"in {arrays['z_mm']}")
-    return values, spacing, placed.get("time_s")
+            values[name] = Value(tuple(numbers.tolist()) if numbers.size > 1 else float(numbers[0]), said)
+    return values, spacing, times
 
 
 def _scaled(variables: _Variables, name: str, text: str) -> FloatArray:
     """Numbers of an array, in one row, times the factor behind its name."""
-    parts = _SCALED.fullmatch(text.strip())
-    try:
-        factor = float(parts["factor"] or 1.0) if parts else 0.0
-    except ValueError:
-        factor = 0.0
-    where = f"{variables.path}: {name}"
-    if parts is None or not factor or not np.isfinite(factor):
+    parts, where = _SCALED.fullmatch(text.strip()), f"{variables.path}: {name}"
+    if parts is None or not float(parts["factor"] or 1.0):
         raise InvalidInputError(f"{where}: expected as NAME, NAME * 1e6 or NAME / 2, got {printable(text)}")
     with reading(where):
         values = np.asarray(variables.array(parts["name"])[()])
     if values.dtype.kind not in "fiu" or (name != "time_s" and not np.isfinite(values).all()):
         raise InvalidInputError(f"{where} = {printable(text)}: expected finite numbers, got others")
+    factor = float(parts["factor"] or 1.0)
     return np.asarray(values.astype(np.float64).ravel() * (factor if parts["sign"] == "*" else 1 / factor))
 
 
