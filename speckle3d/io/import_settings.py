@@ -10,23 +10,13 @@ from __future__ import annotations
 import difflib
 import math
 import os
-from collections.abc import Iterator
 from numbers import Real
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ModelWrapValidatorHandler,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
@@ -36,7 +26,6 @@ SPEED_OF_SOUND_M_S = 1540.0
 """Of scanners that do not say theirs."""
 
 _FOLDER_FILE = "import.toml"
-
 
 _LIKENESS = 0.5
 _NUMBERS = ("_hz", "_mm", "_m_s", "_db", "image_to_probe")
@@ -118,28 +107,17 @@ class ImportSettings(BaseModel):
         description="arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which",
     )
 
-    @model_validator(mode="wrap")
+    @model_validator(mode="before")
     @classmethod
-    def _known(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _known(cls, values: Any) -> Any:
         """Name the known settings that an unknown name is like."""
         for name in values if isinstance(values, dict) else ():
             if name not in cls.model_fields:
                 like = difflib.get_close_matches(str(name), cls.model_fields, cutoff=_LIKENESS)
-                raise ValidationError.from_exception_data(
-                    cls.__name__,
-                    [
-                        InitErrorDetails(
-                            type=PydanticCustomError(
-                                "unknown",
-                                "no such setting, expected {known}",
-                                {"known": " or ".join(like) or f"one of {', '.join(cls.model_fields)}"},
-                            ),
-                            loc=(name,),
-                            input=values[name],
-                        )
-                    ],
-                )
-        return handler(values)
+                known = " or ".join(like) or f"one of {', '.join(cls.model_fields)}"
+                text = "{name}: no such setting, expected {known}"
+                raise PydanticCustomError("unknown", text, {"name": str(name), "known": known})
+        return values
 
     @field_validator("*", mode="before")
     @classmethod
@@ -148,14 +126,14 @@ class ImportSettings(BaseModel):
         name = info.field_name or ""
         if value is None or not name.endswith(_NUMBERS):
             return value
-        numbers = list(_leaves(value))
-        if any(isinstance(each, (bool, np.bool_)) or not isinstance(each, Real) for each in numbers):
+        numbers = np.ravel(np.asarray(value, dtype=object)).tolist()
+        if any(isinstance(one, (bool, np.bool_)) or not isinstance(one, Real) for one in numbers):
             raise PydanticCustomError(
                 "number", "expected numbers" if len(numbers) > 1 else "expected a number"
             )
         if not all(map(math.isfinite, numbers)):
             raise PydanticCustomError("finite", "expected a finite number")
-        if name.endswith("_hz") and name != "frame_rate_hz" and any(0 < each < _LEAST_HZ for each in numbers):
+        if name.endswith("_hz") and name != "frame_rate_hz" and any(0 < one < _LEAST_HZ for one in numbers):
             raise PydanticCustomError("hertz", "expected it in Hz (is this in MHz or kHz?)")
         return value
 
@@ -181,14 +159,6 @@ class ImportSettings(BaseModel):
         if lacking:
             raise MissingSettingsError(path, lacking)
         return values
-
-
-def _leaves(value: Any) -> Iterator[Any]:
-    if isinstance(value, (list, tuple, np.ndarray)):
-        for each in value:
-            yield from _leaves(each)
-    else:
-        yield value
 
 
 class MissingSettingsError(InvalidInputError):

@@ -18,8 +18,8 @@ from speckle3d.io.toml import load_toml
         ("sampling_rate_hz = 40", r"sampling_rate_hz: expected it in Hz"),
         ("centre_frequency_hz = 5000", r"centre_frequency_hz: expected it in Hz .*kHz"),
         ("demodulation_frequency_hz = 5", r"demodulation_frequency_hz: expected it in Hz"),
-        ("colum_pitch_mm = 0.1", r"colum_pitch_mm: no such setting, expected column_pitch_mm.*got 0.1"),
-        ("zzz = 1", r"zzz: no such setting, expected one of sampling_rate_hz, .*, arrays, got 1"),
+        ("colum_pitch_mm = 0.1", r"colum_pitch_mm: no such setting, expected column_pitch_mm"),
+        ("zzz = 1", r"zzz: no such setting, expected one of sampling_rate_hz, .*, arrays"),
     ],
 )
 def test_slips_are_named_in_one_line(tmp_path, text, message):

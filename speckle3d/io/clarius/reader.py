@@ -343,8 +343,9 @@ class Package:
         if self.sensor is not None:
             notes += self.sensor.remarks
             if self.sensor.fit is None:
+                why = "is missing" if self.sensor.quaternion is None else "does not agree with gravity"
                 notes.append(
-                    "the sensor's quaternion does not agree with gravity: the sweep has no orientation, "
+                    f"the sensor's quaternion {why}: the sweep has no orientation, "
                     f"which `speckle3d imu orient {self.files.path} --into SWEEP.h5` finds"
                 )
         return notes

@@ -16,7 +16,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import plausible_bytes
 from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, ReadFrame
-from speckle3d.io.hdf5 import has_member, locate, open_hdf5, reading, require_dataset
+from speckle3d.io.hdf5 import has_member, locate, open_hdf5, read_checked, require_dataset
 
 Turn: TypeAlias = Callable[[Sequence[npt.NDArray[Any]]], npt.NDArray[Any]]
 
@@ -44,14 +44,12 @@ def dataset(group: h5py.Group, name: str) -> h5py.Dataset:
 
 def flat(group: h5py.Group, name: str) -> FloatArray:
     """Read finite numbers along one axis, whatever other axes of length 1 there are."""
-    node, where = dataset(group, name), locate(group, name)
-    if node.dtype.kind not in "fiu" or sum(n > 1 for n in node.shape) > 1:
-        raise InvalidInputError(f"{where}: expected numbers along one axis, got {node.shape} {node.dtype}")
-    with reading(where):
-        values = np.asarray(node[()], dtype=np.float64).ravel()
-    if not np.isfinite(values).all():
-        raise InvalidInputError(f"{where}: expected finite numbers, got {values[~np.isfinite(values)][0]}")
-    return values
+    values: FloatArray = read_checked(group, name, None)
+    if sum(n > 1 for n in values.shape) > 1 or not np.isfinite(values).all():
+        raise InvalidInputError(
+            f"{locate(group, name)}: expected finite numbers along one axis, got others, {values.shape}"
+        )
+    return values.ravel()
 
 
 def single(group: h5py.Group, name: str) -> float | None:

@@ -242,7 +242,7 @@ def _recording(variables: _Variables, settings: ImportSettings, rows: list[Row])
 
 
 def _axes(text: str, node: Any) -> list[tuple[str, int]]:
-    """Names and lengths of axes in MATLAB's order, with those of length 1 that MATLAB leaves out at its end."""
+    """Names and lengths of axes in MATLAB's order, with those of length 1 that it leaves out at its end."""
     names = [name.strip() for name in text.split(",")]
     sizes = [*node.shape[::-1], *(1,) * (len(names) - node.ndim)]
     axes = list(zip(names, sizes, strict=False))
@@ -265,9 +265,11 @@ def _frames(
     shape: tuple[int, int, int],
     data: tuple[str, ...],
 ) -> Frames:
-    dtype: Any = {("rf",): np.float32, ("bmode",): np.uint8}.get(data, np.complex64)
-    if data == ("rf",) and nodes[0].dtype in (np.int8, np.uint8, np.int16):
-        dtype = np.int16
+    dtype: Any = np.complex64
+    if data == ("bmode",):
+        dtype = np.uint8
+    elif data == ("rf",):
+        dtype = np.int16 if nodes[0].dtype in (np.int8, np.uint8, np.int16) else np.float32
     rest = [name for name in names if name != "frame"][::-1]
     lengths = {"-": 1, "vector": shape[1], "sample": shape[2]}
     grid = Grid(tuple(lengths[name] for name in rest), (rest.index("vector"), rest.index("sample")))
@@ -324,7 +326,8 @@ def _scaled(variables: _Variables, name: str, text: str) -> FloatArray:
     if values.dtype.kind not in "fiu" or (name != "time_s" and not np.isfinite(values).all()):
         raise InvalidInputError(f"{where} = {printable(text)}: expected finite numbers, got others")
     factor = float(parts["factor"] or 1.0)
-    return np.asarray(values.astype(np.float64).ravel() * (factor if parts["sign"] == "*" else 1 / factor))
+    flat = values.astype(np.float64).ravel()
+    return flat / factor if parts["sign"] == "/" else flat * factor
 
 
 def _size(node: Any) -> str:

@@ -31,7 +31,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, single, text_attribute, text_of
-from speckle3d.io.hdf5 import find_member, has_member, hdf5_claim, locate, open_hdf5, reading
+from speckle3d.io.hdf5 import find_member, has_member, hdf5_claim, locate, open_hdf5, read_checked, reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
@@ -238,14 +238,11 @@ def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:
     """
     group, name = array.group, f"{array.home}scan/time_to_next_transmit"
     if array.values != group and has_member(file, f"{group}/timestamps"):
-        stamps = np.asarray(dataset(file, f"{group}/timestamps")[()], dtype=np.float64)
-        if stamps.shape == (count,):
-            return stamps + (single(file, f"{group}/start_time_offset") or 0.0)
+        stamps = read_checked(file, f"{group}/timestamps", (count,))
+        return np.asarray(stamps + (single(file, f"{group}/start_time_offset") or 0.0))
     if len(_homes(file)) > 1 or not has_member(file, name):
         return None
-    steps = np.asarray(dataset(file, name)[()], dtype=np.float64)
-    if steps.ndim != 2 or len(steps) != count:
-        raise InvalidInputError(f"{locate(file, name)}: expected {count} rows, got shape {steps.shape}")
+    steps = read_checked(file, name, (count, "transmission"))
     # The last transmission of all has no next one.
     lengths = steps[:-1].sum(axis=1)
     known = np.isfinite(lengths)
@@ -265,14 +262,10 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     kind = text_of(kind_node[()]) if isinstance(kind_node, h5py.Dataset) else ""
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
-    places, turns = (np.asarray(dataset(node, name)[()], float) for name in ("translation", "rotation"))
+    places = read_checked(node, "translation", ("pose", 3))
     rate, count = single(node, "sampling_frequency"), len(places)
-    stamps = np.arange(count) / rate if rate else np.asarray(dataset(node, "timestamps")[()], dtype=float)
-    if places.shape != (count, 3) or turns.shape != (count, 3 if kind == "euler_xyz" else 4):
-        raise InvalidInputError(
-            f"{locate(node)}: expected as many translations as rotations ({kind}), got shapes "
-            f"{places.shape} and {turns.shape}"
-        )
+    turns = read_checked(node, "rotation", (count, 3 if kind == "euler_xyz" else 4))
+    stamps = np.arange(count) / rate if rate else read_checked(node, "timestamps", (count,))
     matrices = np.full((count, 4, 4), np.nan)
     matrices[:, :3, 3], matrices[:, 3] = 1e3 * places, [0.0, 0.0, 0.0, 1.0]
     sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | (kind == "euler_xyz"))

@@ -150,7 +150,8 @@ def write_sequence(
     if suffix == ".nrrd":
         head = _nrrd_header(images, rows, "gzip" if compressed else "raw", is_slicers)
     else:
-        head = _meta_header(images, rows, "LOCAL", 0 if compressed else None)
+        kind = meta_type(images.dtype)
+        head = _meta_header(rows, images.shape, kind, "LOCAL", 0 if compressed else None)
     with atomic_path(target) as part, part.open("wb") as file:
         file.write(head)
         size = images.write(file, (_GZIP if suffix == ".nrrd" else _ZLIB) if compressed else None)
@@ -178,17 +179,8 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     rows = _Rows.of_times(times_s)
     for name, matrices in transforms.items():
         rows.add(name, matrices)
-    lines = [
-        *meta_start(3, None),
-        f"DimSize = 0 0 {len(rows.frames)}",
-        "ElementSpacing = 1 1 1",
-        "ElementType = MET_UCHAR",
-        "Kinds = domain domain list",
-        *_frame_lines(rows, " = "),
-        "ElementDataFile = LOCAL",
-    ]
     with atomic_path(path) as part:
-        part.write_bytes(header_bytes(lines))
+        part.write_bytes(_meta_header(rows, (0, 0, len(rows.frames)), "UCHAR", "LOCAL", None))
 
 
 def _rows_of(sweep: Sweep) -> tuple[_Rows, list[str]]:
@@ -318,7 +310,9 @@ def _write_two_files(target: Path, images: _Images, rows: _Rows, compressed: boo
         try:
             with (part / beside).open("wb") as file:
                 size = images.write(file, _ZLIB if compressed else None)
-            (part / target.name).write_bytes(_meta_header(images, rows, beside, size if compressed else None))
+            packed = size if compressed else None
+            head = _meta_header(rows, images.shape, meta_type(images.dtype), beside, packed)
+            (part / target.name).write_bytes(head)
         except Speckle3DError:
             raise
         except OSError as error:
@@ -330,14 +324,13 @@ def _frame_lines(rows: _Rows, sign: str) -> Iterator[str]:
         yield from (f"Seq_Frame{i:04d}_{name}{sign}{value}" for name, value in frame.items())
 
 
-def _meta_header(images: _Images, rows: _Rows, data: str, packed: int | None) -> bytes:
-    fields = dict(rows.fields)
+def _meta_header(rows: _Rows, shape: tuple[int, int, int], kind: str, data: str, packed: int | None) -> bytes:
+    fields = {"ElementSpacing": "1 1 1", **rows.fields}
     lines = [
         *meta_start(3, packed),
-        f"DimSize = {_spaced(images.shape)}",
+        f"DimSize = {_spaced(shape)}",
+        f"ElementType = MET_{kind}",
         "Kinds = domain domain list",
-        f"ElementSpacing = {fields.pop('ElementSpacing')}",
-        f"ElementType = MET_{meta_type(images.dtype)}",
         *(f"{name} = {value}" for name, value in fields.items()),
         *_frame_lines(rows, " = "),
         f"ElementDataFile = {data}",

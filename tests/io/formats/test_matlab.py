@@ -28,7 +28,7 @@ def saved(tmp_path, new=False, **more):
 
 def mapped(**arrays):
     given = {"axes": AXES, "vector_pitch_mm": "Trans.spacingMm", "time_s": "t"} | arrays
-    given |= {"centre_frequency_hz": "Trans.frequency * 1e6", "bandwidth_hz": "band * 1e6"}
+    given |= {"centre_frequency_hz": "Trans.frequency / 1e-6", "bandwidth_hz": "band * 1e6"}
     return ImportSettings(sampling_rate_hz=40e6, arrays={k: v for k, v in given.items() if v is not None})
 
 
@@ -98,6 +98,11 @@ def test_a_frame_without_a_time_of_its_own_is_left_out(tmp_path, new, bad):
     recording = open_recording(path, mapped(rf="RData"))
     np.testing.assert_array_equal(read(recording.sweep), np.delete(rf(), 2, axis=0))
     assert any("images: 1 of 4 left out" in note for note in recording.notes)
+
+
+def test_times_that_are_all_the_same_are_none(tmp_path):
+    with pytest.raises(MissingSettingsError, match="--frame-rate-hz"):
+        load_sweep(saved(tmp_path, t=0 * TIMES), mapped(rf="RData"))
 
 
 @VERSIONS

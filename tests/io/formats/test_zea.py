@@ -152,7 +152,7 @@ def elsewhere(file):
 
 def never_written(file):
     del file[VALUES]
-    shape = (10**6, SAMPLES, VECTORS, 1)
+    shape = (FRAMES, SAMPLES, VECTORS, 1)
     file.create_dataset(VALUES, shape=shape, dtype="f4", chunks=(1, *shape[1:]))
 
 
