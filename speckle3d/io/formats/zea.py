@@ -202,15 +202,17 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, int, int]) -> tuple[FloatArray
         raise InvalidInputError(
             f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape} {node.dtype}"
         )
-    start = 1e3 * np.asarray(node[0], dtype=np.float64)
-    apart = [np.abs(1e3 * node[i] - start).max() for i in {shape[0] // 2, shape[0] - 1}]
-    x, y, z = start.transpose(2, 0, 1)
-    for x_first in (False, True):
-        columns, depths = (x.T, z.T) if x_first else (x, z)
-        x_mm, z_mm = columns[0], depths[:, 0]
-        off = max(np.abs(columns - x_mm).max(), np.abs(depths.T - z_mm).max(), np.ptp(y), *apart)
-        if off <= _TOLERANCE_MM and np.ptp(x_mm) > 0 and np.ptp(z_mm) > 0:
-            return x_mm, z_mm, x_first
+    places = node.astype(np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        start = 1e3 * places[0]
+        apart = [np.abs(1e3 * places[i] - start).max() for i in {shape[0] // 2, shape[0] - 1}]
+        x, y, z = start.transpose(2, 0, 1)
+        for x_first in (False, True):
+            columns, depths = (x.T, z.T) if x_first else (x, z)
+            x_mm, z_mm = columns[0], depths[:, 0]
+            off = [np.abs(columns - x_mm).max(), np.abs(depths.T - z_mm).max(), np.ptp(y), *apart]
+            if np.less_equal(off, _TOLERANCE_MM).all() and np.ptp(x_mm) > 0 and np.ptp(z_mm) > 0:
+                return x_mm, z_mm, x_first
     raise InvalidInputError(
         f"{locate(node)}: expected pixels on a Cartesian grid in one plane, the same in all frames, got "
         "others, as of a polar image: beamform onto zea's cartesian_pixel_grid, or scan-convert it"
