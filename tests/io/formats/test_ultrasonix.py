@@ -43,6 +43,8 @@ def test_what_the_header_lacks_is_asked_for_at_once(tmp_path):
     missing = ("vector_pitch_mm", "centre_frequency_hz", "bandwidth_hz", "frame_rate_hz")
     assert caught.value.settings == missing
     assert ("recorded", "RF (.rf)", "") in describe(path)
+    with pytest.raises(InvalidInputError, match="centre_frequency_hz: expected one near the band"):
+        load_sweep(write_ultrasonix(path, rf()), RF.model_copy(update={"bandwidth_hz": (12e6, 15e6)}))
 
 
 def header(content, **changes):
