@@ -130,20 +130,16 @@ def means_table(intervals: Sequence[Row]) -> list[list[str]]:
 
 
 def told_apart(paired: Sequence[Row]) -> list[str]:
-    """Which modes have less of what error than others, a line for each finding; one line if none has."""
-    better: dict[str, list[str]] = {}
-    for quantity in QUANTITIES:
-        worse: dict[str, list[str]] = {}
-        for row in paired:
-            if row["quantity"] == quantity and row["better"]:
-                other = row["against"] if row["better"] == row["mode"] else row["mode"]
-                worse.setdefault(row["better"], []).append(other)
-        if worse:
-            words = "; ".join(f"{mode} than {', '.join(others)}" for mode, others in worse.items())
-            better.setdefault(words, []).append(words_of(quantity).partition(" /")[0])
-    if not better:
+    """Which modes have less of what error than others, a line for each pair; one line if none has."""
+    less: dict[str, list[str]] = {}
+    for row in paired:
+        if row["better"]:
+            other = row["against"] if row["better"] == row["mode"] else row["mode"]
+            name = words_of(row["quantity"]).partition(" /")[0]
+            less.setdefault(f"{row['better']} than {other}", []).append(name)
+    if not less:
         return ["no two modes are told apart by these sweeps"] if paired else []
-    apart = [f"less {', '.join(names)}: {words}" for words, names in better.items()]
+    apart = [f"less {', '.join(names)}: {modes}" for modes, names in less.items()]
     return [*apart, f"(told apart sweep by sweep: signed-rank p <= {LEVEL:g} after Holm's correction)"]
 
 
