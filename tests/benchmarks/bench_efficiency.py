@@ -17,11 +17,15 @@ patch's distance over that bound and (the bias in micrometres), where |rho_c|^2 
 """
 
 import os
+import sys
 import timeit
 from functools import lru_cache
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import inplane_twin
 import numpy as np
 from bench_accuracy import CURVE_SEEDS, STEPPED, VECTORS
 from cache import simulated
@@ -124,7 +128,7 @@ class Reader:
     def read(self, fixed, moving, start):
         """In-plane motion of a pair and its correlation by every method, each of shape (p,)."""
         match = self.matcher.match(fixed["ready"], moving["ready"], start)
-        shift, slope = self._shift(match)
+        shift, slope = self._shift(fixed["ready"].image, moving["ready"].image, match.motion)
         lag = np.rint(shift / self.patches.spacing_mm).astype(np.int64)
         place, offset = (self.patches.first, self.patches.size, lag), shift / self.patches.spacing_mm - lag
         ramp = np.exp(1j * self.per_mm * (slope[0] * self.x_mm + slope[1] * self.y_mm))
@@ -134,10 +138,14 @@ class Reader:
             rho[method] = read_at(how(fixed[kind][how], moving[kind][how], *place), offset)
         return match.motion, rho
 
-    def _shift(self, match):
+    def _shift(self, fixed, moving, motion):
         """Shift of each patch, mm, linear in its place as the package has it; slopes of the axial shift."""
-        peak, shift = np.clip(np.nan_to_num(match.correlation), 0, 0.999), np.nan_to_num(match.shift_mm)
-        weight = np.where(np.isfinite(match.shift_mm).all(axis=1), peak / np.sqrt(1 - peak**2), 0.0)
+        about = np.rint(-np.array([motion.x_mm, motion.y_mm]) / self.patches.spacing_mm).astype(np.int64)
+        lag = np.tile(about, (len(self.patches), 1))
+        rho = np.empty((len(lag), 3, 3))
+        patch_correlations(fixed, moving, self.patches.first, self.patches.size, lag, 0.6, rho)
+        shift, weight = inplane_twin.peaks(rho, lag, self.patches.spacing_mm)
+        shift, weight = np.nan_to_num(shift), np.sqrt(weight)
         design = np.pad(self.matcher.at_mm, ((0, 0), (1, 0)), constant_values=1.0)
         for _ in range(4):
             plane = np.linalg.lstsq(design * weight[:, None], shift * weight[:, None], rcond=None)[0]
