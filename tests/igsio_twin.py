@@ -144,26 +144,3 @@ def _linear(volume, weight, place, level, rule):
         else:
             continue
         weight[at] = min((new + ONE // 2) // ONE, MOST)
-
-
-def exact_mean(images, voxel_from_pixel, shape, clip, linear=False):
-    """Mean of the same pixels without rounding, NaN where none are, and their weight, both [i, j, k]."""
-    rows, columns = np.nonzero(clip.mask(images.shape[2], images.shape[1]))
-    pixels = np.stack([columns, rows, np.ones_like(rows)])
-    maps = np.rint(np.asarray(voxel_from_pixel)[:, :, [0, 1, 3]] * ONE) / ONE
-    total, weight = np.zeros(np.prod(shape)), np.zeros(np.prod(shape))
-    for image, axes in zip(images, maps, strict=True):
-        place, level = (axes @ pixels).T, image[rows, columns].astype(float)
-        first = np.floor(place if linear else place + 0.5).astype(int)
-        for corner in np.ndindex(2, 2, 2) if linear else [(0, 0, 0)]:
-            index = first + corner
-            share = np.prod(np.where(corner, place - first, 1 - place + first), axis=1) if linear else 1.0
-            # A pixel near the border counts in none of the eight, as in IGSIO, not in those inside.
-            reach = np.ceil(place).astype(int) if linear else index
-            inside = ((first >= 0) & (reach < shape)).all(axis=1) & (share > 0)
-            flat = np.ravel_multi_index(tuple(index[inside].T), shape)
-            share = np.broadcast_to(share, level.shape)[inside]
-            total += np.bincount(flat, share * level[inside], total.size)
-            weight += np.bincount(flat, share, total.size)
-    with np.errstate(invalid="ignore"):
-        return (total / weight).reshape(shape), weight.reshape(shape)

@@ -41,20 +41,6 @@ def reslice_nearest(
     return result
 
 
-def bin_mean(images, image_points_world, world_from_grid, spacing_mm, shape):
-    """Twin of `speckle3d.kernels.splatting.count_nearest`: mean of the samples nearest each voxel centre.
-
-    images: (n, vector, sample); image_points_world: (n, vector, sample, 3). NaN where a voxel has none.
-    """
-    index = np.rint(world_from_grid.inv().apply(image_points_world.reshape(-1, 3)) / spacing_mm).astype(int)
-    levels = images.astype(float).ravel()
-    kept = ((index >= 0) & (index < shape)).all(axis=1) & ~np.isnan(levels)
-    total, count = np.zeros((2, *shape))
-    np.add.at(total, tuple(index[kept].T), levels[kept])
-    np.add.at(count, tuple(index[kept].T), 1)
-    return np.divide(total, count, out=np.full(shape, np.nan), where=count > 0)
-
-
 def splat(images, index, shape, splat, rule, weights):
     """Twin of the kernels in `speckle3d.kernels.splatting`: every sample of every image, corner by corner.
 
@@ -238,51 +224,6 @@ def patch_coherences(fixed, moving, first, size, shift, ramp_rad, least_overlap,
             if energy > 0:
                 out[p, n] = np.abs(np.vdot(a, b)) ** 2 / energy
     return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)
-
-
-def bin_by_distance(rho, offset_mm, slope, lateral_mm, edges_mm):
-    """Twin of `speckle3d.kernels.coherence.bin_by_distance`: every bin picks its pairs by a mask."""
-    d = np.abs(offset_mm[:, None] + slope[:, None] * lateral_mm)
-    edges = np.append(edges_mm[:-1], np.inf)
-    out = np.zeros((rho.shape[1], len(edges_mm) - 1, 4))
-    for b in range(len(edges_mm) - 1):
-        for p in range(rho.shape[1]):
-            one = np.isfinite(rho[:, p]) & (d[:, p] >= edges[b]) & (d[:, p] < edges[b + 1])
-            r = rho[one, p].astype(float)
-            out[p, b] = [one.sum(), d[one, p].sum(), r.sum(), (r**2).sum()]
-    return out
-
-
-def echo_model(bins, scale, stretch, length_mm, curves, redundancy, gain_precision):
-    """Twin of `speckle3d.kernels.coherence.fit_echo_models` for one patch and model: cost, share and gain."""
-    amplitude, step_mm, cells, of_echo = curves
-    n, d, rho, square = bins[bins[:, 0] > 0].T
-    d, mean, spread = d / n, rho / n, square / n - (rho / n) ** 2
-    at = np.minimum(d * scale / stretch / step_mm, amplitude.size - 1 - 1e-6)
-    g = np.interp(at, np.arange(amplitude.size), amplitude)
-    h = np.exp(-d * scale / length_mm) if length_mm > 0 else np.zeros_like(d)
-    share, gain = 0.1 if length_mm > 0 else 0.0, 1.0
-    for _ in range(8):
-        echo = share * h + (1 - share) * g
-        model = gain * echo**2
-        seen = np.minimum(model, 1.0)
-        variance = (1 - seen) ** 2 / cells * (2 * seen + 1 / cells if of_echo else (1 + seen) ** 2) + 1e-3
-        weight = n / (variance * redundancy)
-        cost = (weight * ((mean - model) ** 2 + spread)).sum() + (n * np.log(variance)).sum() / redundancy
-        if length_mm < 0:
-            break
-        cost += gain_precision * (gain - 1) ** 2
-        jacobian = np.stack([2 * gain * echo * (h - g), echo**2])
-        normal = (jacobian * weight) @ jacobian.T + np.diag([0.1, gain_precision])
-        pull = (jacobian * weight) @ (mean - model) - [0.0, gain_precision * (gain - 1)]
-        if length_mm == 0:
-            normal[0], normal[:, 0], pull[0] = [1.0, 0.0], [1.0, 0.0], 0.0
-        step = 0.8 * np.linalg.solve(normal, pull)
-        moved = np.clip([share + step[0], gain + step[1]], [0.0, 0.1], [0.97, 1.03])
-        if np.abs(moved - [share, gain]).sum() < 2e-3:
-            break
-        share, gain = moved
-    return cost, share, gain
 
 
 def pose_graph_step(poses, first, second, measured, information, huber):

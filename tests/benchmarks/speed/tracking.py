@@ -70,10 +70,3 @@ def transforms_per_second(sweep: Sweep, runs: int) -> float:
             fft.ifft(band, axis=1)
 
     return FRAMES / timed(some, runs).seconds
-
-
-def memory_bandwidth(runs: int) -> float:
-    """GB/s that NumPy copies, read and written, on one core."""
-    source = np.ones(2**26, dtype=np.float32)
-    target = np.empty_like(source)
-    return 2e-9 * source.nbytes / timed(lambda: np.copyto(target, source), runs).seconds
