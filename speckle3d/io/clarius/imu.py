@@ -56,8 +56,6 @@ _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
 _LEAST_G, _MOST_G = 0.8, 1.2
 """0.92 and 0.96 in the recordings at hand."""
-_PAUSE_S = 0.03
-"""Longer than two periods at 80 Hz: a burst has ended."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +120,10 @@ class SensorSamples:
 
     def rows(self) -> list[Row]:
         """Tell what the sensor recorded, and whether its quaternion agrees with gravity."""
-        steps, fit = np.diff(self.time_s), self.fit
+        fit = self.fit
         rows = [
             ("sensor samples", str(len(self)), ""),
-            ("sensor pauses", str(np.sum(steps > _PAUSE_S)), f"over {1e3 * _PAUSE_S:g} ms"),
-            ("sensor, longest pause", f"{steps.max(initial=0.0):.3f}", "s"),
+            ("sensor, longest pause", f"{np.diff(self.time_s).max(initial=0.0):.3f}", "s"),
             ("accelerometer, median norm", f"{_norm(self.accelerometer_g):.3f}", "g"),
         ]
         if fit is None:
@@ -141,7 +138,6 @@ class SensorSamples:
         if self.magnetometer_gauss is not None:
             x, y, z = fit.world_from_sensor.apply(self.magnetometer_gauss).mean(axis=0)
             rows += [
-                ("magnetometer, median norm", f"{_norm(self.magnetometer_gauss):.3f}", "gauss"),
                 ("magnetic field, from the world's x", f"{np.rad2deg(np.arctan2(y, x)):.0f}", "deg"),
                 ("magnetic field, dip", f"{np.rad2deg(np.arctan2(-z, np.hypot(x, y))):.0f}", "deg"),
             ]

@@ -24,7 +24,6 @@ References
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -48,39 +47,8 @@ _EVEN = 1e-3
 """How far a line may be from its place, in pitches; places are written to 17 digits."""
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where the kept part of a frame lies.
-
-    Attributes
-    ----------
-    lines, samples : slice
-        Kept, of those in the file.
-    first_element : float
-        Place of the first kept line in the array.
-    elements_per_line : float
-        Distance between lines, in elements.
-    first_sample : float, optional
-        Samples between transmission and the first kept one; None where the yml does not say.
-    """
-
-    lines: slice
-    samples: slice
-    first_element: float
-    elements_per_line: float
-    first_sample: float | None
-
-    def first_depth_mm(self, sampling_rate_hz: float, speed_of_sound_m_s: float) -> float | None:
-        """Depth of the first kept sample; None where it is not said, or would be above depth 0.
-
-        Less than a sample above is 0: the delay is a whole number of samples.
-        """
-        after = -1.0 if self.first_sample is None else self.first_sample - BEFORE_DEPTH_S * sampling_rate_hz
-        return max(after, 0.0) / sampling_rate_hz * speed_of_sound_m_s * 1e3 / 2 if after > -1.0 else None
-
-
-def place_of(said: Description, lines: slice, samples: slice) -> Place:
-    """Find where the kept lines and samples lie, in elements and samples.
+def place_of(said: Description, kept: slice) -> tuple[float, float]:
+    """Place of the first kept line in the array, and the distance between lines, in elements.
 
     Raises
     ------
@@ -97,7 +65,7 @@ def place_of(said: Description, lines: slice, samples: slice) -> Place:
             f"{said.angle_deg[i]:g} deg, and {steered.size} of {said.lines} lines steered: record without "
             "steering and Doppler"
         )
-    elements = said.receive_element[lines]
+    elements = said.receive_element[kept]
     if elements.size < 2:
         raise InvalidInputError(f"{where}: lines: expected two lines or more, got {elements.size}")
     step = float((elements[-1] - elements[0]) / (elements.size - 1))
@@ -105,13 +73,21 @@ def place_of(said: Description, lines: slice, samples: slice) -> Place:
     if not (np.diff(elements) > 0).all() or off.max() > _EVEN * step:
         i = int(np.argmax(off > _EVEN * abs(step)))
         raise InvalidInputError(
-            f"{where}: lines[{(lines.start or 0) + i}]: rx element: expected lines evenly spaced from the "
-            f"lowest element up, one a place, got {elements[i]:g} where {elements[0] + step * i:g} is even: "
-            "packets of a Doppler mode are no image"
+            f"{where}: lines[{kept.start + i}]: rx element: expected lines evenly spaced from the lowest "
+            f"element up, one a place, got {elements[i]:g} where {elements[0] + step * i:g} is even: packets "
+            "of a Doppler mode are no image"
         )
+    return float(elements[0]), step
+
+
+def first_depth_mm(said: Description, first: int, rate_hz: float, spacing_mm: float) -> float | None:
+    """Depth of the first kept sample; None where it is not said, or would be above depth 0.
+
+    Less than a sample above is 0: the delay is a whole number of samples.
+    """
     delay = said.fields.optional("delay samples")
-    first_sample = None if delay is None else delay + (samples.start or 0)
-    return Place(lines, samples, float(elements[0]), step, first_sample)
+    after = -1.0 if delay is None else delay + first - BEFORE_DEPTH_S * rate_hz
+    return max(after, 0.0) * spacing_mm if after > -1.0 else None
 
 
 def probe_name(said: Description, probe: str | None) -> str:

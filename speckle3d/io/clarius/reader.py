@@ -15,7 +15,7 @@ from speckle3d.core.arrays import ComplexArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
-from speckle3d.io.clarius.lines import Place, differing, element_pitches, place_of, probe_name
+from speckle3d.io.clarius.lines import differing, element_pitches, first_depth_mm, place_of, probe_name
 from speckle3d.io.clarius.package import Files, find_files
 from speckle3d.io.clarius.raw import ClariusFile, Gain, read_header
 from speckle3d.io.clarius.sidecars import Curve, Description, read_description, read_gains
@@ -122,11 +122,16 @@ class Package:
         return True
 
     @cached_property
-    def place(self) -> Place:
-        """Where the samples lie."""
+    def kept(self) -> tuple[slice, slice]:
+        """Lines and samples that are kept."""
         whole = slice(0, self.said.lines), slice(0, self.said.samples)
+        return self.said.roi if self.said.roi and self.is_padded else whole
+
+    @cached_property
+    def place(self) -> tuple[float, float]:
+        """Place of the first line, and the distance between lines, in elements."""
         try:
-            return place_of(self.said, *(self.said.roi if self.said.roi and self.is_padded else whole))
+            return place_of(self.said, self.kept[0])
         except InvalidInputError as error:
             others = [member.name for kind, member in self.raw.items() if kind != self.chosen]
             if not others:
@@ -138,7 +143,7 @@ class Package:
     @cached_property
     def file(self) -> ClariusFile:
         """The kept part of the raw file."""
-        return replace(self.header[0], kept=(self.place.lines, self.place.samples), turns=self.turns)
+        return replace(self.header[0], kept=self.kept, turns=self.turns)
 
     @cached_property
     def rate_hz(self) -> float:
@@ -160,7 +165,7 @@ class Package:
     @cached_property
     def first_mm(self) -> float | None:
         """Depth of the first kept sample as the scanner counts it."""
-        return self.place.first_depth_mm(self.rate_hz, 2e-3 * self.spacing_mm * self.rate_hz)
+        return first_depth_mm(self.said, self.kept[1].start, self.rate_hz, self.spacing_mm)
 
     @cached_property
     def depths_mm(self) -> FloatArray:
@@ -169,7 +174,7 @@ class Package:
         first_mm = self.first_mm
         if first_mm is None or first_mm > most_mm:
             first_mm = self.settings.first_sample_depth_mm or 0.0
-        count = len(range(self.said.samples)[self.place.samples])
+        count = self.kept[1].stop - self.kept[1].start
         return np.asarray(first_mm + np.arange(count) * self.spacing_mm)
 
     @cached_property
@@ -250,7 +255,7 @@ class Package:
     def recording(self) -> Recording:
         """What the package holds, as a recording."""
         said, own, file = self.said, "its yml", replace(self.file, gain=self.gain)
-        fields, per_line = said.fields, self.place.elements_per_line
+        fields, per_line = said.fields, self.place[1]
         pitches = element_pitches(said, self.settings, per_line)
         pitch = Value()
         for source, element_mm in list(pitches.items())[:1]:
@@ -306,7 +311,7 @@ class Package:
         first_mm = (
             given.first_sample_depth_mm if given.first_sample_depth_mm is not None else self.first_mm or 0.0
         )
-        start = first_mm - (self.place.samples.start or 0) * self.spacing_mm
+        start = first_mm - self.kept[1].start * self.spacing_mm
         low_mm, high_mm = (start + count * self.spacing_mm for count in (
             said.roi[1].stop if said.roi else said.samples, said.samples))  # fmt: skip
         if depth_mm and not (low_mm <= (1 + _DEPTH) * depth_mm and high_mm >= (1 - _DEPTH) * depth_mm):
@@ -314,7 +319,7 @@ class Package:
                 f"the samples reach {high_mm:.4g} mm, and the imaging depth in the yml is {depth_mm:g} mm: "
                 "the region of interest is another, or the sampling rate"
             )
-        per_line = self.place.elements_per_line
+        per_line = self.place[1]
         if given.vector_pitch_mm and round(per_line, 3) != 1:
             notes.append(
                 f"lines are {per_line:.4g} elements apart: {given.vector_pitch_mm:g} mm between lines is an "
@@ -377,8 +382,8 @@ class Package:
                 outside = "empty, left out" if self.is_padded else "not empty, kept"
                 rows.append(("outside the region of interest", outside, ""))
             rows += [
-                ("elements per line", f"{self.place.elements_per_line:.6g}", ""),
-                ("first line at element", f"{self.place.first_element:g}, taken as the image's left", ""),
+                ("elements per line", f"{self.place[1]:.6g}", ""),
+                ("first line at element", f"{self.place[0]:g}, taken as the image's left", ""),
                 ("gain by frame", self._gain_words(), ""),
             ]
         try:
