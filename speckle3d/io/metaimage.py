@@ -230,7 +230,8 @@ class _Sequence:
         header = self.header
         dtype, stored = header.pixels.dtype.newbyteorder("="), None
         if layout.is_complex:
-            dtype, stored = np.dtype(np.complex64), dtype if dtype == np.int16 else None
+            fits = dtype == np.int16 and not layout.conjugated  # the opposite of -32768 is none
+            dtype, stored = np.dtype(np.complex64), dtype if fits else None
         elif layout.is_rf and dtype != np.int16:
             limits = np.iinfo(np.int16)
             fits = dtype.kind in "iu" and all(
