@@ -167,7 +167,7 @@ def open_posed(
         Reconstruction, or recording with a calibrated tracker or true poses.
     mode : str, optional
         A mode of the reconstruction (by default that which claims the smallest error of length); "tracker" or
-        "truth" of a recording (by default the truth if stored, else the tracker).
+        "truth" of either (of a recording by default the truth if stored, else the tracker).
     sweep_file : path, optional
         The reconstruction's sweep, if it moved.
     settings : ImportSettings, optional
@@ -194,8 +194,7 @@ def open_posed(
             )
         reconstruction, sweep = open_reconstruction(path, sweep_file)
         chosen, why = default_mode(reconstruction) if mode is None else (mode, "")
-        poses = poses_of(reconstruction, chosen)
-        return PosedSweep(sweep, np.arange(len(sweep)), poses, chosen, reconstruction, chosen_for=why)
+        return replace(posed_at(sweep, chosen, reconstruction), chosen_for=why)
     if sweep_file is not None:
         raise InvalidInputError(f"{path}: expected a reconstruction beside --sweep, got a recording")
     if mode is not None and mode not in REFERENCES:
@@ -207,7 +206,7 @@ def open_posed(
     sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in stated.model_fields_set}
     sweep, range_is_known = _load(path, stated.model_copy(update=sizes), dynamic_range_db)
     mounted, _ = apply_calibrations(resized(sweep, sizes), calibrations)
-    return replace(posed_by_itself(mounted, mode), range_is_known=range_is_known)
+    return replace(posed_at(mounted, mode), range_is_known=range_is_known)
 
 
 def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) -> tuple[Sweep, bool]:
@@ -222,8 +221,13 @@ def _load(path: Path, settings: ImportSettings, dynamic_range_db: float | None) 
     return load_sweep(path, stated), dynamic_range_db is not None
 
 
-def posed_by_itself(sweep: Sweep, mode: str | None = None) -> PosedSweep:
-    """Take a sweep's true poses, or its tracker's where it has any; as for `open_posed`."""
+def posed_at(
+    sweep: Sweep, mode: str | None = None, reconstruction: Reconstruction | None = None
+) -> PosedSweep:
+    """Take a sweep at a mode of its reconstruction, its true poses, or its tracker's; as for `open_posed`."""
+    if reconstruction is not None and mode is not None and mode not in REFERENCES:
+        poses = poses_of(reconstruction, mode)
+        return PosedSweep(sweep, np.arange(len(sweep)), poses, mode, reconstruction)
     reference = find_reference(sweep, mode)
     if reference is None:
         raise InsufficientDataError(
@@ -231,4 +235,4 @@ def posed_by_itself(sweep: Sweep, mode: str | None = None) -> PosedSweep:
             "first (speckle3d reconstruct)"
         )
     frames = np.flatnonzero(reference.covered)
-    return PosedSweep(sweep, frames, reference.world_from_image, reference.name)
+    return PosedSweep(sweep, frames, reference.world_from_image, reference.name, reconstruction)

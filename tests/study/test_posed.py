@@ -17,7 +17,7 @@ from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import recording_sha256
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import sweep_of
-from speckle3d.study.posed import MARK, open_posed, pose_mark, posed_by_itself, require_made_at
+from speckle3d.study.posed import MARK, open_posed, pose_mark, posed_at, require_made_at
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
 LEANING = PIXELS.copy()
@@ -75,8 +75,8 @@ def test_a_tracker_s_images_lie_where_the_whole_calibration_puts_them(tmp_path):
     np.testing.assert_allclose(placed, np.tile(LEANING[:, [0, 1, 3]], (4, 1, 1)), atol=1e-9)
     assert posed.sweep.grid.skew_rad == 0  # of the sweep itself, which others measure on
     with_truth = replace(posed.sweep, truth=RigidTransform.identity(4))
-    assert posed_by_itself(with_truth).source()[0].grid.skew_rad == 0
-    assert posed_by_itself(with_truth, "tracker").source()[0].grid.skew_rad == tracker.image_skew_rad
+    assert posed_at(with_truth).source()[0].grid.skew_rad == 0
+    assert posed_at(with_truth, "tracker").source()[0].grid.skew_rad == tracker.image_skew_rad
 
 
 def test_a_calibration_of_ours_takes_the_place_of_all_of_it(tmp_path):

@@ -108,7 +108,8 @@ def reslice(
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
     from speckle3d.io.voxels.volumes import may_be_volume
     from speckle3d.study.figures import RANGE_DB
-    from speckle3d.study.reslices.cuts import cut_as_volume, cut_posed, cut_voxels, open_modes
+    from speckle3d.study.posed import open_posed
+    from speckle3d.study.reslices.cuts import at_modes, cut_as_volume, cut_posed, cut_voxels
     from speckle3d.study.reslices.places import Place
     from speckle3d.study.reslices.reslice_figures import save_outlines, save_reslices
 
@@ -143,7 +144,8 @@ def reslice(
         read_voxels = None if volume is None else _voxels(volume, state)
         modes = _modes_of(None if read_voxels is None else read_voxels[0], mode or ())
         stated = statement(input_file, sweep_file, imported, transform, calibration, dynamic_range_db)
-        opened = open_modes(input_file, modes, difference_to, *stated)
+        first = open_posed(input_file, modes[0] if modes else None, *stated)
+        opened = at_modes(first, modes, difference_to)
         notes(opened.posed.notes())
         if outlines:
             save_outlines(opened, out)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,20 +13,15 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.files import PathLike
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
 from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
 from speckle3d.imaging.images import Images
-from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import kind_of
-from speckle3d.io.reconstructions import FORMAT
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.scoring.references import REFERENCES, Reference, error_rows, find_reference
-from speckle3d.scoring.trajectories import poses_of
+from speckle3d.scoring.references import Reference, error_rows, find_reference
 from speckle3d.study.figures import RANGE_DB
-from speckle3d.study.posed import PosedSweep, open_posed, posed_by_itself
+from speckle3d.study.posed import PosedSweep, posed_at
 from speckle3d.study.reslices.cut_geometry import Anchors, anchors_of
 from speckle3d.study.reslices.places import (
     AnyCut,
@@ -117,23 +111,14 @@ class OpenedModes:
     reference: str
 
 
-def open_modes(
-    path: Path,
-    modes: Sequence[str] = (),
-    reference: str | None = None,
-    sweep_file: Path | None = None,
-    settings: ImportSettings | None = None,
-    calibrations: Sequence[PathLike] = (),
-    dynamic_range_db: float | None = None,
-) -> OpenedModes:
-    """Open a reconstruction at several modes, or a recording at its own poses.
+def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> OpenedModes:
+    """Take an opened sweep at several modes.
 
     Parameters
     ----------
-    path, sweep_file, settings, calibrations, dynamic_range_db
-        As for `open_posed`.
+    first : PosedSweep
     modes : sequence of str
-        Modes of the reconstruction, "tracker" or "truth"; by default as for `open_posed`.
+        Modes of the reconstruction, "tracker" or "truth"; by default the one it is opened at.
     reference : str, optional
         What to compare them with; by default the truth or a tracker that covers all frames, if there are
         several modes, else the first.
@@ -143,39 +128,21 @@ def open_modes(
     InvalidInputError, InsufficientDataError
         If there is no such mode.
     """
-    is_reconstruction = kind_of(path) == FORMAT
-    own = [mode for mode in modes if mode not in REFERENCES or not is_reconstruction]
-    others = sweep_file, settings, calibrations, dynamic_range_db
-    # Beside a reference alone any mode will do.
-    first = open_posed(path, own[0] if own else ("image" if modes else None), *others)
-    return at_modes(first, modes, reference)
-
-
-def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> OpenedModes:
-    """Take an opened sweep at several modes; as for `open_modes`."""
     asked = list(dict.fromkeys(modes)) or [first.mode]
     if reference is None:
         known = find_reference(first.sweep) if len(asked) > 1 else None
         reference = asked[0] if known is None or not known.covered.all() else known.name
-    every = {mode: _posed(first, mode) for mode in dict.fromkeys([*asked, reference])}
-    shared = reduce(np.intersect1d, [frames for _, frames in every.values()])
+    every = {
+        mode: posed_at(first.sweep, mode, first.reconstruction) for mode in dict.fromkeys([*asked, reference])
+    }
+    shared = reduce(np.intersect1d, [each.frames for each in every.values()])
     if not shared.size:
         raise InsufficientDataError(
             f"{first.sweep.name}: expected a frame that has a pose in {' and '.join(every)}, got none"
         )
-    poses = {mode: each[np.isin(frames, shared)] for mode, (each, frames) in every.items()}
+    poses = {mode: each.world_from_image[np.isin(each.frames, shared)] for mode, each in every.items()}
     posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
     return OpenedModes(posed, poses, reference)
-
-
-def _posed(first: PosedSweep, mode: str) -> tuple[RigidTransform, IntArray]:
-    """Poses of one mode, and the frames that have them."""
-    if mode == first.mode:
-        return first.world_from_image, first.frames
-    if first.reconstruction is not None and mode not in REFERENCES:
-        return poses_of(first.reconstruction, mode), first.frames
-    itself = posed_by_itself(first.sweep, mode)
-    return itself.world_from_image, itself.frames
 
 
 def cut_posed(

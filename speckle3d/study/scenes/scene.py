@@ -17,6 +17,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.labels import STATE_SEGMENTS
 from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
+from speckle3d.core.reconstruction import MODES
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
@@ -28,7 +29,6 @@ from speckle3d.study.figures import colour_of
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scenes.sequences import slicer_sequence
 from speckle3d.study.scenes.voxels import (
-    BEST_FIRST,
     GridRequest,
     VolumeReport,
     VolumeRequest,
@@ -141,7 +141,7 @@ def _stale(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     """Files of a scene in the folder that the new one does not have."""
     if not (folder / SCENE).is_file():
         return ()
-    ours = {name.format(mode) for mode in (*BEST_FIRST, *REFERENCES) for name in _NAMES.values()}
+    ours = {name.format(mode) for mode in (*MODES, *REFERENCES) for name in _NAMES.values()}
     return tuple(sorted(name for name in ours - {*names} if (folder / name).exists()))
 
 

@@ -29,9 +29,6 @@ from speckle3d.io.voxels.volumes import read_volume
 from speckle3d.study.pose_errors import posed_errors_of
 from speckle3d.study.posed import MARK, PosedSweep, pose_mark
 
-BEST_FIRST = ("fused", "crossed", "pose", "orientation", "image")
-"""Modes in the order in which a volume takes its poses: those that set the length first."""
-
 _DEVIATION = "standard deviation of position along the sweep, mm"
 
 Axes = Literal["sweep", "world", "principal"]
