@@ -39,6 +39,7 @@ REMOVED_SETTINGS = {
     "inplane.passes": "lags are centred twice",
     "trajectory.block_frames": "a sweep is matched in one go",
     "trajectory.join": "poses are always solved from all pairs",
+    "volume.max_file_gb": "volumes are made in memory, which `max_memory_gb` limits",
     "inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first",
     "fused.contradiction_sigma": "where images and sensors differ both numbers are told",
 }

@@ -17,7 +17,7 @@ _LEAST_COMMON = 0.5
 
 _TURNS = Rotation.from_rotvec(np.stack(np.meshgrid(*[np.linspace(-0.7, 0.7, 7)] * 3), axis=-1).reshape(-1, 3))
 """Turns at which the smallest box is looked for: with quarter turns, near any orientation there is."""
-_REFINED = 3
+_REFINED = 4
 """Of those, how many are searched from: the smallest box is not the only minimum."""
 _SIMPLEX = np.vstack([np.zeros(3), 0.15 * np.eye(3)])
 """Turns with which each search begins, rad."""
@@ -96,16 +96,15 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
     def log_volumes(axes: Rotation) -> FloatArray:
         return np.asarray(np.log(np.ptp(points @ axes.as_matrix(), axis=-2) + skin).sum(axis=-1))
 
-    def log_volume(turn_rad: FloatArray, start: Rotation) -> float:
-        return float(log_volumes(start * Rotation.from_rotvec(turn_rad)))
-
     def smallest_near(start: Rotation) -> Rotation:
-        turn = fmin(log_volume, np.zeros(3), (start,), 1e-6, 1e-6, initial_simplex=_SIMPLEX, disp=False)
+        def log_volume(turn_rad: FloatArray) -> float:
+            return float(log_volumes(start * Rotation.from_rotvec(turn_rad)))
+
+        turn = fmin(log_volume, np.zeros(3), (), 1e-6, 1e-6, initial_simplex=_SIMPLEX, disp=False)
         return start * Rotation.from_rotvec(turn)
 
     turned = lateral_first * _TURNS
-    smallest_first = turned[np.argsort(log_volumes(turned), kind="stable")[:_REFINED]]
-    starts = [lateral_first, _spread_axes(points), *smallest_first]
+    starts = [lateral_first, *turned[np.argsort(log_volumes(turned), kind="stable")[:_REFINED]]]
     found = Rotation.concatenate([lateral_first, Rotation.identity(), *map(smallest_near, starts)])
     volume = log_volumes(found)
     smallest = found[int(np.flatnonzero(volume <= volume.min() + 1e-4)[0])]
@@ -128,10 +127,3 @@ def line_along(directions: FloatArray) -> FloatArray:
     """
     line = np.asarray(np.linalg.eigh(directions.T @ directions)[1][:, -1], dtype=float)
     return line if directions[0] @ line >= 0 else -line
-
-
-def _spread_axes(points: FloatArray) -> Rotation:
-    """Axes along which points spread most, and least."""
-    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=True)[2].T
-    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
-    return Rotation.from_matrix(axes)

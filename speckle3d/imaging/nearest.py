@@ -56,14 +56,11 @@ class NearestImages:
         # compete for one side and leave the other empty.
         self._index_from_world = source.index_from_image() @ image_from_world
         self._index_from_world[normals @ line_along(normals) < 0, 2] *= -1.0
-        place = self._index_from_world[:, :, :3] @ hull_mm.T + self._index_from_world[:, :, 3:]
-        last = np.array([[source.grid.vectors - 1.0], [source.grid.samples - 1.0], [reach_mm]])
-        first = np.array([[0.0], [0.0], [-reach_mm]])
         # An image reaches no point if all of the hull lies beyond one face of its slab.
-        inside = (place.max(axis=2, keepdims=True) > first - 1e-3) & (
-            place.min(axis=2, keepdims=True) < last + 1e-3
-        )
-        self.near = inside.all(axis=(1, 2))
+        place = self._index_from_world[:, :, :3] @ hull_mm.T + self._index_from_world[:, :, 3:]
+        last = np.array([source.grid.vectors - 1.0, source.grid.samples - 1.0, reach_mm])
+        inside = (place.max(axis=2) > last * [0, 0, -1] - 1e-3) & (place.min(axis=2) < last + 1e-3)
+        self.near = inside.all(axis=1)
         # Distance at right angles to the image, and what it shows: of images behind, then of those in front.
         self._distance_mm = np.full((2, len(lines), points), reach_mm, dtype=np.float32)
         self._grey = np.full(self._distance_mm.shape, np.nan, dtype=np.float32)

@@ -28,7 +28,7 @@ def volume(
     mode: MaybeText = None,
     settings: Annotated[
         dict[str, Any],
-        Fields("speckle3d.imaging.voxels.settings:CompoundingSettings", without=("max_file_gb",)),
+        Fields("speckle3d.imaging.voxels.settings:CompoundingSettings"),
     ],
     axes: Literal["sweep", "world", "principal"] = "sweep",
     spacing_mm: Three | None = None,

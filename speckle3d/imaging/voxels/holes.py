@@ -12,7 +12,12 @@ MAX_RADIUS = 255
 """Largest half edge of a box, to catch wrong units, and within what counts of four bytes hold."""
 
 
-def fill_holes(voxels: Float32Array, state: ByteArray, boxes: int | IntArray) -> None:
+def fill_holes(
+    voxels: Float32Array,
+    state: ByteArray,
+    radius_mm: float,
+    spacing_mm: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> None:
     """Fill empty voxels from measured ones nearby; these are never changed.
 
     An empty voxel becomes the mean of the measured voxels in the smallest box around it that holds any, and
@@ -24,14 +29,8 @@ def fill_holes(voxels: Float32Array, state: ByteArray, boxes: int | IntArray) ->
         What empty ones hold does not matter.
     state : ndarray of uint8, shape (n_k, n_j, n_i), C order, changed in place
         `EMPTY`, `MEASURED` or `FILLED` of `speckle3d.core.labels`.
-    boxes : int, or ndarray of int, shape (n, 3)
-        Half the edge of the largest box in voxels: boxes are cubes that grow by one voxel to every side;
-        with 0 nothing is filled. Or half edges (k, j, i) of each box, smallest first: see `boxes_within`.
-
-    Raises
-    ------
-    InvalidInputError
-        If a box is negative or larger than `MAX_RADIUS`.
+    radius_mm, spacing_mm : float, tuple of float
+        Of the largest box, as for `boxes_within`; in voxels without a spacing.
 
     Examples
     --------
@@ -43,12 +42,7 @@ def fill_holes(voxels: Float32Array, state: ByteArray, boxes: int | IntArray) ->
     """
     from speckle3d.kernels.holes import fill_planes
 
-    ends = np.asarray(boxes)
-    if ends.size and not 0 <= ends.min() <= ends.max() <= MAX_RADIUS:
-        raise InvalidInputError(f"radius: expected 0 to {MAX_RADIUS} voxels, got {boxes}")
-    if ends.ndim == 0:
-        ends = np.repeat(np.arange(1, int(ends) + 1), 3).reshape(-1, 3)
-    boxes = np.ascontiguousarray(ends, dtype=np.int64)
+    boxes = boxes_within(radius_mm, spacing_mm)
     if len(boxes):
         in_parallel(lambda first, stop: fill_planes(voxels, state, boxes, first, stop), len(voxels), 2)
 

@@ -54,9 +54,6 @@ class CompoundingSettings(BaseModel):
     )
     dynamic_range_db: float = Field(60.0, gt=0, description="Range of the log-compressed grey levels.")
     max_memory_gb: float = Field(8.0, gt=0, description="Memory that making a volume may take.")
-    max_file_gb: float = Field(
-        64.0, gt=0, description="Largest volume to make: larger ones are more often due to a wrong unit."
-    )
 
     @model_validator(mode="before")
     @classmethod

@@ -23,7 +23,7 @@ from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import Images, PosedImages
 from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
-from speckle3d.imaging.voxels.holes import boxes_within, fill_holes
+from speckle3d.imaging.voxels.holes import fill_holes
 from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
 from speckle3d.imaging.voxels.splatting import Weights, splat_images
 
@@ -33,7 +33,7 @@ DEFAULT_FILL_RADIUS = 3
 MAX_MEMORY_GB = 8.0
 """Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
 
-BYTES_PER_VOXEL = 25
+_BYTES_PER_VOXEL = 25
 """Of work beside the voxels' own type: sum and weight, or two images beside it; tag, level and state."""
 
 
@@ -182,9 +182,10 @@ def compound_onto(
                 f"rule plus: expected voxels of type uint8, whose whole grey levels it keeps, got {kind}"
             )
         voxels, state = splat_images(source, voxel_grid, settings.splat, settings.rule, weights, region)
-        in_mm = settings.fill_mm > 0
-        boxes = boxes_within(settings.fill_mm, voxel_grid.spacing_mm) if in_mm else settings.fill_radius
-        fill_holes(voxels, state, boxes)
+        if settings.fill_mm > 0:
+            fill_holes(voxels, state, settings.fill_mm, voxel_grid.spacing_mm)
+        else:
+            fill_holes(voxels, state, settings.fill_radius)
     if not state.any():
         raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
     typed = voxels if kind == "float32" else _rounded(voxels, state, kind)
@@ -192,17 +193,13 @@ def compound_onto(
 
 
 def _require_room(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> None:
-    """Raise `InvalidInputError` if a volume is too large for its file or for the memory to make it in."""
-    size_gb = voxel_grid.size_gb(settings.voxel_type)
-    for what, most, needed in (
-        ("GB", settings.max_file_gb, size_gb),
-        ("GB of memory", settings.max_memory_gb, size_gb + BYTES_PER_VOXEL * voxel_grid.size_gb("uint8")),
-    ):
-        if needed > most:
-            raise InvalidInputError(
-                f"volume: expected at most {most:g} {what}, got {needed:.3g} GB for {voxel_grid}: take "
-                "larger voxels, or check the poses"
-            )
+    """Raise `InvalidInputError` if a volume is too large for the memory to make it in."""
+    needed = voxel_grid.size_gb(settings.voxel_type) + _BYTES_PER_VOXEL * voxel_grid.size_gb("uint8")
+    if needed > settings.max_memory_gb:
+        raise InvalidInputError(
+            f"volume: expected at most {settings.max_memory_gb:g} GB of memory, got {needed:.3g} GB for "
+            f"{voxel_grid}: take larger voxels, or check the poses"
+        )
 
 
 def _rounded(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> npt.NDArray[Any]:

@@ -64,7 +64,7 @@ def test_boxes_in_mm_are_those_of_brute_force(seed, spacing, radius_mm):
     voxels, state = some_voxels(np.random.default_rng(seed), (6, 7, 9), 0.05)
     boxes = boxes_within(radius_mm, spacing)
     expected = filled_by_definition(voxels, state, boxes)
-    fill_holes(voxels, state, boxes)
+    fill_holes(voxels, state, radius_mm, spacing)
     np.testing.assert_array_equal(state, expected[1])
     np.testing.assert_array_equal(voxels[state == FILLED], expected[0][state == FILLED])
 
