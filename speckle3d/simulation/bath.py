@@ -14,11 +14,20 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.simulation.medium import TILE_MM, Layer, Scatterers, TiledMedium, tile_rng, tiles_near
+from speckle3d.simulation.medium import TILE_MM, Box, Layer, Scatterers, TiledMedium, tile_rng, tiles_near
 from speckle3d.simulation.settings import Reflector
 
 _STEEPEST = np.cos(np.deg2rad(35.0))
 """Reverberations off virtual surfaces turned further than this miss the aperture."""
+
+_SPACING_MM = 0.0625
+"""Of the lattice of a sheet's scatterers; a tile's side is a multiple of it."""
+
+_ROUGHNESS_MM = 0.01
+"""Standard deviation of their heights, independent of each other.
+
+A twentieth of the wavelength leaves a diffuse echo some 25 dB below the specular one, as of a moulded bath.
+"""
 
 _STRENGTH_PER_MM2 = 8.0
 """Echo strength of the floor. The bar's is higher, so that both are equally bright from above."""
@@ -61,30 +70,23 @@ class RoughSheet:
     ----------
     entropy : int
         Seed; with a tile's indices it determines the tile.
-    spacing_mm : float
-        Of the lattice; a tile's side is a multiple of it.
-    roughness_mm : float
-        Standard deviation of the heights, independent of each other. A twentieth of the wavelength leaves a
-        diffuse echo some 25 dB below the specular one, as of a moulded bath.
     """
 
     entropy: int
-    spacing_mm: float = 0.0625
-    roughness_mm: float = 0.01
 
     def tile(self, i: int, j: int) -> FloatArray:
         """Positions of the scatterers on the tile whose first corner is at i, j tiles, shape (n, 3)."""
-        along = (np.arange(round(TILE_MM / self.spacing_mm)) + 0.5) * self.spacing_mm
+        along = (np.arange(round(TILE_MM / _SPACING_MM)) + 0.5) * _SPACING_MM
         x, z = np.meshgrid(i * TILE_MM + along, j * TILE_MM + along)
-        height = tile_rng(self.entropy, i=i, j=j).normal(0.0, self.roughness_mm, x.size)
+        height = tile_rng(self.entropy, i=i, j=j).normal(0.0, _ROUGHNESS_MM, x.size)
         return np.stack([x.ravel(), height, z.ravel()], axis=1)
 
-    def near(self, image_from_sheet: RigidTransform, low_mm: FloatArray, high_mm: FloatArray) -> FloatArray:
+    def near(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
         """Positions, in the sheet, on all tiles that may reach into a box of the image, shape (n, 3)."""
-        tiles = tiles_near(image_from_sheet.inv(), low_mm, high_mm)
+        tiles = tiles_near(image_from_sheet.inv(), box)
         middle = np.insert((tiles + 0.5) * TILE_MM, 1, 0.0, axis=1)
         place, corner = image_from_sheet.apply(middle), TILE_MM / np.sqrt(2.0)
-        reached = ((place >= low_mm - corner) & (place <= high_mm + corner)).all(axis=1)
+        reached = ((place >= box[0] - corner) & (place <= box[1] + corner)).all(axis=1)
         return np.concatenate([np.empty((0, 3)), *(self.tile(i, j) for i, j in tiles[reached].tolist())])
 
 
@@ -146,9 +148,7 @@ class WaterBath:
     reflector: Reflector = "wall"
     attenuation_db_cm_mhz: float = 0.0
 
-    def seen(
-        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-    ) -> list[Scatterers]:
+    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Reflector, its reverberations and the haze in a box of the image."""
         floor = Level.floor(medium_from_image)
         if self.reflector == "wall":
@@ -161,24 +161,22 @@ class WaterBath:
             slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
             image_from_sheet = image_from_line * RigidTransform.from_translation([-slid, 0.0, 0.0])
             medium_from_sheet = medium_from_image * image_from_sheet
-        position = self._surface(image_from_sheet, low_mm, high_mm)
-        blocks = [*self.haze.seen(medium_from_image, low_mm, high_mm)]
+        position = self._surface(image_from_sheet, box)
+        blocks = [*self.haze.seen(medium_from_image, box)]
         blocks.append(self._scatterers(medium_from_sheet.apply(position)))
         for level, amplitude in _reverberations(floor):
-            position = self._surface(level.image_from_sheet, low_mm, high_mm) * [1.0, 0.0, 1.0]
+            position = self._surface(level.image_from_sheet, box) * [1.0, 0.0, 1.0]
             place = medium_from_image * level.image_from_sheet
             blocks.append(self._scatterers(place.apply(position), amplitude))
         return blocks
 
-    def _surface(
-        self, image_from_sheet: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-    ) -> FloatArray:
+    def _surface(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
         """Those of the sheet's scatterers that the reflector has near a box of the image."""
-        position = self.sheet.near(image_from_sheet, low_mm, high_mm)
+        position = self.sheet.near(image_from_sheet, box)
         return position if self.reflector == "wall" else position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
 
     def _scatterers(self, position: FloatArray, amplitude: float = 1.0) -> Scatterers:
-        strength = amplitude * _STRENGTH_PER_MM2 * self.sheet.spacing_mm**2
+        strength = amplitude * _STRENGTH_PER_MM2 * _SPACING_MM**2
         if self.reflector == "bar":
             strength *= _BEAM_MM / _BAR_MM
         return position, np.full(len(position), strength, np.float32)
@@ -217,14 +215,12 @@ class CrossedThreads:
     position_mm: FloatArray
     attenuation_db_cm_mhz: float = 0.0
 
-    def seen(
-        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-    ) -> list[Scatterers]:
+    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Haze and the parts of the threads in a box of the image."""
         place = medium_from_image.inv().apply(self.position_mm)
-        near = self.position_mm[((place >= low_mm) & (place <= high_mm)).all(axis=1)]
+        near = self.position_mm[((place >= box[0]) & (place <= box[1])).all(axis=1)]
         threads = near, np.full(len(near), _THREAD_STRENGTH, np.float32)
-        return [*self.haze.seen(medium_from_image, low_mm, high_mm), threads]
+        return [*self.haze.seen(medium_from_image, box), threads]
 
 
 def _haze(entropy: int, down_to_mm: float) -> TiledMedium:

@@ -8,7 +8,6 @@ from functools import lru_cache
 import numpy as np
 
 from speckle3d.core.arrays import Complex64Array, ComplexArray, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.diffraction import lens_fields
@@ -70,12 +69,6 @@ class Probe:
     bandwidth_hz: tuple[float, float] = (5e6, 10e6)
     sampling_rate_hz: float = 200e6 / 3
     speed_of_sound_m_s: float = 1540.0
-
-    def __post_init__(self) -> None:
-        if self.transmit_elements < 1 or self.transmit_elements % 2 == 0:
-            raise InvalidInputError(
-                f"transmit_elements: expected an odd number, got {self.transmit_elements}"
-            )
 
     @property
     def signal(self) -> RFSettings:

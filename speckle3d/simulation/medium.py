@@ -42,6 +42,9 @@ _CELL_MM = 0.5
 """Lateral and elevational side of cells with one background scatterer each: the focused beam's width."""
 
 
+Box = tuple[FloatArray, FloatArray]
+"""Opposite corners of a box of the image, the lower first, mm."""
+
 Tile = TypeVar("Tile")
 
 
@@ -52,9 +55,7 @@ class Medium(Protocol):
     def attenuation_db_cm_mhz(self) -> float:
         """One-way attenuation, proportional to frequency."""
 
-    def seen(
-        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-    ) -> list[Scatterers]:
+    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Blocks of scatterers, in the medium, that include all those in a box of the image."""
 
 
@@ -96,9 +97,9 @@ class Tiles(Generic[Tile]):
         return tile
 
 
-def tiles_near(medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray) -> IntArray:
+def tiles_near(medium_from_image: RigidTransform, box: Box) -> IntArray:
     """Indices of the tiles of a medium that together hold a box of the image, shape (n, 2)."""
-    corners = np.stack(np.meshgrid(*np.stack([low_mm, high_mm], axis=-1)), axis=-1)
+    corners = np.stack(np.meshgrid(*np.stack(box, axis=-1)), axis=-1)
     seen = medium_from_image.apply(corners.reshape(-1, 3))[:, [0, 2]]
     first = np.floor(seen.min(axis=0) / TILE_MM).astype(int)
     last = np.floor(seen.max(axis=0) / TILE_MM).astype(int)
@@ -240,11 +241,9 @@ class TiledMedium:
     spheres: Sequence[Sphere] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
 
-    def seen(
-        self, medium_from_image: RigidTransform, low_mm: FloatArray, high_mm: FloatArray
-    ) -> list[Scatterers]:
+    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Tiles that together hold all scatterers in a box of the image."""
-        return self._tiles(tiles_near(medium_from_image, low_mm, high_mm))
+        return self._tiles(tiles_near(medium_from_image, box))
 
     @cached_property
     def _tiles(self) -> Tiles[Scatterers]:

@@ -17,7 +17,6 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.simulation.settings import SimulationSettings
 
@@ -102,13 +101,7 @@ class Trajectory:
 
     def medium_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the medium at any times within the knots."""
-        t = np.asarray(time_s, dtype=float)
-        if t.min() < self.knot_s[0] or t.max() > self.knot_s[-1]:
-            raise InvalidInputError(
-                f"time_s: expected {self.knot_s[0]:.3f} to {self.knot_s[-1]:.3f} s, "
-                f"got {t.min():.3f} to {t.max():.3f} s"
-            )
-        return self.medium_from_columns(self._spline(t))
+        return self.medium_from_columns(self._spline(time_s))
 
     def world_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the world at any times within the knots."""
@@ -117,7 +110,9 @@ class Trajectory:
     @cached_property
     def _spline(self) -> BSpline[np.float64]:
         # Quintic, because an accelerometer feels the second derivative.
-        return make_interp_spline(self.knot_s, self.knots, k=5)
+        spline = make_interp_spline(self.knot_s, self.knots, k=5)
+        spline.extrapolate = False
+        return spline
 
 
 def frame_times(frames: int, rate_hz: float, rng: np.random.Generator, jitter_s: float = 1e-3) -> FloatArray:

@@ -12,11 +12,10 @@ from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.scatter import EchoGrid, FieldTable, field_table, scatter_echoes
 from speckle3d.simulation.beam import PER_PITCH, BeamTable
-from speckle3d.simulation.medium import Medium
+from speckle3d.simulation.medium import Box, Medium
 
 _FULL_SCALE = 8191
 """14 bits, signed."""
@@ -60,13 +59,6 @@ class SimulatedFrames:
     computed: ClassVar[bool] = True
     dtype: ClassVar[np.dtype[Any]] = np.dtype(np.int16)
 
-    def __post_init__(self) -> None:
-        pitch_mm, probe_mm = self.image.vector_pitch_mm, self.beam.probe.pitch_mm
-        if not np.isclose(pitch_mm, probe_mm, rtol=1e-9, atol=0.0):
-            raise InvalidInputError(
-                f"expected vectors at the probe's pitch, {probe_mm:g} mm, got {pitch_mm:g} mm"
-            )
-
     @property
     def shape(self) -> tuple[int, int, int]:
         """Frames, vectors, samples."""
@@ -98,7 +90,7 @@ class SimulatedFrames:
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
         medium_from_image = self.medium_from_image[index]
         matrix = medium_from_image.inv().as_matrix()
-        for position, strength in self.medium.seen(medium_from_image, *self._box):
+        for position, strength in self.medium.seen(medium_from_image, self._box):
             scatter_echoes(
                 position, strength, matrix, image.vector_pitch_mm, self._field, grid, out.view(np.float32)
             )
@@ -112,7 +104,7 @@ class SimulatedFrames:
         return field_table(beam.residual, beam.reach, beam.curvature_per_mm, steps, PER_PITCH)
 
     @cached_property
-    def _box(self) -> tuple[FloatArray, FloatArray]:
+    def _box(self) -> Box:
         """Opposite corners of what the beam reaches, in the image."""
         margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm.max()
         depth = self.beam.depth_mm

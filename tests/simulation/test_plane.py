@@ -125,7 +125,7 @@ def test_no_scatterer_of_the_sheet_in_the_box_is_missed():
         place = image_from_sheet.apply(position)
         return position[((place >= low) & (place <= high)).all(axis=1)]
 
-    kept, wanted = inside(sheet.near(image_from_sheet, low, high)), inside(everything)
+    kept, wanted = inside(sheet.near(image_from_sheet, (low, high))), inside(everything)
     assert len(wanted) > 50_000
     np.testing.assert_array_equal(kept[np.lexsort(kept.T)], wanted[np.lexsort(wanted.T)])
 

@@ -74,7 +74,7 @@ def test_moving_medium_and_probe_together_changes_nothing(beam):
 
 def test_tissue_has_cysts_layers_and_a_poorly_filled_depth():
     medium = tissue(4, 20.0)
-    blocks = medium.seen(RigidTransform.identity(), np.zeros(3), np.array([18.0, 0.0, 10.0]))
+    blocks = medium.seen(RigidTransform.identity(), (np.zeros(3), np.array([18.0, 0.0, 10.0])))
     position = np.concatenate([p for p, _ in blocks])
     power = np.concatenate([s for _, s in blocks]).astype(float) ** 2
     by_depth = np.histogram(position[:, 1], [3.0, 6.0, 17.0, 22.0, 32.0, 42.0], weights=power)[0]
