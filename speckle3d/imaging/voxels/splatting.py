@@ -132,7 +132,12 @@ def _kernel(
         return add_whole, (np.zeros(shape, np.uint8), np.zeros(shape, np.uint16))
     if rule == "maximum":
         return kernels.keep_largest, (np.full(shape, np.nan, np.float32),)
-    if (splat, rule) == ("nearest", "mean") and few_samples and stored.name in _DIRECT[:3]:
+    if (
+        (splat, rule) == ("nearest", "mean")
+        and few_samples
+        and stored.name in _DIRECT[:3]
+        and stored.isnative
+    ):
         return kernels.count_nearest, (np.zeros(shape, np.uint64), 2**15 if stored.kind == "i" else 0)
     tags = np.zeros(shape if rule == "latest" else (1, 1, 1), np.uint32)
     return (kernels.add_linear if splat == "linear" else kernels.add_nearest), (np.zeros((*shape, 2)), tags)
