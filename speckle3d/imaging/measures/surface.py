@@ -85,7 +85,8 @@ def surface_of(
     if not (values.size and values.min() <= level <= values.max()):
         among = f"{values.min():g} to {values.max():g}" if values.size else "of which there is none"
         raise InvalidInputError(f"level: expected a grey level of the volume, {among}, got {level:g}")
-    return smoothed(_marched(volume, volume.voxels, level, inside, held), smooth)
+    found = _marched(volume, volume.voxels, level, inside, held)
+    return smoothed(found, smooth) if smooth else found
 
 
 def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:
