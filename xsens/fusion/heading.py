@@ -207,10 +207,9 @@ def _backward(
     filtered = (each[first:] for each in (states, covariances, transitions, noises))
     means, spread, _, _ = smoother.rts_smoother(*filtered)
     found = np.array([kernel.turn_to_north(x, p) for x, p in zip(means, spread, strict=True)])
+    # Before the first reading the level axes are the gyroscope's, whose errors add up.
     early = bins[1 : first + 1]
     moving_s = early["span_s"] * ~early["resting"]
-    slip = moving_s * (early["level"][:, 2] @ means[0, kernel.BIAS : kernel.BIAS + 3])
-    grown = early["slip_rad2"] + moving_s**2 * early["bias_variance"]
-    turn = np.unwrap(found[:, 0])
-    turn = np.concatenate([turn[0] + np.cumsum(slip[::-1])[::-1], turn])
-    return turn, np.concatenate([found[0, 1] + np.cumsum(grown[::-1])[::-1], found[:, 1]])
+    grown = np.cumsum((early["slip_rad2"] + moving_s**2 * early["bias_variance"])[::-1])[::-1]
+    turn, variance = np.unwrap(found[:, 0]), found[:, 1]
+    return np.pad(turn, (first, 0), mode="edge"), np.concatenate([variance[0] + grown, variance])

@@ -228,17 +228,16 @@ def _checked(
     if not (np.isfinite(step) & (step > 0.0)).all():
         raise InvalidInputError("step_s: expected positive numbers, got one that is not")
     field = np.full((step.size, 3), np.nan) if magnetometer_au is None else magnetometer_au
-    vectors = []
-    for name, values in (
-        ("gyroscope_rad_s", gyroscope_rad_s),
-        ("accelerometer_m_s2", accelerometer_m_s2),
-        ("magnetometer_au", field),
-    ):
-        rows = np.atleast_2d(np.asarray(values, dtype=float))
+    vectors = {
+        "gyroscope_rad_s": np.atleast_2d(np.asarray(gyroscope_rad_s, dtype=float)),
+        "accelerometer_m_s2": np.atleast_2d(np.asarray(accelerometer_m_s2, dtype=float)),
+        "magnetometer_au": np.atleast_2d(np.asarray(field, dtype=float)),
+    }
+    for name, rows in vectors.items():
         if rows.shape != (step.size, 3):
             raise MismatchError(f"{name}: expected shape {(step.size, 3)}, got {rows.shape}")
-        vectors.append(rows)
-    fast = np.linalg.norm(np.where(np.isfinite(vectors[0]), vectors[0], 0.0), axis=1).max(initial=0.0)
+    rate, force, field = vectors.values()
+    fast = np.linalg.norm(np.where(np.isfinite(rate), rate, 0.0), axis=1).max(initial=0.0)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
-    return step, vectors[0], vectors[1], vectors[2]
+    return step, rate, force, field

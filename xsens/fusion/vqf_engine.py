@@ -11,7 +11,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -115,7 +114,7 @@ class VqfEngine:
         if magnetic:
             disturbed = found["magDistDetected"][at]
             self._fields.append(not disturbed.all())
-        apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)), offline)
+        apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)))
         sd = np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi)
         resting = found["restDetected"][at]
         return Estimate(xyzw, sd, found["bias"][at], disturbed, resting, own.field_stray, own.field_iron)
@@ -171,19 +170,11 @@ def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArra
 # -- uncertainty
 
 
-def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float, offline: bool) -> FloatArray:
-    """Squared distance of two orientations about the world's axes, averaged, shape (m, 3).
-
-    On line it is the mean of the past, or what it is now if that is more.
-    """
+def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float) -> FloatArray:
+    """Squared distance of two orientations about the world's axes, shape (m, 3): past mean or now."""
     stride = max(1, round(_COMPARED_S / step_s))
     one, two = (Rotation.from_quat(each[::stride]) for each in (xyzw, other))
     square = (one * two.inv()).as_rotvec() ** 2
-    averaged = _AVERAGED_S / (stride * step_s)
-    if offline:
-        mean = uniform_filter1d(square, max(1, round(averaged)), axis=0, mode="nearest")
-    else:
-        keep = math.exp(-1.0 / averaged)
-        mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
-        mean = np.maximum(mean, square)  # the mean of the past is late
-    return np.repeat(np.maximum(mean, 0.0), stride, axis=0)[: len(xyzw)]
+    keep = math.exp(-stride * step_s / _AVERAGED_S)
+    mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
+    return np.repeat(np.maximum(mean, square), stride, axis=0)[: len(xyzw)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import chain
@@ -20,6 +21,7 @@ _LONGEST_HEADER = 64
 """Lines, not counting comments, among which the names of the columns or the first numbers must be."""
 
 _COMMENT = "#"
+_BLANK = ("", "nan", "NaN")
 _DIGIT = re.compile("[0-9]")
 _LIKE_NAMES = re.compile(r"(?:[a-z°²µ_][\w .()\[\]/^°²µ-]*|)$")
 _AXES = frozenset("wxyzs")
@@ -136,55 +138,37 @@ def _rows(
     count: int,
 ) -> TextTable:
     """Read the columns that are understood, or all if none has a name."""
-    kept = [i for i, column in enumerate(columns) if column is not None]
-    whose = [i for i, name in enumerate(names) if names_a_sensor(name)]
-    counts = {"lines": 0, "words": 0}
-    sensors: list[dict[str, None]] = [{} for _ in whose]
-
-    def even() -> Iterator[str]:
-        for line in lines:
-            if not line.strip("\r\n"):
-                continue
-            cells = line.count(separator) + 1 if separator else len(line.split())
-            if cells != count or not _DIGIT.search(line):
-                counts["lines"] += 1
-                continue
-            if whose:
-                parts = line.split(separator)
-                for values, i in zip(sensors, whose, strict=True):
-                    values[parts[i].strip()] = None
-            yield line if separator == "," else line.replace(",", ".")
-
-    def converted(cell: str) -> float:
+    known = {i: column for i, column in enumerate(columns) if column is not None}
+    kept = list(known) or range(count)
+    sensors = {name: dict[str, None]() for name in names if names_a_sensor(name)}
+    values, left_out, words = array("d"), 0, 0
+    for line in lines:
+        if not line.strip("\r\n"):
+            continue
+        cells = (line if separator == "," else line.replace(",", ".")).split(separator)
+        if len(cells) != count or not _DIGIT.search(line):
+            left_out += 1
+            continue
+        for name, ids in sensors.items():
+            ids[cells[names.index(name)].strip()] = None
         try:
-            return float(cell)
+            values.extend([float(cells[i]) for i in kept])
         except ValueError:  # quoted, blank, or a word
-            value = number(cell)
-            counts["words"] += value != value and bool(cell.strip())
-            return value
-
-    rows = even()
-    if (first := next(rows, None)) is None:
+            row = [number(cells[i]) for i in kept]
+            words += sum(v != v and cells[i].strip() not in _BLANK for i, v in zip(kept, row, strict=True))
+            values.extend(row)
+    if not values:
         raise InvalidInputError(
-            f"expected lines of {count} cells below the names, got {counts['lines']} lines of another length"
+            f"expected lines of {count} cells below the names, got {left_out} lines of another length"
         )
-    values = np.loadtxt(
-        chain([first], rows),
-        delimiter=separator,
-        comments=None,
-        converters=converted,
-        usecols=kept or None,
-        ndmin=2,
-        encoding=None,
-    )
-    for i, ids in zip(whose, sensors, strict=True):
+    for name, ids in sensors.items():
         if len(ids) > 1:
             listed = ", ".join(list(ids)[:4]) + (", ..." if len(ids) > 4 else "")
             raise InvalidInputError(
-                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({listed}): split the table"
+                f"column {name}: expected rows of one sensor, got {len(ids)} ({listed}): split the table"
             )
-    known = tuple(column for column in columns if column is not None)
-    return TextTable(tuple(header[1:]), names, known, values, counts["lines"], counts["words"])
+    rows = np.frombuffer(values).reshape(-1, len(kept))
+    return TextTable(tuple(header[1:]), names, tuple(known.values()), rows, left_out, words)
 
 
 def number(cell: str) -> float:
