@@ -47,16 +47,13 @@ PLAN = {
     "saturated": (40.0,),  # uT
     "frozen": (30.0,),  # s
     "spikes": (100.0,),  # uT, one reading in a hundred
-    "late": (0.02, 0.05),  # s behind the gyroscope, each reading repeated as long
     "bias": (0.5, 2.0),  # deg/s, of the gyroscope
     "truncated": (0.12, 0.25),  # deg/s, the gyroscope's step, cut toward zero as BROAD's own
     "truncated, slow": (0.12, 0.25),  # the same in slow turning
     "scale": (0.01,),  # of the gyroscope
-    "noise": (3.0,),  # times the gyroscope's own
-    "rate": (50.0, 100.0),  # Hz
     "cut": (5.0, 15.0, 25.0, 35.0),  # s of movement left out, and all before: no rest to start from
 }
-"""Kinds of scene, and how strong; the last seven leave the magnetometer as recorded."""
+"""Kinds of scene, and how strong; the last five leave the magnetometer as recorded."""
 
 
 class Scene(NamedTuple):
@@ -286,7 +283,7 @@ FIELDS = {
     "passing": passing,
     "start": start,
     "drift": drift,
-    **dict.fromkeys(("missing", "saturated", "frozen", "spikes", "late"), room),
+    **dict.fromkeys(("missing", "saturated", "frozen", "spikes"), room),
 }
 
 
@@ -317,14 +314,7 @@ def spikes(motion, readings, amount, rng):
     return readings + np.where(hit[:, None], amount * rng.standard_normal(readings.shape), 0.0)
 
 
-def late(motion, readings, amount, rng):
-    """Late by as much on average, each reading repeated until the next."""
-    time_s = motion.log.time_s
-    taken_s = np.floor(time_s / amount) * amount - 0.5 * amount
-    return np.column_stack([np.interp(taken_s, time_s, column) for column in readings.T])
-
-
-FAULTS = {"missing": missing, "saturated": saturated, "frozen": frozen, "spikes": spikes, "late": late}
+FAULTS = {"missing": missing, "saturated": saturated, "frozen": frozen, "spikes": spikes}
 
 
 # -- other gyroscopes: log, truth, where it moves
@@ -355,31 +345,6 @@ def truncated(motion, amount, rng):
     return worse_gyroscope(motion, np.trunc(rate / step) * step)
 
 
-def noise(motion, amount, rng):
-    still = motion.log.gyroscope_rad_s[~motion.moving]
-    own = np.median(np.abs(np.diff(still, axis=0))) / 0.6745 / np.sqrt(2.0)
-    more = max(own, np.deg2rad(0.1)) * np.sqrt(amount**2 - 1.0)
-    rate = motion.log.gyroscope_rad_s
-    return worse_gyroscope(motion, rate + more * rng.standard_normal(rate.shape))
-
-
-def slower(motion, amount, rng):
-    """Means over longer intervals: of the rate, up to the time of the sample; of the others, around it."""
-    step_s = 1.0 / amount
-    ends_s = np.arange(2.0 * step_s, motion.log.time_s[-1] - step_s, step_s)
-    last = np.searchsorted(motion.log.time_s, ends_s)
-    means = []
-    for name, later in (("accelerometer_m_s2", 0.5), ("gyroscope_rad_s", 0.0), ("magnetometer_au", 0.5)):
-        sums = np.cumsum(getattr(motion.log, name), axis=0) / motion.log.rate_hz
-        edges_s = np.append(step_s, ends_s) + later * step_s
-        at_edges = [np.interp(edges_s, motion.log.time_s, column) for column in sums.T]
-        means.append(np.diff(np.column_stack(at_edges), axis=0) / step_s)
-    log = ImuLog(ends_s, *means, source=motion.log.source)
-    seen = np.isfinite(motion.true_wxyz).all(axis=1)
-    turns = Slerp(motion.log.time_s, motion.turns)(ends_s).as_quat(scalar_first=True)
-    return log, np.where((seen[last] & seen[last - 1])[:, None], turns, np.nan), motion.moving[last]
-
-
 def cut(motion, amount, rng):
     """Only what comes after some seconds of movement."""
     first = np.flatnonzero(np.cumsum(motion.moving) > amount * motion.log.rate_hz)[0]
@@ -394,6 +359,4 @@ SENSORS = {
     "truncated": truncated,
     "truncated, slow": truncated,
     "scale": scale,
-    "noise": noise,
-    "rate": slower,
 }

@@ -110,15 +110,6 @@ def test_missing_fields_are_no_reading(method, hole):
     assert error_deg(truth, found).max() < 1.5
 
 
-@pytest.mark.parametrize("method", Method)
-@pytest.mark.parametrize("count", [2, 5])
-def test_a_few_samples_are_enough(method, count):
-    truth, log = swung(even(count / RATE_HZ))
-    found = orient(log, method=method)
-    assert error_deg(truth, found, 0.0).max() < 10.0
-    assert np.isfinite(found.standard_deviation_rad).all()
-
-
 def test_a_python_without_vqf_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "vqf", None)
     _, log = swung(even(1.0))

@@ -49,11 +49,8 @@ VECTORS = ("gyroscope_rad_s", "accelerometer_m_s2", "magnetometer_au")
     [
         ({}, Trust.YES),
         ({"iron": 0.9}, Trust.CARE),
-        ({"stray": 1.01 * ROUGH}, Trust.CARE),
         ({"stray": 1.01 * POOR}, Trust.NO),
-        ({"disbelieved": 0.11}, Trust.CARE),
         ({"disbelieved": 0.51}, Trust.NO),
-        ({"heading_sd_rad": np.radians(3.1)}, Trust.CARE),
         ({"heading_sd_rad": np.radians(10.1)}, Trust.NO),
         ({"stray": np.nan}, Trust.UNKNOWN),
     ],

@@ -1,14 +1,11 @@
-from collections import defaultdict
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from imu_messages import Item, items_payload, mtdata_payloads
+from imu_messages import mtdata_payloads
 
-from xsens.messages.control import MessageId
-from xsens.messages.framing import Message, decode, encode, find_frames
+from xsens.messages.framing import decode, find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode
-from xsens.messages.mtdata2 import KINDS, columns
+from xsens.messages.mtdata2 import columns
 
 FEW = settings(deadline=None, max_examples=60)
 
@@ -93,38 +90,3 @@ def test_a_packet_of_a_real_mti():
     assert table[0x1060].values.tolist() == [[29686846.0]]
     quaternion = [[0.944556, -0.323088, 0.013747, -0.056913]]
     np.testing.assert_allclose(table[0x2010].values, quaternion, atol=5e-7)
-
-
-def mixed(count, seed=0):
-    """Messages of changing arrangement, formats and worlds, as an MTi sends whose items have different rates.
-
-    Items that are not known, or of another size than they should have, lie between the others.
-    """
-    rng = np.random.default_rng(seed)
-    sent = []
-    for i in range(count):
-        items = [Item(0x1020, (i,))]
-        for identifier, kind in KINDS.items():
-            if rng.random() < 0.3 and not kind.whole:
-                bits = int(rng.integers(4) | rng.integers(3) << 2)
-                items.append(Item(identifier | bits, tuple(np.round(rng.normal(size=kind.count) * 64) / 64)))
-        for odd in (0x7777, 0x201C, 0x4040, 0x4020, 0x1060):
-            if rng.random() < 0.1:
-                items.insert(int(rng.integers(len(items))), Item(odd, bytes(int(rng.integers(13, 200)))))
-        sent.append(items)
-    return sent
-
-
-def test_columns_are_what_was_sent():
-    sent = mixed(300)
-    data = b"".join(encode(Message(MessageId.MT_DATA2, items_payload(items))) for items in sent)
-    table, damaged = columns(find_frames(data))
-    assert damaged == 0
-    expected = defaultdict(list)
-    for row, items in enumerate(sent):
-        for item in items:
-            if not isinstance(item.values, bytes):
-                expected[item.identifier].append((row, list(item.values)))
-    assert len(expected) > 90
-    got = {i: list(zip(c.rows.tolist(), c.values.tolist(), strict=True)) for i, c in table.items()}
-    assert got == expected

@@ -81,9 +81,3 @@ def test_a_framer_finds_the_same_whatever_pieces_a_stream_comes_in(sent, pieces)
     # A payload may itself hold a message; those a framer cannot tell apart before more bytes come.
     if not any(0xFA in m.payload or 0xFA in (m.mid, m.bid) or m.mid == 0 for m in sent):
         assert found == sent
-
-
-def test_a_framer_waits_for_no_more_bytes_than_a_message_can_have():
-    framer = Framer()
-    assert framer.feed(bytes.fromhex("faff32ffffff")) == []
-    assert framer.feed(encode(Message(MessageId.WAKE_UP))) == [Message(MessageId.WAKE_UP)]
