@@ -38,7 +38,7 @@ def run_and_save(page, name):
     page.get_by_role("button", name="Run calibration").click()
     page.locator("pre.calibration").wait_for()
     page.wait_for_timeout(300)
-    field = page.locator("input[type=text]").nth(-1)
+    field = page.get_by_label("file of the result")
     field.fill(name)
     field.press("Enter")
     page.get_by_role("button", name="Save result").click()

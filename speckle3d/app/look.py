@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from html import escape
-from typing import Any
+from typing import Any, TypeVar
 
 import panel as pn
 from panel.viewable import Viewable
 
 from speckle3d.app.page import Page
 from speckle3d.core.errors import Speckle3DError
+
+_Act = TypeVar("_Act", bound=Callable[..., Any])
 
 STYLE = """
 :host {
@@ -29,6 +32,17 @@ white-space:nowrap" title="{name}">{name}</span></div>
 """
 
 _BODY = "html, body { background: #fff; overflow-x: hidden; }"
+
+
+def held(act: _Act) -> _Act:
+    """Have the changes of an act sent together; figures may be changed by the event of a widget only so."""
+
+    @wraps(act)
+    def acting(*args: Any, **more: Any) -> Any:
+        with pn.io.hold():
+            return act(*args, **more)
+
+    return acting  # type: ignore[return-value]
 
 
 def shell(pages: Sequence[Page], title: str) -> Viewable:

@@ -22,16 +22,16 @@ def page(browser, recording):
     path = recording[0]
     with viewing(path, "--calibrate", "wires", "--phantom", path.with_suffix(".xml")) as address:
         page = opened(browser, address)
-        page.locator(".points-told").wait_for()
+        page.locator(".phantom-told").wait_for()
         page.get_by_role("button", name="Find points in all frames").click()
-        told(page, "points-told", r"in \d+ frames")
+        told(page, "phantom-told", r"in \d+ frames")
         page.set_default_timeout(30_000)
         yield page
         assert page.complaints == []
 
 
 def saved(page, path, name):
-    field = page.locator("input[type=text]").nth(2)
+    field = page.get_by_label("file of the points")
     field.fill(name)
     field.press("Enter")
     page.get_by_role("button", name="Save points").click()
@@ -41,7 +41,7 @@ def saved(page, path, name):
 
 def test_points_are_found_moved_deleted_and_added_by_mouse(page, recording):
     path, scene = recording
-    told(page, "points-told", "frame 0: 9 points")
+    told(page, "phantom-told", "frame 0: 9 points")
     found = saved(page, path, "found.csv")
     away = found.pixels - scene.pixels[found.frame, found.wire]
     assert np.abs(away).max() < 2.0
@@ -54,21 +54,22 @@ def test_points_are_found_moved_deleted_and_added_by_mouse(page, recording):
     page.mouse.click(*place(page, *found.pixels[1]))
     page.wait_for_timeout(400)
     page.keyboard.press("Backspace")
-    told(page, "points-told", "frame 0: 8 points; none on b")
+    told(page, "phantom-told", "frame 0: 8 points; none on b")
     changed = saved(page, path, "changed.csv")
     assert changed.pixels[0] == pytest.approx(first + np.array([30, -12]), abs=1.5)
     assert 1 not in changed.wire[changed.frame == 0]
     # The wire that is missing is the next one.
     page.mouse.click(*place(page, *first))
-    told(page, "points-told", "frame 0: 9 points")
+    told(page, "phantom-told", "frame 0: 9 points")
     again = saved(page, path, "again.csv")
     assert again.pixels[(again.frame == 0) & (again.wire == 1)][0] == pytest.approx(first, abs=1.5)
 
 
 def test_the_calibration_is_the_commands_with_the_points_that_were_saved(page, recording, tmp_path):
     path = recording[0]
-    page.get_by_text("Leave out frame 0").click()
-    page.get_by_text("Frame 0 is left out").wait_for()
+    field = page.get_by_label("leave out")
+    field.fill("0")
+    field.press("Enter")
     table = run_and_save(page, "wires-cal.h5")
     assert "left out by hand" in table
     result, out = path.with_name("wires-cal.h5"), tmp_path / "again.h5"

@@ -1,1 +1,1 @@
-"""Detection on images of a phantom, tuned and corrected by hand, and the calibration from it."""
+"""The tuners of what is found in recordings of phantoms."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,8 +17,7 @@ from calibration.points import Seen
 from calibration.recording import Outcome, Recording
 from calibration.report import text_report
 from speckle3d.app.folder import Folder
-from speckle3d.app.phantom.picture import DROPPED, USED
-from speckle3d.app.phantom.work import Work, in_turn
+from speckle3d.app.phantom.plots import DROPPED, USED
 from speckle3d.calibrating.phantoms import remarks, solved, write_outcome
 from speckle3d.calibrating.settings import ScanSettings
 from speckle3d.calibrating.written import BESIDE
@@ -26,9 +26,39 @@ from speckle3d.core.progress import Progress
 
 _LACKING = "#9a6700"
 """Dark amber: a result that more motion would improve."""
-_TABLE = "margin:0;font-size:12px;line-height:1.35"
+_POLL_MS = 100
+_POOL = ThreadPoolExecutor(2, "speckle3d-calibration")
 
-Finder = Callable[[ScanSettings, Progress], Seen]
+
+class Work:
+    """A button whose work runs in a thread, and a bar for its progress.
+
+    Parameters
+    ----------
+    name : str
+        Of the button, which cannot be clicked again while its work runs.
+    """
+
+    def __init__(self, name: str, **look: Any) -> None:
+        self.button = pn.widgets.Button(name=name, **look)
+        self.bar = pn.indicators.Progress(value=0, max=100, width=250, visible=False, margin=(14, 8))
+        self._share = 0.0
+
+    def start(self, work: Callable[[Progress], Any], ended: Callable[[Any], None]) -> None:
+        """Do the work, which is given where to count frames done and frames in all; then show its result."""
+        self.button.disabled = self.bar.visible = True
+        future = _POOL.submit(work, self._count)
+        self._clock = pn.state.add_periodic_callback(partial(self._look, future, ended), _POLL_MS)
+
+    def _count(self, done: int, total: int) -> None:
+        self._share = done / max(total, 1)
+
+    def _look(self, future: Future[Any], ended: Callable[[Any], None]) -> None:
+        self.bar.value = int(100 * self._share)
+        if future.done():
+            self._clock.stop()
+            self.button.disabled = self.bar.visible = False
+            ended(future.result())
 
 
 @dataclass(frozen=True)
@@ -39,8 +69,6 @@ class Solved:
     ----------
     seen : Seen, optional
         What was found in the images, as far as it came.
-    lacking : bool
-        Whether the verdict names motions that are missing.
     refusal : str
         Without an outcome, why.
     """
@@ -48,7 +76,6 @@ class Solved:
     settings: ScanSettings
     seen: Seen | None = None
     outcome: Outcome | None = None
-    lacking: bool = False
     refusal: str = ""
 
 
@@ -65,9 +92,9 @@ class RunPane:
         Finds the phantom in the images; called in a thread.
     done : callable
         Called with what came of a run.
-    before_saving : callable, optional
-        Brings the settings of a run, whose calibration goes to a path, into what a command can be given,
-        as by saving points picked by hand.
+    before_saving : callable
+        Brings the settings of a run, whose calibration goes to a path, into what a command can be given, as
+        by saving points picked by hand.
     """
 
     def __init__(
@@ -76,48 +103,47 @@ class RunPane:
         images: Path,
         folder: Folder,
         settings: Callable[[], ScanSettings],
-        find: Finder,
+        find: Callable[[ScanSettings, Progress], Seen],
         done: Callable[[Solved], None],
-        before_saving: Callable[[ScanSettings, Path], ScanSettings] = lambda settings, out: settings,
+        before_saving: Callable[[ScanSettings, Path], ScanSettings],
     ) -> None:
         self._recording, self._images, self._folder = recording, images, folder
         self._settings, self._find, self._done = settings, find, done
         self._before_saving = before_saving
         self._solved: Solved | None = None
-        self.button = pn.widgets.Button(name="Run calibration", button_type="primary", width=150)
-        self._work = Work(self.button)
-        self._verdict = pn.pane.HTML(_told("Not calibrated yet.", "#555555"), width=600)
-        self._table = pn.pane.HTML("", width=600, max_height=300, styles={"overflow-y": "auto"})
-        self._name = pn.widgets.TextInput(name="", value=f"{images.stem}-calibration.h5", width=460)
-        self._save = pn.widgets.Button(name="Save result", width=110, disabled=True)
+        self._work = Work("Run calibration", button_type="primary", width=150)
+        self._verdict = pn.pane.HTML(told("Not calibrated yet.", "#555555"), width=600)
+        self._table = pn.pane.HTML("", width=600)
+        self._name = pn.widgets.TextInput(
+            name="file of the result", value=f"{images.stem}-calibration.h5", width=460
+        )
+        self._save = pn.widgets.Button(name="Save result", width=110, disabled=True, align="end")
         self._saved = pn.pane.HTML("", width=600)
-        self.button.on_click(in_turn(self._run))
-        self._save.on_click(in_turn(self._write))
+        self._work.button.on_click(self._run)
+        self._save.on_click(self._write)
 
     def view(self) -> Viewable:
         """The button, the verdict, saving, and the table."""
         return pn.Column(
-            pn.Row(self.button, self._work.bar),
+            pn.Row(self._work.button, self._work.bar),
             self._verdict,
             pn.Row(self._save, self._name),
             self._saved,
-            # Last, so that what is told of saving is seen without scrolling.
             self._table,
         )
 
     def outdate(self) -> None:
         """Say that the result shown is of other settings than those that stand now; it cannot be saved."""
-        if self._solved is None or self._save.disabled:
-            return
-        self._save.disabled = True
-        words = "Settings changed since this result: run again."
-        self._verdict.object = _told(words, DROPPED) + self._verdict.object
+        if not self._save.disabled:
+            self._save.disabled = True
+            words = "Settings changed since this result: run again."
+            self._verdict.object = told(words, DROPPED) + self._verdict.object
 
-    def _run(self) -> None:
+    def _run(self, _: object) -> None:
         try:
             settings = self._settings()
         except Speckle3DError as error:
-            self._verdict.object = _told(str(error), DROPPED)
+            self._verdict.object = told(str(error), DROPPED)
             return
         self._work.start(partial(self._solve, settings), self._show)
 
@@ -125,51 +151,39 @@ class RunPane:
         seen = None
         try:
             seen = self._find(settings, progress)
-            outcome = solved(self._recording, seen, settings)
-            return Solved(settings, seen, outcome, bool(outcome.solution.adequacy.missing))
+            return Solved(settings, seen, solved(self._recording, seen, settings))
         except Speckle3DError as error:
             return Solved(settings, seen, refusal=str(error))
 
-    def _show(self, found: Solved) -> None:
-        self._solved, self._saved.object = found, ""
-        if found.outcome is None:
-            self._verdict.object = _told(f"No calibration: {found.refusal}", DROPPED)
-            self._table.object = ""
+    def _show(self, run: Solved) -> None:
+        self._solved, self._saved.object, self._save.disabled = run, "", run.outcome is None
+        if run.outcome is None:
+            self._verdict.object, self._table.object = told(f"No calibration: {run.refusal}", DROPPED), ""
         else:
-            calibration = found.outcome.calibration
-            self._verdict.object = _told(calibration.verdict, _LACKING if found.lacking else USED)
-            table = text_report(calibration, found.outcome.beam, remarks(found.outcome))
-            self._table.object = f"<pre class='calibration' style='{_TABLE}'>{html.escape(table)}</pre>"
-        self._save.disabled = found.outcome is None
-        self._done(found)
+            calibration, lacking = run.outcome.calibration, run.outcome.solution.adequacy.missing
+            self._verdict.object = told(calibration.verdict, _LACKING if lacking else USED)
+            table = text_report(calibration, run.outcome.beam, remarks(run.outcome))
+            self._table.object = f"<pre class='calibration' style='margin:0'>{html.escape(table)}</pre>"
+        self._done(run)
 
-    def _write(self) -> None:
-        found = self._solved
-        if found is None or found.outcome is None:
+    def _write(self, _: object) -> None:
+        run, name = self._solved, self._name.value or ""
+        if run is None or run.outcome is None:
             return
         try:
-            written = self._written(found.outcome, found.settings, self._name.value or "")
+            out = self._folder.place(name if name.endswith(".h5") else f"{name}.h5")
+            for suffix in BESIDE:
+                self._folder.place(out.with_suffix(suffix).name)
+            settings = self._before_saving(run.settings, out)
+            files = write_outcome(run.outcome, settings, self._images, out, remarks(run.outcome)).files
         except Speckle3DError as error:
-            self._saved.object = _told(str(error), DROPPED)
+            self._saved.object = told(str(error), DROPPED)
             return
-        names = ", ".join(path.name for path in written)
-        self._saved.object = _told(f"Saved {names} in {self._folder.path}", USED)
-
-    def _written(self, outcome: Outcome, settings: ScanSettings, name: str) -> tuple[Path, ...]:
-        out = self._folder.place(name)
-        if out.suffix != ".h5":
-            self._folder.place(f"{name}.h5")
-            out = out.with_name(f"{name}.h5")
-        for suffix in BESIDE:
-            self._folder.place(out.with_suffix(suffix).name)
-        settings = self._before_saving(settings, out)
-        return write_outcome(outcome, settings, self._images, out, remarks(outcome)).files
+        self._saved.object = told(
+            f"Saved {', '.join(path.name for path in files)} in {self._folder.path}", USED
+        )
 
 
-def _told(words: str, colour: str) -> str:
-    return f"<div class='verdict' style='color:{colour};font-weight:600'>{html.escape(words)}</div>"
-
-
-def labelled(words: str, *held: Any) -> Viewable:
-    """A group of widgets under a heading."""
-    return pn.Column(pn.pane.HTML(f"<b>{html.escape(words)}</b>", margin=(4, 8, 0, 8)), *held)
+def told(words: str, colour: str, name: str = "verdict") -> str:
+    """HTML of a sentence."""
+    return f"<div class='{name}' style='color:{colour};font-weight:600'>{html.escape(words)}</div>"

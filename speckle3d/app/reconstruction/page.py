@@ -13,6 +13,7 @@ import param
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
+from speckle3d.app.look import held
 from speckle3d.app.reconstruction.commands import code, measure_command, reslice_command
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
@@ -224,19 +225,19 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         slider = _CUTS[name][0]
         return Place(**{slider: getattr(self, slider)}, reach_mm=self._page.reach_mm)
 
+    @held
     def _cut(self, name: str) -> None:
         opened, plot = self._page.opened(*self._pair), self._plots[name]
-        with pn.io.hold():
-            try:
-                picture = cut_posed(opened, self._place(name), RANGE_DB, made=self._page.images)
-            except Speckle3DError as error:
-                plot.plot.title.text = str(error).split(";")[0]
-                return
-            plot.show(picture, *self._pair)
-            said = "".join(f"{label_of(mode)}: {length}<br>" for mode, length in picture.lengths.items())
-            if self._pair[1]:
-                said += "green: this mode alone, magenta: the other alone, grey: both"
-            self._lengths.object = said
+        try:
+            picture = cut_posed(opened, self._place(name), RANGE_DB, made=self._page.images)
+        except Speckle3DError as error:
+            plot.plot.title.text = str(error).split(";")[0]
+            return
+        plot.show(picture, *self._pair)
+        said = "".join(f"{label_of(mode)}: {length}<br>" for mode, length in picture.lengths.items())
+        if self._pair[1]:
+            said += "green: this mode alone, magenta: the other alone, grey: both"
+        self._lengths.object = said
 
     def _go(self, point_mm: FloatArray) -> None:
         """Put the cross hair where the nearest frame has a point; beside the images, leave it."""
@@ -253,23 +254,19 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         ):
             self.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
 
+    @held
     def _placed(self, *_: Any) -> None:
         """Draw the cross hair and the points, and write the commands."""
         page = self._page
         points = np.array(self.points_mm).reshape(-1, 3)
-        with pn.io.hold():
-            for plot in self._plots.values():
-                plot.show_points(self._cross_mm, points)
-            self._commands.object = "".join(
-                code(
-                    reslice_command(
-                        page.source, f"{name}.png", self._modes, self._place(name), page.sweep_file
-                    )
-                )
-                for name in _CUTS
-            )
-            if self._space.object is not None:
-                self._draw_planes()
+        for plot in self._plots.values():
+            plot.show_points(self._cross_mm, points)
+        self._commands.object = "".join(
+            code(reslice_command(page.source, f"{name}.png", self._modes, self._place(name), page.sweep_file))
+            for name in _CUTS
+        )
+        if self._space.object is not None:
+            self._draw_planes()
 
     def _add(self, *_: Any) -> None:
         """Measure from and to where the cross hair is."""

@@ -14,6 +14,7 @@ import param
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
+from speckle3d.app.look import held
 from speckle3d.app.sweep.findings import FrameFindings
 from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, SweepPairs
 from speckle3d.app.sweep.plots import FLAGGED, ImagePlot, TimePlots
@@ -160,15 +161,19 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             self._findings.judge_next()
         if self._findings.flags is not None:
             self._clock.stop()
+            self._draw()
         self._draw_findings()
 
+    @held
     def _draw_findings(self) -> None:
         self._times.mark(self._findings.flags, self._findings.doubts)
         self._state.object = escape(self._findings.state())
 
+    @held
     def _draw_levels(self, *_: Any) -> None:
         self._picture.levels.low = 255.0 * (1.0 - self.range_db / _MOST_DB)
 
+    @held
     def _draw(self, *_: Any) -> None:
         frame, pairs = self.frame, self._page.pairs
         # Where the sweep ends, the other way.
@@ -176,12 +181,11 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         values = None
         if self.colour != "none" and self.lag and 0 <= other < len(self._page.sweep):
             values = pairs.values(frame, other, self.colour == "correlation")
-        with pn.io.hold():
-            self._picture.show(self._page.image(frame))
-            most = pairs.most(self.colour, self.lag)
-            self._picture.colour(values, self.colour, most, self.opacity / 100)
-            self._times.move(frame)
-            self._told.object = "<br>".join(self._words(frame, other, values))
+        self._picture.show(self._page.image(frame))
+        most = pairs.most(self.colour, self.lag)
+        self._picture.colour(values, self.colour, most, self.opacity / 100)
+        self._times.move(frame)
+        self._told.object = "<br>".join(self._words(frame, other, values))
 
     def _words(self, frame: int, other: int, values: PatchValues | None) -> Iterator[str]:
         """What is shown, as HTML."""
