@@ -284,7 +284,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
                 lines += [found.line for found in measure(page.reconstruction, points, self.mode)]
                 picked_mm = PICKED * self._grid.vector_pitch_mm
                 lines.append(
-                    f"mode {self.mode}; points picked to {picked_mm:.2g} mm per axis; 95 % in brackets"
+                    f"mode {self.mode}; points picked to {picked_mm:.2g} mm per axis; "
+                    "+- a standard error, 95 % in brackets"
                 )
                 lines += filter(None, [caution(page.reconstruction, self.mode)])
                 command = code(measure_command(page.source, self.mode, list(points)))
