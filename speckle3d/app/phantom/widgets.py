@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args, get_origin
 import panel as pn
 from pydantic import BaseModel
 
-from speckle3d.calibrating.settings import written_as
+from speckle3d.calibrating.settings import AsText
 
 _WIDTH_PX = 285
 _SLIDERS: dict[str, tuple[str, float, float, float]] = {
@@ -37,6 +37,8 @@ def widget(settings: BaseModel, name: str) -> Any:
         return pn.widgets.Select(name=label, options=list(get_args(field.annotation)), value=value, **told)
     if isinstance(field.default, float):
         return pn.widgets.FloatInput(name=f"{label} (default {field.default:g})", value=value, **told)
-    written = written_as(field)
-    text = written.write(value) if written is not None and value not in (None, ()) else ""
+    texts = [
+        part.write(value) for part in field.metadata if isinstance(part, AsText) and value not in (None, ())
+    ]
+    text = texts[0] if texts else ""
     return pn.widgets.TextInput(name=label, value=text, placeholder=field.description, **look)
