@@ -145,10 +145,10 @@ class GrowingSweep:
         InvalidInputError
             If a valid one is not rigid, or its time is not after the one before: it is then not in the file.
         """
-        if valid:
-            transforms_from_matrices(np.asarray(matrix)[None], f"{self.path}: /tracker at {time_s} s")
+        pose = np.asarray(matrix if valid else np.eye(4))
+        transforms_from_matrices(pose[None], f"{self.path}: /tracker at {time_s} s")
         with self._writing():
-            self._tracker.append(matrix, valid, time_s)
+            self._tracker.append(pose, valid, time_s)
 
     def append_orientation(self, time_s: float, quaternion_wxyz: npt.ArrayLike) -> None:
         """Write an orientation sensor's reading: world_from_sensor, scalar first.
@@ -231,14 +231,9 @@ class _Stream:
     def append(self, *values: Any) -> None:
         """Write a row, its time last, and hand it to the operating system."""
         self.require_after(values[-1])
-        row = [np.asarray(value, dtype=float) for value in values]
-        for node, value in zip(self._nodes, row, strict=True):
-            if value.shape != node.shape[1:] or not np.isfinite(value).all():
-                expected = f"finite numbers of shape {node.shape[1:]}"
-                raise InvalidInputError(f"{self._where}: expected {expected}, got {value.tolist()}")
         self._room.require(self._file.get_filesize())
-        for node, value in zip(self._nodes, row, strict=True):
+        for node, value in zip(self._nodes, values, strict=True):
             node.resize(len(node) + 1, axis=0)
-            node[-1] = value.astype(node.dtype)
+            node[-1] = value
             node.id.flush()
         self._time_s = values[-1]

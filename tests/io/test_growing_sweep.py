@@ -120,7 +120,6 @@ def test_calibration_probe_and_offset_are_kept(tmp_path):
     ("append", (np.zeros((5, 40), np.int16), 10.0)),
     ("append_pose", (9.0, np.eye(4))),
     ("append_pose", (11.0, 2 * np.eye(4))),
-    ("append_pose", (11.0, np.full((4, 4), np.nan), False)),
     ("append_orientation", (11.0, [1.0, 1, 0, 0])),
 ])  # fmt: skip
 def test_what_is_refused_is_not_in_the_file_and_the_recording_goes_on(tmp_path, call, values):
