@@ -46,7 +46,7 @@ _READ_FAILURES = (
 _HAS_WRITER = ("already open for write", "unable to lock file")
 """HDF5's words for a file that is being written, or whose writer was killed."""
 
-_HEAPS_BYTES = 2**22
+_HEAPS_BYTES = 2**19
 
 _READ_ATTEMPTS = 20
 """Of what may be half written: a millisecond in all."""

@@ -11,6 +11,7 @@ import shutil
 import sys
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +33,9 @@ class Repeated:
         return self.frames[range(self.shape[0])[index] % len(self.frames)]
 
 
-def seconds(work):
-    """Processor time of a call, the system's included."""
+def seconds(work, out):
+    """Processor time of making a new file, the system's included."""
+    out.unlink(missing_ok=True)
     before = os.times()
     work()
     after = os.times()
@@ -51,11 +53,12 @@ def main(gigabytes=1.0, folder=None):
             write_sweep(path, replace(bare, frames=Repeated(frames, n), frame_time_s=np.arange(n) / 25))
         ratios = []
         for _ in range(5):
-            copied = seconds(lambda: shutil.copyfile(whole, out))
-            ratios.append(copied / seconds(lambda: write_sweep(out, load_sweep(whole))))
+            copied = seconds(lambda: shutil.copyfile(whole, out), out)
+            ratios.append(copied / seconds(lambda: write_sweep(out, load_sweep(whole)), out))
         print(f"{gigabytes} GB: {np.median(ratios):.2f} of copyfile's speed (aim: {AIM})")
         for word, compression in COMPRESSIONS.items():
-            spent = seconds(lambda packing=compression: write_sweep(out, load_sweep(part), None, packing))
+            packed = partial(write_sweep, out, load_sweep(part), None, compression)
+            spent = seconds(packed, out)
             size = part.stat().st_size
             print(f"{word}: {size / 1e6 / spent:.0f} MB/s, {out.stat().st_size / size:.2f} of the size")
     print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB")
