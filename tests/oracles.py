@@ -4,41 +4,35 @@ import numpy as np
 from scipy import ndimage
 
 
-def reslice_nearest(
-    images, pitch_mm, spacing_mm, first_depth_mm, world_from_image, points_mm, max_distance_mm
-):
-    """Twin of `speckle3d.kernels.slicing.keep_nearest` and the blend: every image at every point at once.
+def between_images(images, grid, world_from_image, points_mm, reach_mm, alone_mm=np.inf):
+    """Twin of the kernels in `speckle3d.kernels.cuts`: every image at every point at once.
 
-    points_mm: (..., 3) in the world; images facing one way. Returns (...,) with NaN where unsupported.
+    points_mm: (n, 3) in the world. Returns levels, NaN where unsupported, and states: 1 where an image is no
+    farther away than `alone_mm`, 2 elsewhere between two, else 0.
     """
-    n, vectors, samples = images.shape
-    levels, distances = np.full((2, n, *points_mm.shape[:-1]), np.nan)
-    for f in range(n):
-        x, y, z = np.moveaxis(world_from_image[f].inv().apply(points_mm.reshape(-1, 3)), 1, 0)
-        u, v = x / pitch_mm, (y - first_depth_mm) / spacing_mm
-        inside = (u >= -1e-6) & (u <= vectors - 1 + 1e-6) & (v >= -1e-6) & (v <= samples - 1 + 1e-6)
-        i, j = (
-            np.clip(np.floor(u).astype(int), 0, vectors - 2),
-            np.clip(np.floor(v).astype(int), 0, samples - 2),
-        )
-        a, b = np.clip(u - i, 0, 1), np.clip(v - j, 0, 1)
-        im = images[f].astype(float)
-        level = (1 - a) * ((1 - b) * im[i, j] + b * im[i, j + 1])
-        level += a * ((1 - b) * im[i + 1, j] + b * im[i + 1, j + 1])
-        near = inside & (np.abs(z) < max_distance_mm) & ~np.isnan(level)
-        levels[f] = np.where(near, level, np.nan).reshape(points_mm.shape[:-1])
-        distances[f] = np.where(near, z, np.nan).reshape(points_mm.shape[:-1])
-    result = np.full(points_mm.shape[:-1], np.nan)
-    for point in np.ndindex(result.shape):
-        z, level = distances[(slice(None), *point)], levels[(slice(None), *point)]
-        behind, front = [np.flatnonzero(side) for side in (z >= 0, z < 0)]
-        nearest = [s[np.argmin(np.abs(z[s]))] for s in (behind, front) if s.size]
-        if nearest:
-            apart = sum(abs(z[k]) for k in nearest)
-            one_sided = len(nearest) == 1 or apart == 0
-            weights = [1.0] if one_sided else [abs(z[k]) / apart for k in nearest[::-1]]
-            result[point] = sum(w * level[k] for w, k in zip(weights, nearest, strict=False))
-    return result
+    level, away = np.full((2, len(images), len(points_mm)), np.nan)
+    first = world_from_image[0].rotation.apply([0.0, 0.0, 1.0])
+    for f, pose in enumerate(world_from_image):
+        x, y, z = pose.inv().apply(points_mm).T
+        u, v = x / grid.vector_pitch_mm, (y - grid.first_sample_depth_mm) / grid.sample_spacing_mm
+        # A millionth of a pixel outside is on the border: rounding of poses.
+        at = [np.clip(u, 0, grid.vectors - 1), np.clip(v, 0, grid.samples - 1)]
+        inside = np.abs(at - np.stack([u, v])).max(axis=0) < 1e-6
+        level[f] = ndimage.map_coordinates(np.asarray(images[f], float), at, order=1)
+        away[f] = z if pose.rotation.apply([0.0, 0.0, 1.0]) @ first >= 0 else -z
+        level[f, ~inside | (np.abs(z) >= reach_mm)] = np.nan
+    sides = []
+    for side in (away >= 0, away < 0):
+        d = np.where(side & ~np.isnan(level), np.abs(away), np.inf)
+        k = d.argmin(axis=0), np.arange(d.shape[1])
+        sides += [d[k], np.where(np.isfinite(d[k]), level[k], np.nan)]
+    behind, one, front, other = sides
+    both, measured = np.isfinite(behind + front), np.minimum(behind, front) <= alone_mm
+    with np.errstate(invalid="ignore"):
+        blend = np.where(behind > 0, one + behind / (behind + front) * (other - one), one)
+    found = np.where(both, blend, np.where(np.isfinite(behind), one, other))
+    measured &= ~np.isnan(found)
+    return np.where(measured | both, found, np.nan), np.where(measured, 1, 2 * both)
 
 
 def splat(images, index, shape, splat, rule, weights):

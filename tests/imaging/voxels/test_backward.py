@@ -1,6 +1,7 @@
 """Volumes voxel by voxel: against brute force, on any number of threads."""
 
 import numpy as np
+import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +14,6 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
-from speckle3d.kernels.cuts import EDGE_TOLERANCE
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -21,48 +21,6 @@ GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0
 def shaken(rng, frames, step_mm, turn_rad=0.05):
     moved = rng.normal(0.0, 0.2, (frames, 3)) + np.outer(np.arange(frames) * step_mm, [0, 0, 1])
     return RigidTransform.from_components(moved, Rotation.from_rotvec(rng.normal(0.0, turn_rad, (frames, 3))))
-
-
-def sampled(image, x, y):
-    """Bilinear sample at a point of the image in mm; NaN outside and beside NaN."""
-    u, v = x / GRID.vector_pitch_mm, (y - GRID.first_sample_depth_mm) / GRID.sample_spacing_mm
-    # A millionth of a pixel outside is on the border: rounding of poses.
-    inside = min(max(u, 0.0), GRID.vectors - 1.0), min(max(v, 0.0), GRID.samples - 1.0)
-    if max(abs(u - inside[0]), abs(v - inside[1])) > EDGE_TOLERANCE:
-        return np.nan
-    u, v = inside
-    i, j = min(int(u), GRID.vectors - 2), min(int(v), GRID.samples - 2)
-    a, b = u - i, v - j
-    near = (1 - b) * image[i][j] + b * image[i][j + 1]
-    return (1 - a) * near + a * ((1 - b) * image[i + 1][j] + b * image[i + 1][j + 1])
-
-
-def by_definition(images, poses, voxel_grid, reach_mm):
-    """Each voxel from the nearest image that shows something there on either side, one after another."""
-    voxels = np.full(voxel_grid.shape, np.nan)
-    state = np.full(voxel_grid.shape, EMPTY, np.uint8)
-    normals = poses.rotation.apply([0.0, 0.0, 1.0])
-    facing = np.where(normals @ normals[0] < 0, -1.0, 1.0)
-    along = voxel_grid.world_from_grid.rotation.inv().apply(normals)
-    half = 0.5 * np.abs(along * voxel_grid.spacing_mm).max()
-    index = list(np.ndindex(*voxel_grid.shape))
-    points = voxel_grid.world_from_grid.apply(np.multiply(index, voxel_grid.spacing_mm))
-    in_images = np.stack([pose.inv().apply(points) for pose in poses], axis=1)
-    for at, in_each in zip(index, in_images.tolist(), strict=True):
-        nearest = {}
-        for image, side_of, (x, y, z) in zip(images, facing, in_each, strict=True):
-            away = z * side_of
-            if abs(away) < min(reach_mm, nearest.get(away >= 0, (np.inf,))[0]):
-                level = sampled(image, x, y)
-                if not np.isnan(level):
-                    nearest[away >= 0] = (abs(away), level)
-        if len(nearest) == 2:
-            (behind, level), (front, other) = nearest[True], nearest[False]
-            voxels[at] = (level * front + other * behind) / (behind + front)
-            state[at] = MEASURED if min(behind, front) <= half else FILLED
-        elif nearest and (alone := next(iter(nearest.values())))[0] <= half:
-            voxels[at], state[at] = alone[1], MEASURED
-    return voxels, state
 
 
 @settings(max_examples=6, deadline=None)
@@ -82,10 +40,14 @@ def test_matches_brute_force(seed, spacing, reach_mm):
     region = Region.from_text("rectangle 0.4,0 9,4").mask(GRID)
     grid = grid_around(GRID, poses, spacing, Rotation.from_rotvec(rng.normal(0.0, 0.5, 3)))
     voxels, state = look_up_voxels(PosedImages(images, GRID, poses), grid, reach_mm, region)
-    expected, expected_state = by_definition(np.where(region, images, np.nan).tolist(), poses, grid, reach_mm)
-    np.testing.assert_array_equal(state, expected_state.T)
+    points = grid.world_from_grid.apply(np.indices(grid.shape).reshape(3, -1).T * grid.spacing_mm)
+    along = grid.world_from_grid.rotation.inv().apply(poses.rotation.apply([0.0, 0.0, 1.0]))
+    half = 0.5 * np.abs(along * grid.spacing_mm).max()
+    shown = np.where(region, images, np.nan)
+    expected = oracles.between_images(shown, GRID, poses, points, reach_mm, half)
+    np.testing.assert_array_equal(state.T.ravel(), expected[1])
     # Single precision of levels of order one, of distances up to 5 mm and of their ratios.
-    np.testing.assert_allclose(voxels, expected.T, atol=2e-5)
+    np.testing.assert_allclose(voxels.T.ravel(), expected[0], atol=2e-5)
 
 
 def test_a_linear_field_is_met_between_sparse_images():
