@@ -76,8 +76,9 @@ class Landmarks:
 
 
 def is_challenge_scan(file: h5py.File) -> bool:
-    """Whether an open file is a scan: it has frames, and no format of this package's family."""
-    return "format" not in file.attrs and isinstance(find_member(file, "frames"), h5py.Dataset)
+    """Whether an open file is a scan: it has grey frames, and no format of this package's family."""
+    node = None if "format" in file.attrs else find_member(file, "frames")
+    return isinstance(node, h5py.Dataset) and node.dtype == np.uint8 and len(node.shape or ()) == 3
 
 
 def open_scan(scan: Path, _: ImportSettings) -> Recording:
@@ -95,10 +96,6 @@ def open_scan(scan: Path, _: ImportSettings) -> Recording:
     size_mm, tool_from_image = read_challenge_calibration(_calibration_file(scan))
     with reading(scan), open_hdf5(scan) as file:
         node = require_dataset(file, "frames")
-        if node.dtype != np.uint8 or node.ndim != 3 or 0 in node.shape:
-            raise InvalidInputError(
-                f"{locate(node)}: expected uint8 of shape (n, height, width), got {node.dtype} {node.shape}"
-            )
         n, height, width = node.shape
         slices = HDF5Slices(scan.absolute(), "frames", np.transpose, n)
         frames = FileFrames(scan, slices, (n, width, height), node.dtype)
@@ -186,7 +183,7 @@ def _nearby(scan: Path, *names: str) -> Path | None:
 
 def _calibration_file(scan: Path) -> Path:
     if (file := _nearby(scan, _CALIBRATION)) is None:
-        raise InvalidInputError(f"{scan}: expected {_CALIBRATION} beside or above it, got none")
+        raise InvalidInputError(f"{scan}: expected {_CALIBRATION} of TUS-REC beside or above it, got none")
     return file
 
 

@@ -236,7 +236,8 @@ def file_format(file: h5py.File) -> str:
 
 def has_format(file: h5py.File, name: str) -> bool:
     """Whether an open file is of the family, and of one format."""
-    return "format" in file.attrs and file_format(file) == name
+    raw = plain_attribute(file, "format")
+    return isinstance(raw, str | bytes) and raw in (name, name.encode())
 
 
 def locate(node: Node, name: str = "") -> str:

@@ -93,7 +93,7 @@ class SequenceHeader:
     def is_volume(self) -> bool:
         """Whether all three axes are of space, as they say and frames' fields do not contradict."""
         kinds = self.said.get("kinds", "").lower().split()
-        is_spatial = len(kinds) == 3 and kinds[2] in ("domain", "space")
+        is_spatial = len(kinds) == 3 and {*kinds} <= {"domain", "space"}
         return is_spatial and (not self.frames or self.frame_count > len(self.frames))
 
     @property

@@ -13,7 +13,15 @@ from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file, sha256_of
+from speckle3d.io.hdf5 import (
+    SIGNATURE,
+    file_format,
+    open_hdf5,
+    plain_attribute,
+    reading,
+    require_file,
+    sha256_of,
+)
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
 from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
@@ -157,7 +165,8 @@ def kind_of(path: PathLike) -> str:
             got = "a file packed by gzip: unpack it first"
         raise InvalidInputError(f"{path}: expected a recording ({known}), got {got}")
     with reading(path), open_hdf5(path) as file:
-        if "format" not in file.attrs:
+        raw = plain_attribute(file, "format")
+        if not isinstance(raw, str | bytes) or "speckle3d." not in str(raw):
             held = ", ".join(printable(str(name)) for name in file) or "nothing"
             raise InvalidInputError(
                 f"{path}: HDF5, but none of the kinds that are read: it holds {held[:200]}: "

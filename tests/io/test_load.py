@@ -1,5 +1,6 @@
 import json
 
+import h5py
 import numpy as np
 import pytest
 import sweep_examples
@@ -105,3 +106,11 @@ def test_settings_that_were_in_force_are_told_and_a_sweep_file_has_none(tmp_path
     assert json.loads(record.settings_json) == {"dynamic_range_db": 50, "bandwidth_hz": [3e6, 7e6]}
     write_sweep(tmp_path / "s.h5", sweep_examples.bmode_sweep())
     assert import_record(tmp_path / "s.h5") is None
+
+
+@pytest.mark.parametrize("name", ["other", 5, [1, 2]])
+def test_a_format_of_another_program_is_told(tmp_path, name):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["format"], file["tracking"] = name, np.zeros(3)
+    with pytest.raises(InvalidInputError, match="none of the kinds that are read: it holds tracking"):
+        describe(tmp_path / "a.h5")

@@ -278,6 +278,7 @@ CASES = [
         lambda p: np.moveaxis(p, 0, -1),
     ),
     ("sizes: 5 4 1 3\nkinds: domain domain domain list\nspacings: {3} {4} 1 nan", lambda p: p),
+    ("sizes: 3 5 4\nkinds: list domain domain\nspacings: nan {3} {4}", lambda p: np.moveaxis(p, 0, -1)),
 ]
 
 
@@ -287,7 +288,7 @@ def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange, unit,
     if "unit" not in form:
         factor = 1.0
     steps = [repr(0.2 / factor), repr(0.1 / factor)]
-    if form.startswith("sizes: 3 5"):
+    if form.startswith("sizes: 3 5 4 1"):
         fields = form.format(unit, unit, unit, *steps)
     else:
         fields = form.format(unit, unit, *steps) if "{3}" not in form else form.format("", "", "", *steps)

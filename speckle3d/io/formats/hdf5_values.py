@@ -184,7 +184,7 @@ class HDF5File:
             If there is no echo at all.
         """
         plain = replace(self, turn=Levels(grid, decibels)).frames(shape, np.float64)
-        top = max(float(plain[i].max()) for i in range(shape[0]))
+        top = max((float(plain[i].max()) for i in range(shape[0])), default=0.0)
         plain.close()
         if not (decibels or top > 0):
             raise InvalidInputError(f"{self.path}: expected echoes, got amplitudes up to {top:g}")
