@@ -22,7 +22,10 @@ def assert_same(got, expected, where=""):
         np.testing.assert_allclose(got.as_matrix(), expected.as_matrix(), atol=1e-12, err_msg=where)
     elif is_dataclass(expected):
         for field in fields(expected):
-            if field.name not in ("frames", "name") or not isinstance(expected, Sweep):
+            is_own = field.compare and (
+                field.name not in ("frames", "name") or not isinstance(expected, Sweep)
+            )
+            if is_own:
                 assert_same(getattr(got, field.name), getattr(expected, field.name), f"{where}.{field.name}")
     elif isinstance(expected, dict):
         assert list(got) == list(expected), where
