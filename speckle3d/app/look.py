@@ -50,7 +50,7 @@ def shell(pages: Sequence[Page], title: str) -> Viewable:
 
     A page's view is made when its tab is first opened.
     """
-    pn.extension(*extensions(pages), raw_css=[_BODY])
+    pn.extension("plotly", raw_css=[_BODY])
     header = pn.pane.HTML(
         _HEADER.format(name=escape(title, quote=True)), sizing_mode="stretch_width", margin=0
     )
@@ -59,7 +59,7 @@ def shell(pages: Sequence[Page], title: str) -> Viewable:
 
 def in_notebook(pages: Sequence[Page]) -> Viewable:
     """Pages as tabs, in the app's style."""
-    pn.extension(*extensions(pages))
+    pn.extension("plotly")
     return _styled("720px", inside(pages))
 
 
@@ -67,11 +67,6 @@ def _styled(height: str, *parts: Viewable) -> Viewable:
     return pn.Column(
         *parts, stylesheets=[STYLE], styles={"height": height}, sizing_mode="stretch_both", margin=0
     )
-
-
-def extensions(pages: Sequence[Page]) -> list[str]:
-    """Parts of Panel that pages need; a browser has them from the start, or never."""
-    return sorted({name for page in pages for name in getattr(page, "extensions", ())})
 
 
 def inside(pages: Sequence[Page]) -> Viewable:

@@ -8,10 +8,7 @@ from panel.viewable import Viewable
 
 
 class Page(Protocol):
-    """What one tab of the app shows.
-
-    One that needs parts of Panel which are loaded by name, as ``plotly``, has them as `extensions`.
-    """
+    """What one tab of the app shows."""
 
     title: str
 

@@ -47,12 +47,16 @@ class FramePlot:
         self._black, self._white = levels(recording)
         self.plot = figure(
             name="picture",
-            frame_width=round(columns * column_mm * scale), frame_height=round(rows * row_mm * scale),
-            x_range=Range1d(start=-0.5, end=columns - 0.5), y_range=Range1d(start=rows - 0.5, end=-0.5),
-            x_axis_label=f"column ({column_mm:.3g} mm apart)", y_axis_label=f"row ({row_mm:.3g} mm apart)",
-            tools="box_select,pan,wheel_zoom,reset", active_drag="box_select",
+            frame_width=round(columns * column_mm * scale),
+            frame_height=round(rows * row_mm * scale),
+            x_range=Range1d(start=-0.5, end=columns - 0.5),
+            y_range=Range1d(start=rows - 0.5, end=-0.5),
+            x_axis_label=f"column ({column_mm:.3g} mm apart)",
+            y_axis_label=f"row ({row_mm:.3g} mm apart)",
+            tools="box_select,pan,wheel_zoom,reset",
+            active_drag="box_select",
             toolbar_location="above",
-        )  # fmt: skip
+        )
         self.plot.toolbar.logo = None
         self.plot.grid.visible = False
         self._image = ColumnDataSource({"image": []})
@@ -98,10 +102,15 @@ class FrameStrip:
         self._residuals = ColumnDataSource({"frame": [], "residual": []})
         self._cursor = ColumnDataSource({"frame": [0]})
         self.plot = figure(
-            name="strip", frame_width=WIDTH_PX, frame_height=70, x_range=Range1d(start=-0.5, end=count - 0.5),
-            y_range=Range1d(start=0.0, end=1.0), x_axis_label="frame (click: look; double click: leave out)",
-            tools="", toolbar_location=None,
-        )  # fmt: skip
+            name="strip",
+            frame_width=WIDTH_PX,
+            frame_height=70,
+            x_range=Range1d(start=-0.5, end=count - 0.5),
+            y_range=Range1d(start=0.0, end=1.0),
+            x_axis_label="frame (click: look; double click: leave out)",
+            tools="",
+            toolbar_location=None,
+        )
         self.plot.grid.visible = self.plot.yaxis.visible = False
         self.plot.yaxis.ticker.desired_num_ticks = 3
         bars = self.plot.vbar(

@@ -109,9 +109,15 @@ class PointsViewer(PhantomViewer):
             "column", "row", source=self._points, size=11, line_color=FOUND, line_width=2, fill_alpha=0.0
         )
         self.frame_plot.plot.text(
-            "column", "row", "wire", source=self._points, x_offset=8, y_offset=-4, text_color=FOUND,
+            "column",
+            "row",
+            "wire",
+            source=self._points,
+            x_offset=8,
+            y_offset=-4,
+            text_color=FOUND,
             text_font_size="11px",
-        )  # fmt: skip
+        )
         count = 0 if self._wired.names else 1
         self._tool = PointDrawTool(renderers=[drawn], empty_value="", num_objects=count)
         self.frame_plot.plot.add_tools(self._tool)

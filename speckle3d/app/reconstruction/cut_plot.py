@@ -38,10 +38,16 @@ class CutPlot:
     def __init__(self, name: str, colours: tuple[str, str], tapped: Callable[[FloatArray], None]) -> None:
         self.plane: ReslicePlane | None = None
         self.plot = figure(
-            name=f"cut-{name}", sizing_mode="stretch_both", match_aspect=True, title=" ",
-            y_range=DataRange1d(flipped=True), background_fill_color=UNSEEN,
-            tools="pan,wheel_zoom,reset,save", active_drag=None, active_scroll="wheel_zoom",
-        )  # fmt: skip
+            name=f"cut-{name}",
+            sizing_mode="stretch_both",
+            match_aspect=True,
+            title=" ",
+            y_range=DataRange1d(flipped=True),
+            background_fill_color=UNSEEN,
+            tools="pan,wheel_zoom,reset,save",
+            active_drag=None,
+            active_scroll="wheel_zoom",
+        )
         self.plot.toolbar.logo = None
         self.plot.grid.visible = False
         self.plot.title.update(text_font_size="12px", text_font_style="normal")

@@ -65,7 +65,6 @@ class ReconstructionPage:
     """
 
     title = "Reconstruction"
-    extensions = ("plotly",)
 
     def __init__(
         self,
@@ -88,6 +87,7 @@ class ReconstructionPage:
         # Images reach twice as far as the sweep's longest steps, so that no gaps show.
         steps = np.linalg.norm(np.diff(poses.apply(reconstruction.grid.centre_mm), axis=0), axis=1)
         self.reach_mm = max(_LEAST_REACH_MM, round(2.0 * float(np.percentile(steps, 99)), 1))
+        self.calibrations = [used.path for used in reconstruction.provenance.calibrations]
         self.opened = lru_cache(self._opened)
 
     def view(self) -> Viewable:
@@ -124,10 +124,12 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self.param.lateral_mm.bounds = (0.0, grid.width_mm)
         self.param.depth_mm.bounds = (grid.first_sample_depth_mm, grid.depth_mm)
         super().__init__(
-            mode=page.mode, other="", frame=self.param.frame.bounds[1] // 2,
+            mode=page.mode,
+            other="",
+            frame=self.param.frame.bounds[1] // 2,
             lateral_mm=round(grid.width_mm / 2, 2),
             depth_mm=round((grid.first_sample_depth_mm + grid.depth_mm) / 2, 2),
-        )  # fmt: skip
+        )
         self._plots = {
             name: CutPlot(name, (_COLOURS[upright], _COLOURS[level]), self._go)
             for name, (_, (upright, level)) in _CUTS.items()
@@ -157,9 +159,18 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         remove.on_click(lambda _: setattr(self, "points_mm", self.points_mm[:-1]))
         commands = pn.Card(self._commands, title="The commands", collapsed=True, width=_SIDE_PX)
         side = pn.Column(
-            controls, self._lengths, pn.Row(add, remove, margin=0), self._told, commands,
-            width=_SIDE_PX + 40, scroll="y-auto", sizing_mode="stretch_height",
-        )  # fmt: skip
+            controls,
+            self._lengths,
+            pn.pane.HTML(
+                "<br>".join(f"calibration used: {escape(path)}" for path in self._page.calibrations)
+            ),
+            pn.Row(add, remove, margin=0),
+            self._told,
+            commands,
+            width=_SIDE_PX + 40,
+            scroll="y-auto",
+            sizing_mode="stretch_height",
+        )
         along, frame, depth = (
             pn.pane.Bokeh(plot.plot, sizing_mode="stretch_both") for plot in self._plots.values()
         )
@@ -172,10 +183,15 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         poses = {mode: page.opened(mode, None).poses[mode] for mode in page.modes}
         self._space = pn.pane.Plotly(plot_outlines(poses, self._grid), sizing_mode="stretch_both")
         self._space.object.update_layout(
-            height=None, margin={"l": 0, "r": 0, "t": 0, "b": 0}, font_size=10, uirevision="kept",
-            legend={"y": 1}, scene_camera={"eye": {"x": 2.4, "y": -3.3, "z": 1.4}, "center": {"z": -0.05}},
-            scene_xaxis_nticks=3, scene_yaxis_nticks=3,
-        )  # fmt: skip
+            height=None,
+            margin={"l": 0, "r": 0, "t": 0, "b": 0},
+            font_size=10,
+            uirevision="kept",
+            legend={"y": 1},
+            scene_camera={"eye": {"x": 2.4, "y": -3.3, "z": 1.4}, "center": {"z": -0.05}},
+            scene_xaxis_nticks=3,
+            scene_yaxis_nticks=3,
+        )
         self._space.object.add_scatter3d(mode="lines", line={"color": "#ff4fc3", "width": 6}, name="cuts")
         trust = page.reconstruction.trust
         curves = sweep_curves(

@@ -66,7 +66,6 @@ class SensorPage:
     """
 
     title = "Sensor"
-    extensions = ("plotly",)
 
     def __init__(self, source: Source, sensor_from_image: Rotation | None = None) -> None:
         self._source, self._mounting = source, sensor_from_image
@@ -100,9 +99,10 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def layout(self) -> Viewable:
         """Lay everything out, and begin to follow a live sensor."""
         shown = {
-            label: names for label, names in _PLOTS.items()
+            label: names
+            for label, names in _PLOTS.items()
             if self._source.is_live or np.isfinite(self._columns[names[0]]).any()
-        }  # fmt: skip
+        }
         plots = [self._plot(label, names) for label, names in (shown or _PLOTS).items()]
         plots[-1].xaxis.axis_label = "time before now, s" if self._source.is_live else "time, s"
         left: list[Any] = [self._probe, self._facts]
@@ -125,9 +125,14 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
 
     def _plot(self, label: str, names: tuple[str, ...]) -> figure:
         plot = figure(
-            x_range=self._range, tools="xpan,xwheel_zoom,reset", active_scroll="xwheel_zoom",
-            y_axis_label=label, toolbar_location=None, min_border_left=64, sizing_mode="stretch_both",
-        )  # fmt: skip
+            x_range=self._range,
+            tools="xpan,xwheel_zoom,reset",
+            active_scroll="xwheel_zoom",
+            y_axis_label=label,
+            toolbar_location=None,
+            min_border_left=64,
+            sizing_mode="stretch_both",
+        )
         plot.axis.axis_label_text_font_style = "normal"
         for name in names:
             legend = {"legend_label": name} if len(names) > 1 else {}

@@ -33,8 +33,11 @@ def figure_probe() -> go.Figure:
     eye = {"x": -1.2, "y": 0.9, "z": 0.7}
     return figure.update_layout(
         scene={"xaxis": axis, "yaxis": axis, "zaxis": axis, "aspectmode": "cube", "camera": {"eye": eye}},
-        showlegend=False, margin={"l": 0, "r": 0, "t": 0, "b": 0}, uirevision="kept", template="none",
-    )  # fmt: skip
+        showlegend=False,
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+        uirevision="kept",
+        template="none",
+    )
 
 
 def turn_probe(figure: go.Figure, world_from_image: Rotation) -> None:

@@ -91,7 +91,6 @@ class _Player(param.Parameterized):  # type: ignore[misc]
     frame = param.Integer(0)
     colour = param.Selector(label="patches coloured by")
     lag = param.Integer(-1, bounds=(-NEIGHBOURS, NEIGHBOURS), label="paired with the frame later by")
-    opacity = param.Integer(50, bounds=(10, 100), label="opacity / %")
     range_db = param.Integer(_USUAL_DB, bounds=(30, _MOST_DB), label="dynamic range / dB")
 
     def __init__(self, page: SweepPage) -> None:
@@ -105,7 +104,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         self._times = TimePlots(page.sweep, self.go)
         self._told = pn.pane.HTML("", sizing_mode="stretch_width")
         self._state = pn.pane.HTML("", sizing_mode="stretch_width")
-        self.param.watch(self._draw, ["frame", "colour", "lag", "opacity"])
+        self.param.watch(self._draw, ["frame", "colour", "lag"])
         self.param.watch(self._draw_levels, "range_db")
         self._draw()
         self._draw_levels()
@@ -115,27 +114,33 @@ class _Player(param.Parameterized):  # type: ignore[misc]
         """The image on the left, as high as the window; all else on the right."""
         sweep, wide = self._page.sweep, {"sizing_mode": "stretch_width"}
         player = pn.widgets.Player.from_param(
-            self.param.frame, interval=max(round(1000 * self._times.interval_s), 10), show_value=True,
-            show_loop_controls=False, disabled=len(sweep) == 1, height=75, **wide,
-        )  # fmt: skip
+            self.param.frame,
+            interval=max(round(1000 * self._times.interval_s), 10),
+            show_value=True,
+            show_loop_controls=False,
+            disabled=len(sweep) == 1,
+            height=75,
+            **wide,
+        )
         colour = pn.widgets.RadioButtonGroup.from_param(self.param.colour, button_style="outline")
-        sliders = [
-            pn.widgets.IntSlider.from_param(self.param[name], width=170) for name in ("opacity", "range_db")
-        ]
         streams = [pn.pane.Bokeh(self._times.stream(*each), **wide) for each in streams_of(sweep)]
         if self._findings.flags is None:
             self._clock = pn.state.add_periodic_callback(self._judge, period=_JUDGING_MS)
         right = pn.Column(
             player,
             pn.Row(pn.pane.HTML("<b>patches coloured by</b>", margin=(10, 5)), colour),
-            pn.Row(pn.widgets.IntSlider.from_param(self.param.lag, width=215), *sliders),
+            pn.Row(
+                pn.widgets.IntSlider.from_param(self.param.lag, width=215),
+                pn.widgets.IntSlider.from_param(self.param.range_db, width=215),
+            ),
             self._told,
             self._state,
             *self._doubts(),
             pn.pane.Bokeh(self._times.marks, **wide),
             *(streams or [pn.pane.HTML("No sensor was recorded with this sweep.")]),
-            sizing_mode="stretch_both", scroll="y-auto",
-        )  # fmt: skip
+            sizing_mode="stretch_both",
+            scroll="y-auto",
+        )
         left = pn.pane.Bokeh(self._picture.plot, sizing_mode="stretch_both", max_width=700)
         return pn.Row(left, right, sizing_mode="stretch_both")
 
@@ -183,7 +188,7 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             values = pairs.values(frame, other, self.colour == "correlation")
         self._picture.show(self._page.image(frame))
         most = pairs.most(self.colour, self.lag)
-        self._picture.colour(values, self.colour, most, self.opacity / 100)
+        self._picture.colour(values, self.colour, most)
         self._times.move(frame)
         self._told.object = "<br>".join(self._words(frame, other, values))
 

@@ -20,6 +20,7 @@ from speckle3d.core.sweep import ImageGrid, Sweep
 
 FLAGGED, DOUBTED = "#d55e00", "#7b3fa0"
 _REJECTED = "#ff4d4d"
+_OPACITY = 0.5
 _LINES = ("#0072b2", "#d55e00", "#009e73")
 """Of three quantities, told apart by the colour-blind (Okabe and Ito)."""
 _UNITS = {"distance": "mm", "sigma": "mm", "correlation": ""}
@@ -44,30 +45,49 @@ class ImagePlot:
         self._patches = ColumnDataSource({name: [] for name in _PATCHES})
         self._colours = LinearColorMapper(palette=Viridis256, low=0.0, nan_color="rgba(0,0,0,0)")
         self.plot = figure(
-            x_axis_label="lateral / mm", y_axis_label="depth / mm", match_aspect=True,
-            sizing_mode="stretch_both", x_range=DataRange1d(), y_range=DataRange1d(flipped=True),
-            tools="pan,wheel_zoom,box_zoom,reset,save", active_scroll="wheel_zoom",
-        )  # fmt: skip
+            x_axis_label="lateral / mm",
+            y_axis_label="depth / mm",
+            match_aspect=True,
+            sizing_mode="stretch_both",
+            x_range=DataRange1d(),
+            y_range=DataRange1d(flipped=True),
+            tools="pan,wheel_zoom,box_zoom,reset,save",
+            active_scroll="wheel_zoom",
+        )
         self.plot.toolbar.logo = None
         self.plot.grid.visible = False
         self.plot.axis.axis_label_text_font_style = "normal"
         image = self.plot.image(
-            "image", x=-grid.vector_pitch_mm / 2, y=grid.first_sample_depth_mm - grid.sample_spacing_mm / 2,
-            dw=grid.vectors * grid.vector_pitch_mm, dh=grid.samples * grid.sample_spacing_mm,
-            source=self._image, color_mapper=self.levels,
-        )  # fmt: skip
+            "image",
+            x=-grid.vector_pitch_mm / 2,
+            y=grid.first_sample_depth_mm - grid.sample_spacing_mm / 2,
+            dw=grid.vectors * grid.vector_pitch_mm,
+            dh=grid.samples * grid.sample_spacing_mm,
+            source=self._image,
+            color_mapper=self.levels,
+        )
         # Patches that lie elsewhere in every frame must not move it.
         self.plot.x_range.renderers = self.plot.y_range.renderers = [image]
         width, height = patch_mm
         patches = self.plot.rect(
-            "x", "y", width=width, height=height, angle="angle", source=self._patches, line_color="line",
-            fill_color={"field": "value", "transform": self._colours}, fill_alpha="alpha",
-        )  # fmt: skip
+            "x",
+            "y",
+            width=width,
+            height=height,
+            angle="angle",
+            source=self._patches,
+            line_color="line",
+            fill_color={"field": "value", "transform": self._colours},
+            fill_alpha="alpha",
+        )
         self.plot.scatter("x", "y", marker="x", size="cross", line_color=_REJECTED, source=self._patches)
         told = [
-            ("patch", "@state"), ("distance", "@distance{0.000} mm"), ("correlation", "@correlation{0.000}"),
-            ("standard deviation of the distance", "@sigma{0.000} mm"), ("at", "@x{0.0}, @y{0.0} mm"),
-        ]  # fmt: skip
+            ("patch", "@state"),
+            ("distance", "@distance{0.000} mm"),
+            ("correlation", "@correlation{0.000}"),
+            ("standard deviation of the distance", "@sigma{0.000} mm"),
+            ("at", "@x{0.0}, @y{0.0} mm"),
+        ]
         self.plot.add_tools(HoverTool(renderers=[patches], tooltips=told))
         self._bar = ColorBar(color_mapper=self._colours, width=10, padding=4, visible=False)
         self.plot.add_layout(self._bar, "right")
@@ -76,7 +96,7 @@ class ImagePlot:
         """Draw an image, shape (row, column)."""
         self._image.data = {"image": [image]}
 
-    def colour(self, patches: PatchValues | None, by: str, most: float, opacity: float) -> None:
+    def colour(self, patches: PatchValues | None, by: str, most: float) -> None:
         """Draw patches coloured by a quantity from zero to `most`; none where there are none."""
         self._bar.visible = patches is not None
         if patches is None:
@@ -87,15 +107,17 @@ class ImagePlot:
         rejected = known & ~used
         unmeasured = "correlated" if patches.used is None else "without a distance"
         columns = {
-            "distance": patches.distance_mm, "sigma": patches.sigma_mm, "correlation": patches.correlation,
-        }  # fmt: skip
+            "distance": patches.distance_mm,
+            "sigma": patches.sigma_mm,
+            "correlation": patches.correlation,
+        }
         self._colours.high, self._bar.title = most, " / ".join(filter(None, [by, _UNITS[by]]))
         self._patches.data = columns | {
             "x": patches.centre_mm[:, 0],
             "y": patches.centre_mm[:, 1],
             "angle": np.full(len(known), patches.turn_rad),
             "value": columns[by],
-            "alpha": np.where(np.isfinite(columns[by]), opacity, 0.0),
+            "alpha": np.where(np.isfinite(columns[by]), _OPACITY, 0.0),
             "line": np.where(rejected, _REJECTED, "#ffffff"),
             "cross": np.where(rejected, 16, 0),
             "state": np.where(rejected, "left out", np.where(known, "used", unmeasured)),
@@ -164,10 +186,17 @@ class TimePlots:
 
     def _plot(self, height: int, **more: Any) -> figure:
         plot = figure(
-            height=height, sizing_mode="stretch_width", x_range=self._range, tools="xpan,xwheel_zoom",
-            active_scroll="xwheel_zoom", toolbar_location=None, min_border_left=_LEFT_PX, min_border_top=3,
-            min_border_bottom=3, **more,
-        )  # fmt: skip
+            height=height,
+            sizing_mode="stretch_width",
+            x_range=self._range,
+            tools="xpan,xwheel_zoom",
+            active_scroll="xwheel_zoom",
+            toolbar_location=None,
+            min_border_left=_LEFT_PX,
+            min_border_top=3,
+            min_border_bottom=3,
+            **more,
+        )
         plot.add_layout(self.cursor)
         plot.on_event(Tap, lambda event: self._jump(int(np.argmin(np.abs(self._time_s - event.x)))))
         return plot
