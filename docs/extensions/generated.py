@@ -63,12 +63,14 @@ def command_pages() -> dict[str, str]:
     from speckle3d.cli import app
 
     pages: dict[str, str] = {}
-    for name, command in sorted(app.commands.items()):
+    for name in sorted(app.table):
+        command = app.get_command(None, name)
         parts = [f"# `speckle3d {name}`", ""]
         if hasattr(command, "commands"):
             parts += [_text(command.help), ""]
-            for inner, each in sorted(command.commands.items()):
-                parts += [f"## `speckle3d {name} {inner}`", "", *_command(each)]
+            for inner in sorted(command.table):
+                made = command.get_command(None, inner)
+                parts += [f"## `speckle3d {name} {inner}`", "", *_command(made)]
         else:
             parts += _command(command)
         pages[name] = "\n".join(parts)

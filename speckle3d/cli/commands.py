@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from importlib import import_module
 from pathlib import Path
@@ -233,33 +233,30 @@ def _output_last(args: list[str]) -> list[str]:
     return args
 
 
-class Commands(Mapping[str, Any]):
-    """Commands and groups by name, each loaded when it is first asked for."""
+class Group(TyperGroup):
+    """A group of commands, each loaded when it is asked for, whose help is plain text."""
 
-    def __init__(self, table: Table) -> None:
-        self._table, self._made = table, dict[str, Any]()
+    table: Table
 
-    def __getitem__(self, name: str) -> Any:
-        """The command or group of that name."""
-        if name not in self._made:
-            entry = self._table[name]
-            made = group(*entry) if isinstance(entry, tuple) else command_of(name, _function(entry))
-            self._made[name] = made
-        return self._made[name]
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command or group of that name; None if there is none."""
+        if cmd_name in self.table and self.commands[cmd_name] is None:
+            entry = self.table[cmd_name]
+            made = group(*entry) if isinstance(entry, tuple) else command_of(cmd_name, _function(entry))
+            self.commands[cmd_name] = made
+        return super().get_command(ctx, cmd_name)
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._table)
-
-    def __len__(self) -> int:
-        return len(self._table)
-
-    def summaries(self) -> list[tuple[str, str]]:
-        """Names, and the first sentence of each one's help."""
-        texts = {
-            n: e[0] if isinstance(e, tuple) else inspect.getdoc(_function(e)) for n, e in self._table.items()
-        }
-        first = {name: (text or "").split("\n\n")[0] for name, text in texts.items()}
-        return [(n, re.split(r"[.;](?: |$)", " ".join(t.split()))[0] + ".") for n, t in first.items()]
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print usage, what the group is for, its options and its commands, each with its first sentence."""
+        self.format_usage(ctx, formatter)
+        self.format_help_text(ctx, formatter)
+        _write_list(formatter, "Options", [param.get_help_record(ctx) for param in self.get_params(ctx)])
+        rows = []
+        for name, entry in self.table.items():
+            text = entry[0] if isinstance(entry, tuple) else inspect.getdoc(_function(entry)) or ""
+            sentence = re.split(r"[.;](?:\s|$)", text, maxsplit=1)[0]
+            rows.append((name, " ".join(sentence.split()) + "."))
+        _write_list(formatter, "Commands", rows)
 
 
 def _function(place: str) -> Command:
@@ -267,22 +264,10 @@ def _function(place: str) -> Command:
     return function
 
 
-class Group(TyperGroup):
-    """A group of commands whose help is plain text, each with its first sentence whole."""
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print usage, what the group is for, its options and its commands."""
-        self.format_usage(ctx, formatter)
-        self.format_help_text(ctx, formatter)
-        _write_list(formatter, "Options", [param.get_help_record(ctx) for param in self.get_params(ctx)])
-        assert isinstance(self.commands, Commands)
-        _write_list(formatter, "Commands", self.commands.summaries())
-
-
 def group(text: str, table: Table, callback: Command = lambda: None) -> Any:
     """Make a group of commands; its callback's parameters are options of its own."""
     builder = typer.Typer(cls=Group, add_completion=False, no_args_is_help=True, context_settings=_SETTINGS)
     builder.callback(help=text)(callback)
     made: Any = typer.main.get_command(builder)
-    made.commands = Commands(table)
+    made.table, made.commands = table, dict.fromkeys(table)
     return made

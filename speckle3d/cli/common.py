@@ -66,6 +66,20 @@ def shared() -> None:
         reconstruction.h5 of a results folder, or a recording with a calibrated tracker or true poses.
     reconstruction_file
         reconstruction.h5 of a results folder.
+    log_file
+        A log of the sensor, of any kind that is known, or a sweep with one. A plain CSV has the columns
+        time_s, accelerometer_x_m_s2, gyroscope_x_rad_s, magnetometer_x_au (y and z likewise), quaternion_w to
+        _z.
+    magnetometer
+        Let the magnetic field tell the heading.
+    method
+        smoother: from all of the log; filter: as it would be live; vqf, vqf-online: the same by VQF (Laidig
+        and Seel 2023); sensor: the sensor's own.
+    rate_hz
+        Samples per second, for logs that do not say.
+    world
+        World of the sensor's own orientation (east, north, up and so on); by default as its accelerometer and
+        magnetometer show.
     mode
         Which poses to use: image, orientation, pose, crossed, fused of a reconstruction (by default that
         which claims the smallest error of length); tracker, truth of a recording.

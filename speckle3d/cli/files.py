@@ -107,16 +107,16 @@ def convert(
     )
     packs = compression != "none"
     if is_made:
-        options = {**imported, "transform": transform, "calibration": calibration}
-        range_db = options.pop("dynamic_range_db", 60.0)
-        _require_none(options, "recordings, got a reconstruction")
-        posed = open_posed(source, mode, sweep_file)
+        range_db = imported.pop("dynamic_range_db", 60.0)
+        settings = given_settings(source, imported, transform)
+        posed = open_posed(source, mode, sweep_file, settings, calibration or ())
         notes(posed.notes())
         with progress_bar(f"writing {out.name}") as progress:
             sequence, poses = slicer_sequence(posed, range_db)
             write_sequence(out, sequence, progress, packs, poses)
         return
-    _require_none({"mode": mode, "sweep": sweep_file}, f"a reconstruction, got {source.name}")
+    if mode or sweep_file:
+        raise InvalidInputError(f"--mode, --sweep: are of a reconstruction, got {source.name}")
     given = given_settings(source, imported, transform)
     fitted = {k: v for k, v in fitted_pixels(calibration or ()).items() if k not in given.model_fields_set}
     recording = open_recording(source, given.model_copy(update=fitted))
@@ -129,9 +129,3 @@ def convert(
         left_out = write_sequence(out, sweep, progress, packs)
     for part in left_out:
         note(f"{out}: does not hold {part}")
-
-
-def _require_none(options: dict[str, Any], whose: str) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise InvalidInputError(f"--{name.replace('_', '-')}: is of {whose}")

@@ -11,8 +11,8 @@ def commands(command=app, name=()):
     if not hasattr(command, "commands"):
         yield name, command
         return
-    for key, inner in command.commands.items():
-        yield from commands(inner, (*name, key))
+    for key in command.table:
+        yield from commands(command.get_command(None, key), (*name, key))
 
 
 COMMANDS = dict(commands())

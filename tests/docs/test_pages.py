@@ -37,7 +37,7 @@ def parsed(words):
         assert words, "a group of commands alone"
         name, *words = words
         assert name in command.commands, f"no command {name}"
-        command = command.commands[name]
+        command = command.get_command(context, name)
     words = [word for word in words if word not in ("...", "…")]
     command.make_context("speckle3d", words, parent=context, resilient_parsing=False)
 

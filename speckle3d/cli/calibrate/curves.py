@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,7 +13,6 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from speckle3d.config import Config
     from speckle3d.core.curves import DecorrelationCurves
 
 
@@ -56,39 +55,29 @@ def curves(
     """
     from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
+    from speckle3d.io.toml import load_toml
+    from speckle3d.motion.data_sheet import ProbeSheet
+    from speckle3d.phantom_curves import calibrate_curves
+    from speckle3d.sheet_curves import data_sheet_curves
+    from speckle3d.tracked_curves import jitters, tracked_curves
 
     require_own_place(out, "curves", *(sweeps or []), config_file, probe, like, start)
     settings = load_settings(config_file).with_choices(region=region)
     if (probe is None) == (not sweeps):
         raise InvalidInputError("expected sweeps to measure curves on, or --probe, got both or neither")
     if probe is not None:
-        found = _of_sheet(probe, like, settings)
+        with naming(str(probe)):
+            sheet = load_toml(ProbeSheet, probe)
+            found = data_sheet_curves(sheet, load_sweep(like) if like else None, settings)
     else:
-        known = None if start is None else read_curves(start)
-        found = _measured([load_sweep(path) for path in sweeps or []], known, settings)
+        known, loaded = read_curves(start) if start else None, [load_sweep(path) for path in sweeps or []]
+        with progress_bar("correlating frames") as progress:
+            if known is not None or all(jitters(sweep) for sweep in loaded):
+                found = tracked_curves(loaded, known, settings, progress)
+            else:
+                found = calibrate_curves(loaded, settings, progress)
     write_curves(out, found)
     _show(found, as_json)
-
-
-def _of_sheet(probe: Path, like: Path | None, settings: Config) -> DecorrelationCurves:
-    from speckle3d.io.load import load_sweep
-    from speckle3d.io.toml import load_toml
-    from speckle3d.motion.data_sheet import ProbeSheet
-    from speckle3d.sheet_curves import data_sheet_curves
-
-    sheet = load_toml(ProbeSheet, probe)
-    with naming(str(probe)):
-        return data_sheet_curves(sheet, load_sweep(like) if like else None, settings)
-
-
-def _measured(sweeps: list[Any], start: DecorrelationCurves | None, settings: Config) -> DecorrelationCurves:
-    from speckle3d.phantom_curves import calibrate_curves
-    from speckle3d.tracked_curves import jitters, tracked_curves
-
-    with progress_bar("correlating frames") as progress:
-        if start is not None or all(jitters(sweep) for sweep in sweeps):
-            return tracked_curves(sweeps, start, settings, progress)
-        return calibrate_curves(sweeps, settings, progress)
 
 
 def _show(curves: DecorrelationCurves, as_json: bool) -> None:

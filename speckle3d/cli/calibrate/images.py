@@ -28,7 +28,6 @@ from speckle3d.core.progress import progress_bar
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
-    from calibration.images.angulation import Angulation
     from calibration.images.solver import ImageCalibration
     from calibration.images.stacks import TrackedImages
     from calibration.settings import ImageFit
@@ -85,6 +84,7 @@ def images(
     $ speckle3d calibrate images one.h5 across.h5 -o tracker.h5 --start rough.h5
     """
     from calibration.clock.images import delay_from_images
+    from calibration.images.angulation import angulation
     from calibration.images.report import calibration_from_images, figure_of, notes_of
     from calibration.settings import ImageFit
     from speckle3d.calibrating.recordings import open_tracked, require_unsized
@@ -109,7 +109,8 @@ def images(
     begin = _start(start_mm, start_deg, mounting, first)
     sweeps = one, other
     # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
-    _angulation(sweeps, begin).require(0.5)
+    posed = [sweep.world_from_sensor(sweep.covered()) for sweep in sweeps]
+    angulation(posed[0], posed[1], begin, one.grid.corners_mm).require(0.5)
     found = _solve(sweeps, begin, fit)
     words = []
     if back is not None:
@@ -154,13 +155,6 @@ def _start(
             "with --start-deg ROLL YAW TILT; got none"
         )
     return mounting
-
-
-def _angulation(sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform) -> Angulation:
-    from calibration.images.angulation import angulation
-
-    posed = [sweep.world_from_sensor(sweep.covered()) for sweep in sweeps]
-    return angulation(posed[0], posed[1], start, sweeps[0].grid.corners_mm)
 
 
 def _solve(

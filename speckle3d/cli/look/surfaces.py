@@ -78,7 +78,7 @@ def surface(
     if not labels:
         require_own_place(out, "surface", volume_file, reconstruction, state)
     volume = read_volume(volume_file)
-    errors, grid = _errors(reconstruction, mode, volume, volume_file)
+    errors = _errors(reconstruction, mode, volume, volume_file)
     known = None if state is None else read_states(state, volume) != EMPTY
     if level is not None:
         found = {out: surface_of(volume, level, "below" if below else "above", known)}
@@ -92,7 +92,7 @@ def surface(
         whole = largest_part(rough) if largest else rough
         final = smoothed(whole, smooth) if smooth else whole
         write_surface(place, final)
-        sizes.append(_sizes(place, whole, final, errors, grid))
+        sizes.append(_sizes(place, whole, final, *(errors or ())))
     if as_json:
         emit_json(sizes)
     else:
@@ -101,8 +101,8 @@ def surface(
 
 def _errors(
     path: Path | None, mode: str | None, volume: Volume, where: Path
-) -> tuple[PosedErrors | None, ImageGrid | None]:
-    """Errors of the poses that a volume was made at."""
+) -> tuple[PosedErrors, ImageGrid] | None:
+    """Errors of the poses that a volume was made at, and the grid of the images."""
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import caution, posed_errors_of
@@ -112,7 +112,7 @@ def _errors(
     if mode is not None and mode != made_at:
         raise InvalidInputError(f"--mode: expected {made_at}, at whose poses VOLUME was made, got {mode}")
     if path is None:
-        return None, None
+        return None
     made = read_reconstruction(path, with_pairs=False)
     require_made_at(volume, poses_of(made, made_at), str(where))
     if (words := caution(made, made_at)) is not None:
@@ -120,15 +120,13 @@ def _errors(
     return posed_errors_of(made, made_at), made.grid
 
 
-def _sizes(
-    place: Path, rough: Surface, surface: Surface, errors: PosedErrors | None, grid: ImageGrid | None
-) -> dict[str, Any]:
+def _sizes(place: Path, rough: Surface, surface: Surface, *errors: Any) -> dict[str, Any]:
     """What is said of one surface."""
     from dataclasses import asdict
 
     from speckle3d.imaging.measures.surface import measures_of
 
-    measures = measures_of(surface, errors, grid)
+    measures = measures_of(surface, *errors)
     extent = surface.vertices_mm.max(axis=0) - surface.vertices_mm.min(axis=0)
     sizes = {"file": str(place), **asdict(measures), "parts": int(surface.parts().max()) + 1}
     sizes["size_mm"] = extent.tolist()

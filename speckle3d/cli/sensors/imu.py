@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -19,16 +20,7 @@ from speckle3d.cli.common import (
     require_finite,
 )
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.cli.sensors.imu_logs import (
-    Log,
-    Magnetometer,
-    MethodOption,
-    RateHz,
-    WorldOption,
-    orientation_of,
-    read,
-    tell,
-)
+from speckle3d.cli.sensors.imu_logs import Method, World, orientation_of, read, tell
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -37,7 +29,7 @@ if TYPE_CHECKING:
     from xsens.logs.samples import ImuLog
 
 
-def info(log_file: Log, rate_hz: RateHz = None, world: WorldOption = None, as_json: Json = False) -> None:
+def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None, as_json: Json = False) -> None:
     """Tell what a log holds, what is missing and what was skipped.
 
     Parameters
@@ -75,7 +67,7 @@ def info(log_file: Log, rate_hz: RateHz = None, world: WorldOption = None, as_js
     emit_rows([*rows, *(("note", text, "") for text in notes)], as_json)
 
 
-def convert(log_file: Log, out: OutArgument, rate_hz: RateHz = None, world: WorldOption = None) -> None:
+def convert(log_file: Path, out: OutArgument, rate_hz: MaybeNumber = None, world: World = None) -> None:
     """Turn a log of any kind into a plain CSV in SI units, on the sensor's own clock.
 
     Parameters
@@ -98,16 +90,16 @@ def convert(log_file: Log, out: OutArgument, rate_hz: RateHz = None, world: Worl
 
 
 def orient(
-    log_file: Log,
+    log_file: Path,
     into: MaybePath = None,
     out: OptionalOut = None,
-    method: MethodOption = "smoother",
-    magnetometer: Magnetometer = True,
+    method: Method = "smoother",
+    magnetometer: bool = True,
     time_offset_s: MaybeNumber = None,
     calibration: MaybePath = None,
     replace_stream: Annotated[bool, typer.Option("--replace")] = False,
-    rate_hz: RateHz = None,
-    world: WorldOption = None,
+    rate_hz: MaybeNumber = None,
+    world: World = None,
     as_json: Json = False,
 ) -> None:
     """Find the sensor's orientation from its log, and put it into a sweep, on its own clock.

@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, MaybePath, Paths, Written, emit, emit_rows, note, require_finite
-from speckle3d.cli.sensors.imu_logs import (
-    Log,
-    Magnetometer,
-    MethodOption,
-    RateHz,
-    WorldOption,
-    orientation_of,
-    read,
-    tell,
+from speckle3d.cli.common import (
+    Json,
+    MaybeNumber,
+    MaybePath,
+    Paths,
+    Written,
+    emit,
+    emit_rows,
+    note,
+    require_finite,
 )
+from speckle3d.cli.sensors.imu_logs import Method, World, orientation_of, read, tell
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
@@ -27,18 +28,18 @@ if TYPE_CHECKING:
 
 
 def accuracy(
-    log_file: Log,
+    log_file: Path,
     reference: MaybePath = None,
     optical: MaybePath = None,
     calibration: Paths = None,
     turns: str = "roll, yaw, tilt",
     fit_mounting: Annotated[bool, typer.Option("--fit-mounting/--aligned")] = True,
     time_offset_s: float = 0.0,
-    method: MethodOption = "smoother",
-    magnetometer: Magnetometer = True,
+    method: Method = "smoother",
+    magnetometer: bool = True,
     figure: Written = None,
-    rate_hz: RateHz = None,
-    world: WorldOption = None,
+    rate_hz: MaybeNumber = None,
+    world: World = None,
     as_json: Json = False,
 ) -> None:
     """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2).

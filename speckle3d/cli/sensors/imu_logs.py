@@ -14,34 +14,8 @@ if TYPE_CHECKING:
     from xsens.fusion.orient import Orientation
     from xsens.logs.samples import ImuLog
 
-World = Literal["ENU", "NWU", "NED"]
+World = Annotated[Literal["ENU", "NWU", "NED"] | None, typer.Option(case_sensitive=False)]
 Method = Literal["smoother", "filter", "vqf", "vqf-online", "sensor"]
-Log = Annotated[
-    Path,
-    typer.Argument(
-        metavar="LOG",
-        help="A log of the sensor, of any kind that is known, or a sweep with one. A plain CSV has the "
-        "columns time_s, accelerometer_x_m_s2, gyroscope_x_rad_s, magnetometer_x_au (y and z likewise), "
-        "quaternion_w to _z.",
-    ),
-]
-RateHz = Annotated[float | None, typer.Option(help="Samples per second, for logs that do not say.")]
-WorldOption = Annotated[
-    World | None,
-    typer.Option(
-        case_sensitive=False,
-        help="World of the sensor's own orientation (east, north, up and so on); by default as its "
-        "accelerometer and magnetometer show.",
-    ),
-]
-MethodOption = Annotated[
-    Method,
-    typer.Option(
-        help="smoother: from all of the log; filter: as it would be live; vqf, vqf-online: the same by VQF "
-        "(Laidig and Seel 2023); sensor: the sensor's own."
-    ),
-]
-Magnetometer = Annotated[bool, typer.Option(help="Let the magnetic field tell the heading.")]
 
 
 def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> ImuLog:

@@ -19,11 +19,11 @@ from speckle3d.cli.common import (
     MaybeText,
     Out,
     Paths,
-    emit,
     from_options,
     load_settings,
     note,
 )
+from speckle3d.cli.reconstruction import reconstruct
 from speckle3d.cli.signals import ENDS, handled
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
@@ -137,9 +137,11 @@ def live(
     from speckle3d.live.crossing import CrossingCheck
     from speckle3d.live.session import Session, SessionSettings
     from speckle3d.live.warming import warm_up
-    from speckle3d.study.job import require_own_results, run_job
+    from speckle3d.study.job import require_own_results
 
-    host, port = _address(server)
+    host, _, port = server.rpartition(":")
+    if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
+        raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
     config, curves = load_settings(config_file), read_curves(curves_file)
     sources = {"transform": transform, "orientation": orientation, "crossing": crossing_file}
     _require_possible(drift or (), calibration or (), **sources)
@@ -152,16 +154,15 @@ def live(
     settings = SessionSettings(recorded, image, transform, orientation, known, config, volume, check, packed)
     note("loading")
     warm_up(curves, config)
-    first = crossing = None
+    first = None
     if crossing_file is not None:
-        crossing = load_sweep(crossing_file), crossing_file
         with progress_bar(f"tracking {crossing_file.name}") as progress:
-            first = CrossingCheck.of(crossing[0], curves, config, progress)
+            first = CrossingCheck.of(load_sweep(crossing_file), curves, config, progress)
     with ExitStack() as open_:
         served = None if serve is None else open_.enter_context(Server(serve))
         if served is not None:
             note(f"poses and volume at 127.0.0.1:{served.port}")
-        connection = open_.enter_context(Connection(host, port))
+        connection = open_.enter_context(Connection(host.strip("[]"), int(port)))
         outlets = [connection.send] if served is None else [connection.send, served.send]
         note(f"listening to {server}")
         session = Session(connection, outlets, curves, settings, first)
@@ -176,23 +177,11 @@ def live(
     note(f"{done.recorded} frames in {recorded}, {done.matched} placed as they came{left}")
     if done.missing:
         note(done.missing)
-    modes = list[str](dict.fromkeys(drift or ()))
-    if crossing is not None and not {"crossed", "fused"}.intersection(modes):
-        modes.append("crossed")
-    with progress_bar(f"reconstructing {recorded.name}") as progress:
-        calibrations, sweep = calibration or (), load_sweep(recorded)
-        result = run_job(sweep, recorded, curves, out, modes, None, config, progress, calibrations, crossing)
-    emit(result.table)
-    note(f"{done.recorded} frames; results in {result.directory}")
+    reconstruct(
+        recorded, out, curves_file, drift, crossing_file, calibration=calibration, config_file=config_file
+    )
     if session.failure is not None:
         raise session.failure
-
-
-def _address(server: str) -> tuple[str, int]:
-    host, colon, port = server.rpartition(":")
-    if not (colon and host and port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
-        raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
-    return host.strip("[]"), int(port)
 
 
 def _require_possible(drift: Sequence[str], calibrations: Sequence[Path], **sources: object) -> None:
