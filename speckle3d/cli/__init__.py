@@ -35,7 +35,7 @@ _IMU: Table = {
     "info": "sensors.imu:info",
     "convert": "sensors.imu:convert",
     "orient": "sensors.imu:orient",
-    "accuracy": "sensors.imu_accuracy:accuracy",
+    "accuracy": "sensors.imu:accuracy",
     "record": "sensors.imu:record",
 }
 _COMMANDS: Table = {
@@ -46,10 +46,10 @@ _COMMANDS: Table = {
     ),
     "volume": "look.volumes:volume",
     "view": "look.view:view",
-    "reslice": "look.reslices:reslice",
-    "measure": "look.measure:measure",
-    "surface": "look.surfaces:surface",
-    "scene": "look.scenes:scene",
+    "reslice": "look.volumes:reslice",
+    "measure": "look.measures:measure",
+    "surface": "look.measures:surface",
+    "scene": "look.volumes:scene",
     "info": "files:info",
     "convert": "files:convert",
     "trajectory": ("Trajectories as TUM text, and scores of them.", _TRAJECTORY),
@@ -57,7 +57,7 @@ _COMMANDS: Table = {
     "imu": ("The orientation sensor: logs, live data, orientation.", _IMU),
     "live": "stream.live:live",
     "play": "stream.play:play",
-    "simulate": "simulate:simulate",
+    "simulate": "files:simulate",
     "config": "files:config",
 }
 """In the order of work: what most sessions need first."""

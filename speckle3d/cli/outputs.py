@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from speckle3d.core.errors import InvalidInputError
@@ -40,17 +39,6 @@ def require_own_place(out: Path, kind: str, *inputs: Path | None) -> None:
         raise InvalidInputError(
             f"{out}: expected a new name or a {kind} to replace, got another kind of file"
         )
-
-
-def require_own_places(outputs: Mapping[str, Path | None], kind: str, *inputs: Path | None) -> None:
-    """Refuse as `require_own_place` for each output, by its option, and if two are one file."""
-    taken: dict[Path, str] = {}
-    for option, out in outputs.items():
-        if out is not None:
-            require_own_place(out, kind, *inputs)
-            other = taken.setdefault(out.resolve(), option)
-            if other != option:
-                raise InvalidInputError(f"{option}: expected another file than {other}, got {out} for both")
 
 
 def _kinds_of(path: Path) -> set[str]:

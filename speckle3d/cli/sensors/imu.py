@@ -1,10 +1,10 @@
-"""The orientation sensor: its logs, its orientation, and recording it live."""
+"""The orientation sensor: its logs, its orientation, its accuracy, and recording it live."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -14,19 +14,68 @@ from speckle3d.cli.common import (
     MaybePath,
     OptionalOut,
     OutArgument,
+    Paths,
+    Written,
+    emit,
     emit_json,
     emit_rows,
     note,
+    notes,
     require_finite,
 )
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.cli.sensors.imu_logs import Method, World, orientation_of, read, tell
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
     from speckle3d.core.streams import TimedRotations
     from xsens.fusion.orient import Orientation
     from xsens.logs.samples import ImuLog
+
+World = Annotated[Literal["ENU", "NWU", "NED"] | None, typer.Option(case_sensitive=False)]
+Method = Literal["smoother", "filter", "vqf", "vqf-online", "sensor"]
+
+
+def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> ImuLog:
+    """Read a log of any kind, or what a sweep holds of its orientation sensor (its world is known)."""
+    from speckle3d.sensor_logs import held_log
+    from xsens.logs.parts import Hints
+    from xsens.logs.read import read_log
+
+    held = held_log(path)
+    if held is None:
+        return read_log(path, Hints(rate_hz=rate_hz, world=world))
+    if world is not None:
+        note("--world is not used: it is for logs, and the world of a recording's stream is known")
+    return held
+
+
+def tell(log: ImuLog) -> None:
+    """Report on stderr what a log lacks, and what was assumed in its place."""
+    notes(log.notes)
+    if log.gaps:
+        longest = max(gap.duration_s for gap in log.gaps)
+        lost = f"{log.lost} samples lost in {len(log.gaps)} gaps" if log.lost else f"{len(log.gaps)} pauses"
+        note(f"{lost}, the longest of {longest:.3f} s; nothing filled in")
+
+
+def orientation_of(
+    log: ImuLog, method: Method, magnetometer: bool
+) -> tuple[TimedRotations, Orientation | None]:
+    """Find the orientation of a log; the second result is None for the sensor's own orientation."""
+    readings = log.gyroscope_rad_s is not None or log.accelerometer_m_s2 is not None
+    if method != "sensor" and log.oriented.any() and not readings:
+        note("no gyroscope and no accelerometer: the orientation is the sensor's own")
+        method = "sensor"
+    if method == "sensor":
+        return log.rotations(), None
+    from xsens.fusion.orient import orient
+    from xsens.fusion.settings import FusionSettings
+
+    found = orient(log, FusionSettings(use_magnetometer=magnetometer), method)
+    notes(found.notes)
+    return found.rotations, found
 
 
 def info(log_file: Path, rate_hz: MaybeNumber = None, world: World = None, as_json: Json = False) -> None:
@@ -252,3 +301,106 @@ def _orientation_rows(
         ):
             rows.append((f"{name}, RMS difference from the sensor's own", float(np.rad2deg(value)), "deg"))
     return rows
+
+
+def accuracy(
+    log_file: Path,
+    reference: MaybePath = None,
+    optical: MaybePath = None,
+    calibration: Paths = None,
+    turns: str = "roll, yaw, tilt",
+    fit_mounting: Annotated[bool, typer.Option("--fit-mounting/--aligned")] = True,
+    time_offset_s: float = 0.0,
+    method: Method = "smoother",
+    magnetometer: bool = True,
+    figure: Written = None,
+    rate_hz: MaybeNumber = None,
+    world: World = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2).
+
+    Parameters
+    ----------
+    log_file
+    reference
+        Settings of a mechanism: CSV with tilt, yaw, roll in degrees, perhaps time_s and until_s.
+    optical
+        Orientation by a tracker: TUM text, or a log that carries its own orientation.
+    calibration
+        Calibration files; may be repeated.
+    method
+    figure
+        PNG of single turns, as Figure 5 of the paper.
+    as_json
+
+    Other Parameters
+    ----------------
+    turns
+        The mechanism's axes from its base to the probe.
+    fit_mounting
+        The target's axes on the probe: found from the motion, or those of the image.
+    time_offset_s
+        A reading of the sensor at t belongs to the tracker's time t + this.
+    magnetometer, rate_hz, world
+
+    Examples
+    --------
+    $ speckle3d imu accuracy log.mtb --optical tracker.tum --calibration imu.h5
+    """
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.io.calibrations import read_calibration
+    from speckle3d.study.figures import save_figure
+    from xsens.accuracy.angles import AccuracyTable, pair_errors
+    from xsens.accuracy.figures import figure_turns
+    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
+
+    if (reference is None) == (optical is None):
+        raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
+    require_finite("--time-offset-s", time_offset_s)
+    log = read(log_file, rate_hz, world)
+    tell(log)
+    mountings = Rotation.identity(1)
+    if calibration:
+        mountings = Rotation.concatenate([read_calibration(path).rotation for path in calibration])
+    else:
+        note("no --calibration: the sensor's axes are taken for the image's")
+    with naming(str(log_file)):
+        rotations, _ = orientation_of(log, method, magnetometer)
+        if reference is not None:
+            settings = read_mechanism_csv(reference, turns)
+            measured, right = readings_at(rotations, settings), settings.base_from_image
+        elif optical is not None:
+            measured, right = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+        errors = pair_errors(measured, right, mountings)
+    table = AccuracyTable.of({log_file.stem: errors})
+    if figure is not None:
+        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
+    if as_json:
+        emit_rows(table.values(), as_json)
+        return
+    emit(table.text())
+    emit(f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations")
+
+
+def _beside_tracker(
+    rotations: TimedRotations, optical: Path, time_offset_s: float, fit_mounting: bool, mountings: Rotation
+) -> tuple[Rotation, Rotation]:
+    """Readings of the sensor, and the image's orientation by the tracker at the same moments."""
+    from speckle3d.core.streams import TimedRotations
+    from speckle3d.io.tum import is_tum, read_tum
+    from xsens.accuracy.angles import common_readings, mounting_from_motion
+
+    if is_tum(optical):
+        poses = read_tum(optical)
+        tracked = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+    else:
+        log = read(optical)
+        tell(log)
+        tracked = log.rotations()
+    measured, target = common_readings(rotations, tracked, time_offset_s)
+    if not fit_mounting:
+        return measured, target
+    note("the target's mounting is found from the motion: constant errors of calibration do not show")
+    return measured, target * mounting_from_motion(measured * mountings.mean(), target)
