@@ -52,12 +52,8 @@ def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, refused, made, 
     pose = read_reconstruction(made).poses["orientation"][11]
     matrix = np.reshape([float(x) for x in header.frames[11]["ImageToWorldTransform"].split()], (4, 4))
     np.testing.assert_allclose(matrix[:3, 3] * [-1, -1, 1], pose.apply([0, 0, 0]), atol=1e-6)
-    assert "--mode" in refused(
-        "convert", bench / "sweep.h5", tmp_path / name, "--mode", "image"
-    )
-    assert "reconstruction" in refused(
-        "convert", made, tmp_path / name, "--frame-rate-hz", 20
-    )
+    assert "--mode" in refused("convert", bench / "sweep.h5", tmp_path / name, "--mode", "image")
+    assert "reconstruction" in refused("convert", made, tmp_path / name, "--frame-rate-hz", 20)
     assert "s.h5" in refused("convert", made, tmp_path / "s.h5")
 
 
