@@ -14,7 +14,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import inclination as kernel
 from xsens.fusion.samples import Samples
-from xsens.fusion.settings import LOST, FusionSettings
+from xsens.fusion.settings import FusionSettings
 
 CLAIMED = np.array([0.6, 0.6, 1.0])
 """Of the filter's deviation of inclination, what is claimed. The hand's velocity, an error that persists, is
@@ -35,7 +35,7 @@ def fresh_filter(settings: FusionSettings) -> Any:
 @lru_cache(maxsize=8)
 def _limits(settings: FusionSettings) -> Any:
     """Settings that the filter uses, as its kernel takes them."""
-    values = tuple(getattr(settings, name, np.nan) for name in kernel.LIMITS.names or ())
+    values = tuple(getattr(settings, name) for name in kernel.LIMITS.names or ())
     return np.array([values], kernel.LIMITS)
 
 
@@ -63,7 +63,7 @@ def forward(
     kept: Any,
     pause_s: float = 0.0,
     covariances: bool = False,
-    usual_s: float | None = None,
+    whole: bool = False,
 ) -> FilterSteps:
     """Run the filter over a stretch.
 
@@ -78,14 +78,13 @@ def forward(
         Time since the end of that stretch; `GOES_ON` if this one continues it.
     covariances : bool
         Keep what smoothing needs.
-    usual_s : float, optional
-        Usual step between samples, if these are the samples of one increment alone; by default their median.
+    whole : bool
+        These are the samples of one increment.
     """
     per_block = max(1, round(settings.block_s / float(np.mean(samples.step_s))))
     last = np.arange(per_block, len(samples), per_block)
-    last = np.append([] if usual_s is not None else last, len(samples)).astype(np.int64)
-    limits, n = _limits(settings).copy(), len(last)
-    limits["longest_s"] = LOST * (usual_s or float(np.median(samples.step_s)))
+    last = np.append([] if whole else last, len(samples)).astype(np.int64)
+    n = len(last)
     wide = (n if covariances else 0, kernel.SIZE, kernel.SIZE)
     steps = FilterSteps(last, np.zeros(n, kernel.STEP), np.empty(wide), np.empty(wide))
     kernel.run_filter(
@@ -93,10 +92,11 @@ def forward(
         _plain(samples.rate_rad_s),
         _plain(samples.force_m_s2),
         _plain(samples.field_au),
+        _plain(samples.lost_rad2),
         last,
         pause_s,
         kept,
-        limits,
+        _limits(settings),
         steps.rows,
         steps.covariance,
         steps.transition,

@@ -17,7 +17,7 @@ from speckle3d.kernels.orientation.inclination import GOES_ON
 from xsens.fusion.bins import filtered_bins, steps_per_bin
 from xsens.fusion.heading import HeadingFilter
 from xsens.fusion.inclination import CLAIMED, forward, fresh_filter
-from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, require_metres
+from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, lost_variance, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
 from xsens.logs.faults import LiveFaults
@@ -88,7 +88,8 @@ class OnlineFilter:
         self._last: Any = None
         self._turn_rad, self._heading_sd_rad = 0.0, math.pi
         self._field = (False, math.nan, math.nan)
-        self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray]] = []
+        self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray, float]] = []
+        self._before: FloatArray | None = None
         self._pending_s = self._skipped_s = self._pause_s = self._forceless_s = 0.0
         self._usual_s = math.nan
         self._force = np.full(3, np.nan)
@@ -138,7 +139,7 @@ class OnlineFilter:
         bias, resting = last["bias"].copy(), bool(last["resting"])
         rotation = Rotation.from_euler("z", self._turn_rad) * Rotation.from_quat(last["level"])
         if not resting:
-            for step_s, rate, _, _ in self._pending:
+            for step_s, rate, *_ in self._pending:
                 rotation *= Rotation.from_rotvec((rate - bias) * step_s)
         sd_rad = last["sd"][:3] * CLAIMED
         if self._settings.use_magnetometer:
@@ -175,9 +176,16 @@ class OnlineFilter:
         if step_s > PAUSE_S and self._last is not None:
             self._advance()
             self._pause_s = step_s
+            self._before = None
         # The turn in a pause is not known, nor is the first sample's own step.
         step_s = step_s if step_s <= PAUSE_S else self._settings.block_s
-        self._pending.append((step_s, rate, self._force, field))
+        usual_s = step_s if self._before is None and self._last is None else self._usual_s
+        lost = 0.0
+        if self._before is not None and step_s > LOST * usual_s:
+            lost = float(lost_variance(np.array([0.0, step_s]), np.array([self._before, rate]), usual_s)[0])
+        self._usual_s = usual_s + _FOLLOWS * (min(step_s, LOST * usual_s) - usual_s)
+        self._before = rate
+        self._pending.append((step_s, rate, self._force, field, lost))
         self._pending_s += step_s
         # Half a sample too short is as near to the block's length as half a sample too long.
         if self._pending_s + 0.5 * step_s >= self._settings.block_s:
@@ -195,11 +203,7 @@ class OnlineFilter:
             self._heading.resume()
             self._heading_sd_rad = math.pi  # until the first bin after it
             pause_s = self._pause_s
-        if self._last is None:
-            self._usual_s = float(np.median(samples.step_s))
-        for step_s in samples.step_s.tolist():
-            self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)
-        rows = forward(samples, self._settings, self._level, pause_s, usual_s=self._usual_s).rows
+        rows = forward(samples, self._settings, self._level, pause_s, whole=True).rows
         self._pause_s = 0.0
         self._last = rows[0]
         self._rows.append(rows)

@@ -132,11 +132,7 @@ def orient(
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {PAUSE_S:g} s: orientation found anew after each")
     results = _stretches(samples, breaks, settings, method, notes)
-    kept, joined = _across_holes(log.time_s, used, _joined(results))
-    if holes := kept.size - used.size:
-        notes.append(f"{holes} samples without gyroscope or accelerometer: between those around them")
-    if kept.size < len(log):
-        notes.append(f"{len(log) - kept.size} samples without gyroscope or accelerometer left out")
+    joined = _joined(results)
     bias = float(np.abs(joined.bias_rad_s).max())
     if bias > _FORESEEN * settings.bias_sd_rad_s:
         notes.append(
@@ -146,7 +142,7 @@ def orient(
     heading_sd = float(np.median(joined.sd_rad[:, 2]))
     if heading_sd > UNKNOWN_HEADING_RAD:
         notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
-    rotations = TimedRotations(log.time_s[kept], Rotation.from_quat(joined.xyzw))
+    rotations = TimedRotations(log.time_s[used], Rotation.from_quat(joined.xyzw))
     return Orientation(
         rotations,
         joined.sd_rad,
@@ -198,26 +194,3 @@ def _joined(results: list[Estimate]) -> Estimate:
         return results[0]
     columns = zip(*(vars(each).values() for each in results), strict=True)
     return Estimate(*map(np.concatenate, columns))
-
-
-def _across_holes(time_s: FloatArray, used: IntArray, found: Estimate) -> tuple[IntArray, Estimate]:
-    """Indices and estimates with those of short holes, turned evenly from the sample before to the one after.
-
-    Their standard deviation is the larger of the two: that of the one after holds what the hole adds.
-    """
-    missing = np.setdiff1d(np.arange(used[0], used[-1]), used, assume_unique=True)
-    after = np.searchsorted(used, missing)
-    short = time_s[used[after]] - time_s[used[after - 1]] <= PAUSE_S
-    missing, after = missing[short], after[short]
-    if not missing.size:
-        return used, found
-    start, end = time_s[used[after - 1]], time_s[used[after]]
-    share = ((time_s[missing] - start) / (end - start))[:, None]
-    before = Rotation.from_quat(found.xyzw[after - 1])
-    turn = (before.inv() * Rotation.from_quat(found.xyzw[after])).as_rotvec()
-    filled = {name: values[after - 1] for name, values in vars(found).items()}
-    filled["xyzw"] = (before * Rotation.from_rotvec(share * turn)).as_quat()
-    filled["sd_rad"] = np.maximum(found.sd_rad[after - 1], found.sd_rad[after])
-    order = np.argsort(np.concatenate([used, missing]), kind="stable")
-    both = {name: np.concatenate([values, filled[name]])[order] for name, values in vars(found).items()}
-    return np.concatenate([used, missing])[order], Estimate(**both)

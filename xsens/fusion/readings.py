@@ -57,29 +57,53 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     notes = list(log.notes[before:])
     if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
         raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got none: {notes[-1]}")
-    told = np.asarray(np.isfinite(log.accelerometer_m_s2).all(axis=1))
-    readable = np.isfinite(log.gyroscope_rad_s).all(axis=1) & _near(log.time_s, told)
-    used = np.flatnonzero(readable)
-    part = slice(None) if used.size == len(log) else used
-    rate, force, there = _plain(log.gyroscope_rad_s[part]), _plain(log.accelerometer_m_s2[part]), told[part]
-    if used.size < 2 or there.sum() < 2:
+    turns, told = (
+        np.asarray(np.isfinite(rows).all(axis=1)) for rows in (log.gyroscope_rad_s, log.accelerometer_m_s2)
+    )
+    used = np.flatnonzero(_near(log.time_s, turns) & _near(log.time_s, told))
+    if turns[used].sum() < 2 or told[used].sum() < 2:
         raise InsufficientDataError(
-            f"{source}: expected two samples of gyroscope and accelerometer or more, got {int(there.sum())}"
+            f"{source}: expected two samples of gyroscope and accelerometer or more, got {told[used].sum()}"
         )
-    time_s = log.time_s[part]
-    steps = np.diff(time_s)
+    part = slice(None) if used.size == len(log) else used
+    time_s, turns, told = log.time_s[part], turns[part], told[part]
+    rate, force = _plain(log.gyroscope_rad_s[part]), _plain(log.accelerometer_m_s2[part])
     _require_seconds(np.diff(log.time_s), source)
-    require_metres(force if there.all() else force[there], source)
-    _require_radians(rate, source)
+    require_metres(force if told.all() else force[told], source)
+    _require_radians(rate if turns.all() else rate[turns], source)
     notes += _agreement(log, source)
-    if not there.all():
-        notes.append(f"{int((~there).sum())} accelerometer readings missing: interpolated")
-        force = np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in force.T])
+    if left_out := len(log) - used.size:
+        notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
+    if not turns.all():
+        notes.append(f"{int((~turns).sum())} gyroscope readings missing: interpolated")
+    if not told.all():
+        notes.append(f"{int((~told).sum())} accelerometer readings missing: interpolated")
     field = np.full((used.size, 3), np.nan)
     if log.magnetometer_au is not None:
         field = _plain(log.magnetometer_au[part])
-    step_s = np.concatenate([[np.median(steps)], steps])
-    return used, Samples(step_s, _bridging(rate, step_s), _bridging(force, step_s), field), notes
+    step_s = np.diff(time_s, prepend=time_s[0] - np.median(np.diff(time_s)))
+    lost = lost_variance(time_s[turns], rate[turns], float(np.median(step_s)))
+    lost_rad2 = np.zeros(used.size)
+    lost_rad2[np.flatnonzero(turns)[1:]] = lost
+    rate, force = _filled(time_s, rate, turns), _filled(time_s, force, told)
+    return used, Samples(step_s, _bridging(rate, step_s), _bridging(force, step_s), field, lost_rad2), notes
+
+
+def _filled(time_s: FloatArray, readings: FloatArray, there: BoolArray) -> FloatArray:
+    """Readings, interpolated where missing."""
+    if there.all():
+        return readings
+    return np.column_stack([np.interp(time_s, time_s[there], column[there]) for column in readings.T])
+
+
+def lost_variance(time_s: FloatArray, rate_rad_s: FloatArray, usual_s: float) -> FloatArray:
+    """Variance of the turn about each axis from each sample to the next, where those between were lost.
+
+    Its shape is (m - 1,). The rate may change as much as it did from the sample before to the one after.
+    """
+    step_s, change = np.diff(time_s), np.diff(rate_rad_s, axis=0)
+    lost = (step_s > LOST * usual_s) & (step_s <= PAUSE_S)
+    return np.where(lost, step_s**2 * np.einsum("ij,ij->i", change, change), 0.0)
 
 
 def _agreement(log: ImuLog, source: str) -> list[str]:
@@ -155,8 +179,10 @@ def _require_radians(rate_rad_s: FloatArray, source: str) -> None:
 def _near(time_s: FloatArray, there: BoolArray) -> BoolArray:
     """Where a reading is there, or one before and one after it at most a bridged pause apart."""
     known = time_s[there]
-    if not known.size:
-        return np.ones(len(there), dtype=bool)
-    after = np.clip(np.searchsorted(known, time_s), 0, known.size - 1)
-    before = np.maximum(np.searchsorted(known, time_s, side="right") - 1, 0)
-    return np.asarray(np.maximum(known[after], time_s) - np.minimum(known[before], time_s) <= PAUSE_S)
+    if there.all() or not known.size:
+        return there
+    after = np.searchsorted(known, time_s)
+    before = np.searchsorted(known, time_s, side="right") - 1
+    inside = (after < known.size) & (before >= 0)
+    span = known[np.minimum(after, known.size - 1)] - known[np.maximum(before, 0)]
+    return np.asarray(inside & (span <= PAUSE_S))

@@ -19,18 +19,21 @@ class Samples:
         Gyroscope and accelerometer, finite.
     field_au : ndarray, shape (m, 3)
         Magnetometer; rows may be NaN.
+    lost_rad2 : ndarray, shape (m,)
+        Variance of the turn about each axis over lost readings before each sample.
     """
 
     step_s: FloatArray
     rate_rad_s: FloatArray
     force_m_s2: FloatArray
     field_au: FloatArray
+    lost_rad2: FloatArray
 
     def __len__(self) -> int:
         return int(self.step_s.size)
 
     def __getitem__(self, part: slice) -> Samples:
-        return Samples(self.step_s[part], self.rate_rad_s[part], self.force_m_s2[part], self.field_au[part])
+        return Samples(*(values[part] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,6 @@ LIMITS = np.dtype(
             "rest_force_m_s2",
             "rest_after_s",
             "rest_bias_rad_s",
-            "longest_s",  # step without lost samples
         )
     ]
 )
@@ -81,7 +80,6 @@ FILTER = np.dtype(
         ("start_s", "f8"),
         ("start_force", "f8", 3),  # sum since the start, in its first axes
         ("start_turn", "f8", 4),  # those axes from the present ones
-        ("last_rate", "f8", 3),
     ],
     align=True,
 )
@@ -150,6 +148,7 @@ def run_filter(
     rate_rad_s: FloatArray,
     force_m_s2: FloatArray,
     field_au: FloatArray,
+    lost_rad2: FloatArray,
     last: IntArray,
     pause_s: float,
     filters: Any,
@@ -164,6 +163,8 @@ def run_filter(
     ----------
     step_s : ndarray, shape (m,)
     rate_rad_s, force_m_s2, field_au : ndarray, shape (m, 3)
+    lost_rad2 : ndarray, shape (m,)
+        Variance of the turn over lost readings before each sample.
     last : ndarray of int, shape (n,)
         Sample after each increment's last.
     pause_s : float
@@ -176,13 +177,12 @@ def run_filter(
         Filled.
     """
     s, r, f = filters[0], limits[0], np.zeros((SIZE, SIZE))
-    if pause_s != GOES_ON:
-        s.last_rate[:] = math.nan
     first = 0
     for n in range(last.shape[0]):
         step = steps[n]
         step.start_bias[:] = s.bias
-        _sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], r.longest_s, s.last_rate, step)
+        _sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], step)
+        step.lost_rad2 = lost_rad2[first : last[n]].sum()
         first = last[n]
         if n == 0 and pause_s != GOES_ON:
             _set_up(s, r, step, pause_s)
@@ -215,25 +215,16 @@ def _sum_samples(
     field: FloatArray,
     first: int,
     last: int,
-    longest_s: float,
-    before: FloatArray,
     step: Any,
 ) -> None:
-    """Sum the samples from `first` to before `last`, with the step's bias.
-
-    Over a step longer than `longest_s` the rate may change as much as it did from the sample before, `before`
-    (which becomes that of the last), to the one after.
-    """
+    """Sum the samples from `first` to before `last`, with the step's bias."""
     q = (0.0, 0.0, 0.0, 1.0)
-    step.duration_s = step.lost_rad2 = 0.0
+    step.duration_s = 0.0
     step.rate[:], step.field[:], step.force[:] = 0.0, 0.0, 0.0
     fields = 0
     for k in range(first, last):
         dt = step_s[k]
         for i in range(3):
-            if dt > longest_s and math.isfinite(before[i]):
-                step.lost_rad2 += (dt * (rate[k, i] - before[i])) ** 2
-            before[i] = rate[k, i]
             step.rate[i] += dt * rate[k, i]
         half = _turn(rate[k], step.start_bias, 0.5 * dt)
         q = product(q, half)
