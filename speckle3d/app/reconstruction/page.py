@@ -215,9 +215,11 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def _draw_planes(self) -> None:
         """Draw where the cuts are in space."""
         first = self._page.opened(*self._pair).poses[self.mode][0].inv()
-        planes = [plot.plane for plot in self._plots.values() if plot.plane is not None]
+        hulls = [first.apply(plot.plane.hull_mm) for plot in self._plots.values() if plot.plane is not None]
+        # Of the first pixels of all columns and the last ones, the first and the last column's.
         corners = [
-            np.vstack([first.apply(plane.hull_mm)[[0, 1, 3, 2, 0]], np.full(3, np.nan)]) for plane in planes
+            np.vstack([hull[[0, len(hull) // 2 - 1, -1, len(hull) // 2, 0]], np.full(3, np.nan)])
+            for hull in hulls
         ]
         y, z, x = np.concatenate(corners).T
         self._space.object.data[-1].update(x=x, y=y, z=z)
