@@ -176,7 +176,8 @@ def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
     if field.metadata and any(hasattr(each, "write") for each in field.metadata):
         kind = str
     shown = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
-    info = typer.Option(help=f"{(field.description or '').removesuffix('.')}{shown}.")
+    text = (field.description or "").removesuffix(".")
+    info = typer.Option(help=f"{text[:1].upper()}{text[1:]}{shown}.")
     if default is True:
         info.param_decls = (f"{_flag(name)}/--no-{_flag(name)[2:]}",)
     return _option(name, kind | None, None, info, words)

@@ -164,7 +164,9 @@ def summary_text(summaries: Sequence[Summary], more: Sequence[str] = ()) -> str:
     """Table of some sweeps, below it what its columns are and what is in doubt, then more lines."""
     records = [record for each in summaries for record in each.records()]
     names = dict.fromkeys(each.reference for each in summaries)
-    lines = ["+- 95 %: of the length, mm, as the mode claims it; of tracker by its jitter alone"]
+    lines = [
+        "part: f forward, r back; +- 95 %: of the length, mm, as the mode claims it, of tracker by its jitter"
+    ]
     if set(names) - {"none"}:
         lines.append(f"reference: {', '.join(names)}; errors are estimate minus reference")
     lines += [*(line for each in summaries for line in each.lines), *more]
