@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -58,36 +59,30 @@ _BEARINGS_DEG = (40.0, 125.0)
 """Directions of the threads in their plane, from x towards z: a little off square, as a bench has them."""
 
 
-@dataclass(frozen=True)
-class RoughSheet:
-    """A surface in the plane y = 0: scatterers of one sign on a lattice, raised and lowered at random.
+@lru_cache(maxsize=200)
+def _sheet_tile(entropy: int, i: int, j: int) -> FloatArray:
+    """Scatterers of a rough surface in the plane y = 0 on the tile whose first corner is at i, j tiles.
 
-    The lattice is finer than half the shortest wavelength, so that the scatterers sum to a mirror where they
-    are level, and echo in all directions as far as they are not: with the heights' standard deviation
-    s and k = 2 pi / wavelength, exp(-(2 k s)^2) of the power is specular, the rest diffuse.
-
-    Parameters
-    ----------
-    entropy : int
-        Seed; with a tile's indices it determines the tile.
+    They are of one sign, on a lattice, raised and lowered at random. The lattice is finer than half the
+    shortest wavelength, so that the scatterers sum to a mirror where they are level, and echo in all
+    directions as far as they are not: with the heights' standard deviation s and k = 2 pi / wavelength,
+    exp(-(2 k s)^2) of the power is specular, the rest diffuse.
     """
+    along = (np.arange(round(TILE_MM / _SPACING_MM)) + 0.5) * _SPACING_MM
+    x, z = np.meshgrid(i * TILE_MM + along, j * TILE_MM + along)
+    height = tile_rng(entropy, i=i, j=j).normal(0.0, _ROUGHNESS_MM, x.size)
+    return np.stack([x.ravel(), height, z.ravel()], axis=1)
 
-    entropy: int
 
-    def tile(self, i: int, j: int) -> FloatArray:
-        """Positions of the scatterers on the tile whose first corner is at i, j tiles, shape (n, 3)."""
-        along = (np.arange(round(TILE_MM / _SPACING_MM)) + 0.5) * _SPACING_MM
-        x, z = np.meshgrid(i * TILE_MM + along, j * TILE_MM + along)
-        height = tile_rng(self.entropy, i=i, j=j).normal(0.0, _ROUGHNESS_MM, x.size)
-        return np.stack([x.ravel(), height, z.ravel()], axis=1)
-
-    def near(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
-        """Positions, in the sheet, on all tiles that may reach into a box of the image, shape (n, 3)."""
-        tiles = tiles_near(image_from_sheet.inv(), box)
-        middle = np.insert((tiles + 0.5) * TILE_MM, 1, 0.0, axis=1)
-        place, corner = image_from_sheet.apply(middle), TILE_MM / np.sqrt(2.0)
-        reached = ((place >= box[0] - corner) & (place <= box[1] + corner)).all(axis=1)
-        return np.concatenate([np.empty((0, 3)), *(self.tile(i, j) for i, j in tiles[reached].tolist())])
+def _sheet_near(entropy: int, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
+    """Scatterers, in the sheet, on all tiles that may reach into a box of the image, shape (n, 3)."""
+    tiles = tiles_near(image_from_sheet.inv(), box)
+    middle = np.insert((tiles + 0.5) * TILE_MM, 1, 0.0, axis=1)
+    place, corner = image_from_sheet.apply(middle), TILE_MM / np.sqrt(2.0)
+    reached = ((place >= box[0] - corner) & (place <= box[1] + corner)).all(axis=1)
+    return np.concatenate(
+        [np.empty((0, 3)), *(_sheet_tile(entropy, i, j) for i, j in tiles[reached].tolist())]
+    )
 
 
 class Level(NamedTuple):
@@ -131,8 +126,8 @@ class WaterBath:
     ----------
     haze : TiledMedium
         What drifts in the water above the floor.
-    sheet : RoughSheet
-        The reflector's surface.
+    entropy : int
+        Seed of the reflector's surface.
     reflector : str
         wall: the whole floor. bar: a strip in the floor's plane that is only in the middle of the beam, and
         always turned towards the probe.
@@ -144,7 +139,7 @@ class WaterBath:
     """
 
     haze: TiledMedium
-    sheet: RoughSheet
+    entropy: int
     reflector: Reflector = "wall"
     attenuation_db_cm_mhz: float = 0.0
 
@@ -172,7 +167,7 @@ class WaterBath:
 
     def _surface(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
         """Those of the sheet's scatterers that the reflector has near a box of the image."""
-        position = self.sheet.near(image_from_sheet, box)
+        position = _sheet_near(self.entropy, image_from_sheet, box)
         return position if self.reflector == "wall" else position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
 
     def _scatterers(self, position: FloatArray, amplitude: float = 1.0) -> Scatterers:
@@ -231,7 +226,7 @@ def _haze(entropy: int, down_to_mm: float) -> TiledMedium:
 
 def water_bath(entropy: int, reflector: Reflector) -> WaterBath:
     """Make a bath with a little dust in its water."""
-    return WaterBath(_haze(entropy, 0.0), RoughSheet(entropy), reflector)
+    return WaterBath(_haze(entropy, 0.0), entropy, reflector)
 
 
 def crossed_threads(entropy: int) -> CrossedThreads:
