@@ -29,6 +29,7 @@ from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
 from speckle3d.io.headers import NRRD_NAMES, read_header
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.pixels import meta_type, nrrd_type
 from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
@@ -49,12 +50,7 @@ _ZLIB, _GZIP = 15, 31
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 
 _PREFIX = "Speckle3D_"
-_COUNTS = {
-    "sampling_rate_hz": 1, "vector_pitch_mm": 1, "speed_of_sound_m_s": 1, "centre_frequency_hz": 1,
-    "bandwidth_hz": 2, "demodulation_frequency_hz": 1, "first_sample_depth_mm": 1, "column_pitch_mm": 1,
-    "row_spacing_mm": 1, "dynamic_range_db": 1, "full_scale": 1,
-}  # fmt: skip
-"""Numbers in each field of this package's own, so that reading a sequence back asks for nothing."""
+"""Of this package's own fields, so that reading a sequence back asks for nothing."""
 
 
 def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
@@ -66,12 +62,16 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
         Naming the field that does not make sense.
     """
     own: dict[str, Any] = {}
-    for name, count in _COUNTS.items():
-        if (text := fields.get(_PREFIX + name)) is not None:
-            values = numbers(text, count, f"{path}: {_PREFIX}{name}")
-            own[name] = values[0] if count == 1 else values
-    if (probe := fields.get(f"{_PREFIX}probe")) is not None:
-        own["probe"] = probe
+    for key, text in fields.items():
+        name = key.removeprefix(_PREFIX)
+        if name == key or name not in (*ImportSettings.model_fields, "full_scale"):
+            continue
+        if name == "probe":
+            own[name] = text
+        else:
+            count = 2 if name == "bandwidth_hz" else 1
+            values = numbers(text, count, f"{path}: {key}")
+            own[name] = values if count == 2 else values[0]
     return own
 
 
