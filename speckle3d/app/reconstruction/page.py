@@ -139,7 +139,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         for name, (slider, _) in _CUTS.items():
             self.param.watch(lambda *_, name=name: self._cut(name), ["mode", "other", slider])
             self._cut(name)
-        self.param.watch(self._placed, [*_COLOURS, "mode", "other", "points_mm"])
+        # After the cuts that it is drawn in.
+        self.param.watch(self._placed, [*_COLOURS, "mode", "other", "points_mm"], precedence=1)
         self.param.watch(lambda _: setattr(self, "points_mm", []), "mode")
         self.param.watch(self._measured, "points_mm")
         self._space = pn.pane.Plotly(None)
