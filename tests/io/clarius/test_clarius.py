@@ -166,12 +166,10 @@ def test_region_of_interest_without_data_around_is_cut_out(tmp_path):
     ("old", "new", "named"),
     [
         ("frames: 4", "frames: 5", r"raw: header: .*\(5, 5, 40, 2\), got \(4, 5, 40, 2\)"),
-        ("number of lines: 5", "number of lines: 6", "lines"),
         ("type: RF", "type: IQ", "header: .*IQ"),
         ("type: RF", "type: M", "type"),
         ("compression: none", "compression: jpeg", "compression"),
         ("40.0 MHz", "40.0", "sampling rate: expected a number of Hz"),
-        ("40.0 MHz", "-40.0 MHz", "sampling rate"),
         ("angle: 0 °}\n  - {rx", "angle: 7 °}\n  - {rx", r"lines\[0\]: angle"),
         (SECOND, "{rx element: 0.0", r"lines\[1\]: rx element"),
         (SECOND, "{rx element: 1.9", r"lines\[1\]: rx element"),
@@ -225,9 +223,9 @@ def test_lines_given_by_the_first_and_last(tmp_path):
         ({"probe": "Clarius L15-HD3"}, None, 1.5 * 0.26, False),
         ({"probe": "L15 HD3"}, "{pitch: 0.2 mm}", 0.3, True),
         ({"probe": "L15 HD3", "vector_pitch_mm": 0.26}, None, 0.26, True),
+        ({}, "L7 HD3", 0.3, False),
         ({"probe": "L7"}, None, MissingSettingsError, False),
         ({"probe": "C3 HD3", "element_pitch_mm": 0.3}, None, InvalidInputError, False),
-        ({}, "L7 HD3", 0.3, False),
     ],
 )
 def test_pitches_are_taken_in_turn_and_contradictions_told(tmp_path, given, own, pitch_mm, differs):

@@ -152,16 +152,12 @@ def test_what_is_missing_is_asked_for_at_once(tmp_path):
         {"axes": None},
         {"axes": "sample, vector"},
         {"axes": "sample, sample, vector"},
-        {"axes": "row, column, frame"},
         {"axes": "sample, vector, -"},
         {"axes": "vector, frame, sample"},  # contradicts the length of t
         {"rf": "Data"},
         {"rf": "Trans"},
         {"rf": "Trans.kind"},
         {"rf": "Cells{3}"},
-        {"rf": "Cells{0}"},
-        {"rf": "../etc"},
-        {"bmode": "RData"},  # beside rf
         {"rf": None, "iq": "RData"},
         {"colour": "RData"},
         {"vector_pitch_mm": "t"},
