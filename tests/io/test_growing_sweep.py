@@ -144,7 +144,7 @@ def test_a_damaged_file_of_a_killed_writer_is_refused_and_no_wait_for_good(tmp_p
     at = content.index(b"OHDR") + 20
     content[at] ^= 1
     (tmp_path / "t.h5").write_bytes(content)
-    with pytest.raises(FileError, match=r"t\.h5: cannot be read"):
+    with pytest.raises(FileError, match=r"t\.h5: .*cannot be read"):
         load_sweep(tmp_path / "t.h5")
 
 
