@@ -142,7 +142,7 @@ def judge(solution: Solution) -> Adequacy:
             "numbers the ones named?"
         )
         return Adequacy(error, condition, (), weakest, True, misfit)
-    tied = solution.rival is not None and solution.rival.evidence < TIE
+    tied = solution.evidence < TIE
     extent_of = extents(solution)
     lacking = [motion for motion, extent in extent_of.items() if extent < _ABSENT]
     dots = solution.phantom.seen_as == "dot"

@@ -70,10 +70,6 @@ class Noise:
     covariance : ndarray, shape (p, p)
     white : float
         Standard deviation of the white noise of a residual.
-    wander : float
-        Root mean square effect of the wandering error on a residual, in the residuals' unit.
-    time_s : float
-        Its time constant, in the unit of the times given; NaN where nothing wanders.
     spread : ndarray, shape (k,)
         Variances of the components of the sensor's error in a frame, wandering and jitter together.
     """
@@ -81,8 +77,6 @@ class Noise:
     step: FloatArray
     covariance: FloatArray
     white: float
-    wander: float
-    time_s: float
     spread: FloatArray
 
 
@@ -186,13 +180,10 @@ def fit_wandering(
     step = weight @ steps
     away = steps - step
     covariance = np.einsum("g,gij->ij", weight, spread) + (weight * away.T) @ away
-    moving = weight * (wandering > 0)
     noise = Noise(
         step / scale,
         covariance / np.outer(scale, scale),
         float(np.sqrt(weight @ variance)),
-        float(np.sqrt(weight @ (variance * wandering**2))),
-        float(np.exp(moving @ np.log(constant_s) / moving.sum())) if moving.sum() > 0 else np.nan,
         (weight * variance * (wandering**2 + jitter**2)) @ units,
     )
     return noise, grid[weight > _NEGLIGIBLE * weight.max()]
@@ -214,7 +205,7 @@ def fit_noise(
     seen_as: SeenAs,
     prior: PixelPrior | None = None,
     more: FloatArray | None = None,
-) -> tuple[Chain, Noise]:
+) -> tuple[Chain, FloatArray, FloatArray]:
     """Go from a least-squares solution to the one that knows that the sensor's errors wander.
 
     Parameters
@@ -229,9 +220,10 @@ def fit_noise(
     Returns
     -------
     chain : Chain
-    noise : Noise
-        Its covariance is that of the free parameters, and of the further ones after them. Its step is the
-        last one's, of the further ones the sum of all.
+    further : ndarray, shape (k,)
+        Values of the further parameters.
+    covariance : ndarray, shape (p + k, p + k)
+        Of the free parameters, and of the further ones after them.
     """
     points, columns, several = equations.points, columns_of(free), equations.rows.shape[1]
     first = np.flatnonzero(np.diff(points.frame, prepend=points.frame[0] - 1))
@@ -263,7 +255,7 @@ def fit_noise(
         corrected, expected = _corrected(equations, chain, sensor, image)
         if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
             break
-    return chain, replace(noise, step=np.append(noise.step[:count], further))
+    return chain, further, noise.covariance
 
 
 def _proportions(seen_as: SeenAs) -> list[FloatArray]:

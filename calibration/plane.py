@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.motion import Adequacy, judge, require_adequate
-from calibration.noise import Noise, fit_noise
+from calibration.noise import fit_noise
 from calibration.points import (
     ANGLES,
     CHAIN,
@@ -352,21 +352,6 @@ def sigma_of(residuals: FloatArray) -> float:
     return robust_sigma(residuals, _SMALLEST_SIGMA)
 
 
-@dataclass(frozen=True)
-class Rival:
-    """Another answer, far away, to which a discrete ambiguity leads.
-
-    Attributes
-    ----------
-    evidence : float
-        By how much the sum of its squared residuals exceeds the solution's, in variances of an independent
-        one.
-    """
-
-    chain: Chain
-    evidence: float
-
-
 @shown
 @dataclass(frozen=True)
 class Solution:
@@ -376,9 +361,8 @@ class Solution:
     ----------
     free : tuple of str, length p
         The parameters estimated, among `CHAIN`.
-    noise : Noise
-        What the sensor's errors are like, and the covariance of the free parameters that follows: of small
-        displacements in the image's frame and in the phantom's.
+    covariance : ndarray, shape (p, p)
+        Of the free parameters: small displacements in the image's frame and in the phantom's.
     points : ImagePoints
         All that were given.
     used : ndarray of bool, shape (n,)
@@ -386,6 +370,9 @@ class Solution:
         Of all points, mm (sines of angles for directions).
     sigma : float
         Robust standard deviation of the residuals of the points used.
+    evidence : float
+        By how much the sum of squared residuals of another answer, far away, to which a discrete ambiguity
+        leads, exceeds the solution's, in variances of an independent one.
     assumed : str
         What no image tells, and was taken for granted.
     """
@@ -393,24 +380,19 @@ class Solution:
     chain: Chain
     phantom: Phantom
     free: tuple[str, ...]
-    noise: Noise
+    covariance: FloatArray
     points: ImagePoints
     used: BoolArray
     residuals: FloatArray
     sigma: float
     prior: PixelPrior | None = None
-    rival: Rival | None = None
+    evidence: float = np.inf
     assumed: str = ""
 
     @property
     def angular(self) -> bool:
         """Whether only directions are known: residuals are sines of angles, and nothing has a length."""
         return self.phantom.seen_as == "direction"
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Of the free parameters, shape (p, p)."""
-        return self.noise.covariance
 
     @cached_property
     def jacobian(self) -> FloatArray:
@@ -501,7 +483,7 @@ class Problem:
         chain, used = self.agreed(points, start)
         equations, free = Equations.of(points, self.phantom), self.free
         least = sigma_of(equations[used].residuals(chain))
-        settled, noise = fit_noise(equations[used], chain, free, self.phantom.seen_as, self.prior)
+        settled, _, covariance = fit_noise(equations[used], chain, free, self.phantom.seen_as, self.prior)
         resized = np.abs(np.log(settled.pixel_mm / chain.pixel_mm)).max()
         if sigma_of(equations[used].residuals(settled)) < _RUNAWAY * least and resized < _RESIZED:
             chain = settled
@@ -510,7 +492,7 @@ class Problem:
             chain = least_squares(equations[used], chain, self.phantom.determined)
         residuals = equations.residuals(chain)
         sigma = sigma_of(residuals[used])
-        return Solution(chain, self.phantom, free, noise, points, used, residuals, sigma, self.prior)
+        return Solution(chain, self.phantom, free, covariance, points, used, residuals, sigma, self.prior)
 
     def agreed(self, points: ImagePoints, start: Chain) -> tuple[Chain, BoolArray]:
         """Least squares of the frames that do not contradict the others, and which points those are."""
@@ -559,8 +541,8 @@ class Problem:
             if apart(solution.chain, rival, points, self.phantom):
                 ours, theirs = self._costs(solution.points_used, [solution.chain, rival])
                 if theirs < ours:
-                    rival, solution = solution.chain, self.solve(points, rival)
-                return replace(solution, rival=Rival(rival, abs(float(theirs - ours))))
+                    solution = self.solve(points, rival)
+                return replace(solution, evidence=abs(float(theirs - ours)))
         return solution
 
     def _ends(self, points: ImagePoints, starts: Sequence[Chain]) -> list[Chain]:

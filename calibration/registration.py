@@ -44,13 +44,10 @@ class Choice:
     missed_mm : mapping of str to float
         Mean distance of the dots of left-out frames from their wires; of the registrations that give a
         calibration.
-    worse_mm : mapping of str to (float, float)
-        Mean difference to the best, and its standard error over the blocks.
     """
 
     registration: Registration
     missed_mm: Mapping[Registration, float]
-    worse_mm: Mapping[Registration, tuple[float, float]]
 
     def __str__(self) -> str:
         each = ", ".join(f"{name} {missed:.3f} mm" for name, missed in self.missed_mm.items())
@@ -98,12 +95,11 @@ def choose(missed_mm: Mapping[Registration, FloatArray]) -> Choice:
     """
     means = {name: float(each.mean()) for name, each in missed_mm.items()}
     best = missed_mm[min(missed_mm, key=lambda name: means[name])]
-    worse = {
-        name: (float(np.mean(each - best)), float(np.std(each - best, ddof=1) / np.sqrt(len(each))))
-        for name, each in missed_mm.items()
-    }
-    simplest = next(name for name in missed_mm if worse[name][0] <= worse[name][1])
-    return Choice(simplest, means, worse)
+    worse = {name: each - best for name, each in missed_mm.items()}
+    simplest = next(
+        name for name, each in worse.items() if each.mean() <= np.std(each, ddof=1) / np.sqrt(len(each))
+    )
+    return Choice(simplest, means)
 
 
 def _missed_mm(solution: Solution) -> FloatArray:

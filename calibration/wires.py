@@ -127,7 +127,7 @@ def _beside(solution: Solution, beside_mm: float) -> Solution:
     posed = moved[[free.index(name) for name in POSE]]
     alike = sum(np.correlate(row, row, "full")[len(row) - 1 :] / max(row @ row, _TINY) for row in posed)
     covariance = beside_mm**2 * moved @ toeplitz(alike / max(alike[0], _TINY)) @ moved.T
-    return replace(solution, noise=replace(solution.noise, covariance=solution.covariance + covariance))
+    return replace(solution, covariance=solution.covariance + covariance)
 
 
 def _image_and_point(chain: Chain) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from calibration.clock.offset import ClockOffset, covered, delays_around, peak_o
 from calibration.clock.smoothing import SmoothReadings
 from calibration.motion import InadequateError
 from calibration.noise import fit_noise
-from calibration.plane import Chain, Equations, Solution, nearly_absolute, sigma_of
+from calibration.plane import Equations, Solution, nearly_absolute, sigma_of
 from calibration.points import SCALES, SOME_FRAMES, ImagePoints, as_directions
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
@@ -73,7 +73,7 @@ def estimate_offset(
     seconds = float(tried[peak_of(tried, misfit, "the motion repeats itself; move irregularly")])
     for _ in range(_MOST_STEPS):
         # Anew, for the frames that contradict the others depend on the offset.
-        _, step, covariance = _joint_fit(_adequate_or_not(calibrate, points_at(seconds)), points_at, seconds)
+        step, covariance = _joint_fit(_adequate_or_not(calibrate, points_at(seconds)), points_at, seconds)
         error = float(np.sqrt(covariance[-1, -1]))
         seconds += float(np.clip(step, -STEP_S, STEP_S))
         if not abs(seconds - around_s) < search_s - STEP_S:
@@ -91,10 +91,9 @@ def with_uncertain_offset(
     """Return a solution whose covariance includes that of the clock offset it was made with."""
     there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
     shown = replace(solution, points=solution.points[there], used=solution.used[there])
-    _, _, joint = _joint_fit(shown, _Reader(shown.points, readings).at, seconds)
+    _, joint = _joint_fit(shown, _Reader(shown.points, readings).at, seconds)
     along, variance = joint[:-1, -1], joint[-1, -1]
-    covariance = solution.covariance + np.outer(along, along) / variance
-    return replace(solution, noise=replace(solution.noise, covariance=covariance))
+    return replace(solution, covariance=solution.covariance + np.outer(along, along) / variance)
 
 
 class _Reader:
@@ -111,8 +110,8 @@ class _Reader:
 
 def _joint_fit(
     solution: Solution, points_at: Callable[[float], ImagePoints], seconds: float
-) -> tuple[Chain, float, FloatArray]:
-    """Solve for chain and offset together: the chain, the offset's step, s, and their covariance.
+) -> tuple[float, FloatArray]:
+    """Solve for chain and offset together: the offset's step, s, and the covariance of both.
 
     The covariance is that of the free parameters, in frames that lie on the image and on the phantom, and of
     the offset after them.
@@ -125,8 +124,8 @@ def _joint_fit(
     change = Equations.of(later, phantom).residuals(chain) - Equations.of(sooner, phantom).residuals(chain)
     column = change.reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
     equations, seen_as = Equations.of(here, phantom), phantom.seen_as
-    found, noise = fit_noise(equations, chain, solution.free, seen_as, solution.prior, column)
-    return found, float(noise.step[-1]), noise.covariance
+    _, further, joint = fit_noise(equations, chain, solution.free, seen_as, solution.prior, column)
+    return float(further[-1]), joint
 
 
 def _as_seen(solution: Solution, points: ImagePoints) -> ImagePoints:

@@ -41,7 +41,6 @@ def test_one_size_and_time_give_what_dense_algebra_gives():
     np.testing.assert_allclose(noise.step, step, rtol=1e-9)
     np.testing.assert_allclose(noise.covariance, variance * bread, rtol=1e-9)
     assert noise.white == pytest.approx(np.sqrt(variance))
-    assert noise.wander == pytest.approx(2.0 * noise.white)
 
 
 def test_what_is_known_before_counts_as_one_more_measurement():

@@ -6,19 +6,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
-from calibration.detection.dots import Dots, dots_in_frames
+from calibration.detection.dots import Dots
 from calibration.nwires import (
     label_and_start,
     middle_wires,
     nwire_errors_mm,
-    pixel_matrix,
     start_from_nwires,
     trimmed_mean_mm,
 )
-from calibration.points import ImagePoints, Seen
+from calibration.points import Seen
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.metaimage import read_metaimage, read_poses
+from speckle3d.io.metaimage import read_poses
 from speckle3d.io.plus_config import read_wire_phantom
 
 PUBLISHED = {"Calibration": (0.479116, 0.22656), "Validation": (0.539932, 0.223536)}
@@ -105,33 +103,3 @@ def test_published_errors_are_reproduced_for_every_frame(realdata, fcal, kind):
     # Six digits of pixels, poses and matrix leave 0.0002 mm.
     np.testing.assert_allclose(found.reshape(-1, 3), errors, atol=1e-3)
     np.testing.assert_allclose(trimmed_mean_mm(found), PUBLISHED[kind], atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.realdata
-def test_dots_found_here_calibrate_real_images_for_others(realdata, fcal):
-    known = ImportSettings(column_pitch_mm=0.08, row_spacing_mm=0.0745, dynamic_range_db=60.0)
-    labelled, starts = {}, {}
-    for kind, step in (("Calibration", 3), ("Validation", 2)):
-        path = realdata / "plus" / f"fCal_Test_{kind}_3NWires_fCal2.0.igs.mha"
-        kept = read_metaimage(path, known).frames
-        frames = np.stack([kept[i] for i in range(0, len(kept), step)])
-        dots = dots_in_frames(frames, [fcal.pixel_mm] * 2, region_px=fcal.clip_px)
-        poses = poses_of(realdata / "plus", kind)[::step]
-        labelled[kind], starts[kind] = label_and_start(dots, fcal.phantom, poses, [fcal.pixel_mm] * 2)
-        # In all frames, the six included in which PLUS found no points.
-        assert len(labelled[kind]) == 9 * len(frames)
-        theirs, pixels, _, _ = plus_results(realdata / "plus", kind)
-        of_frame = dict(zip(theirs.tolist(), pixels, strict=True))
-        both = np.array([f * step in of_frame for f in labelled[kind].frame])
-        pairs = zip(labelled[kind].frame[both], labelled[kind].wire[both], strict=True)
-        others = np.array([of_frame[f * step][wire] for f, wire in pairs])
-        away = np.linalg.norm(labelled[kind].pixels[both] - others, axis=1)
-        # Measured 0.8 px in the middle, 6.7 px at most; the next wire is 100 px away.
-        assert np.median(away) < 1.0
-        assert away.max() < 10.0
-    points: ImagePoints = labelled["Validation"].points(poses[labelled["Validation"].frame])
-    place = fcal.phantom.world_from_phantom
-    errors = nwire_errors_mm(points, fcal.phantom, pixel_matrix(starts["Calibration"]), place)
-    # PLUS, with its own points, has 0.540 mm; a tenth more for other dots in other frames (measured 0.575).
-    assert trimmed_mean_mm(errors)[0] < 0.6

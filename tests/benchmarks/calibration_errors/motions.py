@@ -1,4 +1,4 @@
-"""Motions that are missing, wrong lines and good scans: what is accepted, how wrong it is, what is named.
+"""Motions that are missing, and good scans: what is accepted, how wrong it is, what is named.
 
 The hand moves smoothly: each motion is a sum of slow sinusoids, all at once or one after the other. Probes,
 mountings, floors, frame rates, numbers of frames, noise and drop-outs differ from scan to scan.
@@ -20,10 +20,11 @@ from calibration.points import ImagePoints
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 
+from .hand import wander
 from .rows import Row, trials
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from calibration_examples import BEAM_DOWN, about, scan_plane
+from calibration_examples import BEAM_DOWN, about
 
 WOBBLE_DEG, WOBBLE_MM = 1.0, 2.0
 """What a hand does that means to hold still."""
@@ -86,14 +87,6 @@ def by_hand(rng, time_s: np.ndarray, reach: float) -> np.ndarray:
     phase = 2 * np.pi * (time_s / rng.uniform(3.0, 10.0) + rng.random()) + 2.0 * slowly(3)
     moved = np.sin(phase) * (1.0 + 0.4 * slowly(3))
     return reach * moved / np.abs(moved).max()
-
-
-def drift(rng, time_s: np.ndarray, size: float, columns: int) -> np.ndarray:
-    """Ornstein-Uhlenbeck processes."""
-    out = size * rng.standard_normal((len(time_s), columns))
-    for k, step in enumerate(np.exp(-np.diff(time_s) / DRIFT_S), 1):
-        out[k] = step * out[k - 1] + np.sqrt(1 - step**2) * out[k]
-    return out
 
 
 def moves_of(rng, time_s, reaches: dict[str, float], wobbles: dict[str, float]) -> dict[str, np.ndarray]:
@@ -166,8 +159,8 @@ def scan(seed, missing: tuple[str, ...] = (), level: bool = False) -> Scan:
     if rng.random() < 0.5:
         # A scan is good if its tracker is, too.
         size = 1.0 if missing else 0.5
-        shifts += drift(rng, time_s, 0.3 * size, 3)
-        turns += np.deg2rad(drift(rng, time_s, 0.2 * size, 3))
+        shifts += 0.3 * size * wander(rng, time_s, DRIFT_S, 3)
+        turns += np.deg2rad(0.2 * size * wander(rng, time_s, DRIFT_S, 3))
     wrong = RigidTransform.from_components(shifts, Rotation.from_rotvec(turns))
     place, orientation = readings.as_components()
     moved, turned = wrong.as_components()
@@ -198,26 +191,10 @@ def crossing(seed, still: tuple[str, ...]) -> tuple[ImagePoints, Scan]:
     world_from_image = RigidTransform.from_components(-turn.apply(flat), turn)
     readings = world_from_image * made.mounting.inv()
     shift, rotation = readings.as_components()
-    shift = shift + drift(rng, made.time_s, 0.2, 3) + 0.1 * rng.standard_normal((count, 3))
+    shift = shift + 0.2 * wander(rng, made.time_s, DRIFT_S, 3) + 0.1 * rng.standard_normal((count, 3))
     pixels = (at + 0.2 * rng.standard_normal((count, 2))) / made.pixel_mm
     poses = RigidTransform.from_components(shift, rotation)
     return ImagePoints(pixels, np.arange(count), poses, time_s=made.time_s), made
-
-
-def with_wrong_lines(made: Scan, seed: int, share: float = 0.08) -> ImagePoints:
-    """Lines with wrong ones among them: anywhere, at the probe's face, or at twice the depth."""
-    rng = np.random.default_rng([seed, 6])
-    ends = made.ends_px.copy()
-    wrong = rng.choice(len(ends), round(share * len(ends)), replace=False)
-    rows = made.size_mm[1] / made.pixel_mm[1]
-    kinds = rng.choice(3) if rng.random() < 0.5 else rng.integers(0, 3, len(wrong))
-    anywhere = (
-        rng.uniform(0.05, 0.95, (len(wrong), 1)) * rows + rng.uniform(-0.15, 0.15, (len(wrong), 2)) * rows
-    )
-    face = rng.uniform(0.02, 0.06) * rows + 0.005 * rows * rng.standard_normal((len(wrong), 2))
-    twice = np.minimum(2.0 * ends[wrong, :, 1], rows)
-    ends[wrong, :, 1] = np.choose(np.broadcast_to(kinds, len(wrong))[:, None], [anywhere, face, twice])
-    return ImagePoints.of_lines(np.arange(len(ends)), ends, made.readings, made.time_s)
 
 
 def judged(trial) -> tuple[float, float, frozenset[str] | None]:
@@ -233,22 +210,14 @@ def judged(trial) -> tuple[float, float, frozenset[str] | None]:
         if mode == "crossing":
             points, made = crossing([seed, place], missing)
             solution = calibrate_cross_wire(points)
-        elif kind == "recipe":
-            rng = np.random.default_rng([seed, 7])
-            lines = scan_plane(
-                rng, int(rng.choice([80, 150, 300])), line_noise_mm=rng.uniform(0.05, 0.4)
-            ).lines
-            calibrate_plane(lines)
-            return 0.0, 0.0, None
         else:
             made = scan([seed, place], missing)
-            lines = with_wrong_lines(made, seed) if kind == "wrong lines" else made.lines
             given = {
                 "prior": (made.given_mm,),
                 "held": (made.pixel_mm, PlaneFit(fixed_pixels=True)),
                 "unknown": (),
             }[mode]
-            solution = calibrate_plane(lines, *given)
+            solution = calibrate_plane(made.lines, *given)
     except InsufficientDataError as refusal:
         return np.nan, np.nan, frozenset(word for word, text in WORDS.items() if text in str(refusal))
     return *made.error(solution), None
@@ -271,7 +240,7 @@ def missing_row(mode: str, kind: str, found: list) -> Row:
 
 
 def measure(share: float, first_seed: int) -> list[Row]:
-    """Missing motions (100 scans of each kind), good scans (400), and wrong lines (100)."""
+    """Missing motions (100 scans of each kind) and good scans (300)."""
     rows = []
     count = max(1, round(100 * share))
     seeds = [first_seed + k for k in range(count)]
@@ -280,16 +249,10 @@ def measure(share: float, first_seed: int) -> list[Row]:
             if mode == "directions" and kind == "constant depth":
                 continue
             rows.append(missing_row(mode, kind, trials(judged, [(kind, mode, seed) for seed in seeds])))
-    for kind, mode in (("good", "prior"), ("good", "held"), ("recipe", "prior"), ("good", "crossing")):
+    for kind, mode in (("good", "prior"), ("good", "held"), ("good", "crossing")):
         found = trials(judged, [(kind, mode, seed) for seed in seeds])
         refused = sum(one[2] is not None for one in found)
         worst = np.nanmax([one[:2] for one in found], axis=0)
         text = f"{refused} of {len(found)} refused, worst {worst[0]:.1f} mm, {worst[1]:.1f} deg"
         rows.append(Row(f"{kind} scans, {mode}", text, "0 refused", refused == 0))
-    for mode in ("prior", "unknown"):
-        found = trials(judged, [("wrong lines", mode, seed) for seed in seeds])
-        worst = np.nanmax([one[0] for one in found])
-        refused = sum(one[2] is not None for one in found)
-        text = f"worst corner {worst:.1f} mm, {refused} of {len(found)} refused"
-        rows.append(Row(f"8 % wrong lines, {mode}", text, "8 mm, or refused", worst <= 8.0))
     return rows
