@@ -89,7 +89,6 @@ class Adequacy:
     """
 
     standard_error: float
-    condition_number: float
     missing: tuple[str, ...]
     weakest: str
     refused: bool
@@ -141,7 +140,7 @@ def judge(solution: Solution) -> Adequacy:
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
             "numbers the ones named?"
         )
-        return Adequacy(error, condition, (), weakest, True, misfit)
+        return Adequacy(error, (), weakest, True, misfit)
     tied = solution.evidence < TIE
     extent_of = extents(solution)
     lacking = [motion for motion, extent in extent_of.items() if extent < _ABSENT]
@@ -158,18 +157,16 @@ def judge(solution: Solution) -> Adequacy:
     if not angular and errors[1] / REFUSED_RAD > errors[0] / REFUSED_MM:
         state += f" and {_size(errors[1], True)}"
     state += f", condition number {condition:.3g}"
-    advice = "; and ".join(missing)
+    verdict = "the motion was sufficient"
     if tied and excess <= allowed:
-        verdict = f"two answers explain the images equally well, one of them mirrored ({state}): {advice}"
-    elif refused:
-        verdict = f"the motion does not determine the calibration ({state}): {advice}; weakest is {weakest}"
-    elif weak:
-        verdict = f"the motion determines the calibration weakly ({state}): {advice}; weakest is {weakest}"
-    else:
-        verdict = f"the motion was sufficient ({state})"
-    if solution.assumed:
-        verdict += f"; {solution.assumed}"
-    return Adequacy(error, condition, missing, weakest, refused, verdict)
+        verdict = "two answers explain the images equally well, one of them mirrored"
+    elif refused or weak:
+        verdict = (
+            "the motion " + ("does not determine" if refused else "weakly determines") + " the calibration"
+        )
+    verdict += f" ({state})" + (f": {'; and '.join(missing)}; weakest is {weakest}" if missing else "")
+    verdict += f"; {solution.assumed}" if solution.assumed else ""
+    return Adequacy(error, missing, weakest, refused, verdict)
 
 
 def weakest_of(jacobian: FloatArray, free: tuple[str, ...]) -> str:
