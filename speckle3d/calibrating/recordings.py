@@ -44,18 +44,10 @@ def open_recording(
     InsufficientDataError
         If there is no such sensor.
     """
-    if sensor not in ("tracker", "orientation"):
-        raise InvalidInputError(f"--sensor: expected tracker or orientation, got {sensor!r}")
-    require_sequence(images if poses is None else poses, transform)
-    sweep = _load(images, pixel_mm, transform if poses is None else None)
-    readings, offset = (
-        _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
-    )
-    pictures, grid = _grey(sweep)
+    sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, sensor, transform)
     size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    return Recording(
-        pictures, size, grid.first_sample_depth_mm / size[1], sweep.frame_time_s, readings, offset
-    )
+    first_row = grid.first_sample_depth_mm / size[1]
+    return Recording(pictures, size, first_row, sweep.frame_time_s, readings, offset_s)
 
 
 def open_tracked(
@@ -79,16 +71,26 @@ def open_tracked(
     InsufficientDataError
         If there is no tracker.
     """
+    sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, "tracker", transform)
+    assert isinstance(readings, TimedPoses)
+    offset_s = offset_s if time_offset_s is None else time_offset_s
+    mounting = None if sweep.tracker is None else sweep.tracker.sensor_from_image
+    return TrackedImages(pictures, grid, sweep.frame_time_s, readings, offset_s, images.name), mounting
+
+
+def _opened(
+    images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, sensor: str, transform: str | None
+) -> tuple[Sweep, Frames, ImageGrid, TimedPoses | TimedRotations, float]:
+    """A sweep, its grey images and their grid, and one sensor's readings with the offset of their clock."""
+    if sensor not in ("tracker", "orientation"):
+        raise InvalidInputError(f"--sensor: expected tracker or orientation, got {sensor!r}")
     require_sequence(images if poses is None else poses, transform)
     sweep = _load(images, pixel_mm, transform if poses is None else None)
-    readings, offset = (
-        _readings(sweep, images, "tracker") if poses is None else _readings_of(poses, "tracker", transform)
-    )
-    assert isinstance(readings, TimedPoses)
-    pictures, grid = _grey(sweep)
-    offset = offset if time_offset_s is None else time_offset_s
-    mounting = None if sweep.tracker is None else sweep.tracker.sensor_from_image
-    return TrackedImages(pictures, grid, sweep.frame_time_s, readings, offset, images.name), mounting
+    given = _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
+    if isinstance(sweep.signal, BModeSettings):
+        return sweep, sweep.frames, sweep.grid, *given
+    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False)
+    return sweep, pictures, pictures.grid, *given
 
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
@@ -154,14 +156,6 @@ def require_unsaid(path: Path, given: ImportSettings) -> None:
     if names and kind_of(path) in SIZED:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in names)
         raise InvalidInputError(f"{options}: expected none with {path} ({kind_of(path)}), which has its own")
-
-
-def _grey(sweep: Sweep) -> tuple[Frames, ImageGrid]:
-    """Return B-mode images as they are, or log-compressed images made from RF."""
-    if isinstance(sweep.signal, BModeSettings):
-        return sweep.frames, sweep.grid
-    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False)
-    return pictures, pictures.grid
 
 
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:

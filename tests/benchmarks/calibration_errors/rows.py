@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from multiprocessing import get_context
 from typing import TypeVar
 
@@ -51,5 +52,10 @@ def coverage_row(case: str, errors: np.ndarray, claimed: np.ndarray) -> Row:
 
 def trials(run: Callable[[Trial], Result], todo: Iterable[Trial]) -> list[Result]:
     """Run a function of this kind of trial on all cores, in order."""
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
-        return list(pool.map(run, todo, chunksize=4))
+    return list(_pool().map(run, todo, chunksize=4))
+
+
+@cache
+def _pool() -> ProcessPoolExecutor:
+    """Processes that are started once: each loads everything, for seconds."""
+    return ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn"))
