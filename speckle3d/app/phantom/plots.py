@@ -44,7 +44,7 @@ class FramePlot:
         column_mm, row_mm = (float(size) for size in recording.pixel_mm)
         scale = min(WIDTH_PX / (columns * column_mm), HEIGHT_PX / (rows * row_mm))
         self._images, self._drawn = recording.images, drawn
-        self._black, self._white = levels(recording)
+        black, white = levels(recording)
         self.plot = figure(
             name="picture",
             frame_width=round(columns * column_mm * scale),
@@ -62,7 +62,7 @@ class FramePlot:
         self._image = ColumnDataSource({"image": []})
         self.plot.image(
             "image", x=-0.5, y=-0.5, dw=columns, dh=rows, source=self._image, palette="Greys256"
-        ).glyph.color_mapper.update(low=0, high=255)
+        ).glyph.color_mapper.update(low=black, high=white)
         self._region = ColumnDataSource({"x": [], "y": []})
         self.plot.patch("x", "y", source=self._region, fill_alpha=0.06, color=REGION, line_dash="dashed")
         self.plot.on_event(SelectionGeometry, self._selected)
@@ -70,10 +70,7 @@ class FramePlot:
     def show(self, frame: int, region: npt.ArrayLike | None) -> npt.NDArray[Any]:
         """Draw a frame and the region, and return the frame as it is, shape (column, row)."""
         image = self._images[frame]
-        share = (np.nan_to_num(np.asarray(image, np.float32), nan=self._black) - self._black) / (
-            self._white - self._black
-        )
-        self._image.data = {"image": [(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8).T.copy()]}
+        self._image.data = {"image": [np.ascontiguousarray(image.T)]}
         x, y = np.reshape([] if region is None else np.asarray(region), (-1, 2)).T
         self._region.data = {"x": x, "y": y}
         return image
