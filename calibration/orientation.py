@@ -65,15 +65,11 @@ def calibrate_orientation(
     normals = normals[:1] if s.level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
     starts = angle_starts(directions.of_some_frames(SOME_FRAMES), size, normals, s.level)
     problem = Problem(LineDirections(size, s.level), ANGLES, s.outlier_sigma)
-    solution = problem.best(directions, starts)
-    solution = require_adequate(replace(solution, assumed=_assumption(s.viewed_from)))
+    side = "down (plane seen from above)" if s.viewed_from == "above" else "up (plane seen from below)"
+    assumed = f"assumed, as no image tells it: the beam points {side}"
+    solution = require_adequate(replace(problem.best(directions, starts), assumed=assumed))
     _require_floor(solution)
     return _upright(solution, s.viewed_from)
-
-
-def _assumption(viewed_from: str) -> str:
-    side = "down (plane seen from above)" if viewed_from == "above" else "up (plane seen from below)"
-    return f"assumed, as no image tells it: the beam points {side}"
 
 
 def _upright(solution: Solution, viewed_from: str) -> Solution:
