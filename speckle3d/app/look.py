@@ -34,15 +34,15 @@ white-space:nowrap" title="{name}">{name}</span></div>
 _BODY = "html, body { background: #fff; overflow-x: hidden; }"
 
 
-def held(act: _Act) -> _Act:
+def batched(act: _Act) -> _Act:
     """Have the changes of an act sent together; figures may be changed by the event of a widget only so."""
 
     @wraps(act)
-    def acting(*args: Any, **more: Any) -> Any:
+    def run(*args: Any, **more: Any) -> Any:
         with pn.io.hold():
             return act(*args, **more)
 
-    return acting  # type: ignore[return-value]
+    return run  # type: ignore[return-value]
 
 
 def shell(pages: Sequence[Page], title: str) -> Viewable:
@@ -99,7 +99,7 @@ def _viewed(page: Page) -> Viewable:
     try:
         return page.view()
     except Speckle3DError as error:
-        return told(str(error))
+        return message(str(error))
 
 
 def _opening(title: str) -> Viewable:
@@ -107,7 +107,7 @@ def _opening(title: str) -> Viewable:
     return pn.pane.HTML(f'<div role="status" style="color:#6b7780;padding:8px 12px">{words}</div>', margin=10)
 
 
-def told(words: str) -> Viewable:
+def message(words: str) -> Viewable:
     """Words of an error, or in place of what there is nothing to show of."""
     box = "border-left:4px solid #b3541e;background:#fdf3ec;padding:8px 12px;max-width:60em"
     return pn.pane.HTML(f'<div role="status" style="{box}">{escape(words)}</div>', margin=10)

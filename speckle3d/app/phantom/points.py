@@ -16,9 +16,9 @@ from panel.viewable import Viewable
 from calibration.points import Seen
 from calibration.recording import Recording, choose_crossings
 from speckle3d.app.folder import Folder
-from speckle3d.app.look import held
+from speckle3d.app.look import batched
 from speckle3d.app.phantom.plots import DROPPED, FOUND, USED
-from speckle3d.app.phantom.run import Work, told
+from speckle3d.app.phantom.run import Work, sentence
 from speckle3d.app.phantom.viewer import PhantomViewer
 from speckle3d.calibrating.phantoms import Wired, found, picked
 from speckle3d.calibrating.settings import ScanSettings, WireSettings, with_values
@@ -183,7 +183,7 @@ class PointsViewer(PhantomViewer):
         self.mark_used(dict.fromkeys(map(int, self.picks.points().frame), "has points"))
         self.changed()
 
-    @held
+    @batched
     def _named(self, *_: Any) -> None:
         self._tool.default_overrides = {"wire": self._wire.value or ""}
 
@@ -216,9 +216,9 @@ class PointsViewer(PhantomViewer):
     def _save(self, _: object) -> None:
         try:
             path = self._write(self._name.value or "", self.picks.points())
-            self._saved.object = told(f"Saved {path}", USED, "saved")
+            self._saved.object = sentence(f"Saved {path}", USED, "saved")
         except Speckle3DError as error:
-            self._saved.object = told(str(error), DROPPED, "saved")
+            self._saved.object = sentence(str(error), DROPPED, "saved")
 
     def _write(self, name: str, points: PickedPoints) -> Path:
         if not len(points):

@@ -112,7 +112,7 @@ class RunPane:
         self._before_saving = before_saving
         self._solved: Solved | None = None
         self._work = Work("Run calibration", button_type="primary", width=150)
-        self._verdict = pn.pane.HTML(told("Not calibrated yet.", "#555555"), width=600)
+        self._verdict = pn.pane.HTML(sentence("Not calibrated yet.", "#555555"), width=600)
         self._table = pn.pane.HTML("", width=600)
         self._name = pn.widgets.TextInput(
             name="file of the result", value=f"{images.stem}-calibration.h5", width=460
@@ -137,13 +137,13 @@ class RunPane:
         if not self._save.disabled:
             self._save.disabled = True
             words = "Settings changed since this result: run again."
-            self._verdict.object = told(words, DROPPED) + self._verdict.object
+            self._verdict.object = sentence(words, DROPPED) + self._verdict.object
 
     def _run(self, _: object) -> None:
         try:
             settings = self._settings()
         except Speckle3DError as error:
-            self._verdict.object = told(str(error), DROPPED)
+            self._verdict.object = sentence(str(error), DROPPED)
             return
         self._work.start(partial(self._solve, settings), self._show)
 
@@ -158,10 +158,10 @@ class RunPane:
     def _show(self, run: Solved) -> None:
         self._solved, self._saved.object, self._save.disabled = run, "", run.outcome is None
         if run.outcome is None:
-            self._verdict.object, self._table.object = told(f"No calibration: {run.refusal}", DROPPED), ""
+            self._verdict.object, self._table.object = sentence(f"No calibration: {run.refusal}", DROPPED), ""
         else:
             calibration, lacking = run.outcome.calibration, run.outcome.solution.adequacy.missing
-            self._verdict.object = told(calibration.verdict, _LACKING if lacking else USED)
+            self._verdict.object = sentence(calibration.verdict, _LACKING if lacking else USED)
             table = text_report(calibration, run.outcome.beam, remarks(run.outcome))
             self._table.object = f"<pre class='calibration' style='margin:0'>{html.escape(table)}</pre>"
         self._done(run)
@@ -177,13 +177,13 @@ class RunPane:
             settings = self._before_saving(run.settings, out)
             files = write_outcome(run.outcome, settings, self._images, out, remarks(run.outcome)).files
         except Speckle3DError as error:
-            self._saved.object = told(str(error), DROPPED)
+            self._saved.object = sentence(str(error), DROPPED)
             return
-        self._saved.object = told(
+        self._saved.object = sentence(
             f"Saved {', '.join(path.name for path in files)} in {self._folder.path}", USED
         )
 
 
-def told(words: str, colour: str, name: str = "verdict") -> str:
+def sentence(words: str, colour: str, name: str = "verdict") -> str:
     """HTML of a sentence."""
     return f"<div class='{name}' style='color:{colour};font-weight:600'>{html.escape(words)}</div>"

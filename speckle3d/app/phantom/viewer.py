@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ from panel.viewable import Viewable
 from calibration.points import Seen
 from calibration.recording import Recording
 from speckle3d.app.folder import Folder
-from speckle3d.app.look import held
+from speckle3d.app.look import batched
 from speckle3d.app.phantom.plots import DROPPED, USED, WIDTH_PX, FramePlot, FrameStrip
-from speckle3d.app.phantom.run import RunPane, Solved, told
+from speckle3d.app.phantom.run import RunPane, Solved, sentence
 from speckle3d.app.phantom.widgets import widget
 from speckle3d.calibrating.phantoms import BY_HAND, found, require_frames
 from speckle3d.calibrating.settings import (
@@ -135,14 +136,14 @@ class PhantomViewer:
 
     def tell(self, words: str, colour: str = USED) -> None:
         """Say something below the picture."""
-        self._said.object = told(words, colour, "phantom-told")
+        self._said.object = sentence(words, colour, "phantom-told")
 
     def mark_used(self, frames: dict[int, str]) -> None:
         """Say which frames have something, and forget what became of them before."""
         self._used, self._dropped = frames, {}
         self._show()
 
-    @held
+    @batched
     def _show(self, *_: Any) -> None:
         try:
             settings = self.settings()
@@ -163,14 +164,15 @@ class PhantomViewer:
         return self.settings()
 
     def _toggle(self, frame: int) -> None:
-        self.widgets["leave_out"].value = frames_text({*self.settings().leave_out} ^ {frame})
+        with suppress(Speckle3DError):  # which is shown
+            self.widgets["leave_out"].value = frames_text({*self.settings().leave_out} ^ {frame})
 
     def _draw_region(self, corners: npt.NDArray[Any]) -> None:
         # A mouse knows no more than a tenth of a pixel, and a command can be given that.
         places: Corners = tuple((float(column), float(row)) for column, row in corners.round(1))
         self.widgets["region"].value = region_text(places)
 
-    @held
+    @batched
     def _solved(self, run: Solved) -> None:
         self._used = {} if run.seen is None else dict.fromkeys(map(int, run.seen.frame), "found")
         self._dropped = {} if run.seen is None else dict(run.seen.dropped)

@@ -13,7 +13,7 @@ import param
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.look import held
+from speckle3d.app.look import batched
 from speckle3d.app.reconstruction.commands import code, measure_command, reslice_command
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
@@ -244,7 +244,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         slider = _CUTS[name][0]
         return Place(**{slider: getattr(self, slider)}, reach_mm=self._page.reach_mm)
 
-    @held
+    @batched
     def _cut(self, name: str) -> None:
         opened, plot = self._page.opened(*self._pair), self._plots[name]
         try:
@@ -273,7 +273,7 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         ):
             self.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
 
-    @held
+    @batched
     def _placed(self, *_: Any) -> None:
         """Draw the cross hair and the points, and write the commands."""
         page = self._page

@@ -15,7 +15,7 @@ from bokeh.plotting import figure
 from panel.viewable import Viewable
 from scipy.spatial.transform import Rotation
 
-from speckle3d.app.look import held
+from speckle3d.app.look import batched
 from speckle3d.app.sensor.probe import figure_probe, turn_probe
 from speckle3d.app.sensor.source import COLUMNS, Source, thinned
 from speckle3d.app.sensor.watch import SHOWN_S
@@ -159,14 +159,14 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         self._draw()
         self._show()
 
-    @held
+    @batched
     def _draw(self, from_s: float = -np.inf, until_s: float = np.inf) -> None:
         """Draw what is in sight, as fine as a screen shows it."""
         first, last = np.searchsorted(self._columns["t"], [from_s, until_s])
         part = slice(max(first - 1, 0), last + 1)
         self._data.data = thinned({name: values[part] for name, values in self._columns.items()})
 
-    @held
+    @batched
     def _show(self, *_: Any) -> None:
         """Show how it is held, and what is to say."""
         time_s = _STEP_S * self.step

@@ -14,7 +14,7 @@ import param
 from panel.viewable import Viewable
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.look import held
+from speckle3d.app.look import batched
 from speckle3d.app.sweep.findings import FrameFindings
 from speckle3d.app.sweep.pairs import NEIGHBOURS, PatchValues, SweepPairs
 from speckle3d.app.sweep.plots import FLAGGED, ImagePlot, TimePlots
@@ -169,16 +169,16 @@ class _Player(param.Parameterized):  # type: ignore[misc]
             self._draw()
         self._draw_findings()
 
-    @held
+    @batched
     def _draw_findings(self) -> None:
         self._times.mark(self._findings.flags, self._findings.doubts)
         self._state.object = escape(self._findings.state())
 
-    @held
+    @batched
     def _draw_levels(self, *_: Any) -> None:
         self._picture.levels.low = 255.0 * (1.0 - self.range_db / _MOST_DB)
 
-    @held
+    @batched
     def _draw(self, *_: Any) -> None:
         frame, pairs = self.frame, self._page.pairs
         # Where the sweep ends, the other way.
