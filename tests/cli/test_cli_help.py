@@ -102,12 +102,13 @@ def test_every_setting_is_printed_with_what_it_is_and_its_default(run):
 )
 def test_what_is_refused_is_refused_before_work(refused, monkeypatch, tmp_path, shipped, arguments, expected):
     from speckle3d import sensor_logs
-    from speckle3d.study import job
+    from speckle3d.study import job, paper
 
     def work(*_, **__):
         raise AssertionError("the work began")
 
     monkeypatch.setattr(job, "track", work)
+    monkeypatch.setattr(paper, "paper_study", work)
     monkeypatch.setattr(sensor_logs, "ridden_along", work)
     monkeypatch.chdir(tmp_path)
     sweep = shipped / "phantom.h5"
