@@ -116,7 +116,7 @@ WRONG = {
 CASES = [(kind, edit, message) for kind, rows in WRONG.items() for edit, message in rows]
 
 
-@pytest.mark.parametrize(("kind", "edit", "message"), CASES, ids=str)
+@pytest.mark.parametrize(("kind", "edit", "message"), CASES, ids=range(len(CASES)))
 def test_what_is_wrong_is_named_in_one_line(tmp_path, kind, edit, message):
     path = tmp_path / "bad.h5"
     path.write_bytes((old_files.FOLDER / f"{kind}.h5").read_bytes())
