@@ -145,21 +145,6 @@ def test_points_picked_by_hand_are_explained_to_a_millimetre(picked):
     assert solution.condition_number < 20
 
 
-@pytest.mark.realdata
-def test_half_of_the_picked_points_may_be_wrong(picked):
-    points, rng = points_of(*picked), np.random.default_rng(0)
-    wrong = rng.permutation(54) < 28
-    pixels = np.where(
-        wrong[:, None], rng.uniform(points.pixels.min(0), points.pixels.max(0), (54, 2)), points.pixels
-    )
-    solution = calibrate_cross_wire(replace(points, pixels=pixels))
-    far = np.hypot(*(0.145 * (pixels - points.pixels)).T) > 5.0
-    assert not solution.used[far].any()
-    # Points 11, 12 and 13 are doubtful.
-    assert (~solution.used[~wrong]).sum() <= 3
-    assert (np.abs(moved_in_errors(solution, calibrate_cross_wire(points[~wrong]))) < 1.0).all()
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_any_mounting_and_any_place_of_three_wires_is_found(seed):
     rng = np.random.default_rng([seed, 9])
