@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -182,25 +181,32 @@ def _describe_volume(path: PathLike) -> list[Row]:
     return rows
 
 
-def _record_rows(record: object, inside: str = "") -> list[Row]:
-    """Fields of a dataclass: lengths of arrays, and other values as they are."""
-    rows: list[Row] = []
-    for name, value in vars(record).items():
-        words, _, unit = name.rpartition("_") if name.endswith(("_mm", "_hz")) else (name, "", "")
-        unit = unit.replace("hz", "Hz")
-        words = inside + words.replace("_", " ")
-        if is_dataclass(value):
-            rows += [(words, type(value).__name__, "")]
-            rows += _record_rows(value, "" if name in ("key", "signal") else f"{words}, ")
-        elif isinstance(value, np.ndarray):
-            rows.append((words, " x ".join(map(str, value.shape)), "values"))
-        elif value is not None:
-            rows.append((words, str(value), unit))
-    return rows
+def _describe_curves(path: PathLike) -> list[Row]:
+    held = curves.read_curves(path)
+    key, signal = held.key, held.key.signal
+    kind = "B-mode" if not isinstance(signal, RFSettings) else "I/Q" if signal.are_complex else "RF"
+    half = [np.interp(-0.5, -row, held.distance_mm) for row in held.correlation]
+    return [
+        ("probe", key.probe or "not named", ""),
+        ("origin", held.origin, ""),
+        ("signal", kind, ""),
+        *(number_row(name, value) for name, value in vars(signal).items() if value and name != "full_scale"),
+        ("vector pitch", f"{key.vector_pitch_mm:.4g}", "mm"),
+        ("patches", f"{key.patch_width_mm:g} x {key.patch_height_mm:g}", "mm"),
+        ("correlation of", key.correlation_of, ""),
+        ("depths", f"{held.depth_mm.size}, {held.depth_mm[0]:.1f} to {held.depth_mm[-1]:.1f}", "mm"),
+        ("distances", f"up to {held.distance_mm[-1]:.2f}", "mm"),
+        ("correlation halves at", f"{min(half):.2f} to {max(half):.2f}", "mm"),
+        ("frame pairs", str(held.pairs_used), ""),
+        ("tilt", "no" if held.tilt is None else "yes", ""),
+        ("speckle size", "no" if held.speckle is None else "yes", ""),
+        ("spectrum", "no" if held.spectrum is None else "yes", ""),
+        ("lengths read with them, 95 %", f"+- {196 * held.scale_sigma:.1f}", "%"),
+    ]
 
 
 _DESCRIBERS: dict[str, Callable[[PathLike], list[Row]]] = {
     reconstructions.FORMAT: _describe_reconstruction,
-    curves.FORMAT: lambda path: _record_rows(curves.read_curves(path)),
+    curves.FORMAT: _describe_curves,
     calibrations.FORMAT: _describe_calibration,
 }
