@@ -20,6 +20,8 @@ JOINT_CLAIMS = 3.0
 UNITS = {1000.0: "metres", 100.0: "decimetres", 25.4: "inches", 10.0: "centimetres"}
 UNIT_FACTOR = 1.5
 """Factor within which a path must be such a multiple: units are farther apart, paths by images nearer."""
+BY_IMAGES = {"image", "consistent-subset", "orientation"}
+"""Modes that take their length from the images alone."""
 FEWEST_FRAMES = 10
 SMOOTH_FRAMES = 9
 """Frames of which the running median is taken, so that jitter is not taken for motion."""
@@ -141,6 +143,8 @@ def unit_of_length(image: RigidTransform, tracker: Tracker, poses: RigidTransfor
 def differing_lengths(lengths: Mapping[str, tuple[float, float]]) -> tuple[Doubt, ...]:
     """Modes whose lengths differ by more than three joint claims: among these there is no best.
 
+    Those whose lengths are the images' own cannot contradict each other.
+
     Parameters
     ----------
     lengths : dict of str to (float, float)
@@ -148,7 +152,7 @@ def differing_lengths(lengths: Mapping[str, tuple[float, float]]) -> tuple[Doubt
     """
     found = []
     for (one, (first, own)), (other, (second, its)) in combinations(lengths.items(), 2):
-        if apart((first, second), (own, its)):
+        if not {one, other} <= BY_IMAGES and apart((first, second), (own, its)):
             words = (
                 f"length {first:.2f} +- {1.96 * own:.2f} mm in mode {one}, {second:.2f} +- "
                 f"{1.96 * its:.2f} mm in {other} (95 %)"

@@ -49,7 +49,8 @@ def default_mode(reconstruction: Reconstruction) -> tuple[str, str]:
         raise MismatchError(f"{doubts[0].evidence}: expected --mode to say which to take, got none")
     if len(claims) < 2:
         return "image", ""
-    best = min(claims, key=lambda mode: claims[mode][1])
+    # Of modes that claim as much, the later corrects more.
+    best = min(reversed(claims), key=lambda mode: claims[mode][1] / max(claims[mode][0], 1e-9))
     length, sigma = claims[best]
     return best, (
         f"mode {best}: claims the smallest error of length, {length:.2f} +- {1.96 * sigma:.2f} mm (95 %); "
