@@ -11,7 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 from made_once import made_once
 
-# Started in the background, or by nohup, a process ignores these signals and so would all that tests interrupt.
+# Started in the background or by nohup, a process ignores these, and so would all that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 if hasattr(signal, "SIGHUP"):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
