@@ -80,6 +80,7 @@ def live(
     volume: bool = True,
     check: bool = False,
     crossing_file: MaybePath = None,
+    region: MaybeText = None,
     drift: list[Drift] | None = None,
     compression: Literal["none", "gzip"] = "none",
     duration_s: Annotated[float | None, typer.Option(min=0.0)] = None,
@@ -119,6 +120,9 @@ def live(
         Serve poses and volume to others, too; 0: any free port.
     crossing_file
         First sweep, which this one crosses.
+    region
+        Part of the image to look at, in mm: 'rectangle x,y x,y', 'polygon x,y x,y x,y ...' or 'fan x,y
+        angle,angle radius,radius'; several joined by ' and '.
     compression
         Of the recording.
     duration_s
@@ -142,7 +146,7 @@ def live(
     host, _, port = server.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
         raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
-    config, curves = load_settings(config_file), read_curves(curves_file)
+    config, curves = load_settings(config_file).with_choices(region=region), read_curves(curves_file)
     sources = {"transform": transform, "orientation": orientation, "crossing": crossing_file}
     _require_possible(drift or (), calibration or (), **sources)
     recorded = out / "sweep.h5"
@@ -178,7 +182,14 @@ def live(
     if done.missing:
         note(done.missing)
     reconstruct(
-        recorded, out, curves_file, drift, crossing_file, calibration=calibration, config_file=config_file
+        recorded,
+        out,
+        curves_file,
+        drift,
+        crossing_file,
+        region=region,
+        calibration=calibration,
+        config_file=config_file,
     )
     if session.failure is not None:
         raise session.failure
