@@ -139,8 +139,11 @@ def shadowed(left_out: FloatArray) -> Doubt | None:
     share = float(left_out.mean())
     if share < SHADOW_TOLD:
         return None
-    evidence = f"expected echoes all over the image, got none in {share:.0%} of it, which is left out"
-    return Doubt(IMAGES, "shadow, noise, lost contact, or text on the image", evidence, False)
+    evidence = (
+        f"expected echoes all over the image, got none in {share:.0%} of it (shadow, noise, lost contact, or "
+        "text on the image), which is left out"
+    )
+    return Doubt(IMAGES, "", evidence, False)
 
 
 def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float) -> Doubt | None:

@@ -50,7 +50,7 @@ def doubted_modes(sweep: Sweep, doubts: Sequence[Doubt], modes: Collection[str])
         about = {"" if sensor is None else sensor.label}
         if mode != TRACKER:
             about |= {"images", "curves"}
-        suspected = dict.fromkeys(doubt.suspect for doubt in doubts if doubt.about in about)
+        suspected = dict.fromkeys(d.suspect for d in doubts if d.about in about and d.suspect)
         if suspected:
             suspicions[mode] = ", ".join(suspected)
     return suspicions
