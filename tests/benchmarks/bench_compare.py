@@ -23,7 +23,8 @@ from speckle3d.study.schedulers import Scheduler
 CURVES = Path(__file__).resolve().parents[2] / "data" / "curves.h5"
 
 
-def main(sweeps=16, frames=150):
+def seconds_by_workers(sweeps=16, frames=150):
+    """Seconds that one worker and two take for a study of many small sweeps."""
     small = {"preset": "tissue", "vectors": 26, "samples": 1000, "length_mm": frames / 8, "frames": frames}
     paths = [simulated(SimulationSettings(**small, seed=300 + i)) for i in range(sweeps)]
     seconds = {}
@@ -32,11 +33,15 @@ def main(sweeps=16, frames=150):
             began = time.perf_counter()
             study = compare_sweeps(paths, Path(folder), curves=CURVES, scheduler=Scheduler(workers))
             seconds[workers] = time.perf_counter() - began
-            done = sum(each.status == "done" for each in study.outcomes)
-        sys.stdout.write(
-            f"{workers} workers {seconds[workers]:7.1f} s  ratio {seconds[workers] / seconds[1]:.2f}  "
-            f"{done} of {len(paths)} done  load {os.getloadavg()[0]:.1f}\n"
-        )
+            assert all(each.status == "done" for each in study.outcomes)
+    return seconds
+
+
+def main(sweeps=16, frames=150):
+    seconds = seconds_by_workers(sweeps, frames)
+    for workers, spent in seconds.items():
+        ratio, load = spent / seconds[1], os.getloadavg()[0]
+        sys.stdout.write(f"{workers} workers {spent:7.1f} s  ratio {ratio:.2f}  load {load:.1f}\n")
 
 
 if __name__ == "__main__":
