@@ -1,6 +1,7 @@
 """Simulated sweeps for the benchmarks, kept by what determines them: their settings and the simulator."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import speckle3d
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.io.load import load_sweep
-from speckle3d.io.sweep_writer import SweepWriter, write_sweep
+from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.simulation.presets import SimulationSettings, simulate
 
 DEFAULT = Path(__file__).resolve().parents[2] / ".cache" / "sweeps"
@@ -45,13 +46,34 @@ def to_and_fro(source: Path, frames: int, folder: Path = DEFAULT) -> Path:
     sweep = load_sweep(source)
     there = np.arange(len(sweep))
     index = np.resize(np.concatenate([there, there[-2:0:-1]]), frames)
-    with SweepWriter(path, sweep.grid, sweep.signal) as writer:
-        for number, each in enumerate(index):
-            writer.append(sweep.frames[each], 0.04 * number)
-        writer.write_truth(sweep.truth[index])
-        for sensor in _sensors(sweep, index):
-            writer.write_sensor(sensor)
+    tracker, orientation = _sensors(sweep, index)
+    long = replace(
+        sweep,
+        frames=_InOrder(sweep.frames, index),
+        frame_time_s=0.04 * np.arange(frames),
+        truth=sweep.truth[index],
+        tracker=tracker,
+        orientation=orientation,
+        path=None,
+    )
+    write_sweep(path, long)
     return path
+
+
+class _InOrder:
+    """Frames of a sweep, in another order."""
+
+    any_thread = False
+
+    def __init__(self, frames, index: np.ndarray) -> None:
+        self._frames, self._index = frames, index
+        self.shape, self.dtype = (index.size, *frames.shape[1:]), frames.dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, number):
+        return self._frames[int(self._index[number])]
 
 
 def _sensors(sweep: Sweep, index: np.ndarray) -> tuple[Tracker, OrientationSensor]:
