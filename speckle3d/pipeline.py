@@ -308,7 +308,7 @@ def require_placed(flags: IntArray, name: str) -> None:
 
 
 def _tracked(
-    found: ImageMotion,
+    solution: ImageMotion,
     subset: RigidTransform | None,
     used: BoolArray,
     flags: IntArray,
@@ -316,8 +316,8 @@ def _tracked(
     source: str,
 ) -> Tracked:
     """Seen from the side on which the elevational motion has its sign."""
-    motion, taken = found.motion, found.motion.pairs.planes.used
-    image, covariance, edges = found.poses, found.covariance, found.edges
+    motion, taken = solution.motion, solution.motion.pairs.planes.used
+    image, covariance, edges = solution.poses, solution.covariance, solution.edges
     if direction < 0:
         image, covariance, edges = mirrored(image), MIRROR @ covariance @ MIRROR, edges.mirrored()
         subset = None if subset is None else mirrored(subset)
@@ -328,13 +328,13 @@ def _tracked(
         rejected_share=float("nan") if subset is None else float((taken & ~used).sum() / taken.sum()),
         flags=flags,
         edges=edges,
-        scale_sigma=found.length_sigma,
-        curves_sigma=found.shared.curves_sigma,
+        scale_sigma=solution.length_sigma,
+        curves_sigma=solution.shared.curves_sigma,
         direction=direction,
         direction_from=source,
-        attenuation=found.attenuation,
+        attenuation=solution.attenuation,
         coherence=motion.coherence,
         curves=motion.problem.curves,
         rows=motion.rows,
-        shared=found.shared,
+        shared=solution.shared,
     )

@@ -200,7 +200,7 @@ def match_chosen(sweep: Sweep, matcher: FrameMatcher, pairs: Sequence[tuple[int,
                 del kept[frame]
             fixed, moving = [kept[first] for first in firsts], kept[second]
             starts = [matcher.search(other, moving) for other in fixed]
-            found = matcher.match_with_each(fixed, moving, starts)
-            yield from ((first, second, match) for first, match in zip(firsts, found, strict=True))
+            matches_of_frame = matcher.match_with_each(fixed, moving, starts)
+            yield from ((first, second, match) for first, match in zip(firsts, matches_of_frame, strict=True))
 
     return CorrelationTable.of(matches(), len(matcher.patches))

@@ -208,10 +208,15 @@ class FrameInspector:
                 samples_db=float(_decibel(np.mean(below * below))),
                 near_db=float(_decibel(near.mean())) if near.size else np.nan,
                 level_db=_decibel(mean[live].mean(axis=0)),
-                speckle=speckle[live].mean(axis=0),
-                noise_share=float(noise[live].mean()),
+                speckle=self._share_inside(speckle, live),
+                noise_share=float(self._share_inside(noise, live).mean()),
                 usable=(usable & finite).ravel() & self._inside,
             )
+
+    def _share_inside(self, chosen: BoolArray, live: BoolArray) -> FloatArray:
+        """Share of the patches in the region, columns all black aside, that are chosen in each row."""
+        inside = self._inside.reshape(chosen.shape) & live[:, None]
+        return np.asarray((chosen & inside).sum(axis=0) / np.maximum(inside.sum(axis=0), 1))
 
     def _rails(self, samples: npt.NDArray[Any], counted: bool) -> tuple[float, float]:
         """Intensity below which there is no echo, and clipping over its limit."""

@@ -120,7 +120,7 @@ def estimate_image_motion(
 
 
 def consistent_poses(
-    found: ImageMotion, sensed: Rotation | None, direction: int
+    solution: ImageMotion, sensed: Rotation | None, direction: int
 ) -> tuple[RigidTransform | None, BoolArray]:
     """Poses from the orientation-consistent patches (None without a sensor), and each pair's patches used.
 
@@ -131,24 +131,24 @@ def consistent_poses(
     direction : int
         Sign of the elevational motion.
     """
-    motion = found.motion
+    motion = solution.motion
     if sensed is None:
         return None, motion.pairs.planes.used
-    planes = consistent_planes(motion, found.table, sensed, direction)
-    edges, problem = edges_of(found.table, motion.pairs, planes), motion.problem
+    planes = consistent_planes(motion, solution.table, sensed, direction)
+    edges, problem = edges_of(solution.table, motion.pairs, planes), motion.problem
     solved = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory)
     return solved.poses, planes.used
 
 
-def frame_pairs(found: ImageMotion, used: BoolArray, direction: int) -> Iterator[FramePairs]:
+def frame_pairs(solution: ImageMotion, used: BoolArray, direction: int) -> Iterator[FramePairs]:
     """Yield the pairs for the reconstruction file, some at a time; deviations include that of the scale."""
-    motion, edges, problem = found.motion, found.edges, found.motion.problem
+    motion, edges, problem = solution.motion, solution.edges, solution.motion.problem
     pairs = motion.pairs
     centre = RigidTransform.from_translation(problem.centre_mm)
     flip, turn = np.diag([1.0, 1.0, direction, 1.0]), MIRROR if direction < 0 else np.eye(6)
     for start in range(0, max(len(pairs), 1), PAIRS_AT_ONCE):
         some = slice(start, start + PAIRS_AT_ONCE)
-        correlation = found.table.correlation[pairs.row[some]]
+        correlation = solution.table.correlation[pairs.row[some]]
         d = problem.fitter.distances(correlation, motion.coherence, pairs.first[some]).scaled(motion.scale)
         yield FramePairs(
             first=edges.first[some],
@@ -156,7 +156,7 @@ def frame_pairs(found: ImageMotion, used: BoolArray, direction: int) -> Iterator
             first_from_second=flip @ (centre * edges.poses[some] * centre.inv()).as_matrix() @ flip,
             covariance=turn @ edges.covariance[some] @ turn,
             distance_mm=d.distance_mm.astype(np.float32),
-            sigma_mm=np.hypot(d.sigma_mm, found.length_sigma * d.distance_mm).astype(np.float32),
+            sigma_mm=np.hypot(d.sigma_mm, solution.length_sigma * d.distance_mm).astype(np.float32),
             used=used[some],
             patch_centre_mm=problem.patches.centre_mm,
         )

@@ -83,11 +83,11 @@ def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
     )
     rows = values(path)
     assert rows["sampling rate"][0] == "80"
-    told = {name: value for name, value, _ in describe(path) if "(" in value}
-    assert told["sampling rate"] == "80 (given by import.toml, the file says 40)"
-    assert told["vector pitch"] == "0.2005 (given by import.toml, the file says 0.2)"
-    assert told["centre frequency"] == "5 (given by import.toml)"
-    assert told["speed of sound"] == "1540 (assumed)"
+    rows = {name: value for name, value, _ in describe(path) if "(" in value}
+    assert rows["sampling rate"] == "80 (given by import.toml, the file says 40)"
+    assert rows["vector pitch"] == "0.2005 (given by import.toml, the file says 0.2)"
+    assert rows["centre frequency"] == "5 (given by import.toml)"
+    assert rows["speed of sound"] == "1540 (assumed)"
     notes = import_notes(path)
     assert notes[0].startswith("sampling rate 80 MHz, given by import.toml: the file says 40 (of samples")
     assert not any("vector pitch" in note for note in notes)  # 0.2005 is within 1 %

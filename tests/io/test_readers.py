@@ -91,8 +91,8 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path, mo
     with pytest.raises(MissingSettingsError, match=r"--frame-rate-hz.*--column-pitch-mm"):
         load_sweep(scan)
     (tmp_path / "scan.toml").write_text("frame_rate_hz = 10\ncolumn_pitch_mm = 0.3\n")
-    told = {name: value for name, value, _ in describe(scan)}
-    assert (told["format"], told["frames"]) == ("folder of a lab", "3")
+    rows = {name: value for name, value, _ in describe(scan)}
+    assert (rows["format"], rows["frames"]) == ("folder of a lab", "3")
     sweep = load_sweep(scan)
     assert sweep.frame_time_s.tolist() == [0.0, 0.1, 0.2]
     assert recording_files(scan) == [scan / "frames.npy", tmp_path / "scan.toml"]

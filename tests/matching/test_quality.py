@@ -13,7 +13,7 @@ from speckle3d.core.sweep import BModeSettings, ImageGrid
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.intensity import IntensityExtractor
-from speckle3d.matching.patches import lay_patches
+from speckle3d.matching.patches import PatchSettings, lay_patches
 from speckle3d.matching.quality import (
     DrawnOver,
     FrameFlag,
@@ -472,3 +472,15 @@ def test_text_on_images_is_found_where_it_is_and_nowhere_else():
         frame[v : v + wide // 2, s : s + high // 4] = 255
         drawn.keep(frame)
     assert np.flatnonzero(drawn.patches).tolist() == [9]
+
+
+def test_frames_are_judged_by_the_region_alone():
+    """A shadow over most of the image is no frame without speckle where one looks beside it."""
+    rng, grid = np.random.default_rng(3), ImageGrid(96, 420, GRID.vector_pitch_mm, GRID.sample_spacing_mm)
+    image = intensity(Speckle(rng).seen()).astype(np.float32)
+    image[12:] = 1e-3 * image[12:].mean() * (1.0 + 0.01 * rng.random(image[12:].shape, np.float32))
+    width = 12 * grid.vector_pitch_mm
+    region = PatchSettings(region=f"rectangle 0,0 {width},{grid.depth_mm}")
+    whole, part = (FrameInspector(BModeSettings(60.0), lay_patches(grid, s)) for s in (None, region))
+    assert part.inspect(image, image).speckle_share > 0.5
+    assert whole.inspect(image, image).speckle_share < QualitySettings().speckle_share

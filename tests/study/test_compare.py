@@ -84,8 +84,8 @@ def test_the_enlarged_part_lies_where_it_does_in_the_whole_cut(study):
     folder = study.directory / stored(study.directory)["sweeps"][0]["folder"]
     whole, part = (read_plane(folder / name, "pose").cut for name in ("reslice.png", "enlarged.png"))
     x, y = part.first_mm
-    there = whole.world_from_mm([x, x + 1.0], [y, y + 2.0])
-    np.testing.assert_allclose(part.world_from_mm([x, x + 1.0], [y, y + 2.0]), there, atol=1e-9)
+    pixels_mm = whole.world_from_mm([x, x + 1.0], [y, y + 2.0])
+    np.testing.assert_allclose(part.world_from_mm([x, x + 1.0], [y, y + 2.0]), pixels_mm, atol=1e-9)
 
 
 def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tmp_path):

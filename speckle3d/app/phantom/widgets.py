@@ -24,7 +24,7 @@ def widget(settings: BaseModel, name: str) -> Any:
     """Make the widget of a setting, which has its value; its description is the field's."""
     field, value = type(settings).model_fields[name], getattr(settings, name)
     label, look = name.replace("_", " "), {"width": _WIDTH_PX, "margin": (2, 8)}
-    told = {"description": field.description, **look}
+    options = {"description": field.description, **look}
     if name in _SLIDERS:
         label, low, high, step = _SLIDERS[name]
         kind = pn.widgets.IntSlider if isinstance(field.default, int) else pn.widgets.FloatSlider
@@ -34,9 +34,9 @@ def widget(settings: BaseModel, name: str) -> Any:
     if isinstance(field.default, bool):
         return pn.widgets.Checkbox(name=field.description, value=value, **look)
     if get_origin(field.annotation) is Literal:
-        return pn.widgets.Select(name=label, options=list(get_args(field.annotation)), value=value, **told)
+        return pn.widgets.Select(name=label, options=list(get_args(field.annotation)), value=value, **options)
     if isinstance(field.default, float):
-        return pn.widgets.FloatInput(name=f"{label} (default {field.default:g})", value=value, **told)
+        return pn.widgets.FloatInput(name=f"{label} (default {field.default:g})", value=value, **options)
     texts = [
         part.write(value) for part in field.metadata if isinstance(part, AsText) and value not in (None, ())
     ]

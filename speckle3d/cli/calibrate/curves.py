@@ -87,8 +87,8 @@ def _show(curves: DecorrelationCurves, as_json: bool) -> None:
     below = curves.correlation.min(axis=1) < 0.5
     half = [float(curves.distance_mm[i]) if b else float("nan") for i, b in zip(first, below, strict=True)]
     if as_json:
-        told = [width if np.isfinite(width) else None for width in half]
-        by_depth = {"depth_mm": curves.depth_mm.tolist(), "half_mm": told, "cells": curves.cells.tolist()}
+        half_mm = [width if np.isfinite(width) else None for width in half]
+        by_depth = {"depth_mm": curves.depth_mm.tolist(), "half_mm": half_mm, "cells": curves.cells.tolist()}
         tilt = {} if curves.tilt is None else {name: v.tolist() for name, v in vars(curves.tilt).items()}
         about = {"pairs": curves.pairs_used, "origin": curves.origin, "scale_sigma": curves.scale_sigma}
         emit_json(by_depth | tilt | about)

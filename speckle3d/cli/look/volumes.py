@@ -169,8 +169,8 @@ def volume(
             if (other := places.setdefault(path.resolve(), flag)) != flag:
                 raise InvalidInputError(f"{flag}: expected another file than {other}, got {path} for both")
     checked = compounding_settings(config_file, settings)
-    told = given_settings(input_file, imported, transform)
-    stated = sweep_file, told, calibration or (), settings.get("dynamic_range_db")
+    imports = given_settings(input_file, imported, transform)
+    stated = sweep_file, imports, calibration or (), settings.get("dynamic_range_db")
     (posed,) = open_sweep_at([mode], input_file, stated)
     region = region or _clip_of(input_file, stated, posed)
     request = VolumeRequest(
@@ -237,8 +237,8 @@ def scene(
     from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
 
     require_scene_place(out, input_file, sweep_file, *files_of(imported, calibration))
-    told = given_settings(input_file, imported, transform)
-    stated = sweep_file, told, calibration or (), settings.get("dynamic_range_db")
+    imports = given_settings(input_file, imported, transform)
+    stated = sweep_file, imports, calibration or (), settings.get("dynamic_range_db")
     request = SceneRequest(
         compounding_settings(config_file, settings), with_images=images, with_deviation=deviation
     )
@@ -373,8 +373,8 @@ def reslice(
     else:
         read_voxels = None if volume is None else _voxels(volume, state)
         modes = _modes_of(None if read_voxels is None else read_voxels[0], mode or ())
-        told = given_settings(input_file, imported, transform)
-        stated = sweep_file, told, calibration or (), dynamic_range_db
+        imports = given_settings(input_file, imported, transform)
+        stated = sweep_file, imports, calibration or (), dynamic_range_db
         first = open_posed(input_file, modes[0] if modes else None, *stated)
         opened = at_modes(first, modes, difference_to)
         notes(opened.posed.notes())
