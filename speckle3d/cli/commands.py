@@ -113,7 +113,12 @@ def command_of(name: str, function: Command) -> TyperCommand:
     options = {each: options[each] for each in sorted(options, key=order.index)}
 
     def run(**values: Any) -> None:
-        given = {_flag(n): o for n, o in options.items() if values[n] not in (None, False, o.default)}
+        # Zero is a value that was given, and equal to False.
+        given = {
+            _flag(name): option
+            for name, option in options.items()
+            if values[name] is not None and values[name] is not False and values[name] != option.default
+        }
         for flag, option in given.items():
             _require_fit(flag, option, values[option.name], given)
         for group, names in groups.items():

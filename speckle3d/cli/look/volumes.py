@@ -361,6 +361,9 @@ def reslice(
             "volume": volume,
             "sweep": sweep_file,
             "calibration": calibration,
+            "transform": transform,
+            "difference_to": difference_to,
+            "dynamic_range_db": dynamic_range_db,
         }
         for name, value in of_sweeps.items():
             if value:
@@ -371,6 +374,8 @@ def reslice(
         voxels, states = _voxels(input_file, state)
         picture = cut_voxels(voxels, located(None), input_file.name, states)
     else:
+        if state is not None and volume is None:
+            raise InvalidInputError("--state: expected --volume with it, got none")
         read_voxels = None if volume is None else _voxels(volume, state)
         modes = _modes_of(None if read_voxels is None else read_voxels[0], mode or ())
         imports = given_settings(input_file, imported, transform)

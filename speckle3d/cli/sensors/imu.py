@@ -162,15 +162,15 @@ def orient(
         CSV of the log with this orientation.
     method, magnetometer
     time_offset_s
-        A reading at t belongs to image time t + this (0, or as LOG has it if it is a sweep); see `speckle3d
-        calibrate clock`.
+        With --into: a reading at t belongs to image time t + this (0, or as LOG has it if it is a sweep); see
+        `speckle3d calibrate clock`.
     calibration
-        Calibration file of this mounting, to go into the sweep with it.
+        With --into: calibration file of this mounting, to go into the sweep with it.
 
     Other Parameters
     ----------------
     replace_stream
-        Replace a stream that the sweep has.
+        With --into: replace a stream that the sweep has.
     rate_hz, world, as_json
 
     Examples
@@ -359,6 +359,8 @@ def accuracy(
     if (reference is None) == (optical is None):
         raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
     require_finite("--time-offset-s", time_offset_s)
+    if figure is not None:
+        require_own_place(figure, "picture", log_file, reference, optical, *(calibration or ()))
     log = read(log_file, rate_hz, world)
     tell(log)
     mountings = Rotation.identity(1)
