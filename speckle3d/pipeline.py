@@ -231,7 +231,10 @@ def track(
     require_placed(flags, sweep.name)
 
     problem = motion_problem(curves, matcher, len(sweep), settings)
-    spectra, match = matches.texture.spectra(flags == 0), partial(match_chosen, sweep, matcher)
+    spectra, match = (
+        matches.texture.spectra(flags == 0),
+        partial(match_chosen, sweep, matcher, usable=matches.usable),
+    )
     same_probe = settings.curves.same_probe
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
     motion = estimate_image_motion(problem, matches.table, spectra, bad, same_probe, match)

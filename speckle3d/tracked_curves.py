@@ -27,7 +27,7 @@ LENGTH_SIGMA = 0.005
 """Of a tracker's millimetres and of how well its mounting is known, beside its jitter."""
 ALIKE_FRAMES = 10
 """Frames over which the images' departure from the tracker stays the same."""
-LEAST_FRAMES = 5
+LEAST_FRAMES = 8
 """Frames with readings from which a length and its error are estimated."""
 LEAST_SURE = 0.3
 """Relative standard deviation of length beyond which it corrects nothing; up to it the curves claim it."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import spoiled_images as spoil
 
+from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.pipeline import track
 
@@ -53,6 +54,16 @@ def test_a_shadow_is_left_out_and_told_and_the_length_stays(sweep, curves):
     assert abs(seen / true - 1) < 0.03
     assert abs(seen - true) < 2 * claimed
     assert any("which is left out" in str(doubt) for doubt in found.doubts)
+
+
+def test_what_stands_still_outside_the_region_changes_nothing(sweep, curves):
+    part = sweep.part(0, 40)
+    frames = np.array([part.frames[k] for k in range(len(part))], np.float32)
+    frames[:, 24:] = frames[0, 24:]
+    settings = Config(patches={"region": "rectangle 0,0 7,40"})
+    true, seen, claimed = length_of(part, track(spoil.spoiled(part, frames), curves, settings))
+    assert abs(seen / true - 1) < 0.03
+    assert abs(seen - true) < 2 * claimed
 
 
 REFUSED = {

@@ -102,9 +102,9 @@ def examine_images(
     pairs, path_mm = motion.motion.pairs, motion.motion.path[:, 0]
     doubts = unrefuted(
         [
-            shadowed(matches.left_out),
+            shadowed(matches.left_out[matcher.patches.inside]),
             interleaved(matches.table, len(sweep), motion.motion.problem.trajectory.least_correlation),
-            _standing_echoes(sweep, matcher, far_apart(path_mm, usable, curves), curves),
+            _standing_echoes(sweep, matcher, matches, far_apart(path_mm, usable, curves), curves),
         ],
         sweep.name,
         InsufficientDataError,
@@ -120,11 +120,16 @@ def examine_images(
 
 
 def _standing_echoes(
-    sweep: Sweep, matcher: FrameMatcher, frames: IntArray, curves: DecorrelationCurves
+    sweep: Sweep,
+    matcher: FrameMatcher,
+    matches: MatchedSweep,
+    frames: IntArray,
+    curves: DecorrelationCurves,
 ) -> Doubt | None:
     if len(frames) < 2:
         return None
     share = standing_share(sweep, matcher, frames.tolist())
+    share[~matcher.patches.inside | (matches.left_out > 0.5)] = np.nan
     return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
 
 
@@ -134,7 +139,7 @@ def shadowed(left_out: FloatArray) -> Doubt | None:
     Parameters
     ----------
     left_out : ndarray, shape (p,)
-        Share of the frames in which each was.
+        Share of the frames in which each patch of the region was.
     """
     share = float(left_out.mean())
     if share < SHADOW_TOLD:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead
 from speckle3d.matching.inplane import InPlaneMotion, MatchedPair, compose, inverse
@@ -50,6 +50,13 @@ class MatchedSweep:
     features: Sequence[FrameFeatures]
     texture: Texture
     left_out: FloatArray
+    drawn: BoolArray
+    """Patches that something is drawn on, shape (p,)."""
+
+    @property
+    def usable(self) -> list[BoolArray]:
+        """Patches of each frame that may be matched, shape (p,)."""
+        return [features.usable & ~self.drawn for features in self.features]
 
 
 def match_sweep(
@@ -99,7 +106,7 @@ def match_sweep(
     table = CorrelationTable.of(pairs(), len(matcher.patches))
     over = drawn.patches if drawn else np.zeros(len(matcher.patches), dtype=bool)
     left_out = matcher.patches.inside - np.mean([f.usable & ~over for f in features], axis=0)
-    return MatchedSweep(table.among(~over), features, texture, left_out)
+    return MatchedSweep(table.among(~over), features, texture, left_out, over)
 
 
 @dataclass(frozen=True)
@@ -178,15 +185,26 @@ class FrameByFrame:
         return pairs
 
 
-def match_chosen(sweep: Sweep, matcher: FrameMatcher, pairs: Sequence[tuple[int, int]]) -> CorrelationTable:
+def match_chosen(
+    sweep: Sweep,
+    matcher: FrameMatcher,
+    pairs: Sequence[tuple[int, int]],
+    usable: Sequence[BoolArray] | None = None,
+) -> CorrelationTable:
     """Match chosen pairs of a sweep, reading frames anew; in-plane motion is searched for in each pair.
 
     Fastest where pairs of one second frame follow each other.
+
+    Parameters
+    ----------
+    usable : sequence of ndarray of bool, shape (p,), optional
+        Patches of each frame that may be matched; by default all in the region.
     """
     kept: dict[int, ReadyFrame] = {}
 
     def ready(frame: int) -> ReadyFrame:
-        return matcher.prepare(matcher.echo(read_frame(sweep.frames, frame)))
+        echo = matcher.echo(read_frame(sweep.frames, frame))
+        return matcher.prepare(echo, None if usable is None else usable[frame])
 
     def matches() -> Iterator[tuple[int, int, MatchedPair]]:
         for second, some in groupby(pairs, key=itemgetter(1)):

@@ -90,6 +90,14 @@ class MatchedPair:
     median: float
     motion: InPlaneMotion
 
+    def laid_out(self, patches: BoolArray) -> MatchedPair:
+        """Correlations of all patches, NaN but for those that were matched, shape (p,)."""
+        if patches.all():
+            return self
+        correlation = np.full(patches.size, np.nan)
+        correlation[patches] = self.correlation
+        return replace(self, correlation=correlation)
+
     def among(self, usable: BoolArray) -> MatchedPair:
         """Keep the correlations of some patches."""
         if usable.all():

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
 from speckle3d.core.curves import CurveKey
+from speckle3d.core.region import Region
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.inplane import (
     CoarseMatcher,
@@ -86,6 +88,7 @@ class FrameMatcher:
         self.laid = lay_patches(self.grid, patches)
         self.patches = self.laid
         self.inplane = inplane
+        self._mask = Region.from_text(patches.region).mask(self.grid) if patches.region else None
         self._coarse = CoarseMatcher(self.grid, inplane.search_mm)
         rf = sweep.signal if isinstance(sweep.signal, RFSettings) else None
         self.of_echo = rf is not None and (matching or MatchingSettings()).correlate == "echo"
@@ -127,7 +130,9 @@ class FrameMatcher:
         """
         image, parts = self.equalised(echo)
         kept = self.patches.inside if usable is None else self.patches.inside & usable
-        return ReadyFrame(kept, image, self._coarse.spectrum(image), parts)
+        # Only what lies in the region is searched for.
+        searched = image if self._mask is None else np.where(self._mask, image, image[self._mask].mean())
+        return ReadyFrame(kept, image, self._coarse.spectrum(searched), parts)
 
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array | None]:
         """Intensity and, where there is phase, echo over their local mean; see `ReadyFrame`."""
@@ -149,15 +154,19 @@ class FrameMatcher:
     ) -> list[MatchedPair]:
         """In-plane motion and correlation of a frame's pairs with some others, from a start for each."""
         theirs = [frame.echo for frame in fixed if frame.echo is not None]
+        # The others would pull the motion, too.
+        some = moving.usable
         matches = match_with_each(
             [frame.image for frame in fixed],
             moving.image,
-            self.patches,
+            self.patches.among(some),
             starts,
             self.centre_mm,
             self.inplane,
             None if moving.echo is None else (theirs, moving.echo),
             self._wavenumber,
         )
-        both = [frame.usable & moving.usable for frame in fixed]
-        return [match.among(usable) for match, usable in zip(matches, both, strict=True)]
+        return [
+            match.laid_out(some).among(frame.usable & some)
+            for match, frame in zip(matches, fixed, strict=True)
+        ]

@@ -87,14 +87,16 @@ class PatchGrid:
             )
         return self.with_rows(kept)
 
+    def among(self, chosen: BoolArray) -> PatchGrid:
+        """Keep some of the patches, shape (p,)."""
+        if chosen.all():
+            return self
+        first, centre_mm, inside = self.first[chosen], self.centre_mm[chosen], self.inside[chosen]
+        return replace(self, first=first, centre_mm=centre_mm, inside=inside)
+
     def with_rows(self, kept: BoolArray) -> PatchGrid:
         """Keep some of the rows, shape (r,)."""
-        if kept.all():
-            return self
-        chosen = np.isin(self.centre_mm[:, 1], self.row_depth_mm[kept])
-        return replace(
-            self, first=self.first[chosen], centre_mm=self.centre_mm[chosen], inside=self.inside[chosen]
-        )
+        return self.among(np.isin(self.centre_mm[:, 1], self.row_depth_mm[kept]))
 
 
 def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> PatchGrid:

@@ -50,9 +50,10 @@ _NOISY = 1 / 3
 """Share of patches with noise alone, in a frame without speckle, from which it is said to be lifted. Noise of
 an amplifier is in all patches that hold no echo; only the name of the flag hangs on it."""
 
-_DRAWN_SHARE, _DRAWN_FRAMES = 0.01, 8
-"""Share of a patch's pixels that no frame changes, from which something is drawn on it, and frames that must
-have been seen: speckle of so many frames agrees in no pixel by chance."""
+_DRAWN_SHARE, _DRAWN_OVER_SPECKLE, _DRAWN_FRAMES = 0.01, 10.0, 8
+"""Share of a patch's pixels that no frame changes, from which something is drawn on it, also over that of the
+median patch, and frames that must have been seen. Speckle that goes on by a quarter of a millimetre in all
+has up to 0.02 of such pixels, by more none."""
 
 _LISTED = 8
 """Frames named in a line of `describe`."""
@@ -286,15 +287,15 @@ class DrawnOver:
 
     @property
     def patches(self) -> BoolArray:
-        """Which patches something is drawn on, shape (p,); none where the probe may have been at rest."""
+        """Which patches something is drawn on, shape (p,)."""
         none = np.zeros(len(self._patches), dtype=bool)
         if self._darkest is None or self._frames < _DRAWN_FRAMES:
             return none
         fixed = (self._darkest == self._brightest) & (self._darkest > 0)
         wide, high = self._patches.size
         share = np.array([fixed[v : v + wide, s : s + high].mean() for v, s in self._patches.first])
-        drawn = share > _DRAWN_SHARE
-        return none if drawn.mean() > 0.5 else np.asarray(drawn)
+        # Where the probe hardly moves, speckle agrees here and there, but all over the image.
+        return np.asarray(share > max(_DRAWN_SHARE, _DRAWN_OVER_SPECKLE * float(np.median(share))))
 
 
 def _digest(samples: npt.NDArray[Any]) -> int:

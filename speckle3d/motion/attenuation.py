@@ -107,7 +107,7 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     ----------
     curves : DecorrelationCurves
     spectra : EchoSpectra or None
-        Of the sweep's rows of patches; see `speckle3d.matching.spectra`.
+        Of the sweep's rows of patches; see `speckle3d.matching.texture`.
     """
     unknown = Attenuation(
         0.0, UNKNOWN_SIGMA, curves.depth_mm, np.zeros(curves.depth_mm.size), LENGTH_PER_UNIT * UNKNOWN_SIGMA

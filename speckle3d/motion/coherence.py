@@ -346,8 +346,10 @@ def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, floa
     # Standard error of a median of rows, by their median absolute deviation from a line: tilt makes one.
     finite = np.isfinite(rows.logarithm)
     logarithm, depth = rows.logarithm[finite], rows.depth_mm[finite]
-    line = theilslopes(logarithm, depth)
-    spread = 1.4826 * float(np.median(np.abs(logarithm - line.intercept - line.slope * depth)))
+    spread = ROW_SIGMA
+    if logarithm.size > 2:
+        line = theilslopes(logarithm, depth)
+        spread = 1.4826 * float(np.median(np.abs(logarithm - line.intercept - line.slope * depth)))
     if typical >= NO_STRUCTURE:
         count = logarithm.size
         spread = np.sqrt((count * spread**2 + PRIOR_ROWS * ROW_SIGMA**2) / (count + PRIOR_ROWS))

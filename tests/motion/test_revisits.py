@@ -107,7 +107,7 @@ def test_one_way_no_frame_is_matched_again(sweep, curves, monkeypatch):
     chosen = []
     plain = pipeline.match_chosen
     monkeypatch.setattr(
-        pipeline, "match_chosen", lambda s, m, pairs: chosen.extend(pairs) or plain(s, m, chosen)
+        pipeline, "match_chosen", lambda s, m, pairs, **_: chosen.extend(pairs) or plain(s, m, chosen)
     )
     frames = np.arange(48)
     # Six millimetres, twice what a return takes at least.
