@@ -23,11 +23,11 @@ from calibration.detection.dots import Dots
 from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.plane import Chain
 from calibration.points import ImagePoints, Seen, affine_equations
+from calibration.robust import cauchy_weights, robust_linear
 from calibration.wires import wire_start
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import nearest_rotation
-from speckle3d.core.leastsquares import cauchy_weights, robust_linear
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95

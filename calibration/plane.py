@@ -38,18 +38,13 @@ from calibration.points import (
     as_directions,
     columns_of,
 )
+from calibration.robust import autocorrelation_time, robust_linear
 from calibration.settings import OUTLIER_SIGMA, PlaneFit
 from calibration.starts import hemisphere, in_plane_mirror, rotation_to_z, rotations_all_over
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import roll_yaw_tilt, skew
-from speckle3d.core.leastsquares import (
-    autocorrelation_time,
-    condition_number,
-    huber_weights,
-    robust_linear,
-    robust_sigma,
-)
+from speckle3d.core.leastsquares import condition_number, huber_weights, robust_sigma
 from speckle3d.core.shown import shown
 
 _FEWEST_LINES = 6

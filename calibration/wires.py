@@ -21,12 +21,13 @@ from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
 from calibration.motion import require_adequate
 from calibration.plane import Chain, Equations, Problem, Solution, probe_parameters
 from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
+from calibration.robust import RobustFit, robust_linear
 from calibration.settings import Registration, WireFit
 from calibration.starts import rotations_all_over
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
-from speckle3d.core.leastsquares import RobustFit, huber_weights, robust_linear
+from speckle3d.core.leastsquares import huber_weights
 from speckle3d.core.wires import WirePhantom
 
 _ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "free": TARGET}

@@ -20,10 +20,10 @@ from scipy.ndimage import gaussian_filter1d
 
 from calibration.detection.region import DENSELY, Columns, checked_pixel, lay_columns, without_standing
 from calibration.points import Seen
+from calibration.robust import autocorrelation_time
 from calibration.settings import LineSettings, Place
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.leastsquares import autocorrelation_time
 from speckle3d.core.sweep import Frames
 from speckle3d.kernels.lines import consensus_line
 

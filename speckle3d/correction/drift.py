@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt, skew
-from speckle3d.core.leastsquares import Fit, levenberg_marquardt
 from speckle3d.core.shown import shown
 from speckle3d.correction.claims import curve_errors, length_sigma
 from speckle3d.correction.curves import (
@@ -27,6 +27,9 @@ from speckle3d.correction.curves import (
     angle_axes,
     curve_basis,
 )
+
+_MOST_EVALUATIONS = 200
+"""Of the optimisation; sweeps need 10 to 20."""
 
 
 class DriftSettings(BaseModel):
@@ -72,9 +75,10 @@ class DriftCorrection:
     ----------
     poses : RigidTransform, length n
         ``world_from_image`` in the sensor's world.
-    fit : Fit
-        Of the curves' coefficients. The covariance takes the robust residuals of `correct_pose` for
-        Gaussian ones, so there it compares parameters rather than predicting errors.
+    fit : OptimizeResult
+        Of the curves' coefficients, by SciPy.
+    names : tuple of str
+        Of the coefficients.
     curves : ndarray, shape (n, 6)
         Every frame's correction (x, y, z, tilt, yaw, roll) of the step into it, mm and rad; row 0 is the
         offset at the first frame, after a rigid registration. In `correct_orientation` it acts at the
@@ -89,7 +93,8 @@ class DriftCorrection:
     """
 
     poses: RigidTransform
-    fit: Fit
+    fit: OptimizeResult
+    names: tuple[str, ...]
     curves: FloatArray
     coverage: float
     settings: DriftSettings
@@ -144,15 +149,15 @@ def correct_pose(
     chain = _chain(world_from_image, corners.mean(axis=0), AXES, settings)
     problem = _CornerProblem(chain, used, corners, target, settings.loss_epsilon_mm)
     fit = _solve(problem, chain, settings)
-    bent = chain.poses(fit.parameters)
+    bent = chain.poses(fit.x)
     poses = sensor_from_start * RigidTransform.from_matrix(bent)
     centre = corners.mean(axis=0)
     left = poses[used].inv() * reference
     error = np.hstack([left.apply(centre) - centre, left.rotation.as_rotvec()])
     covariance = curve_errors(error, len(poses))
     sigma = length_sigma(poses, covariance, centre)
-    values = chain.values(fit.parameters)
-    return DriftCorrection(poses, fit, values, float(used.mean()), settings, covariance, sigma)
+    values = chain.values(fit.x)
+    return DriftCorrection(poses, fit, chain.names, values, float(used.mean()), settings, covariance, sigma)
 
 
 def correct_orientation(
@@ -198,14 +203,14 @@ def correct_orientation(
     image_from_centred = RigidTransform.from_translation(centre)
     chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
     fit = _solve(_OrientationProblem(chain, used, target), chain, settings)
-    bent = chain.poses(fit.parameters)
-    angles = fit.residuals.reshape(-1, 3)[:, ::-1]
+    bent = chain.poses(fit.x)
+    angles = fit.fun.reshape(-1, 3)[:, ::-1]
     covariance = curve_errors(np.hstack([np.zeros_like(angles), angles]), len(world_from_image))
     centred = RigidTransform.from_matrix(bent)
     turned = RigidTransform.from_rotation(sensor_from_start) * centred * image_from_centred.inv()
     poses = RigidTransform.from_translation(-turned[0].translation) * turned
-    sigma, values = length_sigma(poses, covariance, centre), chain.values(fit.parameters)
-    return DriftCorrection(poses, fit, values, float(used.mean()), settings, covariance, sigma)
+    sigma, values = length_sigma(poses, covariance, centre), chain.values(fit.x)
+    return DriftCorrection(poses, fit, chain.names, values, float(used.mean()), settings, covariance, sigma)
 
 
 @dataclass(frozen=True)
@@ -273,10 +278,18 @@ class _OrientationProblem:
 
 def _solve(
     problem: _CornerProblem | _OrientationProblem, chain: CorrectedChain, settings: DriftSettings
-) -> Fit:
-    start = np.zeros(len(chain.names))
-    return levenberg_marquardt(
-        problem.residuals, start, problem.jacobian, names=chain.names, tolerance=settings.tolerance
+) -> OptimizeResult:
+    start, tolerance = np.zeros(len(chain.names)), settings.tolerance
+    return least_squares(
+        problem.residuals,
+        start,
+        problem.jacobian,
+        method="lm",
+        x_scale="jac",
+        xtol=tolerance,
+        ftol=tolerance,
+        gtol=tolerance,
+        max_nfev=_MOST_EVALUATIONS,
     )
 
 

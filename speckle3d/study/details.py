@@ -7,6 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Trust
 from speckle3d.core.sweep import Sweep
@@ -101,10 +103,8 @@ def _correction_details(correction: Correction) -> dict[str, Any]:
     return {
         "curves": correction.settings.curves,
         "coverage": correction.coverage,
-        "rms": fit.rms,
-        "condition_number": fit.condition_number,
-        "evaluations": fit.evaluations,
-        "converged": fit.converged,
-        "parameters": dict(zip(fit.names, fit.parameters.tolist(), strict=True)),
-        "standard_errors": dict(zip(fit.names, fit.standard_errors.tolist(), strict=True)),
+        "rms": float(np.sqrt(np.mean(fit.fun**2))),
+        "evaluations": int(fit.nfev),
+        "converged": bool(fit.success),
+        "parameters": dict(zip(correction.names, fit.x.tolist(), strict=True)),
     }
