@@ -24,7 +24,6 @@ from unittest.mock import patch
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import bench_drift
 import numpy as np
 from cache import DEFAULT, simulated
 from scipy.spatial.transform import RigidTransform
@@ -311,9 +310,6 @@ def main() -> None:
             print(file=sys.stderr)
             report(case, results)
             every[case.name] = [vars(score) for result in results for score in result.scores]
-    if not options.case:
-        print("\ncorrections alone, on drift put on true poses (bench_drift.py):")
-        bench_drift.main()
     print(f"\n{time.perf_counter() - began:.0f} s")
     if options.json:
         options.json.write_text(json.dumps(every, indent=1), encoding="utf-8")

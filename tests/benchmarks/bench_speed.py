@@ -18,14 +18,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench_accuracy import curves_of
 from cache import DEFAULT, simulated, to_and_fro
-from speed import commands, memory, patches, sensors, simulation, studies, tracking
+from speed import commands, memory, patches, sensors, simulation, tracking
 from speed.rows import Row, print_table
 
 from speckle3d.core.threads import cores
 from speckle3d.io.curves import write_curves
 from speckle3d.simulation.settings import SimulationSettings
 
-PARTS = ("tracking", "patches", "sensors", "simulation", "commands", "studies", "memory")
+PARTS = ("tracking", "patches", "sensors", "simulation", "commands", "memory")
 SWEEP = SimulationSettings(preset="phantom", seed=2001, length_mm=7.5, frames=60)
 
 
@@ -56,7 +56,6 @@ def main() -> None:
         "sensors": lambda: sensors.rows(options.runs),
         "simulation": lambda: simulation.rows(options.runs),
         "commands": lambda: commands.rows(options.runs),
-        "studies": studies.rows,
         "memory": lambda: memory.rows(long, curves_file),
     }
     print(machine(), flush=True)

@@ -3,12 +3,10 @@
 Run: ``python tests/benchmarks/bench_surfaces.py [--first-seed N] [--count 24] [--workers 2]``.
 
 First the digital phantom at known poses: spheres and a helix, cut by formula along a curved freehand path and
-compounded in three ways. Then simulated sweeps (`corpus.py`), each reconstructed once and kept: how often two
-points picked in different frames are as far apart as claimed (68 % and 95 % of them should be), by mode; and
-the digital phantom cut at their true poses and compounded at the reconstructed ones: how often volumes of
-spheres and distances between their centres are as claimed. Rows of one sweep are wrong together, so that the
-shares say less than their number suggests; the median over sweeps of each one's own root mean square, in
-claimed deviations, stands beside them.
+compounded in three ways. Then simulated sweeps of every kind, each reconstructed once and kept: how often two
+points picked in different frames are as far apart as claimed (68 % and 95 % of them should be), by mode. Rows
+of one sweep are wrong together, so that the shares say less than their number suggests; the median over
+sweeps of each one's own root mean square, in claimed deviations, stands beside them.
 """
 
 import argparse
@@ -23,8 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 import numpy as np
-from cache import DEFAULT, key_of
-from corpus import CURVES, good_sweep
+from cache import DEFAULT, key_of, simulated
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Helix, Phantom, curved_path
@@ -34,14 +31,12 @@ from speckle3d.config import Config
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.pose_errors import Belonging
 from speckle3d.core.reconstruction import Provenance, Reconstruction
-from speckle3d.core.surface import Surface
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.corrections import correct
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.measures.measure import measured
-from speckle3d.imaging.measures.surface import measures_of, surface_of
+from speckle3d.imaging.measures.surface import surface_of
 from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import grid_around
 from speckle3d.imaging.voxels.volume import compound
@@ -49,6 +44,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
 from speckle3d.pipeline import track
+from speckle3d.simulation.settings import SimulationSettings
 from speckle3d.study.details import trust_of
 from speckle3d.study.pose_errors import posed_errors_of
 
@@ -56,8 +52,9 @@ FIRST_SEED = 41001
 MODES = ("orientation", "pose", "fused")
 _ESTIMATORS = ("matching", "motion", "correction")
 STEP_MM = 0.25
-PAIRS, LEAST_APART_MM, VOXEL_MM = 60, 1.0, 0.3
-BALL_MM, ROOM_MM = 1.2, 1.8
+PAIRS, LEAST_APART_MM = 60, 1.0
+PRESETS = ("phantom", "tissue", "reversal", "rotation")
+CURVES = Path(__file__).resolve().parents[2] / "data" / "curves.h5"
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,11 @@ def _voxel_volume(volume: Volume, ball: Ball) -> float:
 
 def reconstructed(number: int, first_seed: int, folder: Path) -> Path | None:
     """Reconstruction of a sweep in all modes it has, made once; None if it is refused."""
-    source = good_sweep(number, first_seed, folder)
+    length_mm = float(np.random.default_rng(first_seed + number).uniform(4.0, 16.0))
+    settings = SimulationSettings(
+        preset=PRESETS[number % 4], seed=first_seed + number, vectors=32, samples=1500, length_mm=length_mm
+    )
+    source = simulated(settings, folder)
     package = Path(speckle3d.__file__).parent
     files = [path for room in _ESTIMATORS for path in sorted((package / room).rglob("*.py"))]
     text = "".join(path.read_text(encoding="utf-8") for path in files if path.stem != "joint_errors")
@@ -154,7 +155,6 @@ def judged(number: int, first_seed: int, folder: Path) -> list[Found]:
     found = []
     for mode in held.poses:
         found += distances(sweep, held, mode, np.random.default_rng(number))
-        found += bodies(sweep, held, mode)
     return found
 
 
@@ -182,59 +182,6 @@ def distances(sweep: Sweep, held: Reconstruction, mode: str, rng: np.random.Gene
 
 def _at(poses, frames, points):
     return np.array([poses[int(frame)].apply(point) for frame, point in zip(frames, points, strict=True)])
-
-
-def bodies(sweep: Sweep, held: Reconstruction, mode: str) -> list[Found]:
-    """Volumes of spheres in the sweep, and distances between their middles.
-
-    Cut at the true poses and compounded at the reconstructed ones, against the same compounded at the true
-    ones: what voxels and marching cubes do to a sphere is judged at known poses.
-    """
-    image, truth, poses = sweep.grid, sweep.truth, held.poses[mode]
-    depth = min(image.depth_mm - image.first_sample_depth_mm, 8.0)
-    shallow = (image.depth_mm + image.first_sample_depth_mm - depth) / 2
-    grid = ImageGrid(int(image.width_mm / 0.15), int(depth / 0.15), 0.15, 0.15, shallow)
-    frames = _apart(truth, grid.centre_mm)
-    if len(frames) < 2:
-        return []
-    middles = [truth[frame].apply(grid.centre_mm) for frame in frames]
-    images = Phantom(tuple(Ball(tuple(middle), BALL_MM) for middle in middles), grid).images(truth)
-    errors, found = posed_errors_of(held, mode), []
-    pairs = list(zip(_balls(images, grid, poses, frames), _balls(images, grid, truth, frames), strict=True))
-    for own, true in pairs:
-        told, wanted = measures_of(own, errors, image), measures_of(true)
-        if told.volume_mm3 is not None and wanted.volume_mm3 is not None:
-            shares = (told.volume_mm3 - wanted.volume_mm3, told.volume_sigma_mm3)
-            found.append(
-                Found(sweep.name, mode, "sphere's volume, %", *(100 * v / wanted.volume_mm3 for v in shares))
-            )
-    own_mm, true_mm = (
-        np.array([each.vertices_mm.mean(axis=0) for each in side]) for side in zip(*pairs, strict=True)
-    )
-    rows = measured(own_mm, belonging_of(own_mm, image, poses), errors, 0.0)
-    for row in rows:
-        if row.kind == "distance":
-            apart = float(np.linalg.norm(np.diff(true_mm[list(row.points)], axis=0)))
-            found.append(Found(sweep.name, mode, "spheres' distance", row.value - apart, row.pose_sigma))
-    return found
-
-
-def _apart(truth, centre: np.ndarray) -> list[int]:
-    """Frames at which spheres have room, one after the other along the first pass."""
-    z = np.abs((truth[0].inv() * truth).apply(centre)[:, 2])
-    way = np.maximum.accumulate(z[: int(z.argmax()) + 1])
-    wanted = np.arange(ROOM_MM, way[-1] - ROOM_MM, 2 * BALL_MM + 0.6)
-    chosen = np.unique(np.linspace(0, len(wanted) - 1, 3).round().astype(int)) if len(wanted) else []
-    return [int(np.searchsorted(way, wanted[k])) for k in chosen]
-
-
-def _balls(images, grid: ImageGrid, poses, frames: list[int]) -> list[Surface]:
-    """The surface round the middle of each of some frames' images, in the world of `poses`."""
-    surface = surface_of(compound(images, grid, poses, VOXEL_MM, splat="linear"), LEVEL)
-    part, middles = surface.parts(), surface.vertices_mm[surface.triangles].mean(axis=1)
-    places = [poses[frame].apply(grid.centre_mm) for frame in frames]
-    nearest = [np.linalg.norm(middles - place, axis=1).argmin() for place in places]
-    return [surface.of_triangles(part == part[each]) for each in nearest]
 
 
 def report(rows: list[Found]) -> None:

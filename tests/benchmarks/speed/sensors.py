@@ -5,24 +5,61 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-from bench_calibration import LINES, differences
 from bench_image_calibration import displaced, prepared
-from bench_imu_reading import LOGS
 from calibration_examples import scan_plane
-from imu_logs import samples
+from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
+from scipy import optimize
 from vqf import VQF, offlineVQF
 
 from calibration.images.solver import calibrate_from_sweeps
 from calibration.plane import Equations, Plane, calibrate_plane, least_squares
+from calibration.points import CHAIN, columns_of
 from calibration.settings import ImageFit
 from speed.rows import Row, timed
 from xsens.fusion.methods import Method
 from xsens.fusion.orient import orient
 from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
+from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings
 
+LINES = 700
 RATE_HZ, READ_S, FILTERED_S = 256.0, 3600.0, 600.0
 PLANE_MS, IMAGES_S, READ_MB_S, READ_TIMES, FILTERED = 50.0, 3.0, 50.0, 3.0, 250e3
+
+
+def legacy(made: dict[str, np.ndarray]) -> bytes:
+    """A log of calibrated samples and quaternions in Xsens' older messages."""
+    layout = DataLayout(OutputMode.CALIBRATED | OutputMode.ORIENTATION, OutputSettings.COUNTER)
+    return configured(layout, period=450) + b"".join(legacy_messages(made, layout))
+
+
+def text(made: dict[str, np.ndarray]) -> bytes:
+    """A log as MT9's program exports it."""
+    names = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
+    rows = np.column_stack([made["time_s"], *(made[name] for name in names)]).tolist()
+    return ("\n".join("\t".join(f"{value:.6f}" for value in row) for row in rows) + "\n").encode()
+
+
+LOGS = {
+    "MT9 .bin": lambda made: mt9_bin(made, calibration()),
+    "legacy .mtb": legacy,
+    "MTData2 .mtb": lambda made: b"".join(mtdata2_messages(made, ticks=39)),
+    "MT9 text": text,
+}
+
+
+def differences(equations, start, free):
+    """Levenberg-Marquardt of SciPy with finite differences of the same small displacements."""
+    columns = columns_of(free)
+
+    def moved(x):
+        step = np.zeros(len(CHAIN))
+        step[columns] = x
+        return start.displaced(step)
+
+    return optimize.least_squares(
+        lambda x: equations.residuals(moved(x)).ravel(), np.zeros(len(free)), jac="2-point", method="lm"
+    )
 
 
 def plane(runs: int) -> list[Row]:
