@@ -91,11 +91,10 @@ def many_threads(monkeypatch):
     """Five threads, more than these machines have: slices end in other places, their order is any."""
     from speckle3d.core import threads
 
-    monkeypatch.setattr(threads, "_pool", None)
+    threads.end_threads()
     monkeypatch.setattr(threads, "cores", lambda: 5)
     yield
-    if threads._pool is not None:
-        threads._pool.shutdown()
+    threads.end_threads()
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.polygons import polygon_corners, polygon_mask
+from speckle3d.core.region import polygon_mask
 from speckle3d.core.sweep import Frames
 
 Result = TypeVar("Result")
@@ -81,7 +81,7 @@ def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
-    mask = polygon_mask(shape, polygon_corners(region_px, "region_px"))
+    mask = polygon_mask(shape, region_px, "region_px")
     if not mask.any():
         raise InvalidInputError(
             f"region_px: expected a polygon that covers part of the {shape[0]} x {shape[1]} pixels, got none"

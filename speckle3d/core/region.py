@@ -9,11 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.polygons import polygon_corners, polygon_mask
+from speckle3d.core.extras import extra_module
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import ImageGrid
 
 REGION_HELP = "'rectangle x0,y0 x1,y1', 'fan x,y angle,angle radius,radius' or 'polygon x,y x,y x,y ...'"
@@ -26,129 +28,31 @@ Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Rectangle:
-    """A rectangle with sides along the image's.
-
-    Parameters
-    ----------
-    low_mm, high_mm : tuple of float
-        Its least and its largest x and y.
-    """
-
-    low_mm: Pair
-    high_mm: Pair
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite([self.low_mm, self.high_mm]).all() and np.less(self.low_mm, self.high_mm).all()):
-            raise InvalidInputError(
-                f"rectangle: expected two finite corners, the lower values first, got {self.low_mm} and "
-                f"{self.high_mm} mm"
-            )
-
-    def mask(self, grid: ImageGrid) -> BoolArray:
-        """Which samples are inside or on a side, shape (vector, sample)."""
-        position, hair = np.stack(_positions_mm(grid), axis=-1), _hair_mm(grid)
-        low, high = np.array(self.low_mm) - hair, np.array(self.high_mm) + hair
-        return np.asarray(((position >= low) & (position <= high)).all(axis=-1))
-
-
-@dataclass(frozen=True)
-class Fan:
-    """What a curved or a phased array sees: between two angles and two radii about an apex.
-
-    Parameters
-    ----------
-    apex_mm : tuple of float
-        x and y of the point where the lines of sight meet; often above the image.
-    angles_deg : tuple of float
-        The two sides, from straight down (along y) and towards growing x; within 90 degrees.
-    radii_mm : tuple of float
-        Distances from the apex, the nearer first.
-    """
-
-    apex_mm: Pair
-    angles_deg: Pair
-    radii_mm: Pair
-
-    def __post_init__(self) -> None:
-        (left, right), (near, far) = self.angles_deg, self.radii_mm
-        if not (np.isfinite(self.apex_mm).all() and -90 <= left < right <= 90 and 0 <= near < far < np.inf):
-            raise InvalidInputError(
-                "fan: expected a finite apex, two angles of -90 to 90 degrees and two radii of zero or more, "
-                f"the smaller first, got {self.apex_mm} {self.angles_deg} {self.radii_mm}"
-            )
-
-    def mask(self, grid: ImageGrid) -> BoolArray:
-        """Which samples are inside or on a side, shape (vector, sample)."""
-        x, y = (position - apex for position, apex in zip(_positions_mm(grid), self.apex_mm, strict=True))
-        hair = _hair_mm(grid)
-        radius = np.hypot(x, y)
-        between = (radius >= self.radii_mm[0] - hair) & (radius <= self.radii_mm[1] + hair)
-        left, right = np.radians(self.angles_deg)
-        # Distances from the two sides, positive inside; each is right for all angles up to 90 degrees.
-        past_left = x * np.cos(left) - y * np.sin(left) >= -hair
-        before_right = y * np.sin(right) - x * np.cos(right) >= -hair
-        return np.asarray(between & past_left & before_right & (y >= -hair))
-
-
-@dataclass(frozen=True)
-class Polygon:
-    """Any simple polygon.
-
-    Parameters
-    ----------
-    corners_mm : tuple of tuple of float
-        x and y of three corners or more, in order.
-    """
-
-    corners_mm: tuple[Pair, ...]
-
-    def __post_init__(self) -> None:
-        polygon_corners(self.corners_mm, "polygon")
-
-    def mask(self, grid: ImageGrid) -> BoolArray:
-        """Which samples are inside or on a side, shape (vector, sample)."""
-        image_from_sample = grid.image_from_sample[:2]
-        corners = np.linalg.solve(image_from_sample[:, :2], (self.corners_mm - image_from_sample[:, 2]).T).T
-        # Rounded, so that a sample on a side counts whatever the size of a pixel.
-        return polygon_mask((grid.vectors, grid.samples), np.round(corners, 6))
-
-
-Shape = Rectangle | Fan | Polygon
-
-
-@dataclass(frozen=True)
 class Region:
-    """The part of the image that all of some shapes cover.
+    """The part of the image that all of some shapes cover, their sides included.
 
     Parameters
     ----------
-    shapes : tuple of Rectangle, Fan or Polygon
-        Without any, the region is the whole image.
+    text : str
+        Shapes joined by ' and ': see `REGION_HELP`. A fan is what a curved or a phased array sees: apex, two
+        angles of -90 to 90 degrees from straight down towards growing x, two distances from the apex.
+
+    Raises
+    ------
+    InvalidInputError
+        If the text is no region.
 
     Examples
     --------
-    >>> region = Region.from_text("rectangle 0,1 2,3") & Region((Polygon(((0, 0), (4, 0), (0, 4))),))
+    >>> region = Region("rectangle 0,1 2,3 and polygon 0,0 4,0 0,4")
     >>> region.mask(ImageGrid(4, 5, 1.0, 1.0)).astype(int).tolist()
     [[0, 1, 1, 1, 0], [0, 1, 1, 1, 0], [0, 1, 1, 0, 0], [0, 0, 0, 0, 0]]
     """
 
-    shapes: tuple[Shape, ...] = ()
+    text: str
 
-    def __and__(self, other: Region) -> Region:
-        """What both cover."""
-        return Region((*self.shapes, *other.shapes))
-
-    @classmethod
-    def from_text(cls, text: str) -> Region:
-        """Region as written on the command line: shapes (see `REGION_HELP`) joined by ' and '.
-
-        Raises
-        ------
-        InvalidInputError
-            If the text is no region.
-        """
-        return cls(tuple(_shape(part, text) for part in text.split(" and ")))
+    def __post_init__(self) -> None:
+        self._inside(ImageGrid(1, 1, 1.0, 1.0))
 
     def mask(self, grid: ImageGrid) -> BoolArray:
         """Which samples count, shape (vector, sample).
@@ -158,9 +62,7 @@ class Region:
         InvalidInputError
             If none does.
         """
-        inside = np.ones((grid.vectors, grid.samples), dtype=bool)
-        for shape in self.shapes:
-            inside &= shape.mask(grid)
+        inside = self._inside(grid)
         if not inside.any():
             raise InvalidInputError(
                 "region: expected samples of the image inside, which is x 0 to "
@@ -185,38 +87,95 @@ class Region:
         within = replace(grid, vectors=sides[0], samples=sides[1])
         return within, world_from_image * RigidTransform.from_translation(moved_mm)
 
+    def _inside(self, grid: ImageGrid) -> BoolArray:
+        inside = np.ones((grid.vectors, grid.samples), dtype=bool)
+        for part in self.text.split(" and "):
+            kind, *words = part.split() or [""]
+            try:
+                corners = [(float(x), float(y)) for x, y in (word.split(",") for word in words)]
+                inside &= _SHAPES[kind](grid, *corners)
+            except InvalidInputError:
+                raise
+            except (KeyError, TypeError, ValueError):
+                raise InvalidInputError(
+                    f"region: expected {REGION_HELP}, joined by ' and ', got {self.text!r}"
+                ) from None
+        return inside
 
-def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray]:
-    """Where the samples lie: x and y, each of shape (vector, sample)."""
+
+def polygon_mask(shape: tuple[int, ...], corners: npt.ArrayLike, name: str = "polygon") -> BoolArray:
+    """Which pixels of an image are in a polygon, its sides included.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Columns and rows of the image.
+    corners : array_like, shape (k, 2)
+        Three or more corners (column, row) of any simple polygon; pixel centres are whole numbers.
+    name : str
+        Of the corners, for the errors.
+
+    Returns
+    -------
+    ndarray of bool, shape (columns, rows)
+
+    Raises
+    ------
+    InvalidInputError
+        If corners are too few, or not all finite.
+    """
+    outline = np.asarray(corners, dtype=float)
+    if outline.ndim != 2 or outline.shape[0] < 3 or outline.shape[1] != 2:
+        raise InvalidInputError(f"{name}: expected shape (k, 2) with k of 3 or more, got {outline.shape}")
+    require_finite(outline, name)
+    draw = extra_module("skimage.draw", "calibrate", "a region")
+    return np.asarray(draw.polygon2mask(shape, outline), dtype=bool)
+
+
+def _rectangle(grid: ImageGrid, low: Pair, high: Pair) -> BoolArray:
+    if not (np.isfinite([low, high]).all() and np.less(low, high).all()):
+        raise InvalidInputError(
+            f"rectangle: expected two finite corners, the lower values first, got {low} and {high} mm"
+        )
+    x, y, hair = _positions_mm(grid)
+    across = (x >= low[0] - hair) & (x <= high[0] + hair)
+    return np.asarray(across & (y >= low[1] - hair) & (y <= high[1] + hair))
+
+
+def _fan(grid: ImageGrid, apex: Pair, angles_deg: Pair, radii: Pair) -> BoolArray:
+    (left, right), (near, far) = angles_deg, radii
+    if not (np.isfinite(apex).all() and -90 <= left < right <= 90 and 0 <= near < far < np.inf):
+        raise InvalidInputError(
+            "fan: expected a finite apex, two angles of -90 to 90 degrees and two radii of zero or more, "
+            f"the smaller first, got {apex} {angles_deg} {radii}"
+        )
+    x, y, hair = _positions_mm(grid)
+    x, y = x - apex[0], y - apex[1]
+    radius = np.hypot(x, y)
+    left, right = np.radians(angles_deg)
+    # Distances from the two sides, positive inside; each is right for all angles up to 90 degrees.
+    between = (x * np.cos(left) - y * np.sin(left) >= -hair) & (
+        y * np.sin(right) - x * np.cos(right) >= -hair
+    )
+    return np.asarray(between & (radius >= near - hair) & (radius <= far + hair) & (y >= -hair))
+
+
+def _polygon(grid: ImageGrid, *corners: Pair) -> BoolArray:
+    image_from_sample = grid.image_from_sample[:2]
+    offset = np.reshape(corners, (-1, 2)) - image_from_sample[:, 2]
+    # Rounded, so that a sample on a side counts whatever the size of a pixel.
+    outline = np.round(np.linalg.solve(image_from_sample[:, :2], offset.T).T, 6)
+    return polygon_mask((grid.vectors, grid.samples), outline)
+
+
+_SHAPES: dict[str, Callable[..., BoolArray]] = {"rectangle": _rectangle, "fan": _fan, "polygon": _polygon}
+
+
+def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray, float]:
+    """Where the samples lie, x and y of shape (vector, sample), and the rounding of such places."""
     sample = np.arange(float(grid.samples))
     x, y = (
         along * np.arange(float(grid.vectors))[:, None] + (down * sample + first)
         for along, down, first in grid.image_from_sample[:2].tolist()
     )
-    return x, y
-
-
-def _hair_mm(grid: ImageGrid) -> float:
-    return _HAIR * min(grid.vector_pitch_mm, grid.sample_spacing_mm)
-
-
-def _shape(part: str, text: str) -> Shape:
-    kind, *words = part.split() or [""]
-    try:
-        return _MAKERS[kind](*map(_pair, words))
-    except InvalidInputError:
-        raise
-    except (KeyError, TypeError, ValueError):
-        raise InvalidInputError(f"region: expected {REGION_HELP}, joined by ' and ', got {text!r}") from None
-
-
-_MAKERS: dict[str, Callable[..., Shape]] = {
-    "rectangle": Rectangle,
-    "fan": Fan,
-    "polygon": lambda *corners: Polygon(corners),
-}
-
-
-def _pair(word: str) -> Pair:
-    first, second = word.split(",")
-    return float(first), float(second)
+    return x, y, _HAIR * min(grid.vector_pitch_mm, grid.sample_spacing_mm)

@@ -5,15 +5,14 @@ Results do not depend on how many threads there are: each item is worked on alon
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
-from functools import partial
-from typing import Generic, TypeVar
+from functools import cache, partial
+from typing import TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -22,7 +21,6 @@ _SLICES_PER_CORE = 4
 """So that a core that has done its own share takes from another's."""
 _LIMITS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 _ALONE: ContextVar[bool] = ContextVar("alone", default=False)
-_pool: ThreadPoolExecutor | None = None
 
 
 @contextmanager
@@ -50,12 +48,10 @@ def cores() -> int:
     return max(1, min([allowed, *(int(value) for value in told if value.isascii() and value.isdecimal())]))
 
 
-def _others() -> ThreadPoolExecutor:
-    """Return the threads that all of the process shares: fewer by one than cores: callers work, too."""
-    global _pool
-    if _pool is None:
-        _pool = ThreadPoolExecutor(max(1, cores() - 1), "speckle3d")
-    return _pool
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """Return the threads that all of the process shares."""
+    return ThreadPoolExecutor(cores(), "speckle3d")
 
 
 def end_threads() -> None:
@@ -63,17 +59,17 @@ def end_threads() -> None:
 
     One whose start was interrupted is not known to the interpreter, whose end would wait for it for good.
     """
-    if _pool is not None:
-        _pool.shutdown(wait=False, cancel_futures=True)
-        _forget()
+    _pool().shutdown(wait=False, cancel_futures=True)
+    _pool.cache_clear()
 
 
-def _submitted(work: Callable[[], Result]) -> Future[Result] | None:
-    """Give work to another thread; None while the interpreter ends, when there are none."""
-    try:
-        return _others().submit(work)
-    except RuntimeError:
-        return None
+if hasattr(os, "register_at_fork"):
+    # Threads do not live on in a forked process.
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def _submitted(work: Callable[[], Result]) -> Future[Result]:
+    return _pool().submit(copy_context().run, work)
 
 
 def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1) -> None:
@@ -96,23 +92,20 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
             function(0, count)
         return
     size = max(grain, -(-count // (_SLICES_PER_CORE * threads)))
-    starts = itertools.count(0, size)
-
-    failed: list[bool] = []
+    # An iterator gives each start once, whichever thread asks.
+    starts = iter(range(0, count, size))
 
     def work() -> None:
-        # The counter gives each start once, whichever thread asks.
-        for first in iter(starts.__next__, None):
-            if first >= count or failed:
-                return
-            function(first, min(first + size, count))
+        try:
+            for first in starts:
+                function(first, min(first + size, count))
+        finally:
+            # After an error no thread begins another slice.
+            deque(starts, maxlen=0)
 
-    others = [other for _ in range(threads - 1) if (other := _submitted(partial(copy_context().run, work)))]
+    others = [_submitted(work) for _ in range(threads - 1)]
     try:
         work()
-    except BaseException:
-        failed.append(True)
-        raise
     finally:
         begun = [other for other in others if not other.cancel()]
         wait(begun)
@@ -123,56 +116,25 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
 def ahead(function: Callable[[Item], Result], items: Iterable[Item], most: int = 3) -> Generator[Result]:
     """Yield what a function makes of items, in order, `most` of them worked out before they are asked for.
 
-    Other threads work ahead; this one helps while it would have to wait. On one core nothing is done ahead.
+    Other threads work ahead; what none has begun when it is asked for is made on this one, so that calls may
+    be nested. On one core nothing is done ahead.
     """
     if cores() == 1:
         yield from map(function, items)
         return
-    waiting: deque[_Ahead[Item, Result]] = deque()
+    waiting: deque[tuple[Future[Result], Callable[[], Result]]] = deque()
+
+    def first_result() -> Result:
+        future, work = waiting.popleft()
+        return work() if future.cancel() else future.result()
+
     try:
         for item in items:
-            waiting.append(_Ahead(function, item))
+            work = partial(function, item)
+            waiting.append((_submitted(work), work))
             if len(waiting) > most:
-                yield _first_of(waiting)
+                yield first_result()
         while waiting:
-            yield _first_of(waiting)
+            yield first_result()
     finally:
-        wait([each.future for each in waiting if not each.future.cancel()])
-
-
-class _Ahead(Generic[Item, Result]):
-    """The result for one item, which whoever comes first makes."""
-
-    def __init__(self, function: Callable[[Item], Result], item: Item) -> None:
-        self._function, self._item = function, item
-        work = partial(copy_context().run, function, item)
-        self.future: Future[Result] = _submitted(work) or Future()
-
-    def begin_here(self) -> bool:
-        """Make the result on this thread, unless it is made or being made."""
-        if not self.future.cancel():
-            return False
-        self.future = Future()
-        try:
-            self.future.set_result(self._function(self._item))
-        except Exception as error:  # noqa: BLE001 (raised when its turn comes; Ctrl-C at once)
-            self.future.set_exception(error)
-        return True
-
-
-def _first_of(waiting: deque[_Ahead[Item, Result]]) -> Result:
-    first = waiting.popleft()
-    first.begin_here()
-    while not first.future.done() and any(each.begin_here() for each in waiting):
-        pass
-    return first.future.result()
-
-
-def _forget() -> None:
-    """Threads do not live on in a forked process."""
-    global _pool
-    _pool = None
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget)
+        wait([future for future, _ in waiting if not future.cancel()])

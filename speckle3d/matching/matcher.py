@@ -88,7 +88,7 @@ class FrameMatcher:
         self.laid = lay_patches(self.grid, patches)
         self.patches = self.laid
         self.inplane = inplane
-        self._mask = Region.from_text(patches.region).mask(self.grid) if patches.region else None
+        self._mask = Region(patches.region).mask(self.grid) if patches.region else None
         self._coarse = CoarseMatcher(self.grid, inplane.search_mm)
         rf = sweep.signal if isinstance(sweep.signal, RFSettings) else None
         self.of_echo = rf is not None and (matching or MatchingSettings()).correlate == "echo"

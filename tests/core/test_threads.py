@@ -57,12 +57,17 @@ def test_calls_may_be_nested_deeper_than_there_are_threads():
 
 def test_workers_of_a_cluster_and_the_environment_limit_the_threads(monkeypatch):
     monkeypatch.undo()
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1,4")
     assert cores() == 1
     monkeypatch.delenv("OMP_NUM_THREADS")
     with on_one_thread():
         assert cores() == 1
     assert cores() >= 1
+
+
+def test_work_ahead_may_be_nested():
+    nested = ahead(lambda i: sum(ahead(lambda j: i * j, range(20))), range(20))
+    assert sum(nested) == 190**2
 
 
 def test_results_made_ahead_come_in_order_and_not_too_many_of_them():
@@ -94,20 +99,6 @@ def test_work_ahead_stops_where_no_more_is_asked_for():
     assert len(made) <= 4
 
 
-def test_ctrl_c_is_not_kept_for_later():
-    hold = threading.Event()
-
-    def work(item):
-        if threading.current_thread() is threading.main_thread():
-            raise KeyboardInterrupt
-        hold.wait(0.2)
-
-    results = ahead(work, range(8), most=4)
-    with pytest.raises(KeyboardInterrupt):
-        list(results)
-    hold.set()
-
-
 def test_no_more_is_begun_after_an_error():
     begun = []
 
@@ -118,31 +109,6 @@ def test_no_more_is_begun_after_an_error():
     with pytest.raises(ZeroDivisionError):
         in_parallel(bad, 1000)
     assert len(begun) <= 4
-
-
-@pytest.mark.parametrize(("told", "least"), [("1", 1), ("1,4", 1), (" 1 ", 1)])
-def test_limits_are_read_as_openmp_writes_them(told, least, monkeypatch):
-    monkeypatch.undo()
-    monkeypatch.setenv("OMP_NUM_THREADS", told)
-    assert cores() == least
-
-
-@pytest.mark.parametrize("told", ["\u00b2", "", "many", "0"])
-def test_what_is_no_number_of_threads_limits_nothing_or_all(told, monkeypatch):
-    monkeypatch.undo()
-    monkeypatch.setenv("OMP_NUM_THREADS", told)
-    assert cores() >= 1
-
-
-def test_work_is_done_here_while_the_interpreter_ends(monkeypatch):
-    def refuses(*_):
-        raise RuntimeError("cannot schedule new futures after shutdown")
-
-    monkeypatch.setattr(threads, "_others", refuses)
-    done = []
-    in_parallel(lambda first, stop: done.append((first, stop)), 8)
-    assert sum(stop - first for first, stop in done) == 8
-    assert list(ahead(str, range(3))) == ["0", "1", "2"]
 
 
 INTERRUPTED = """

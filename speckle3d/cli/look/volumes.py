@@ -177,7 +177,7 @@ def volume(
         out,
         checked,
         GridRequest(axes, spacing_mm, origin_mm, shape, size_mm, within_gb, like),
-        None if region is None else Region.from_text(region),
+        None if region is None else Region(region),
         state,
         deviation,
     )

@@ -37,7 +37,7 @@ def test_matches_brute_force(seed, spacing, reach_mm):
     there, back = shaken(rng, 3, 0.9), shaken(rng, 3, 0.9) * turned
     poses, images = RigidTransform.concatenate([there, back]), rng.normal(size=(6, 9, 14)).astype(np.float32)
     images[2, 3:5] = np.nan
-    region = Region.from_text("rectangle 0.4,0 9,4").mask(GRID)
+    region = Region("rectangle 0.4,0 9,4").mask(GRID)
     grid = grid_around(GRID, poses, spacing, Rotation.from_rotvec(rng.normal(0.0, 0.5, 3)))
     voxels, state = look_up_voxels(PosedImages(images, GRID, poses), grid, reach_mm, region)
     points = grid.world_from_grid.apply(np.indices(grid.shape).reshape(3, -1).T * grid.spacing_mm)

@@ -160,5 +160,5 @@ def region_of(clip, grid):
     outline += [(clip.fan[0], forked[-1] + 0.5), *((spans[r, 1, 0] - 0.5, r) for r in forked[::-1])]
     placed = np.asarray(outline, float) @ grid.image_from_sample[:2, :2].T + grid.image_from_sample[:2, 2]
     text = "polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in placed)
-    np.testing.assert_array_equal(Region.from_text(text).mask(grid), clip.mask(WIDTH, HEIGHT).T)
+    np.testing.assert_array_equal(Region(text).mask(grid), clip.mask(WIDTH, HEIGHT).T)
     return text

@@ -153,7 +153,7 @@ def test_the_clip_of_volumes_is_that_of_plus(tmp_path):
     for text, angles in (("", None), (fan, (380, 20, 120, 360, -45, 45))):
         device = read_device_set(written(tmp_path / "set.xml", scan=clip.format(text)))
         expected = Clip((192, 612), (16, 596), angles).mask(820, 616).T
-        mask = Region.from_text(device.clip.region_text(grid)).mask(grid)
+        mask = Region(device.clip.region_text(grid)).mask(grid)
         assert (mask != expected).mean() < (0.0003 if angles else 1e-9)
     whole = '<VolumeReconstruction ClipRectangleOrigin="0 0" ClipRectangleSize="820 616"/>'
     assert read_device_set(written(tmp_path / "set.xml", scan=whole)).clip.region_text(grid) is None

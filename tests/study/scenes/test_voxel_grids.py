@@ -36,7 +36,7 @@ def test_spacing_origin_and_shape_are_in_the_file_to_the_last_bit(posed, tmp_pat
 
 @pytest.mark.parametrize("settings", [COARSE, CompoundingSettings(voxel_mm=1.0, backward_mm=1.0)])
 def test_a_region_bounds_the_grid_and_what_is_in_it(posed, tmp_path, settings):
-    region = Region.from_text("rectangle 3,10 9,20")
+    region = Region("rectangle 3,10 9,20")
     image = written(posed, tmp_path / "v.nrrd", region=region, settings=settings)
     # Images are nearly parallel: the region's 6 x 10 mm, and a voxel or two more that their tilt takes.
     assert image.GetSize()[0] in (7, 8, 9)
