@@ -22,8 +22,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.handover.plots import plot_poses
-from speckle3d.core.handover.tables import poses_array, poses_table
+from speckle3d.core.pose_table import plot_poses, pose_columns, pose_table
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
@@ -132,12 +131,9 @@ class Tracked:
         return plot_poses(poses, self._centre_mm, self.covariance)
 
     def to_dataframe(self) -> Any:
-        """Poses in mode `image` as a `pandas.DataFrame`, a row for each frame; see `poses_table`."""
-        return poses_table(self.image, self._centre_mm, self.frame_time_s, self.covariance, self.flags)
-
-    def to_xarray(self) -> Any:
-        """Poses in mode `image` as an `xarray.DataArray` of rigid matrices, mm."""
-        return poses_array(self.image, self.frame_time_s)
+        """Poses in mode `image` as a `pandas.DataFrame`, a row for each frame; see `pose_columns`."""
+        columns = pose_columns(self.image, self._centre_mm, self.covariance)
+        return pose_table({"time_s": self.frame_time_s, **columns, "flags": self.flags})
 
     @property
     def _centre_mm(self) -> FloatArray:

@@ -174,16 +174,6 @@ class Calibration:
             )
         return RigidTransform.from_components(self.translation_mm, self.rotation)
 
-    def pixel_matrix(self) -> FloatArray:
-        """Affine matrix from pixels (column, row, slice, 1) to the sensor's frame in mm, shape (4, 4).
-
-        The form that PLUS and 3D Slicer call ``ImageToProbe``; a slice is as thick as the average pixel.
-        """
-        if self.pixel_mm is None:
-            raise InsufficientDataError("expected a calibration with a pixel size, got one without")
-        scale = np.diag([*self.pixel_mm, float(self.pixel_mm.mean()), 1.0])
-        return np.asarray(self.sensor_from_image.as_matrix() @ scale)
-
 
 def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     """Put a calibration on a sweep's sensor, in place of what the sweep says of it.
@@ -241,15 +231,11 @@ def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
 
 def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, float]:
     """Return how far a calibration's mounting is from the sweep's own, in degrees and mm; zero if unknown."""
-    if calibration.sensor == "orientation":
-        turn = None if sweep.orientation is None else sweep.orientation.sensor_from_image
-        return (0.0 if turn is None else _apart_deg(turn, calibration.rotation)), 0.0
-    held = None if sweep.tracker is None else sweep.tracker.sensor_from_image
+    sensor = sweep.tracker if calibration.sensor == "tracker" else sweep.orientation
+    held = None if sensor is None else sensor.sensor_from_image
     if held is None:
         return 0.0, 0.0
+    if isinstance(held, Rotation):
+        return float(np.rad2deg((held.inv() * calibration.rotation).magnitude())), 0.0
     step = held.inv() * calibration.sensor_from_image
-    return _apart_deg(held.rotation, calibration.rotation), float(np.linalg.norm(step.translation))
-
-
-def _apart_deg(one: Rotation, other: Rotation) -> float:
-    return float(np.rad2deg((one.inv() * other).magnitude()))
+    return float(np.rad2deg(step.rotation.magnitude())), float(np.linalg.norm(step.translation))

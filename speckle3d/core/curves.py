@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 
@@ -73,8 +73,16 @@ class CurveKey:
                 raise MismatchError(f"{what}: {name} is {mine} and {theirs}{advice}")
 
 
+class _ByDepth:
+    """Fields that are numbers by depth."""
+
+    def at(self, depth_mm: FloatArray, known_mm: FloatArray) -> Self:
+        """The same at other depths than those known, by linear interpolation."""
+        return type(self)(*(np.interp(depth_mm, known_mm, values) for values in vars(self).values()))
+
+
 @dataclass(frozen=True)
-class TiltResponse:
+class TiltResponse(_ByDepth):
     """Effect of tilt, by depth, on the correlation.
 
     Speckle that is tilted by theta while its patch moves by z decorrelates as if it had moved by d, with
@@ -89,15 +97,9 @@ class TiltResponse:
     pivot_mm: FloatArray
     spread_mm: FloatArray
 
-    def at(self, depth_mm: FloatArray, known_mm: FloatArray) -> TiltResponse:
-        """Response at other depths than those known, by linear interpolation."""
-        return TiltResponse(
-            np.interp(depth_mm, known_mm, self.pivot_mm), np.interp(depth_mm, known_mm, self.spread_mm)
-        )
-
 
 @dataclass(frozen=True)
-class SpeckleSize:
+class SpeckleSize(_ByDepth):
     """Width of speckle in the image, by depth, as a probe and its settings make it.
 
     Attributes
@@ -108,12 +110,6 @@ class SpeckleSize:
 
     lateral_mm: FloatArray
     axial_mm: FloatArray
-
-    def at(self, depth_mm: FloatArray, known_mm: FloatArray) -> SpeckleSize:
-        """Sizes at other depths than those known, by linear interpolation."""
-        return SpeckleSize(
-            np.interp(depth_mm, known_mm, self.lateral_mm), np.interp(depth_mm, known_mm, self.axial_mm)
-        )
 
 
 @dataclass(frozen=True)
@@ -177,13 +173,10 @@ class NominalProbe:
     attenuation_db_cm_mhz: float
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0) or (
-                value == 0 and name in ("aperture_mm", "focus_mm")
-            ):
-                raise InvalidInputError(f"{name}: expected a number above zero, got {value}")
-        if not 0 < self.low_hz < self.high_hz:
-            raise InvalidInputError(f"low_hz: expected 0 < low < high, got {self.low_hz} and {self.high_hz}")
+        above_zero = self.aperture_mm > 0 and self.focus_mm > 0 and 0 < self.low_hz < self.high_hz
+        numbers = np.array([*vars(self).values()])
+        if not (above_zero and np.isfinite(numbers).all() and (numbers >= 0).all()):
+            raise InvalidInputError(f"probe: expected aperture, focus and 0 < low < high, got {vars(self)}")
 
 
 @shown
@@ -246,16 +239,12 @@ class DecorrelationCurves:
         steps = np.diff(self.distance_mm)
         if not steps.size or self.distance_mm[0] != 0 or not steps[0] > 0 or not np.allclose(steps, steps[0]):
             raise InvalidInputError("distance_mm: expected equal steps from zero, got others")
-        if self.cells.shape != self.depth_mm.shape or not (np.isfinite(self.cells) & (self.cells > 0)).all():
-            raise InvalidInputError("cells: expected a number above zero for each depth, got others")
-        for part in (self.tilt, self.speckle):
-            for name, values in vars(part).items() if part is not None else ():
-                if values.shape != self.depth_mm.shape or not np.isfinite(values).all():
-                    raise InvalidInputError(f"{name}: expected a finite number for each depth, got others")
-        sizes = vars(self.speckle).items() if self.speckle is not None else ()
-        for name, values in sizes:
-            if (values <= 0).any():
-                raise InvalidInputError(f"{name}: expected speckle sizes above zero, got others")
+        sizes = {"cells": self.cells, **(vars(self.speckle) if self.speckle else {})}
+        for name, values in (sizes | (vars(self.tilt) if self.tilt else {})).items():
+            usable = values.shape == self.depth_mm.shape and np.isfinite(values).all()
+            if not usable or (name in sizes and (values <= 0).any()):
+                least = " above zero" if name in sizes else ""
+                raise InvalidInputError(f"{name}: expected a number{least} for each depth, got others")
         if not ((self.correlation > 0) & (self.correlation <= 1)).all():
             raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
         if (np.diff(self.correlation, axis=1) > 0).any():
@@ -267,19 +256,13 @@ class DecorrelationCurves:
         """Curves at other depths, shape (p,), by linear interpolation of sqrt(-ln rho)."""
         roots = np.sqrt(-np.log(self.correlation))
         columns = [np.interp(depth_mm, self.depth_mm, column) for column in roots.T]
-        return DecorrelationCurves(
-            self.key,
-            np.asarray(depth_mm),
-            self.distance_mm,
-            np.exp(-(np.stack(columns, axis=1) ** 2)),
-            np.interp(depth_mm, self.depth_mm, self.cells),
-            self.pairs_used,
-            None if self.tilt is None else self.tilt.at(np.asarray(depth_mm), self.depth_mm),
-            None if self.speckle is None else self.speckle.at(np.asarray(depth_mm), self.depth_mm),
-            self.scale_sigma,
-            self.origin,
-            self.nominal,
-            self.spectrum,
+        return replace(
+            self,
+            depth_mm=np.asarray(depth_mm),
+            correlation=np.exp(-(np.stack(columns, axis=1) ** 2)),
+            cells=np.interp(depth_mm, self.depth_mm, self.cells),
+            tilt=self.tilt and self.tilt.at(depth_mm, self.depth_mm),
+            speckle=self.speckle and self.speckle.at(depth_mm, self.depth_mm),
         )
 
     def mismatch(self, same_probe: bool, attenuation_sigma: float = ATTENUATION_SIGMA) -> float:

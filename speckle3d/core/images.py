@@ -12,13 +12,6 @@ from speckle3d.core.errors import InvalidInputError
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Of red, green and blue: ITU-R BT.601."""
 
-_HELP = {
-    "pitch_mm": "distance between columns and between rows, from the scanner's depth ruler",
-    "frame_rate_hz": "frames per second, on the scanner's screen, or frame_time_s",
-    "dynamic_range_db": "decibels from black to white, beside the image on the scanner's screen",
-    "signal": "an RFSettings that says how the echoes were sampled",
-}
-
 
 class Images(Protocol):
     """Images in memory or in files: shape (n, row, column), with an axis of 3 or 4 colours more or not."""
@@ -73,12 +66,3 @@ class ImageFrames:
         if image.ndim == 3:
             image = np.rint(image[..., :3] @ _LUMINANCE).astype(np.uint8)
         return np.ascontiguousarray(image.T, self.dtype)
-
-
-def require_all(**values: object) -> None:
-    """Raise `InvalidInputError` that asks by name for all values that are None."""
-    missing = [f"{name} ({_HELP[name]})" for name, value in values.items() if value is None]
-    if missing:
-        raise InvalidInputError(
-            f"arrays do not say, so give {', '.join(missing)}: see docs/howto/pictures.md"
-        )

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.sparse import csr_array
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
-
-COMPONENTS = 6
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class PoseErrors:
 
     def __post_init__(self) -> None:
         shape = self.factors.shape
-        if len(shape) != 3 or shape[2] != COMPONENTS or not np.isfinite(self.factors).all():
+        if len(shape) != 3 or shape[2] != 6 or not np.isfinite(self.factors).all():
             raise InvalidInputError(f"factors: expected finite values of shape (m, n, 6), got shape {shape}")
 
     def __len__(self) -> int:
@@ -48,15 +47,6 @@ class PoseErrors:
     def covariance(self) -> FloatArray:
         """Covariance of each frame's pose, shape (n, 6, 6)."""
         return np.asarray(np.einsum("mia,mib->iab", self.factors, self.factors))
-
-    def between(self, first: int, second: int) -> FloatArray:
-        """Covariance of two frames' errors with each other, shape (6, 6)."""
-        return np.asarray(self.factors[:, first].T @ self.factors[:, second])
-
-    def require_of(self, world_from_image: RigidTransform) -> None:
-        """Raise `MismatchError` unless there are as many poses as frames here."""
-        if len(world_from_image) != len(self):
-            raise MismatchError(f"expected {len(self)} poses, as their errors, got {len(world_from_image)}")
 
 
 @dataclass(frozen=True)
@@ -99,77 +89,46 @@ class PosedErrors:
     centre_mm: FloatArray
 
     def __post_init__(self) -> None:
-        self.errors.require_of(self.world_from_image)
-
-    @property
-    def variables(self) -> int:
-        """How many independent variables the errors are made of."""
-        return int(self.errors.factors.shape[0])
-
-    def displacements(self, points_mm: FloatArray, belonging: Belonging) -> FloatArray:
-        """Displacements of points for one deviation of each variable, in the world, shape (m, k, 3), mm."""
-        along = self._axes().inv()
-        centres = along.apply(self.world_from_image.apply(self.centre_mm))
-        points = along.apply(points_mm)
-        moved = np.zeros((self.variables, *points.shape))
-        for side in range(belonging.frames.shape[1]):
-            frames, weight = belonging.frames[:, side], belonging.weights[:, side, None]
-            error = self.errors.factors[:, frames]
-            moved += weight * (error[:, :, :3] + np.cross(error[:, :, 3:], points - centres[frames]))
-        return np.asarray(moved @ self._axes().as_matrix().T)
+        if len(self.world_from_image) != len(self.errors):
+            raise MismatchError(
+                f"expected {len(self.errors)} poses, as their errors, got {len(self.world_from_image)}"
+            )
 
     def variance(self, points_mm: FloatArray, directions: FloatArray, belonging: Belonging) -> FloatArray:
-        """Variance of points' places along directions, shape (k,), mm2; frames of a pair must be neighbours.
-
-        The same as by `displacements`, from covariances of frames and of neighbours: for many points.
+        """Variance of points' places along directions, shape (k,), mm2.
 
         Parameters
         ----------
         points_mm, directions : ndarray, shape (k, 3)
             In the world; directions of length one.
         """
-        factors = self.errors.factors
-        along = self._axes().inv()
-        centres = along.apply(self.world_from_image.apply(self.centre_mm))
-        points, towards = along.apply(points_mm), along.apply(directions)
-        arms = [
-            weight[:, None] * np.concatenate([towards, np.cross(points - centres[frame], towards)], axis=1)
-            for frame, weight in zip(belonging.frames.T, belonging.weights.T, strict=True)
-        ]
-        own, next_ = self.errors.covariance(), np.einsum("mia,mib->iab", factors[:, :-1], factors[:, 1:])
-        total = sum(
-            np.einsum("ka,kab,kb->k", arm, own[frame], arm, optimize=True)
-            for arm, frame in zip(arms, belonging.frames.T, strict=True)
-        )
-        first, second = belonging.frames.T
-        forward = second > first
-        pair = (
-            next_[np.clip(np.minimum(first, second), 0, max(len(next_) - 1, 0))] if len(next_) else own[first]
-        )
-        pair = np.where(forward[:, None, None], pair, pair.transpose(0, 2, 1))
-        return np.asarray(total + 2.0 * np.einsum("ka,kab,kb->k", arms[0], pair, arms[1], optimize=True))
+        moved = self._wrenches(points_mm, directions, belonging) @ self._factors.T
+        return np.asarray((moved**2).sum(axis=1))
 
     def of_gradient(self, points_mm: FloatArray, gradient: FloatArray, belonging: Belonging) -> FloatArray:
         """What a quantity changes by for one deviation of each variable, shape (m,).
-
-        Forces on a rigid body add up to one force and one torque: of a million points, n frames are left.
 
         Parameters
         ----------
         points_mm, gradient : ndarray, shape (k, 3)
             Points in the world, and the quantity's derivative with respect to each.
         """
-        along = self._axes().inv()
-        centres = along.apply(self.world_from_image.apply(self.centre_mm))
-        points, pull = along.apply(points_mm), along.apply(gradient)
-        total = np.zeros((len(self.errors), COMPONENTS))
-        for side in range(belonging.frames.shape[1]):
-            frames, force = belonging.frames[:, side], belonging.weights[:, side, None] * pull
-            both = np.concatenate([force, np.cross(points - centres[frames], force)], axis=1)
-            for component in range(COMPONENTS):
-                total[:, component] += np.bincount(frames, both[:, component], len(total))
-        return np.asarray(np.einsum("mia,ia->m", self.errors.factors, total))
+        return np.asarray(self._factors @ self._wrenches(points_mm, gradient, belonging).sum(axis=0))
 
-    def _axes(self) -> Rotation:
-        """The first frame's axes in the world."""
-        return self.world_from_image[0].rotation
+    @property
+    def _factors(self) -> FloatArray:
+        return self.errors.factors.reshape(len(self.errors.factors), -1)
+
+    def _wrenches(self, points_mm: FloatArray, forces: FloatArray, belonging: Belonging) -> csr_array:
+        """Force and torque that a force on each point exerts on each frame's pose, shape (k, 6 n).
+
+        What the poses' errors displace a point by along the force is their product with this.
+        """
+        along = self.world_from_image[0].rotation.inv()
+        centres = along.apply(self.world_from_image.apply(self.centre_mm))
+        arms = along.apply(points_mm)[:, None] - centres[belonging.frames]
+        pull = belonging.weights[..., None] * along.apply(forces)[:, None]
+        wrenches = np.concatenate([pull, np.cross(arms, pull)], axis=-1)
+        columns = 6 * belonging.frames[..., None] + np.arange(6)
+        rows = np.arange(len(arms) + 1) * wrenches[:1].size
+        return csr_array((wrenches.ravel(), columns.ravel(), rows), (len(arms), 6 * len(self.errors)))

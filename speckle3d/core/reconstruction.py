@@ -11,9 +11,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.handover.plots import plot_poses
-from speckle3d.core.handover.tables import poses_array, poses_table
-from speckle3d.core.handover.viewers import frames_for_pyvista
+from speckle3d.core.extras import extra_module
+from speckle3d.core.pose_table import plot_poses, pose_columns, pose_table
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid
 
@@ -218,22 +217,20 @@ class Reconstruction:
         return plot_poses(self.poses, self.grid.centre_mm, covariance)
 
     def to_dataframe(self, mode: str = "image") -> Any:
-        """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `poses_table`."""
-        trust = self.trust
-        held = None if trust is None else trust.modes.get(mode)
-        covariance = held.covariance if held is not None else None
-        if mode == "image" and trust is not None:
-            covariance = trust.covariance
+        """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `pose_columns`."""
+        poses, trust = self._of(mode), self.trust
+        errors = None if trust is None else trust if mode == "image" else trust.modes.get(mode)
+        columns = pose_columns(poses, self.grid.centre_mm, None if errors is None else errors.covariance)
         flags = None if trust is None else trust.flags
-        return poses_table(self._of(mode), self.grid.centre_mm, self.frame_time_s, covariance, flags)
-
-    def to_xarray(self, mode: str = "image") -> Any:
-        """Poses of a mode as an `xarray.DataArray` of rigid matrices, mm."""
-        return poses_array(self._of(mode), self.frame_time_s)
+        return pose_table({"time_s": self.frame_time_s, **columns, "flags": flags})
 
     def to_pyvista(self, mode: str = "image") -> Any:
         """Outlines of the frames at the poses of a mode as a `pyvista.PolyData`, mm (extra ``pyvista``)."""
-        return frames_for_pyvista(self._of(mode), self.grid)
+        pyvista = extra_module("pyvista", "pyvista", "a mesh of pyvista")
+        poses = self._of(mode)
+        corners = np.concatenate([pose.apply(self.grid.corners_mm) for pose in poses])
+        faces = np.insert(np.arange(4 * len(poses)).reshape(-1, 4), 0, 4, axis=1)
+        return pyvista.PolyData(corners, faces=faces.ravel())
 
     def _of(self, mode: str) -> RigidTransform:
         if mode not in self.poses:
@@ -265,9 +262,6 @@ class Reconstruction:
                 )
         if self.trust is not None:
             n = self.frame_time_s.size
-            held = {"covariance": self.trust.covariance, "flags": self.trust.flags}
-            held |= {f"covariance of mode {mode}": each.covariance for mode, each in self.trust.modes.items()}
-            for name, values in held.items():
-                shape = (n,) if name == "flags" else (n, 6, 6)
-                if values.shape != shape:
-                    raise InvalidInputError(f"{name}: expected shape {shape}, got {values.shape}")
+            covariances = [self.trust.covariance, *(each.covariance for each in self.trust.modes.values())]
+            if self.trust.flags.shape != (n,) or any(each.shape != (n, 6, 6) for each in covariances):
+                raise InvalidInputError(f"trust: expected flags and a covariance of each of {n} frames")

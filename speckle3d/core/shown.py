@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import fields, is_dataclass
 from html import escape
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 Shown = TypeVar("Shown", bound=type)
 
-MOST_LINES = 10
-_MOST_LETTERS = 96
-_NAME_LETTERS = 60
+_MOST_ROWS = 9
+_MOST_LETTERS = 72
 
 
 def shown(cls: Shown) -> Shown:
@@ -28,72 +27,45 @@ def shown(cls: Shown) -> Shown:
     return cls
 
 
-def facts_of(thing: Any) -> list[tuple[str, str]]:
-    """Names and short values of what an object holds."""
-    if hasattr(thing, "facts"):
-        return [(name, brief(value)) for name, value in thing.facts()]
-    return [(each.name, brief(getattr(thing, each.name))) for each in fields(thing) if each.repr]
-
-
 def brief(value: Any) -> str:
     """One short line for a value."""
-    if value is None:
-        return "none"
-    if isinstance(value, np.ndarray) and value.size > 6:
-        return f"{value.dtype} {value.shape}"
     if isinstance(value, np.ndarray):
-        return _clipped(np.array2string(value, precision=4, separator=", ").replace("\n", ""))
-    if hasattr(value, "single") and hasattr(value, "as_matrix"):
-        return _turns(value)
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, str | Path):
-        return _clipped(str(value) or "none")
-    if is_dataclass(value) and not isinstance(value, type):
-        return _clipped(f"{type(value).__name__}: {', '.join(f'{n} {v}' for n, v in facts_of(value))}")
-    if isinstance(value, Mapping):
-        return _clipped(f"{len(value)}: {', '.join(map(str, value))}" if value else "none")
-    if isinstance(value, Collection):
-        whole = ", ".join(map(brief, value)) if len(value) <= _FEW else ""
-        return whole if whole and len(whole) <= _NAME_LETTERS else f"{len(value)}" if value else "none"
-    return _clipped(str(value))
+        text = f"{value.dtype} {value.shape}" if value.size > 6 else np.array2string(value, precision=4)
+    elif isinstance(value, Rotation | RigidTransform):
+        text = _turn(value) if value.single else f"{len(value)} {_KINDS[type(value)]}s"
+    elif isinstance(value, float):
+        text = f"{value:.4g}"
+    elif isinstance(value, Collection) and not isinstance(value, str):
+        text = ", ".join(map(brief, value)) if len(value) <= 4 else f"{len(value)}"
+    else:
+        text = type(value).__name__ if is_dataclass(value) else "" if value is None else str(value)
+    text = " ".join(text.split()) or "none"
+    return text if len(text) <= _MOST_LETTERS else f"{text[: _MOST_LETTERS - 1]}…"
 
 
-_FEW = 4
+_KINDS = {Rotation: "rotation", RigidTransform: "rigid transform"}
 
 
-def _turns(value: Any) -> str:
-    """Rotations or rigid transforms: how many, or the one."""
-    single = value.single
-    what = "rotation" if not hasattr(value, "translation") else "rigid transform"
-    if not single:
-        return f"{len(value)} {what}s"
-    turn = value.rotation if hasattr(value, "translation") else value
-    angle = f"{np.rad2deg(turn.magnitude()):.4g} degrees"
-    if not hasattr(value, "translation"):
-        return f"rotation by {angle}"
-    place = ", ".join(f"{each:.4g}" for each in value.translation)
-    return f"rotation by {angle}, translation ({place}) mm"
-
-
-def _clipped(text: str, letters: int = _MOST_LETTERS - 24) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= letters else f"{text[: letters - 1]}…"
+def _turn(pose: Rotation | RigidTransform) -> str:
+    rotation = pose.rotation if isinstance(pose, RigidTransform) else pose
+    text = f"rotation by {np.rad2deg(rotation.magnitude()):.4g} degrees"
+    place = f", translation {np.round(pose.translation, 3)} mm" if isinstance(pose, RigidTransform) else ""
+    return text + place
 
 
 def _rows(thing: Any) -> list[tuple[str, str]]:
-    rows = facts_of(thing)
-    if len(rows) < MOST_LINES:
+    held = [(each.name, getattr(thing, each.name)) for each in fields(thing) if each.repr]
+    rows = [(name, brief(value)) for name, value in (thing.facts() if hasattr(thing, "facts") else held)]
+    if len(rows) <= _MOST_ROWS:
         return rows
-    left = ", ".join(name for name, _ in rows[MOST_LINES - 2 :])
-    return [*rows[: MOST_LINES - 2], ("and", _clipped(left))]
+    rest = ", ".join(name for name, _ in rows[_MOST_ROWS - 1 :])
+    return [*rows[: _MOST_ROWS - 1], ("and", brief(rest))]
 
 
 def _text(self: Any) -> str:
     rows = _rows(self)
     width = max((len(name) for name, _ in rows), default=0)
-    lines = [f"  {name:<{width}}  {value}"[:_MOST_LETTERS].rstrip() for name, value in rows]
-    return "\n".join([type(self).__name__, *lines])
+    return "\n".join([type(self).__name__, *(f"  {name:<{width}}  {value}" for name, value in rows)])
 
 
 def _table(self: Any) -> str:

@@ -13,9 +13,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.handover.tables import frames_array
-from speckle3d.core.images import ImageFrames, Images, require_all
+from speckle3d.core.images import ImageFrames, Images
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
 
@@ -117,19 +117,15 @@ class RFSettings:
         _require_positive(self, ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz"))
         low, high = self.bandwidth_hz
         middle, half = self.demodulation_frequency_hz, self.sampling_rate_hz / 2
-        if middle is not None and not (np.isfinite(middle) and middle >= 0):
+        if middle is not None and not 0 <= middle < np.inf:
             raise InvalidInputError(f"demodulation_frequency_hz: expected zero or above, got {middle}")
-        if middle:
-            # A complex signal holds as much on either side of the frequency it was shifted down by.
-            if not (0 < low < high and middle - half <= low and high <= middle + half):
-                raise InvalidInputError(
-                    "bandwidth_hz: expected 0 < low < high within half the sampling rate of the demodulation "
-                    f"frequency, {middle:g}, got ({low:g}, {high:g})"
-                )
-        elif not 0 < low < high <= self.sampling_rate_hz * (1 if middle == 0 else 0.5):
-            most = "the sampling rate" if middle == 0 else "half the sampling rate"
+        # I/Q hold as much on either side of the frequency they were shifted down by, the analytic signal
+        # all up to the sampling rate.
+        least, most = (middle - half, middle + half) if middle else (0, 2 * half if middle == 0 else half)
+        if not (0 < low < high and least <= low and high <= most):
             raise InvalidInputError(
-                f"bandwidth_hz: expected 0 < low < high <= {most}, got ({low:g}, {high:g})"
+                f"bandwidth_hz: expected 0 < low < high from {least:g} to {most:g}, as sampled, "
+                f"got ({low:g}, {high:g})"
             )
 
     @property
@@ -207,19 +203,14 @@ class ImageGrid:
     @property
     def centre_mm(self) -> FloatArray:
         """The image's centre in P, shape (3,), mm."""
-        if self.skew_rad:
-            return np.asarray(self.corners_mm.mean(axis=0))
-        return np.array([self.width_mm / 2, (self.first_sample_depth_mm + self.depth_mm) / 2, 0.0])
+        return self.image_from_sample[:3] @ [(self.vectors - 1) / 2, (self.samples - 1) / 2, 1.0]
 
     @property
     def corners_mm(self) -> FloatArray:
         """The image's corners in P, clockwise from the top left, shape (4, 3), mm."""
-        if self.skew_rad:
-            v, s = self.vectors - 1, self.samples - 1
-            corners = np.array([[0, 0, 1], [v, 0, 1], [v, s, 1], [0, s, 1]])
-            return np.asarray(corners @ self.image_from_sample[:3].T)
-        x, top, bottom = self.width_mm, self.first_sample_depth_mm, self.depth_mm
-        return np.array([[0.0, top, 0.0], [x, top, 0.0], [x, bottom, 0.0], [0.0, bottom, 0.0]])
+        v, s = self.vectors - 1, self.samples - 1
+        corners = np.array([[0, 0, 1], [v, 0, 1], [v, s, 1], [0, s, 1]])
+        return np.asarray(corners @ self.image_from_sample[:3].T)
 
     @property
     def image_from_sample(self) -> FloatArray:
@@ -414,17 +405,21 @@ class Sweep:
         """
         read = ImageFrames(frames if hasattr(frames, "shape") else np.asarray(frames))  # type: ignore[arg-type]
         n, columns, rows = read.shape
-        is_grey = read.dtype == np.uint8 and signal is None
-        of_kind = {"dynamic_range_db": dynamic_range_db} if is_grey else {"signal": signal}
-        rate = frame_rate_hz if frame_time_s is None else 1.0
-        require_all(pitch_mm=pitch_mm, frame_rate_hz=rate, **of_kind)
+        if frame_time_s is None and frame_rate_hz is not None:
+            frame_time_s = np.arange(n) / frame_rate_hz
+        kind: RFSettings | BModeSettings | None = signal
+        if dynamic_range_db is not None and signal is None and read.dtype == np.uint8:
+            kind = BModeSettings(dynamic_range_db)
+        of_kind = "dynamic_range_db" if read.dtype == np.uint8 else "signal"
+        if pitch_mm is None or frame_time_s is None or kind is None:
+            known = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, of_kind: kind}
+            missing = ", ".join(name for name, value in known.items() if value is None)
+            raise InvalidInputError(f"arrays do not say, so give {missing}: see docs/howto/pictures.md")
         across, down = np.broadcast_to(np.asarray(pitch_mm, dtype=float), (2,)).tolist()
-        held = signal or BModeSettings(float(dynamic_range_db or 0.0))
-        if isinstance(held, RFSettings):
-            down = held.sample_spacing_mm
-        times = np.arange(n) / float(rate or 1.0) if frame_time_s is None else np.asarray(frame_time_s)
+        if isinstance(kind, RFSettings):
+            down = kind.sample_spacing_mm
         grid = ImageGrid(columns, rows, across, down, first_row_depth_mm)
-        return cls(read, grid, held, times, **others)
+        return cls(read, grid, kind, np.asarray(frame_time_s), **others)
 
     def facts(self) -> list[tuple[str, object]]:
         """What the sweep shows of itself."""
@@ -447,7 +442,20 @@ class Sweep:
 
     def to_xarray(self) -> Any:
         """All frames as an `xarray.DataArray` over frame, lateral_mm and depth_mm; read into memory."""
-        return frames_array(self)
+        xarray = extra_module("xarray", "notebook", "a labelled array")
+        grid = self.grid
+        axes_mm = {
+            "lateral_mm": np.arange(grid.vectors) * grid.vector_pitch_mm,
+            "depth_mm": grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm,
+        }
+        frames = {"frame": np.arange(len(self)), "time_s": ("frame", self.frame_time_s, {"units": "s"})}
+        places = {name: (name, values, {"units": "mm"}) for name, values in axes_mm.items()}
+        return xarray.DataArray(
+            np.stack([np.asarray(self.frames[i]) for i in range(len(self))]),
+            coords=frames | places,
+            dims=("frame", *axes_mm),
+            name=self.name,
+        )
 
     def part(self, first: int, stop: int) -> Sweep:
         """The frames from `first` to before `stop` as a sweep of their own, with all sensors' readings.

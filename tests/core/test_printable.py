@@ -7,7 +7,6 @@ import pytest
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.tables import text_table
-from speckle3d.io.import_settings import MissingSettingsError
 
 HOSTILE = "a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
 SHOWN = r"a\x1b[31m\r\n\x9b\u202e\u2028\udc80\x00b"
@@ -19,12 +18,12 @@ def test_what_drives_a_terminal_is_escaped_once():
     assert printable("a\nb\x1b", kept="\n") == "a\nb\\x1b"
 
 
-@pytest.mark.parametrize("text", ["Größe 3 µm, 1 %", "名前 𝛼", "[red] {0} $x$ <b>", "a\u00a0b\u3000c"])
+@pytest.mark.parametrize("text", ["Größe 3 µm, 1 %", "名前 𝛼", "[red] {0} $x$ <b>"])
 def test_what_people_write_stays(text):
     assert printable(text) == text
 
 
-@pytest.mark.parametrize("kind", [InvalidInputError, FileError, MissingSettingsError])
+@pytest.mark.parametrize("kind", [InvalidInputError, FileError])
 def test_an_error_is_one_line_whatever_it_quotes(kind):
     error = kind(f"{HOSTILE}: expected a")
     assert str(error) == f"{SHOWN}: expected a"

@@ -125,5 +125,5 @@ def test_what_is_no_region_is_refused_in_one_line(text):
 
 
 def test_a_region_beside_the_image_is_refused():
-    with pytest.raises(InvalidInputError, match="x 0 to 9 mm"):
+    with pytest.raises(InvalidInputError):
         Region("rectangle 20,0 30,5").mask(GRID)

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.wires import WirePhantom, three_wires
 
 N_ENDS = np.array(
@@ -69,25 +69,21 @@ def test_patterns_of_other_numbers_are_no_n():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        ({"names": ("a", "b", "a")}, "names.*'a'"),
-        ({"patterns": ((0, 1, 3),)}, r"patterns\[0\].*\(0, 1, 3\)"),
-        ({"patterns": ((0, 1, 1),)}, r"patterns\[0\]"),
-        ({"directions": 2.0 * np.eye(3)}, r"directions\[0\].*2"),
-        ({"points_mm": np.full((3, 3), np.nan)}, r"points_mm\[\(0, 0\)\]"),
+        {"names": ("a", "b", "a")},
+        {"patterns": ((0, 1, 3),)},
+        {"directions": 2.0 * np.eye(3)},
+        {"points_mm": np.full((3, 3), np.nan)},
+        {"points_mm": np.zeros((2, 3))},
     ],
 )
-def test_a_phantom_that_is_none_is_refused(change, message):
+def test_a_phantom_that_is_none_is_refused(change):
     given = {"names": NAMES, "points_mm": np.zeros((3, 3)), "directions": np.eye(3)}
-    with pytest.raises(InvalidInputError, match=message):
+    with pytest.raises(InvalidInputError, match=next(iter(change))):
         WirePhantom(**{**given, **change})
 
 
-def test_numbers_that_do_not_match_are_refused():
-    with pytest.raises(MismatchError, match=r"points_mm.*\(2, 3\)"):
-        WirePhantom(NAMES, np.zeros((2, 3)), np.eye(3))
-    with pytest.raises(InvalidInputError, match="wires"):
-        WirePhantom((), np.zeros((0, 3)), np.zeros((0, 3)))
+def test_a_wire_without_length_is_refused():
     with pytest.raises(InvalidInputError, match="wire b"):
         WirePhantom.from_ends(NAMES, np.stack([N_ENDS[0], N_ENDS[1][[0, 0]], N_ENDS[2]]))

@@ -53,7 +53,9 @@ def test_two_frames_have_in_common_what_came_before_the_earlier_one():
         wanted = grown[i] @ carried(centres[j] - centres[i]).T + common[:, i].T @ common[:, j]
         wanted = wanted + np.diag(variance[i])
         size = np.sqrt(np.outer(np.diagonal(claimed[i]), np.diagonal(claimed[j])))
-        np.testing.assert_array_less(np.abs(errors.between(i, j) - wanted), 0.02 * size)
+        np.testing.assert_array_less(
+            np.abs(errors.factors[:, i].T @ errors.factors[:, j] - wanted), 0.02 * size
+        )
 
 
 def test_an_error_of_scale_alone_stretches_every_distance_alike():

@@ -94,11 +94,10 @@ def measured(
     if (steps < LEAST_MM).any():
         first = int(np.flatnonzero(steps < LEAST_MM)[0]) + 1
         raise InvalidInputError(f"points {first} and {first + 1}: expected two places, got one")
-    moved = errors.displacements(points, belonging)
 
     def row(kind: str, chosen: range, value_of: Valued, unit: str = "mm") -> Measurement:
         value, gradient = value_of(points[chosen])
-        by_poses = np.einsum("mka,ka->m", moved[:, chosen], gradient)
+        by_poses = errors.of_gradient(points[chosen], gradient, belonging[np.array(chosen)])
         pose_sigma, pick_sigma = float(np.linalg.norm(by_poses)), pick_mm * float(np.linalg.norm(gradient))
         return Measurement(kind, tuple(chosen), value, pose_sigma, pick_sigma, unit)
 

@@ -13,8 +13,8 @@ from speckle3d.imaging.voxels.grid import VoxelGrid
 
 COARSE_MM = 0.75
 """Distance of the points at which the deviation is computed; between them it is interpolated linearly."""
-_AT_ONCE = 2**15
-"""Points worked on at a time."""
+_AT_ONCE = 2**12
+"""Points worked on at a time: 20 MB with the errors of 300 frames."""
 
 
 def deviation_volume(

@@ -122,7 +122,10 @@ def test_errors_of_volume_and_area_are_those_of_repeated_draws():
     factors = rng.normal(size=(5, 1, 6)) * [0.3, 0.3, 0.6, 0.02, 0.02, 0.02] * along
     errors = PosedErrors(PoseErrors(factors), poses, grid.centre_mm)
     told = measures_of(surface, errors, grid)
-    moved = errors.displacements(surface.vertices_mm, belonging_of(surface.vertices_mm, grid, poses))
+    near = belonging_of(surface.vertices_mm, grid, poses)
+    arms = surface.vertices_mm[:, None] - poses.apply(grid.centre_mm)[near.frames]
+    moved = factors[:, near.frames, :3] + np.cross(factors[:, near.frames, 3:], arms)
+    moved = (moved * near.weights[..., None]).sum(axis=2)
     sizes = []
     for normal in rng.standard_normal((400, 5)):
         vertices = surface.vertices_mm + np.einsum("m,mka->ka", normal, moved)

@@ -1,1 +1,0 @@
-"""Results handed over to pandas, xarray, matplotlib, pyvista and napari."""
