@@ -174,6 +174,16 @@ class Calibration:
             )
         return RigidTransform.from_components(self.translation_mm, self.rotation)
 
+    def pixel_matrix(self) -> FloatArray:
+        """Affine matrix from pixels (column, row, slice, 1) to the sensor's frame in mm, shape (4, 4).
+
+        The form that PLUS and 3D Slicer call ``ImageToProbe``; a slice is as thick as the average pixel.
+        """
+        if self.pixel_mm is None:
+            raise InsufficientDataError("expected a calibration with a pixel size, got one without")
+        scale = np.diag([*self.pixel_mm, float(self.pixel_mm.mean()), 1.0])
+        return np.asarray(self.sensor_from_image.as_matrix() @ scale)
+
 
 def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     """Put a calibration on a sweep's sensor, in place of what the sweep says of it.

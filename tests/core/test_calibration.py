@@ -21,6 +21,15 @@ def test_a_trackers_calibration_goes_on_the_tracker_and_nothing_else():
     assert replace(got, tracker=None) == replace(sweep, tracker=None)
 
 
+def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():
+    sweep = calibrated(sweep_examples.rf_sweep(), made(time_offset_s=0.0))
+    time_s = sweep.tracker.readings.time_s[4]
+    world_from_sensor = sweep.tracker.readings.world_from_sensor[4].as_matrix()
+    expected = world_from_sensor @ made().pixel_matrix() @ [3.0, 7.0, 0.0, 1.0]
+    got = sweep.tracker.world_from_image(time_s).apply([0.137 * 3.0, 0.138 * 7.0, 0.0])
+    np.testing.assert_allclose(got, expected[:3], atol=1e-9)
+
+
 def test_an_orientation_sensors_calibration_goes_on_that_sensor_and_nothing_else():
     sweep = sweep_examples.rf_sweep()
     got = calibrated(sweep, made("orientation"))
