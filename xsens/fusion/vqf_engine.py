@@ -8,16 +8,15 @@ this package's own engine, and what that engine claims, and how far VQF is from 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.samples import Estimate, Samples
-from xsens.logs.worlds import nwu_from, turned
+from xsens.logs.worlds import nwu_from
 
 _EVEN = 0.05
 """Largest distance of a sample from its place on an even clock, in steps, that is left as it is: at 5 rad/s
@@ -28,14 +27,6 @@ _COMPARED_S = 1.0 / 32.0
 
 _AVERAGED_S = 5.0
 """Time over which their squared distance is averaged, so that it is not zero where the two cross."""
-
-
-class _Even(NamedTuple):
-    """Rate, force and field on an even clock; if it is another, where the samples lie on it, in steps."""
-
-    vectors: list[FloatArray]
-    step_s: float
-    place: FloatArray | None
 
 
 class VqfEngine:
@@ -93,39 +84,39 @@ class VqfEngine:
             Use later readings as well.
         """
         magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
-        field = [_field_carried(stretch, own.xyzw)] if magnetic else []
-        (rate, force, *fields), step_s, place = _even_clock(
-            [stretch.rate_rad_s, stretch.force_m_s2, *field], stretch.step_s
-        )
-        readings = (rate, force, fields[0] if fields else None)
-        if offline:
-            found = self._vqf.offlineVQF(*readings, step_s)
-        else:
-            found = self._vqf.VQF(step_s).updateBatch(*readings)
-        wxyz = found["quat9D" if magnetic else "quat6D"]
-        start = Rotation.from_quat(own.xyzw[0]) * Rotation.from_quat(wxyz[0], scalar_first=True).inv()
-        xyzw = turned(nwu_from("ENU") if magnetic else _about_up(start), wxyz)
-        at: IntArray | slice = slice(None)
-        if place is not None:
+        readings = [stretch.rate_rad_s, stretch.force_m_s2]
+        if magnetic:
+            readings.append(_field_carried(stretch, own.xyzw))
+        place = np.cumsum(stretch.step_s) - stretch.step_s[0]
+        step_s = float(place[-1]) / (len(place) - 1) if len(place) > 1 else float(stretch.step_s[0])
+        place, at = place / step_s, slice(None)
+        uneven = float(np.abs(place - np.arange(len(place))).max()) >= _EVEN
+        if uneven:
             self._uneven += len(stretch)
-            xyzw = Slerp(np.arange(len(xyzw)), Rotation.from_quat(xyzw))(place).as_quat()
-            at = np.rint(place).astype(np.int64)
+            # Losses make the mean step longer than the median, bursts shorter: at most two for one.
+            fewer = min(max(float(np.median(stretch.step_s)) / step_s, 0.5), 1.0)
+            place, step_s = place / fewer, step_s * fewer
+            readings = _on_even_clock(readings, place)
+        find = self._vqf.offlineVQF if offline else self._vqf.VQF(step_s).updateBatch
+        found = find(*readings, *([] if magnetic else [None]), *([step_s] if offline else []))
+        turns = Rotation.from_quat(found["quat9D" if magnetic else "quat6D"], scalar_first=True)
+        north = nwu_from("ENU")
+        if not magnetic:  # about up as the other engine begins
+            about_up = np.arctan2(*(Rotation.from_quat(own.xyzw[0]) * turns[0].inv()).as_quat()[2:])
+            north = Rotation.from_rotvec([0.0, 0.0, 2.0 * about_up])
+        turns = north * turns
+        if uneven:
+            turns = Slerp(np.arange(len(turns)), turns)(np.minimum(place, len(turns) - 1))
+            at = np.minimum(np.rint(place).astype(np.int64), len(found["bias"]) - 1)
         disturbed = np.zeros(len(stretch), dtype=bool)
         if magnetic:
             disturbed = found["magDistDetected"][at]
             self._fields.append(not disturbed.all())
+        xyzw = turns.as_quat()
         apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)))
         sd = np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi)
         resting = found["restDetected"][at]
         return Estimate(xyzw, sd, found["bias"][at], disturbed, resting, own.field_stray, own.field_iron)
-
-
-def _about_up(turn: Rotation) -> Rotation:
-    """That part of a rotation that is about up."""
-    return Rotation.from_rotvec([0.0, 0.0, 2.0 * np.arctan2(*turn.as_quat()[2:])])
-
-
-# -- what VQF wants
 
 
 def _field_carried(stretch: Samples, xyzw: FloatArray) -> FloatArray:
@@ -138,36 +129,20 @@ def _field_carried(stretch: Samples, xyzw: FloatArray) -> FloatArray:
     return np.asarray(turns.inv().apply(turns[last].apply(stretch.field_au[last])))
 
 
-def _even_clock(vectors: list[FloatArray], steps_s: FloatArray) -> _Even:
-    """Rate, force and perhaps field of a stretch on an even clock: unchanged if theirs is one.
+def _on_even_clock(readings: list[FloatArray], place: FloatArray) -> list[FloatArray]:
+    """Rate, force and perhaps field that lie at places on an even clock, in its steps, brought to it.
 
     A gyroscope's reading is the mean rate since the sample before; on the new clock, too, so that the turn
     from end to end stays what it was. Accelerometer and field are interpolated.
     """
-    time_s, last = np.cumsum(steps_s) - steps_s[0], len(steps_s) - 1
-    if last == 0:
-        return _Even(vectors, float(steps_s[0]), None)
-    step_s = float(time_s[-1]) / last
-    off = np.abs(time_s / step_s - np.arange(last + 1)).max()
-    if off < _EVEN:
-        return _Even(vectors, step_s, None)
-    if off > 0.5:
-        # Samples were lost. A clock of bursts has a median step far below the mean: at most two for one.
-        last = max(1, round(float(time_s[-1]) / max(float(np.median(steps_s)), 0.5 * step_s)))
-        step_s = float(time_s[-1]) / last
-    grid_s = step_s * np.arange(last + 1.0)
-    rate = vectors[0]
-    angle = np.vstack([np.zeros(3), np.cumsum(rate[1:] * steps_s[1:, None], axis=0)])
-    mean = np.vstack([rate[:1], np.diff(_at(grid_s, time_s, angle), axis=0) / step_s])
-    others = [_at(grid_s, time_s, values) for values in vectors[1:]]
-    return _Even([mean, *others], step_s, np.minimum(time_s / step_s, last))
+    grid = np.arange(round(float(place[-1])) + 1.0)
 
+    def at_grid(values: FloatArray) -> FloatArray:
+        return np.column_stack([np.interp(grid, place, axis) for axis in values.T])
 
-def _at(grid_s: FloatArray, time_s: FloatArray, values: FloatArray) -> FloatArray:
-    return np.column_stack([np.interp(grid_s, time_s, axis) for axis in values.T])
-
-
-# -- uncertainty
+    rate, *others = readings
+    angle = np.cumsum(np.vstack([np.zeros(3), rate[1:] * np.diff(place)[:, None]]), axis=0)
+    return [np.vstack([rate[:1], np.diff(at_grid(angle), axis=0)]), *map(at_grid, others)]
 
 
 def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float) -> FloatArray:

@@ -22,7 +22,7 @@ UNKNOWN_PAUSE_S = 1.0
 _RATES_HZ = (1e-3, 1e5)
 """Sampling rates that a sensor may have: they end at 2 kHz."""
 
-_WORD, _TICK_SPAN = 1 << 16, 1 << 32
+_TICK_SPAN = 1 << 32
 _RARE = 0.01
 _LONGER, _MUCH_LONGER = 1.6, 10.0
 """A clock step of more periods is a gap; the latter if the clock is irregular."""
@@ -69,15 +69,19 @@ class Stamps:
     computer_s: FloatArray | None = None
     time_s: FloatArray | None = None
 
+    def __getitem__(self, which: Any) -> Stamps:
+        arrays: dict[str, Any] = {k: v[which] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **arrays)
+
 
 @dataclass(frozen=True)
 class Timeline:
     """Times of the samples that are kept (of those sent twice, one), with their counter made to rise.
 
-    `rows` are the indices of those samples in order of time; None if they are all, in their order.
+    `rows` are the indices of those samples in order of time; all of them as a slice.
     """
 
-    rows: IntArray | None
+    rows: IntArray | slice
     time_s: FloatArray
     counter: IntArray | None = None
     gaps: tuple[Gap, ...] = ()
@@ -91,23 +95,10 @@ def require_rate(rate_hz: float, what: str) -> None:
         raise InvalidInputError(f"{what}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
 
 
-def timeline_of_times(
-    time_s: FloatArray, counter: IntArray | None = None, stated_hz: float = float("nan")
-) -> Timeline:
-    """Find gaps in samples that have times, and perhaps a counter.
-
-    Samples out of order are sorted; of several at one time, the first is kept.
-
-    Raises
-    ------
-    InvalidInputError
-        If the times contradict a stated sampling rate.
-    """
-    return timeline(Stamps(counter, time_s=time_s, period_s=1.0 / stated_hz if stated_hz else np.nan))
-
-
 def timeline(stamps: Stamps) -> Timeline:
     """Rebuild the times of samples from their stamps.
+
+    Samples out of order are sorted; of several with the same stamps, the first is kept.
 
     Raises
     ------
@@ -122,31 +113,17 @@ def timeline(stamps: Stamps) -> Timeline:
         raise InvalidInputError(
             f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
         )
-    order = _order_of(stamps)
-    stamps = stamps if order is None else _taken(stamps, order)
-    kept = np.append(True, ~_repeats(stamps))
-    if not kept.all():
-        stamps = _taken(stamps, kept)
-    notes = []
-    if order is not None:
-        rank = np.argsort(order)
+    notes, rows = [], _order(stamps)
+    if rows is not None:
+        stamps, rank = stamps[rows], np.argsort(rows)
         late = int((rank < np.maximum.accumulate(rank)).sum())
         notes.append(f"{late} samples came out of order and were sorted")
+    kept = np.append(True, ~_repeats(stamps))
     if left_out := int((~kept).sum()):
-        why = "came twice; the second was" if stamps.time_s is None else "at the time of another were"
-        notes.append(f"{left_out} samples {why} left out")
-    rows = None if order is None and kept.all() else (np.arange(kept.size) if order is None else order)[kept]
-    seconds, counts, gaps, told = _steps(stamps)
-    if (time_s := stamps.time_s) is None:
-        first_s = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
-        time_s = _risen(first_s, seconds)
-    counter = None if stamps.counter is None else _risen(int(stamps.counter[0]), counts)
-    return Timeline(rows, time_s, counter, gaps, (*notes, *told))
-
-
-def _taken(stamps: Stamps, which: Any) -> Stamps:
-    arrays: dict[str, Any] = {k: v[which] for k, v in vars(stamps).items() if isinstance(v, np.ndarray)}
-    return replace(stamps, **arrays)
+        stamps, rows = stamps[kept], (np.arange(kept.size) if rows is None else rows)[kept]
+        notes.append(f"{left_out} samples at the time of another were left out")
+    line = _unwrapped(stamps, notes)
+    return line if rows is None else replace(line, rows=rows)
 
 
 def _repeats(stamps: Stamps) -> BoolArray:
@@ -159,49 +136,30 @@ def _repeats(stamps: Stamps) -> BoolArray:
     return np.asarray(np.logical_and.reduce(same))
 
 
-def _order_of(stamps: Stamps) -> IntArray | None:
+def _order(stamps: Stamps) -> IntArray | None:
     """Indices that put samples which came late, by time, counter or clock, in order; None if none did."""
     if stamps.time_s is not None:
-        rises = bool((np.diff(stamps.time_s) >= 0.0).all())
-        return None if rises else np.argsort(stamps.time_s, kind="stable")
-    values, span = stamps.counter, stamps.counter_span
-    late = _LATE
-    if values is None:
-        assert stamps.ticks is not None  # one of the two is there
-        values, span = stamps.ticks, _TICK_SPAN
-        steps = np.diff(values) % span
-        usual = np.median(steps[steps < span // 2]) if (steps < span // 2).any() else 0
-        late = int(_LATE * usual)
-    signed = (np.diff(values) + span // 2) % span - span // 2
-    anew = np.zeros(signed.size, dtype=bool) if stamps.starts is None else stamps.starts[1:]
-    if not ((signed < 0) & (signed >= -late) & ~anew).any():
-        return None
-    signed[(signed < -late) | (signed > span // 4) | anew] = late  # a new start
-    return np.asarray(np.argsort(np.append(0, np.cumsum(signed)), kind="stable"))
+        key = stamps.time_s
+    else:
+        values, span = stamps.counter, stamps.counter_span
+        if values is None:
+            values, span = stamps.ticks, _TICK_SPAN
+        steps = (np.diff(values) + span // 2) % span - span // 2
+        late = int(_LATE * (np.median(steps[steps > 0]) if (steps > 0).any() else 0))
+        anew = False if stamps.starts is None else stamps.starts[1:]
+        steps[(steps < -late) | (steps > span // 4) | anew] = late
+        key = np.append(0, np.cumsum(steps))
+    return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
 
 
-def _risen(first: float, steps: Any) -> Any:
-    """Running sum of steps from `first` on, shape (steps + 1,)."""
-    sums = np.empty(steps.size + 1, dtype=steps.dtype)
-    sums[0] = 0
-    np.cumsum(steps, out=sums[1:])
-    sums += steps.dtype.type(first)
-    return sums
-
-
-def _steps(stamps: Stamps) -> tuple[FloatArray, Any, tuple[Gap, ...], list[str]]:
-    """Steps from each sample to the next: seconds, rise of the counter, gaps, and notes."""
-    span, period_s, irregular, notes = stamps.counter_span, stamps.period_s, False, []
-    counts = None if stamps.counter is None else np.diff(stamps.counter)
-    if counts is not None and (counts < 0).any():
-        counts %= span
-    ticks = None if stamps.ticks is None else np.diff(stamps.ticks) % _TICK_SPAN
-    seconds = np.asarray(ticks * stamps.tick_s) if ticks is not None else None
-    anew = _starts_anew(stamps, counts, ticks)
-    if stamps.time_s is not None:
-        seconds, period_s = np.diff(stamps.time_s), np.nan
-    if seconds is not None and not period_s > 0.0:
+def _unwrapped(stamps: Stamps, notes: list[str]) -> Timeline:
+    """Times, rising counter and gaps of samples in order, without repeats."""
+    span, period_s = stamps.counter_span, stamps.period_s
+    counts = None if stamps.counter is None else np.diff(stamps.counter) % span
+    seconds, anew = _clock_steps(stamps), _starts_anew(stamps, counts)
+    if seconds is not None and (stamps.time_s is not None or not period_s > 0.0):
         period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
+    irregular = False
     if counts is None:
         assert seconds is not None  # one of the two is there
         taken, irregular = _by_clock(seconds, anew)
@@ -211,10 +169,8 @@ def _steps(stamps: Stamps) -> tuple[FloatArray, Any, tuple[Gap, ...], list[str]]
             seconds = taken * period_s
         else:
             _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
-        if (
-            ticks is not None and period_s > 0.0
-        ):  # the clock tells how often the counter went all the way round
-            rounds = np.maximum(np.round((seconds / period_s - taken) / span), 0.0)
+        if stamps.ticks is not None:  # the clock tells how often the counter went all the way round
+            rounds = np.nan_to_num(np.maximum(np.round((seconds / period_s - taken) / span), 0.0))
             counts, taken = counts + rounds.astype(np.int64) * span, taken + rounds * span
     if irregular:
         shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
@@ -223,17 +179,31 @@ def _steps(stamps: Stamps) -> tuple[FloatArray, Any, tuple[Gap, ...], list[str]]
         )
     if anew.any():
         pauses = _pauses(stamps, anew, seconds)
-        told = anew & np.isfinite(pauses)
-        seconds = np.where(anew, np.where(told, pauses, UNKNOWN_PAUSE_S), seconds)
+        measured = anew & np.isfinite(pauses)
+        seconds = np.where(anew, np.where(measured, pauses, UNKNOWN_PAUSE_S), seconds)
         notes.append(
             f"the sensor started anew {anew.sum()} times; the pause is by the computer's clock "
-            f"{told.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
+            f"{measured.sum()} times, else not known and taken as {UNKNOWN_PAUSE_S:g} s"
         )
     long = (seconds > _LONGER * period_s) & (not irregular)
     at = np.flatnonzero((taken > 1.5) | anew | long)
     missing = np.where(anew[at], 0, np.round(np.minimum(taken[at], _MOST_PERIODS)) - 1)
     gaps = tuple(Gap(int(i), int(lost), float(seconds[i])) for i, lost in zip(at, missing, strict=True))
-    return seconds, counts, gaps, notes
+    time_s = stamps.time_s
+    if time_s is None:
+        first_s = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
+        time_s = first_s + np.append(0.0, np.cumsum(seconds))
+    counter = None
+    if stamps.counter is not None:
+        counter = stamps.counter[0] + np.append(0, np.cumsum(counts))
+    return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
+
+
+def _clock_steps(stamps: Stamps) -> FloatArray | None:
+    """Seconds from each sample to the next by their clock; None without one."""
+    if stamps.time_s is not None:
+        return np.diff(stamps.time_s)
+    return None if stamps.ticks is None else np.diff(stamps.ticks) % _TICK_SPAN * stamps.tick_s
 
 
 def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) -> None:
@@ -248,25 +218,26 @@ def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) 
         )
 
 
-def _starts_anew(stamps: Stamps, counts: IntArray | None, ticks: IntArray | None) -> BoolArray:
+def _starts_anew(stamps: Stamps, counts: IntArray | None) -> BoolArray:
     """Mark steps over which the sensor's clock, or else its counter, went back or was reset."""
+    starts = stamps.starts
     if stamps.time_s is not None:
         return np.zeros(stamps.time_s.size - 1, dtype=bool)
-    if ticks is not None:
+    if stamps.ticks is not None:
+        ticks = np.diff(stamps.ticks) % _TICK_SPAN
         anew = (ticks > _TICK_SPAN // 2) | (ticks == 0)
-        known = None if stamps.computer_s is None else np.isfinite(stamps.computer_s)
+        starts = None if stamps.computer_s is None else np.isfinite(stamps.computer_s)
     else:
         assert counts is not None
-        anew, known = counts > stamps.counter_span // 2, stamps.starts
-    return anew if known is None else np.asarray(anew | known[1:])
+        anew = counts > stamps.counter_span // 2
+    return anew if starts is None else np.asarray(anew | starts[1:])
 
 
 def _by_counter(counts: IntArray, anew: BoolArray) -> FloatArray:
     """Sampling periods of each step of the counter; a sensor may count several for each sample."""
-    often = np.bincount(np.clip(counts[~anew] if anew.any() else counts, 0, _WORD))
-    stride = int(np.gcd.reduce(np.flatnonzero(often >= max(_RARE * counts.size, 1.0)))) or 1
-    taken = counts / stride
-    return np.asarray(np.maximum(taken, 1.0, out=taken))
+    usual, often = np.unique(counts[~anew] if anew.any() else counts, return_counts=True)
+    stride = int(np.gcd.reduce(np.maximum(usual[often >= max(_RARE * counts.size, 1.0)], 0))) or 1
+    return np.maximum(counts / stride, 1.0)
 
 
 def _by_clock(seconds: FloatArray, anew: BoolArray) -> tuple[FloatArray, bool]:
@@ -285,7 +256,7 @@ def _pauses(stamps: Stamps, anew: BoolArray, seconds: FloatArray) -> FloatArray:
     pauses = np.full(anew.size, np.nan)
     if stamps.computer_s is None:
         return pauses
-    running = np.concatenate(([0.0], np.cumsum(np.where(anew, 0.0, seconds))))
+    running = np.append(0.0, np.cumsum(np.where(anew, 0.0, seconds)))
     behind = stamps.computer_s - running  # constant while the sensor runs, and larger by each pause
     for before, after in pairwise(np.flatnonzero(np.isfinite(behind))):
         if anew[before:after].sum() == 1:

@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from scipy.constants import g
 
-Names = tuple[str, ...]
-
 
 class Column(NamedTuple):
     """Meaning of a column; `scale` turns its numbers to SI units, None if the name states no unit."""
@@ -28,17 +26,19 @@ _UNITS = {
 
 _VECTOR = re.compile(r"(?:imu )?(acc|gyr|mag)[a-z ]*[ _.]?([xyz])(?![a-z])\W*_?(.*?)\W*$", re.ASCII)
 _TIME = re.compile(r"time(?:[ _]?stamp)?[ _(\[/]+([a-zµ]+)[)\]]?$")
-_SHORT = re.compile(r"([agm])([xyz])$|(acc|gyr|mag)[a-z]*[ _.]?([xyz])", re.ASCII)
 _OTHERS = (
     ("counter", re.compile(r"(?:packet)?counter$")),
     ("ticks", re.compile(r"sampletimefine$")),
     ("quat_{}", re.compile(r"quat(?:ernion)?_(?:q)?([wxyz0-3])$")),
     ("optical_{}", re.compile(r"vicon orientation_([wxyz])$")),
-    ("euler_{}", re.compile(r"(?:euler_)?(x|y|z|roll|pitch|yaw)$")),
+    ("euler_{}", re.compile(r"euler_([xyz])$|(roll|pitch|yaw)$")),
     ("mat_{}{}", re.compile(r"mat\[([1-3])\]\[([1-3])\]$")),
 )
-_SAME = {"0": "w", "1": "x", "2": "y", "3": "z"}
-_ANGLES = {"x": "roll", "y": "pitch", "z": "yaw"}
+_SAME = {
+    "quat_{}": {"0": "w", "1": "x", "2": "y", "3": "z"},
+    "euler_{}": {"x": "roll", "y": "pitch", "z": "yaw"},
+}
+"""Names of one axis."""
 
 _WHOSE = re.compile(
     r"(?:sensor|device|imu|node|unit)[ _]?(?:id|name|no|nr|number|tag|serial)?$"
@@ -59,28 +59,11 @@ def column_of(name: str) -> Column | None:
         return Column("time", _UNITS["time"][match[1]]) if match[1] in _UNITS["time"] else None
     for key, pattern in _OTHERS:
         if match := pattern.match(name):
-            if key == "euler_{}" and name in "xyz":
-                return None
-            parts = [_SAME.get(part, part) if key == "quat_{}" else part for part in match.groups()]
-            parts = [_ANGLES.get(part, part) for part in parts] if key == "euler_{}" else parts
-            return Column(key.format(*parts))
+            parts = filter(None, match.groups())
+            return Column(key.format(*(_SAME.get(key, {}).get(part, part) for part in parts)))
     return None
 
 
 def names_a_sensor(name: str) -> bool:
     """Whether a column of this name says which sensor a row is of."""
     return _WHOSE.match(name) is not None
-
-
-_PLAIN = {"a": "accelerometer_{}_m_s2", "g": "gyroscope_{}_rad_s", "m": "magnetometer_{}_au"}
-
-
-def suggestion(name: str) -> str:
-    """The name, with the plain one that it may stand for."""
-    short = name if len(name) <= 40 else f"{name[:40]}..."
-    if match := _SHORT.match(name):
-        quantity, axis = match[1] or match[3][0], match[2] or match[4]
-        return f"{short} (expected {_PLAIN[quantity].format(axis)})"
-    if re.match(r"t$|ts$|.*time|.*stamp", name):
-        return f"{short} (expected time_s, time_ms or the like)"
-    return short

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import TypeVar
@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
-from xsens.logs.parts import Parts, of_unit_length, only
+from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
-from xsens.logs.worlds import Claim
+from xsens.logs.worlds import Claim, quaternions_of
 from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, Values
-from xsens.messages.mtdata2 import columns, name_of, world_of
+from xsens.messages.mtdata2 import ORIENTATIONS, STAMPS, read_items
 from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
 
 _Read = TypeVar("_Read")
@@ -32,14 +32,14 @@ def _stretches(frames: Frames, which: IntArray) -> Stamps:
     """Mark the data messages before which the sensor was started anew, with the computer's clock then."""
     at = np.flatnonzero(np.isin(frames.mid, _STARTS))
     after = np.searchsorted(which, at)
-    at, after = at[after < which.size], after[after < which.size]
-    starts = np.zeros(which.size, dtype=bool)
-    starts[after] = True
-    utc = frames.mid[at] == MessageId.UTC_TIME
-    computer_s = np.full(which.size, np.nan) if utc.any() else None
-    if computer_s is not None:
-        for i, message in dict(zip(after[utc].tolist(), at[utc].tolist(), strict=True)).items():
-            computer_s[i] = utc_time_s(frames.message(message))
+    starts, computer_s = np.zeros(which.size, dtype=bool), None
+    for i, place in zip(at.tolist(), after.tolist(), strict=True):
+        if place == which.size:
+            break
+        starts[place] = True
+        if frames.mid[i] == MessageId.UTC_TIME:
+            computer_s = np.full(which.size, np.nan) if computer_s is None else computer_s
+            computer_s[place] = utc_time_s(frames.message(i))
     return Stamps(starts=starts, computer_s=computer_s)
 
 
@@ -47,6 +47,8 @@ def _stretches(frames: Frames, which: IntArray) -> Stamps:
 
 _RAW = OutputMode.RAW | OutputMode.MT9
 _RAW_WITH_COUNTER = 22
+_RAW_VECTORS = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
+_NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
 _SOME = 1 << 12
 """Messages decoded at a time: as numbers they take several times their memory."""
 
@@ -54,11 +56,7 @@ _ENOUGH = 10_000
 """Messages that show where the counter is."""
 
 
-Found = tuple[Stamps, Parts, Claim, tuple[FloatArray | None, ...]]
-"""Samples, and their orientation as quaternions, matrices or angles: all that the bytes are needed for."""
-
-
-def legacy_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
+def legacy_samples(frames: Frames, which: IntArray) -> Parts:
     """Read the samples of the MTData messages at indices `which`.
 
     Raises
@@ -66,58 +64,57 @@ def legacy_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     InvalidInputError
         If the layout, or the calibration of raw counts, is not in the log.
     """
-    configuration = _last(
-        frames, np.flatnonzero(frames.mid == MessageId.CONFIGURATION), Configuration.from_message
-    )
-    blocks = np.flatnonzero(frames.mid == MessageId.EMTS)
-    blocks = blocks[frames[blocks].payload_size == BLOCK_SIZE]
+    configuration = _last(frames, frames.mid == MessageId.CONFIGURATION, Configuration.from_message)
+    blocks = (frames.mid == MessageId.EMTS) & (frames.payload_size == BLOCK_SIZE)
     calibration = _last(frames, blocks, RawCalibration.from_message)
-    layout = _layout(frames[which], configuration)
-    fits = frames[which].payload_size == layout.size
+    layout, notes = _layout(frames[which], configuration), []
+    fits = frames.payload_size[which] == layout.size
     if not fits.any():
         raise InvalidInputError(f"expected data messages of {layout.size} bytes, as configured, got none")
     if not fits.all():
-        parts = parts.noting(f"{(~fits).sum()} data messages were not as long as configured: left out")
-    which = only(which, fits)
-    data = frames[which]
-    raw = layout.mode & _RAW
+        notes.append(f"{(~fits).sum()} data messages were not as long as configured: left out")
+        which = which[fits]
+    raw = bool(layout.mode & _RAW)
     if raw and calibration is None:
         raise InvalidInputError("expected a calibration block before raw counts, got none")
+    if raw:
+        notes.append(NOT_COMPENSATED)
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
     rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
-    stamps = replace(_stretches(frames, which), period_s=1.0 / rate_hz)
-    notations = ("quaternion_wxyz", "matrix", "euler_deg")
-    counter = _all_of(layout, data, ("counter",)).get("counter")
-    if counter is not None:
-        stamps, counter = replace(stamps, counter=counter[:, 0].astype(np.int64)), None
-    values = _all_of(layout, data, (*notations, *VECTORS))
-    if raw and calibration is not None:
-        values |= zip(VECTORS, _in_units(layout, data, calibration), strict=True)
-        parts = parts.noting(NOT_COMPENSATED)
-    parts = replace(parts, vectors=tuple(map(values.get, VECTORS)))
-    return stamps, parts, Claim(layout.frame, "as configured"), tuple(map(values.get, notations))
+    values = _decoded(layout, frames[which], calibration if raw else None)
+    counter = values.get("counter")
+    return Parts(
+        replace(
+            _stretches(frames, which),
+            period_s=1.0 / rate_hz,
+            counter=None if counter is None else counter[:, 0].astype(np.int64),
+        ),
+        tuple(map(values.get, VECTORS)),
+        next((values[name] for name in _NOTATIONS if name in values), None),
+        Claim(layout.frame, "as configured"),
+        tuple(notes),
+    )
 
 
-def _decoded(layout: DataLayout, frames: Frames) -> Iterator[tuple[slice, Values]]:
-    """Values of some thousand messages at a time, with their places among all."""
+def _decoded(layout: DataLayout, frames: Frames, calibration: RawCalibration | None) -> Values:
+    """Counter, orientation and readings of all messages, raw counts in units."""
+    values: Values = {}
     for first in range(0, len(frames), _SOME):
         some = slice(first, first + _SOME)
-        yield some, layout.decode(frames[some].payloads())
-
-
-def _all_of(layout: DataLayout, frames: Frames, names: tuple[str, ...]) -> Values:
-    """Values of those fields that are there, of all messages."""
-    counts = {field.name: field.count for field in layout.fields if field.name in names}
-    values = {name: np.empty((len(frames), count)) for name, count in counts.items()}
-    for some, decoded in _decoded(layout, frames) if counts else ():
-        for name, column in values.items():
-            column[some] = decoded[name]
+        decoded = layout.decode(frames[some].payloads())
+        if calibration is not None:
+            counts = np.stack([decoded[name] for name in _RAW_VECTORS], axis=1)
+            decoded |= zip(VECTORS, calibration.to_units(counts), strict=True)
+        for name in decoded.keys() & {"counter", *_NOTATIONS, *VECTORS}:
+            if name not in values:
+                values[name] = np.empty((len(frames), decoded[name].shape[1]))
+            values[name][some] = decoded[name]
     return values
 
 
-def _last(frames: Frames, which: IntArray, read: Callable[[Message], _Read]) -> _Read | None:
+def _last(frames: Frames, which: BoolArray, read: Callable[[Message], _Read]) -> _Read | None:
     """The last of some messages that can be read."""
-    for i in which[::-1].tolist():
+    for i in np.flatnonzero(which)[::-1].tolist():
         with suppress(InvalidInputError):
             return read(frames.message(i))
     return None
@@ -145,21 +142,10 @@ def _share_counting(frames: Frames, at: IntArray) -> float:
     return float(np.mean(steps % (1 << 16) == 1)) if steps.size else 0.0
 
 
-def _in_units(layout: DataLayout, data: Frames, calibration: RawCalibration) -> FloatArray:
-    names = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
-    vectors = np.empty((3, len(data), 3))
-    for some, values in _decoded(layout, data):
-        vectors[:, some] = calibration.to_units(np.stack([values[name] for name in names], axis=1))
-    return vectors
-
-
 # -- MTData2
 
-_NOTATIONS = ("quaternion_wxyz", "rotation_matrix_by_column", "euler_deg")
-_STAMPS = ("packet_counter", "sample_time_fine")
 
-
-def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
+def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
     """Read the samples of the MTData2 messages at indices `which`.
 
     Messages without a measurement, as those of a satellite receiver, are no samples, but raise the counter.
@@ -169,65 +155,49 @@ def mtdata2_samples(frames: Frames, which: IntArray, parts: Parts) -> Found:
     InvalidInputError
         If none holds a measurement, or none a time.
     """
-    items, world, rows, damaged = _items(frames[which])
-    if damaged:
-        parts = parts.noting(f"{damaged} messages could not be taken apart and were left out")
-    told = [items.pop(name, None) for name in _STAMPS]
-    for stamp in told:
+    items, world, rows, damaged = read_items(frames[which])
+    notes = []
+    if damaged.any():
+        notes.append(f"{damaged.sum()} messages could not be taken apart and were left out")
+    stamps = [items.pop(name, None) for name in STAMPS]
+    for stamp in stamps:
         rows &= True if stamp is None else np.isfinite(stamp[:, 0])
     if not rows.any():
         raise InvalidInputError(
             f"expected measurements with a time in {which.size} MTData2 messages, got none"
         )
+    others = None
     if not rows.all():
-        parts = parts.noting(f"{(~rows).sum()} messages without a measurement or its time are no samples")
+        notes.append(f"{(~rows).sum()} messages without a measurement or its time are no samples")
         items = {name: values[rows] for name, values in items.items()}
-    stamps = _stretches(frames, only(which, rows))
-    counter, ticks = (None if stamp is None else stamp[rows, 0].astype(np.int64) for stamp in told)
-    others = None if rows.all() else np.cumsum(~rows, dtype=np.int64)[rows]
-    stamps = replace(stamps, counter=counter, ticks=ticks, others=others)
-    claim = Claim(world, "as its messages say")
-    return stamps, _measured(items, parts), claim, tuple(map(items.get, _NOTATIONS))
-
-
-def _items(frames: Frames) -> tuple[Values, str, BoolArray, int]:
-    """Items of messages by name, NaN where missing; their world; which measure; how many are damaged.
-
-    Orientations in another world than the first are left out.
-    """
-    items: Values = {}
-    world, damaged = "", 0
-    measured = np.zeros(len(frames), dtype=bool)
-    for first in range(0, len(frames), _SOME):
-        found, bad = columns(frames[first : first + _SOME])
-        damaged += bad
-        for identifier, column in found.items():
-            name, values, rows = name_of(identifier), column.values, first + column.rows
-            measured[rows] |= name not in _STAMPS
-            if name in _NOTATIONS:
-                world = world or world_of(identifier)
-                if world != world_of(identifier):
-                    continue
-            if name == _NOTATIONS[1]:
-                values = values.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
-            if name not in items:
-                items[name] = np.full((len(frames), values.shape[1]), np.nan)
-            items[name][rows] = values
-    return items, world or "NWU", measured, damaged
-
-
-def _measured(items: Values, parts: Parts) -> Parts:
-    """Add readings, or increments in their place."""
-    acceleration, rate = items.get("acceleration_m_s2"), items.get("rate_of_turn_rad_s")
+        others, which = np.cumsum(~rows, dtype=np.int64)[rows], which[rows]
+    counter, ticks = (None if stamp is None else stamp[rows, 0].astype(np.int64) for stamp in stamps)
+    force, rate = items.get("acceleration_m_s2"), items.get("rate_of_turn_rad_s")
     increments = []
-    if acceleration is None and (acceleration := items.get("delta_v_m_s")) is not None:
-        parts = parts.noting("acceleration is the sensor's velocity increments over its sampling period")
+    if force is None and (force := items.get("delta_v_m_s")) is not None:
+        notes.append("acceleration is the sensor's velocity increments over its sampling period")
         increments.append(VECTORS[0])
     if rate is None and (turns := items.get("delta_q_wxyz")) is not None:
-        unit = of_unit_length(turns)[:, None]
-        turned = Rotation.from_quat(np.where(unit, turns, 1.0), scalar_first=True)
-        rate = np.where(unit, turned.as_rotvec(), np.nan)
-        parts = parts.noting("rate of turn is the sensor's orientation increments over its sampling period")
+        rate = _rotation_vectors(turns)
+        notes.append("rate of turn is the sensor's orientation increments over its sampling period")
         increments.append(VECTORS[1])
-    vectors = (acceleration, rate, items.get("magnetic_field_au"))
-    return replace(parts, vectors=vectors, increments=tuple(increments))
+    notation = next((name for name in ORIENTATIONS if name in items), None)
+    own = None if notation is None else items[notation]
+    if own is not None and notation == ORIENTATIONS[1]:
+        own = own.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
+    return Parts(
+        replace(_stretches(frames, which), counter=counter, ticks=ticks, others=others),
+        (force, rate, items.get("magnetic_field_au")),
+        own,
+        Claim(world or "NWU", "as its messages say"),
+        tuple(notes),
+        tuple(increments),
+    )
+
+
+def _rotation_vectors(wxyz: FloatArray) -> FloatArray:
+    """Rotation vectors of quaternions; NaN of those that are damage."""
+    wxyz, _ = quaternions_of(wxyz, None)
+    there = np.isfinite(wxyz)
+    turns = Rotation.from_quat(np.where(there, wxyz, 1.0), scalar_first=True)
+    return np.where(there[:, :1], turns.as_rotvec(), np.nan)

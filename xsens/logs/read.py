@@ -6,6 +6,7 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from io import BufferedReader, TextIOWrapper
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from xsens.logs.datamessages import legacy_samples, mtdata2_samples
-from xsens.logs.parts import Hints, Parts, on_clock, oriented
+from xsens.logs.parts import Hints, assembled
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import parse_text
 from xsens.messages.control import MessageId
@@ -33,22 +34,6 @@ _TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in
 
 _WIDE = (b"\xff\xfe", b"\xfe\xff")
 """First bytes of text whose characters take two bytes."""
-
-_BEGINNINGS = (
-    (b"\x89HDF\r\n\x1a\n", "an HDF5 file"),
-    (b"MATLAB 7.3 MAT-file", "a MATLAB file"),
-    (b"MATLAB 5.0 MAT-file", "a MATLAB file"),
-    (b"\x93NUMPY", "a NumPy array"),
-    (b"PK\x03\x04", "a ZIP archive (or a spreadsheet)"),
-    (b"\x1f\x8b", "a gzip archive"),
-    (b"\x89PNG\r\n\x1a\n", "a PNG image"),
-    (b"\xff\xd8\xff", "a JPEG image"),
-    (b"%PDF-", "a PDF document"),
-    (b"PAR1", "a Parquet file"),
-    (b"ObjectType = ", "a MetaImage header"),
-    (b"NRRD000", "an NRRD image"),
-)
-"""First bytes of files that are no log of the sensor, so that an error can name what was given instead."""
 
 _DATA = (MessageId.MT_DATA, MessageId.MT_DATA2)
 
@@ -90,8 +75,6 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
         file.seek(0)
         if not size:
             raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
-        if (other := next((kind for first, kind in _BEGINNINGS if head.startswith(first)), None)) is not None:
-            raise InvalidInputError(f"{path}: expected a sensor log (binary or text), got {other}")
         if _is_text(head):
             encoding = "utf-16" if head.startswith(_WIDE) else "utf-8-sig"
             with TextIOWrapper(file, encoding, errors="replace") as text:
@@ -162,18 +145,14 @@ def parse_stream(data: bytes | ByteArray, hints: Hints | None = None, source: st
     InvalidInputError
         If they hold no data message, or lack what is needed to understand one.
     """
-    hints = hints or Hints()
     with naming(source):
         frames = find_frames(data)
         which = _of_one_kind(frames)
-        parts = Parts(source, tuple(_passed_over(frames, which)))
         read = legacy_samples if frames.mid[which[0]] == MessageId.MT_DATA else mtdata2_samples
-        stamps, parts, claim, notations = read(frames, which, parts)
-        samples = 0 if stamps.starts is None else stamps.starts.size
+        parts = read(frames, which)
+        parts = replace(parts, notes=(*_passed_over(frames, which), *parts.notes))
         del data, frames, which  # as large as the samples
-        parts = oriented(parts, claim, hints, *notations)
-        del notations
-        return on_clock(stamps, samples, parts, hints)
+        return assembled(parts, hints or Hints(), source)
 
 
 def _of_one_kind(frames: Frames) -> IntArray:

@@ -12,7 +12,9 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.columns import Column, Names, column_of, names_a_sensor, suggestion
+from xsens.logs.columns import Column, column_of, names_a_sensor
+
+Names = tuple[str, ...]
 
 _SEPARATORS = ("\t", ";", ",", None)
 """In order of trust: a tab only separates, a comma may be a decimal point, blanks (None) may be padding."""
@@ -21,7 +23,6 @@ _LONGEST_HEADER = 64
 """Lines, not counting comments, among which the names of the columns or the first numbers must be."""
 
 _COMMENT = "#"
-_BLANK = ("", "nan", "NaN")
 _DIGIT = re.compile("[0-9]")
 _LIKE_NAMES = re.compile(r"(?:[a-z°²µ_][\w .()\[\]/^°²µ-]*|)$")
 _AXES = frozenset("wxyzs")
@@ -32,30 +33,32 @@ _AXES = frozenset("wxyzs")
 class TextTable:
     """A table of numbers: the lines before it, names in lower case, and the columns that are understood.
 
-    `values` has a column for each of `columns`, or for each cell where none has a name. `left_out` counts
-    lines of another length than the first or without a digit, `words` other cells that hold no number.
+    `values` has a column for each of `columns`, or for each cell where none has a name. `notes` count lines
+    of another length than the first or without a digit, and cells that hold no number.
     """
 
     header: Names
     names: Names
     columns: tuple[Column, ...]
     values: FloatArray
-    left_out: int = 0
-    words: int = 0
+    notes: Names = ()
 
-    def column(self, key: str) -> FloatArray | None:
-        """Numbers of the column, shape (rows,); None if there is none, or it is blank."""
-        at = next((i for i, column in enumerate(self.columns) if column.key == key), None)
-        return None if at is None or not np.isfinite(self.values[:, at]).any() else self.values[:, at]
+    def __getitem__(self, key: str) -> FloatArray | None:
+        """Numbers of a column in SI units, shape (rows,); None if there is none, or it is blank."""
+        for column, values in zip(self.columns, self.values.T, strict=False):
+            if column.key == key and np.isfinite(values).any():
+                with np.errstate(over="ignore"):  # damage, which is left out as no measurement
+                    return values if column.scale in (None, 1.0) else values * column.scale
+        return None
 
-    def group(self, pattern: str, axes: Iterable[str]) -> FloatArray | None:
-        """Columns side by side, shape (rows, axes); None if one is missing."""
-        columns = [column for axis in axes if (column := self.column(pattern.format(axis))) is not None]
+    def group(self, quantity: str, axes: Iterable[str]) -> FloatArray | None:
+        """Columns of a quantity side by side, shape (rows, axes); None if one is missing."""
+        columns = [column for axis in axes if (column := self[f"{quantity}_{axis}"]) is not None]
         return np.stack(columns, axis=1) if len(columns) == len(tuple(axes)) else None
 
-    def scale(self, key: str) -> float | None:
-        """Factor to SI units that the column's name states; None if it states none."""
-        return next((column.scale for column in self.columns if column.key == key), None)
+    def states_unit(self, key: str) -> bool:
+        """Whether a column's name says its unit."""
+        return any(column.key == key and column.scale is not None for column in self.columns)
 
 
 def read_table(lines: Iterable[str]) -> TextTable:
@@ -71,17 +74,17 @@ def read_table(lines: Iterable[str]) -> TextTable:
     """
     lines, header, count = iter(lines), [""], 0
     for line in lines:
-        if not line.startswith(_COMMENT):
-            for separator in _SEPARATORS:
-                cells = _cells(line, separator)
-                for names in (cells, _of_two_lines(_cells(header[-1], separator), cells)):
-                    if sum(column_of(name) is not None for name in names) >= 2:
-                        return _named(chain(lines), header, names, separator)
-                if len(cells) >= 4 and all(map(_is_number, cells)):
-                    _refuse_unknown_names(header[-1], len(cells))
-                    return _rows(chain([line], lines), header, (), (), separator, len(cells))
+        comment = line.startswith(_COMMENT)
+        for separator in () if comment else _SEPARATORS:
+            cells = _cells(line, separator)
+            for names in (cells, _of_two_lines(_cells(header[-1], separator), cells)):
+                if sum(column_of(name) is not None for name in names) >= 2:
+                    return _named(lines, tuple(header[1:]), names, separator)
+            if len(cells) >= 4 and all(cell == "nan" or number(cell) == number(cell) for cell in cells):
+                _refuse_unknown_names(header[-1], len(cells))
+                return _rows(chain([line], lines), tuple(header[1:]), (), separator, len(cells))
         header.append(line.rstrip("\n"))
-        count += not line.startswith(_COMMENT)
+        count += not comment
         if count > _LONGEST_HEADER:
             break
     raise InvalidInputError("expected a table of numbers, got none")
@@ -91,8 +94,12 @@ def _cells(line: str, separator: str | None) -> Names:
     return tuple(cell.strip().strip('"').lower() for cell in line.split(separator))
 
 
-def _is_number(cell: str) -> bool:
-    return cell == "nan" or not np.isnan(number(cell.replace(",", ".")))
+def number(cell: str) -> float:
+    """The number in a cell, whose decimal point may be a comma; NaN if it is none."""
+    try:
+        return float(cell.strip().strip('"').replace(",", "."))
+    except ValueError:
+        return float("nan")
 
 
 def _of_two_lines(groups: Names, axes: Names) -> Names:
@@ -109,38 +116,41 @@ def _of_two_lines(groups: Names, axes: Names) -> Names:
 
 def _refuse_unknown_names(line: str, count: int) -> None:
     """Raise if a line above numbers names their columns, none of them by a name that is understood."""
-    for separator in ("\t", ";", ",", None):
+    for separator in _SEPARATORS:
         names = tuple(cell.strip(' "#') for cell in _cells(line, separator))
         if len(names) == count and sum(map(bool, names)) > 1 and all(map(_LIKE_NAMES.match, names)):
-            listed = ", ".join(map(suggestion, names))
-            raise InvalidInputError(f"columns not understood: {listed}")
+            raise InvalidInputError(not_understood(names))
 
 
-def _named(lines: Iterator[str], header: list[str], names: Names, separator: str | None) -> TextTable:
+def not_understood(names: Iterable[str]) -> str:
+    """Sentence on names of columns, with some of those that are understood."""
+    names = list(names)
+    more = f" and {len(names) - 9} more" if len(names) > 9 else ""
+    listed = ", ".join(name[:40] for name in names[:9])
+    return f"columns not understood: {listed}{more} (expected time_s, acc_x, gyr_x_rad_s, mag_x)"
+
+
+def _named(lines: Iterator[str], header: Names, names: Names, separator: str | None) -> TextTable:
     first = next((line for line in lines if line.strip("\r\n") and _DIGIT.search(line)), "")
     if len(_cells(first, separator)) != len(names):  # a blank where a tab should be, or the like
         blanks = tuple(part for name in names for part in name.split())
         names = blanks if len(blanks) == len(_cells(first, separator)) else names
-    columns = [column_of(name) for name in names]
-    keys = [column.key for column in columns if column is not None and column.key != "counter"]
-    if twice := next((key for key in keys if keys.count(key) > 1), None):
-        both = [name for name in names if (column := column_of(name)) and column.key == twice]
-        raise InvalidInputError(f"expected the columns of one sensor, got two of {twice}: {', '.join(both)}")
-    return _rows(chain([first], lines), header, names, tuple(columns), separator, len(names))
+    keys: dict[str, str] = {}
+    for name in names:
+        if (column := column_of(name)) and column.key != "counter" and (twin := keys.get(column.key)):
+            raise InvalidInputError(
+                f"expected the columns of one sensor, got two of {column.key}: {twin}, {name}"
+            )
+        if column:
+            keys[column.key] = name
+    return _rows(chain([first], lines), header, names, separator, len(names))
 
 
-def _rows(
-    lines: Iterable[str],
-    header: list[str],
-    names: Names,
-    columns: tuple[Column | None, ...],
-    separator: str | None,
-    count: int,
-) -> TextTable:
+def _rows(lines: Iterable[str], header: Names, names: Names, separator: str | None, count: int) -> TextTable:
     """Read the columns that are understood, or all if none has a name."""
-    known = {i: column for i, column in enumerate(columns) if column is not None}
+    known = {i: column for i, name in enumerate(names) if (column := column_of(name)) is not None}
     kept = list(known) or range(count)
-    sensors = {name: dict[str, None]() for name in names if names_a_sensor(name)}
+    sensors = {i: dict[str, None]() for i, name in enumerate(names) if names_a_sensor(name)}
     values, left_out, words = array("d"), 0, 0
     for line in lines:
         if not line.strip("\r\n"):
@@ -149,31 +159,29 @@ def _rows(
         if len(cells) != count or not _DIGIT.search(line):
             left_out += 1
             continue
-        for name, ids in sensors.items():
-            ids[cells[names.index(name)].strip()] = None
+        for i, ids in sensors.items():
+            ids[cells[i].strip()] = None
         try:
             values.extend([float(cells[i]) for i in kept])
         except ValueError:  # quoted, blank, or a word
             row = [number(cells[i]) for i in kept]
-            words += sum(v != v and cells[i].strip() not in _BLANK for i, v in zip(kept, row, strict=True))
+            blank = [cells[i].strip().lower() in ("", "nan") for i in kept]
+            words += int(np.sum(np.isnan(row) & ~np.array(blank)))
             values.extend(row)
     if not values:
         raise InvalidInputError(
             f"expected lines of {count} cells below the names, got {left_out} lines of another length"
         )
-    for name, ids in sensors.items():
+    for i, ids in sensors.items():
         if len(ids) > 1:
-            listed = ", ".join(list(ids)[:4]) + (", ..." if len(ids) > 4 else "")
+            listed = ", ".join(list(ids)[:4])
             raise InvalidInputError(
-                f"column {name}: expected rows of one sensor, got {len(ids)} ({listed}): split the table"
+                f"column {names[i]}: expected rows of one sensor, got {len(ids)} ({listed}): split the table"
             )
+    notes = []
+    if left_out:
+        notes.append(f"{left_out} lines of another length or without a digit were left out")
+    if words:
+        notes.append(f"{words} cells hold something else than a number: missing")
     rows = np.frombuffer(values).reshape(-1, len(kept))
-    return TextTable(tuple(header[1:]), names, tuple(known.values()), rows, left_out, words)
-
-
-def number(cell: str) -> float:
-    """The number in a cell; NaN if it is none."""
-    try:
-        return float(cell.strip().strip('"'))
-    except ValueError:
-        return float("nan")
+    return TextTable(header, names, tuple(known.values()), rows, tuple(notes))

@@ -119,9 +119,6 @@ class Frames:
         return int(self.start.size)
 
     def __getitem__(self, which: Any) -> Frames:
-        listed = isinstance(which, np.ndarray) and which.dtype != bool and which.size > 0
-        if listed and (np.diff(which) == 1).all():
-            which = slice(int(which[0]), int(which[-1]) + 1)  # of which NumPy makes no copy
         return Frames(self.data, self.start[which], self.end[which])
 
     @cached_property

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -35,9 +34,6 @@ _BLOCK = np.dtype(
     }
 )
 """Misalignments of accelerometer and gyroscope, and of the magnetometer, over 2**14; gains over 2**8."""
-
-_ROWS = 2048
-"""Rows converted at a time: they stay in the cache, and are too few for BLAS to wake a team of threads."""
 
 
 @dataclass(frozen=True)
@@ -105,10 +101,5 @@ class RawCalibration:
         -------
         ndarray, shape (3, n, 3)
         """
-        mixing = block_diag(*np.linalg.inv(self.misalignments) / self.gains[:, None])
-        rows = np.asarray(counts, dtype=float).reshape(-1, 9)
-        values = np.empty(rows.shape)
-        for at in range(0, len(rows), _ROWS):
-            some = slice(at, at + _ROWS)
-            np.matmul(rows[some] - self.offsets.ravel(), mixing.T, out=values[some])
-        return np.moveaxis(values.reshape(-1, 3, 3), 1, 0)
+        mixing = np.linalg.inv(self.misalignments) / self.gains[:, None]
+        return np.asarray(np.einsum("sij,nsj->sni", mixing, np.asarray(counts, dtype=float) - self.offsets))
