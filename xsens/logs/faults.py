@@ -6,12 +6,10 @@ become NaN, as if they had not come, so that whatever uses the log grows less ce
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
@@ -73,35 +71,22 @@ def measured(log: ImuLog) -> ImuLog:
     InvalidInputError
         If its rows are of several sensors in turn.
     """
-    rows: dict[str, FloatArray] = {}
+    readings = {name: rows for name in VECTORS if (rows := getattr(log, name)) is not None}
+    _require_one_sensor(log, readings)
+    changed: dict[str, Any] = {}
     notes: list[str] = []
-
-    def leave_out(name: str, wrong: BoolArray, told: str) -> None:
-        rows[name] = np.where(wrong[:, None], np.nan, rows[name])
-        notes.append(f"{name.split('_')[0]}: {told}: taken as missing")
-
-    for name in VECTORS:
-        if (readings := getattr(log, name)) is not None:
-            rows[name] = readings
-            if not (readings.min() > -_ABSURD and readings.max() < _ABSURD):  # or NaN
-                wild = (np.abs(readings) >= _ABSURD).any(axis=1)
-                if wild.any():
-                    leave_out(name, wild, f"{int(wild.sum())} out of range")
-    _require_one_sensor(log, rows)
-    force, rate = rows.get(VECTORS[0]), rows.get(VECTORS[1])
     dead = np.zeros(len(log), dtype=bool)
-    for name in rows:
-        bad = _bad(name, rows[name], dead, force, rate)
+    for name, rows in readings.items():
+        bad = _bad(name, rows, dead, readings.get(VECTORS[0]), readings.get(VECTORS[1]))
         if name == VECTORS[0]:
-            dead = bad["readings of zero"] | ~_finite(rows[name])
-        told = ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any())
-        if told:
-            leave_out(name, np.logical_or.reduce(list(bad.values())), told)
-    changed: dict[str, Any] = {
-        name: readings if _finite(readings).any() else None
-        for name, readings in rows.items()
-        if readings is not getattr(log, name) or not _finite(readings).any()
-    }
+            dead = bad["readings of zero"] | ~_finite(rows)
+        counts = ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any())
+        if counts:
+            wrong = np.logical_or.reduce(list(bad.values()))
+            changed[name] = np.where(wrong[:, None], np.nan, rows)
+            notes.append(f"{name.split('_')[0]}: {counts}: taken as missing")
+        if not _finite(changed.get(name, rows)).any():
+            changed[name] = None
     if (stuck := _stuck(log)).any():
         notes.append(f"own orientation: {int(stuck.sum())} repeated: taken as missing")
         changed["oriented"] = log.oriented & ~stuck
@@ -114,7 +99,8 @@ def _finite(rows: FloatArray) -> BoolArray:
 
 
 def _norm(rows: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
+    with np.errstate(over="ignore", invalid="ignore"):  # damage
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
 
 
 class _Runs(NamedTuple):
@@ -139,30 +125,26 @@ class _Runs(NamedTuple):
         return np.asarray(self.length > max(2, 2 * self.usual))
 
     def marked(self, which: BoolArray, but_first: int = 0) -> BoolArray:
-        """The rows of some runs, each but its first."""
+        """The rows of some runs, but the first so many of each."""
         place = np.arange(self.length.sum()) - np.repeat(self.start, self.length)
         return np.asarray(np.repeat(which, self.length) & (place >= but_first))
-
-    def mean(self, values: FloatArray) -> FloatArray:
-        return np.asarray(np.add.reduceat(values, self.start) / self.length)
 
 
 def _bad(
     name: str, rows: FloatArray, dead: BoolArray, force: FloatArray | None, rate: FloatArray | None
 ) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
-    limits, finite = _LIMITS[name], _finite(rows)
-    size = np.where(finite, _norm(rows), 0.0)
-    zero, unit = finite & (size == 0.0), 1.0
-    if name == VECTORS[2]:
-        zero |= finite & (size < 1e-12)
-        some = size[finite & ~zero]
-        unit = float(np.median(some)) if some.size else 1.0
+    limits, size = _LIMITS[name], _norm(rows)
+    finite = ~np.isnan(size)
+    size[~finite] = 0.0
+    zero, unit = finite & (size < 1e-12), 1.0
+    if name == VECTORS[2] and (finite & ~zero).any():
+        unit = float(np.median(size[finite & ~zero]))
     beyond = size > limits.largest * unit
     if beyond.any():
         beyond = finite & (np.abs(rows).max(axis=1) > limits.largest * unit)
     if beyond.sum() > _FEW * finite.sum():  # another unit, which whoever uses the log refuses
-        beyond[:] = False
+        beyond = size >= _ABSURD
     if beyond.any() or not finite.all():
         rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
     runs = _Runs.of(rows)
@@ -199,7 +181,7 @@ def _turning(rate: FloatArray | None, runs: _Runs) -> BoolArray:
     """Runs in which the gyroscope turns."""
     if rate is None:
         return np.zeros(len(runs.start), dtype=bool)
-    return np.asarray(runs.mean(np.nan_to_num(_norm(rate))) > _TURNING_RAD_S)
+    return np.asarray(np.add.reduceat(np.nan_to_num(_norm(rate)), runs.start) > _TURNING_RAD_S * runs.length)
 
 
 def _clipped(rows: FloatArray) -> BoolArray:
@@ -239,11 +221,11 @@ def _stuck(log: ImuLog) -> BoolArray:
     at = np.flatnonzero(log.oriented)
     rows, rate = log.world_from_sensor[at].as_quat(), log.gyroscope_rad_s
     runs = _Runs.of(rows)
-    end = np.minimum(runs.start + runs.length, len(rows) - 1)
-    turn = (Rotation.from_quat(rows[runs.start]).inv() * Rotation.from_quat(rows[end])).magnitude()
-    goes_on = runs.start + runs.length == len(rows)
-    behind = (turn > _STUCK_RAD) | (goes_on & _turning(None if rate is None else rate[at], runs))
-    stuck[at] = runs.marked(runs.long & behind, runs.usual)
+    behind = np.minimum(runs.start + runs.length, len(rows) - 1)
+    cosine = np.abs(np.einsum("ij,ij->i", rows[runs.start], rows[behind]))
+    moves = 2.0 * np.arccos(np.minimum(cosine, 1.0)) > _STUCK_RAD
+    moves[-1] |= _turning(None if rate is None else rate[at], runs)[-1]
+    stuck[at] = runs.marked(runs.long & moves, runs.usual)
     return stuck
 
 
@@ -272,34 +254,25 @@ def _median_norm(rows: FloatArray) -> float:
     return float(np.median(norms)) if norms.size else float("nan")
 
 
-_RUNS = 9
-"""Runs of one value whose median length is the usual one while samples arrive."""
-
-
 class LiveFaults:
     """Readings that are no measurements, as they arrive: zeros, repeats in movement, values out of range."""
 
     def __init__(self) -> None:
-        self._last = np.full((3, 3), np.nan)
-        self._run = [0, 0, 0]
-        self._lengths = [deque[int](maxlen=_RUNS) for _ in VECTORS]
+        self._last = np.full((2, 3), np.nan)
+        self._run = 0
 
     def measured(self, *readings: FloatArray) -> list[FloatArray]:
         """Rate, force and field of a sample, each NaN if it is no measurement."""
         rate, force, field = readings
-        dead = np.isnan(force).any() or not force.any()
-        moves = float(np.linalg.norm(rate)) > _SLOW_RAD_S
-        bad = [bool(dead and not rate.any()), bool(dead), not field.any()]
-        for i, reading in enumerate(readings):
-            if (reading == self._last[i]).all():
-                self._run[i] += 1
-            else:
-                self._lengths[i].append(self._run[i] or 1)
-                self._last[i], self._run[i] = reading, 1
-            if moves and self._run[i] > 2 and len(self._lengths[i]) == _RUNS:
-                bad[i] |= self._run[i] > 2 * sorted(self._lengths[i])[_RUNS // 2]
-            bad[i] |= bool((np.abs(reading) > _LIVE[i]).any())
-        return [np.full(3, np.nan) if wrong else row for wrong, row in zip(bad, readings, strict=True)]
+        same = bool((self._last == readings[:2]).all())
+        self._last, self._run = np.array(readings[:2]), self._run + 1 if same else 1
+        stuck = self._run > 2 and float(np.linalg.norm(rate)) > _SLOW_RAD_S
+        dead = not (np.isfinite(force).all() and force.any())
+        bad = [dead and not rate.any(), dead, not field.any()]
+        return [
+            np.full(3, np.nan) if wrong or stuck or (np.abs(row) > most).any() else row
+            for row, wrong, most in zip(readings, bad, _LIVE, strict=True)
+        ]
 
 
 _LIVE = (_LIMITS[VECTORS[1]].largest, _LIMITS[VECTORS[0]].largest, 1e12)
