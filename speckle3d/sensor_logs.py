@@ -19,7 +19,7 @@ from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.load import load_sweep
 from speckle3d.io.readers import find_reader
 from speckle3d.io.sweep_writer import attach_orientation
-from xsens.logs.clocks import timeline_of_times
+from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.faults import measured
 from xsens.logs.samples import Gap, ImuLog
 
@@ -47,7 +47,7 @@ def _inside_probe(path: Path) -> ImuLog | None:
     if find_reader(path) is not READER:
         return None
     samples = sensor_of(path)
-    clock, fit = timeline_of_times(samples.time_s), samples.fit
+    clock, fit = timeline(Stamps(time_s=samples.time_s)), samples.fit
     found = "is not used: it does not agree with gravity" if fit is None else f"is {MEANING}"
     log = ImuLog(
         clock.time_s,
@@ -64,7 +64,7 @@ def _inside_probe(path: Path) -> ImuLog | None:
 
 def log_of(sensor: OrientationSensor, source: str) -> ImuLog:
     """Log of a sweep's orientation sensor, on its own clock."""
-    clock = timeline_of_times(sensor.readings.time_s)
+    clock = timeline(Stamps(time_s=sensor.readings.time_s))
     log = ImuLog(
         clock.time_s,
         **{name: getattr(sensor, name) for name in INERTIAL},

@@ -26,44 +26,26 @@ def lasts_of_bins(steps: int, settings: FusionSettings) -> IntArray:
     return np.minimum(np.arange(per_bin, steps + per_bin, per_bin), steps) - 1
 
 
-def filtered_bins(rows: Any, settings: FusionSettings) -> Any:
-    """Average the steps of each bin as the filter left them, with its corrections of its tilt."""
-    sd = rows["sd"]
-    bins = averaged_bins(rows, rows["start"], rows["bias"], sd[:, 3:6], sd[:, :3], settings)
-    turns = Rotation.from_quat(rows["level"]) * Rotation.from_quat(rows["predicted"]).inv()
-    lasts = lasts_of_bins(len(rows), settings)
-    firsts = np.append(0, lasts[:-1] + 1)
-    # Corrections are small: the turn of all is the sum of their rotation vectors.
-    bins["correction"] = Rotation.from_rotvec(np.add.reduceat(turns.as_rotvec(), firsts)).as_matrix()
-    return bins
-
-
 def averaged_bins(
-    rows: Any,
-    levels: FloatArray,
-    bias_rad_s: FloatArray,
-    bias_sd_rad_s: FloatArray,
-    sd_rad: FloatArray,
-    settings: FusionSettings,
+    rows: Any, levels: FloatArray, bias_rad_s: FloatArray, sd: FloatArray, settings: FusionSettings
 ) -> Any:
     """Average the steps of each bin.
 
     Parameters
     ----------
     rows : structured ndarray, shape (n,)
-        As in `FilterSteps`.
+        As in `xsens.fusion.inclination.FilterSteps`.
     levels : ndarray, shape (n, 4)
         Level axes from the sensor's at the start of each step.
-    bias_rad_s, bias_sd_rad_s : ndarray, shape (n, 3)
+    bias_rad_s : ndarray, shape (n, 3)
         After each step.
-    sd_rad : ndarray, shape (n, 3)
-        Deviation of the level axes about the world's; the third is not used.
+    sd : ndarray, shape (n, 6)
+        Deviation of the level axes about the world's, rad, of which the third is not used, and of the bias.
     settings : FusionSettings
 
     Returns
     -------
     structured ndarray, shape (bins,), of `BIN`
-        Fields as they were read, not yet over their norm; no corrections.
     """
     lasts = lasts_of_bins(len(rows), settings)
     firsts, counts = np.append(0, lasts[:-1] + 1), np.diff(lasts, prepend=-1)
@@ -71,9 +53,9 @@ def averaged_bins(
     bins["span_s"] = np.add.reduceat(rows["duration_s"], firsts)
     bins["resting"] = np.logical_and.reduceat(rows["resting"], firsts)
     bins["slip_rad2"] = np.add.reduceat(rows["noise"][:, 2], firsts)
-    bins["bias_variance"] = (bias_sd_rad_s[lasts] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
-    bins["tilt_rad2"] = np.add.reduceat((sd_rad[:, :2] ** 2).mean(axis=1), firsts) / counts
-    bins["correction"] = np.eye(3)
+    bins["bias"] = bias_rad_s[lasts]
+    bins["bias_variance"] = (sd[lasts, 3:] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
+    bins["tilt_rad2"] = np.add.reduceat((sd[:, :2] ** 2).mean(axis=1), firsts) / counts
     seen = np.asarray(np.isfinite(rows["field"]).all(axis=1))
     bins["seen"] = np.logical_or.reduceat(seen, firsts)
     field = np.where(seen[:, None], rows["field"], 0.0)

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.kernels.orientation import heading as kernel
 from xsens.fusion.settings import FusionSettings
 
@@ -84,9 +84,6 @@ class Headings:
     stray: FloatArray
     iron: FloatArray
 
-    def __getitem__(self, which: IntArray) -> Headings:
-        return Headings(*(values[which] for values in vars(self).values()))
-
 
 class HeadingFilter:
     """The three filters, bin by bin; `online` if the readings so far are all there is."""
@@ -101,115 +98,79 @@ class HeadingFilter:
         self._models["white_sqrt_s"] = settings.field_noise_sqrt_s
         self._models["lag_s"] = settings.magnetometer_lag_s
         self._models["first_stray"] = _FIRST_STRAY if online else 1.0
-        self._filters = _fresh(_STRAY)
-        self._evidence, self._doubt = np.zeros(len(_ODDS)), np.zeros(len(_ODDS))
-        self._norm = math.nan
-        self._bias: FloatArray | None = None
+        self._models["memory_s"] = _MEMORY_S if online else math.inf
+        self._begin(_STRAY)
+
+    def _begin(self, stray: float) -> None:
+        self._filters = np.zeros(len(_ODDS), kernel.FILTER)
+        self._filters["stray"] = stray
 
     def resume(self) -> None:
         """Find north again after a pause; keep iron, lag and the evidence."""
         self._filters["begun"] = False
-        self._bias = None
 
-    def follow(self, bins: Any, bias_rad_s: FloatArray) -> Headings:
-        """Take in bins; `bias_rad_s`, shape (n, 3), is the bias with which each one's steps ended."""
-        bins = bins.copy()
-        before = bias_rad_s[:1] if self._bias is None else self._bias[None]
-        bins["bias_change"] = np.diff(bias_rad_s, axis=0, prepend=before)
-        self._bias = bias_rad_s[-1].copy()
-        found = self._run(self._scaled(bins, 1), self._filters)
-        moving = ~bins["resting"][:, None]  # a sensor at rest repeats itself and proves nothing
-        keep = np.where(moving, np.exp(-bins["span_s"][:, None] / _MEMORY_S), 1.0)
-        evidence = found["evidence"] * moving
-        for now, share in zip(evidence, keep, strict=True):
-            now += share * self._evidence
-            self._evidence = now
-        doubt = self._doubt + np.cumsum(found["doubt"] * moving, axis=0)
-        self._evidence, self._doubt = evidence[-1].copy(), doubt[-1]
-        return _mean(found, _weights(evidence, doubt), bins)
+    def follow(self, bins: Any) -> Headings:
+        """Take in bins."""
+        rows = self._run(bins)
+        return _mean(rows, _weights(rows), bins)
 
     def smooth(self, bins: Any) -> Headings:
         """North over a whole stretch, smoothed backward; the stray at first is the recording's."""
-        bins, moving = self._scaled(bins, len(bins)), ~bins["resting"]
-        found, stray = self._run(bins, self._filters), _STRAY
-        if moving.any():
-            best = _weights(*_sums(found, moving)).argmax()
-            stray = max(float(np.median(found["stray"][moving, best])), _STRAY)
-        shapes = ((kernel.SIZE,), *3 * [(kernel.SIZE, kernel.SIZE)])
-        kept = [np.zeros((len(_ODDS), len(bins), *shape)) for shape in shapes]
-        found = self._run(bins, _fresh(stray), kept)
-        weights = _weights(*_sums(found, moving))
-        for j in np.flatnonzero(weights > _NEGLIGIBLE):
-            found["turn_rad"][:, j], found["variance"][:, j] = _backward(bins, *(each[j] for each in kept))
-        return _mean(found, np.tile(np.where(weights > _NEGLIGIBLE, weights, 0.0), (len(bins), 1)), bins)
+        bins["bias"] = 0.0  # with a smoothed bias, there is no better one to come
+        rows, moving = self._run(bins), ~bins["resting"]
+        best = _weights(rows[-1]).argmax()
+        self._begin(max(float(np.median(rows["stray"][moving, best])) if moving.any() else 0.0, _STRAY))
+        filtered = _shaped(len(_ODDS), len(bins))
+        rows = self._run(bins, filtered)
+        weights = _weights(rows[-1])
+        weights[weights < _NEGLIGIBLE] = 0.0
+        for j in np.flatnonzero(weights):
+            rows["turn_rad"][:, j], rows["variance"][:, j] = _backward(*(each[j] for each in filtered))
+        return _mean(rows, np.tile(weights, (len(bins), 1)), bins)
 
-    def _scaled(self, bins: Any, readings: int) -> Any:
-        """Bins whose fields are fractions of the norm, which is that of the first readings."""
-        if not math.isfinite(self._norm) and bins["seen"].any():
-            first = bins["field"][bins["seen"]][:readings]
-            self._norm = float(np.median(np.linalg.norm(first, axis=1)))
-        if self._norm > 0.0:
-            bins["field"] /= self._norm
-            bins["field_rate"] /= self._norm
-        return bins
-
-    def _run(self, bins: Any, filters: Any, kept: list[FloatArray] | None = None) -> Any:
+    def _run(self, bins: Any, filtered: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""
-        found = np.zeros((len(_ODDS), len(bins)), kernel.HEADING)
-        none = [np.zeros((0, kernel.SIZE)), *3 * [np.zeros((0, kernel.SIZE, kernel.SIZE))]]
-        for j in range(len(_ODDS)):
-            into = none if kept is None else [each[j] for each in kept]
-            kernel.find_headings(bins, self._models[j : j + 1], filters[j : j + 1], found[j], *into)
-        return found.T
+        rows = np.zeros((len(bins), len(_ODDS)), kernel.HEADING)
+        kernel.find_headings(bins, self._models, self._filters, rows, *(filtered or _shaped(0, 0)))
+        return rows
 
 
-def _fresh(stray: float) -> Any:
-    """The filters before the first reading."""
-    filters = np.zeros(len(_ODDS), kernel.FILTER)
-    filters["stray"] = stray
-    return filters
+def _shaped(*shape: int) -> list[FloatArray]:
+    """Arrays for states, covariances, transitions and noises."""
+    size = kernel.SIZE
+    return [np.zeros((*shape, *each)) for each in ((size,), *3 * [(size, size)])]
 
 
-def _sums(found: Any, moving: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Evidence and doubt of each filter over a recording."""
-    return found["evidence"].sum(axis=0), found["doubt"][moving].sum(axis=0)
-
-
-def _weights(evidence: FloatArray, doubt: FloatArray) -> FloatArray:
+def _weights(rows: Any) -> FloatArray:
     """Weights of the filters: iron on the sensor by its evidence over the better one of the other two."""
-    against = np.tile(_ODDS, (*evidence.shape[:-1], 1))
+    evidence, against = rows["evidence"], np.tile(_ODDS, (*rows.shape[:-1], 1))
     against[..., _IRON] -= evidence[..., _IRON] - evidence[..., :_IRON].max(axis=-1)
-    against[..., :_IRON] += doubt[..., :_IRON]
+    against[..., :_IRON] += rows["doubt"][..., :_IRON]
     against[..., :_IRON] -= against[..., :_IRON].min(axis=-1, keepdims=True)
     likely = np.exp(against.min(axis=-1, keepdims=True) - against)
     return np.asarray(likely / likely.sum(axis=-1, keepdims=True))
 
 
-def _mean(found: Any, weights: FloatArray, bins: Any) -> Headings:
+def _mean(rows: Any, weights: FloatArray, bins: Any) -> Headings:
     """The likeliest filter's angle, and deviation of all from it by their weights, shape (n, filters)."""
-    best = np.take_along_axis(found["turn_rad"], weights.argmax(axis=1)[:, None], axis=1)
-    off = np.angle(np.exp(1j * (found["turn_rad"] - best)))
-    variance = (weights * (found["variance"] + off**2)).sum(axis=1)
-    trust, stray = ((weights * found[name]).sum(axis=1) for name in ("trust", "stray"))
+    best = np.take_along_axis(rows["turn_rad"], weights.argmax(axis=1)[:, None], axis=1)
+    off = np.angle(np.exp(1j * (rows["turn_rad"] - best)))
+    variance = (weights * (rows["variance"] + off**2)).sum(axis=1)
+    trust, stray = ((weights * rows[name]).sum(axis=1) for name in ("trust", "stray"))
     disturbed = bins["seen"] & (trust < _DISTRUSTED)
     return Headings(best[:, 0], np.sqrt(variance), disturbed, stray, weights[:, _IRON])
 
 
 def _backward(
-    bins: Any, states: FloatArray, covariances: FloatArray, transitions: FloatArray, noises: FloatArray
+    states: FloatArray, covariances: FloatArray, transitions: FloatArray, noises: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle and variance of one filter, smoothed; before the first reading, back by the gyroscope."""
+    """Angle and variance of one filter, smoothed; before the first reading as there."""
     from filterpy.kalman import KalmanFilter
 
     first = int(np.argmax(covariances[:, 0, 0] > 0.0))
     smoother = KalmanFilter(dim_x=kernel.SIZE, dim_z=3)
-    noises = noises + _ROUNDING * np.eye(kernel.SIZE)
-    filtered = (each[first:] for each in (states, covariances, transitions, noises))
-    means, spread, _, _ = smoother.rts_smoother(*filtered)
-    found = np.array([kernel.turn_to_north(x, p) for x, p in zip(means, spread, strict=True)])
-    # Before the first reading the level axes are the gyroscope's, whose errors add up.
-    early = bins[1 : first + 1]
-    moving_s = early["span_s"] * ~early["resting"]
-    grown = np.cumsum((early["slip_rad2"] + moving_s**2 * early["bias_variance"])[::-1])[::-1]
-    turn, variance = np.unwrap(found[:, 0]), found[:, 1]
-    return np.pad(turn, (first, 0), mode="edge"), np.concatenate([variance[0] + grown, variance])
+    filtered = (states, covariances, transitions, noises + _ROUNDING * np.eye(kernel.SIZE))
+    means, spread, _, _ = smoother.rts_smoother(*(each[first:] for each in filtered))
+    turns = np.array([kernel.turn_to_north(x, p) for x, p in zip(means, spread, strict=True)])
+    turn, variance = np.pad(turns, ((first, 0), (0, 0)), mode="edge").T
+    return np.unwrap(turn), variance

@@ -1,4 +1,4 @@
-"""Inclination and turning, without the magnetometer: the filter over a stretch, and its smoothing backward.
+"""Inclination and turning, without the magnetometer: the filter over samples, and its smoothing backward.
 
 So iron cannot tilt the orientation; `heading` then turns it to north.
 """
@@ -22,16 +22,6 @@ taken for white noise as strong at low frequencies: so it is for the smoother, b
 Measured on twelve trials of BROAD (Laidig et al. 2021)."""
 
 
-def fresh_filter(settings: FusionSettings) -> Any:
-    """The filter before the first stretch; its heading starts at zero by definition."""
-    fresh = np.zeros(1, kernel.FILTER)
-    tilt = 2.0 * settings.speed_m_s / settings.gravity_m_s2  # of the mean force over a second
-    deviations = [tilt, tilt, 1e-6, *3 * [settings.bias_sd_rad_s], *3 * [2.0 * settings.speed_m_s]]
-    fresh["fresh"], fresh["level"] = np.square(deviations), [0.0, 0.0, 0.0, 1.0]
-    fresh["p"] = np.diag(fresh["fresh"][0])
-    return fresh
-
-
 @lru_cache(maxsize=8)
 def _limits(settings: FusionSettings) -> Any:
     """Settings that the filter uses, as its kernel takes them."""
@@ -41,7 +31,7 @@ def _limits(settings: FusionSettings) -> Any:
 
 @dataclass(frozen=True)
 class FilterSteps:
-    """What the filter leaves behind of n increments.
+    """Increments that some samples complete.
 
     Attributes
     ----------
@@ -49,88 +39,50 @@ class FilterSteps:
         Sample after each increment's last.
     rows : structured ndarray, shape (n,), of `speckle3d.kernels.orientation.inclination.STEP`
     covariance, transition : ndarray, shape (n, 9, 9), or (0, 9, 9) if they are not wanted
+    xyzw : ndarray, shape (m, 4)
+        Level axes from the sensor's at every sample, by what came before it.
     """
 
     last: IntArray
     rows: Any
     covariance: FloatArray
     transition: FloatArray
+    xyzw: FloatArray
 
 
-def forward(
-    samples: Samples,
-    settings: FusionSettings,
-    kept: Any,
-    pause_s: float = 0.0,
-    covariances: bool = False,
-    whole: bool = False,
-) -> FilterSteps:
-    """Run the filter over a stretch.
+class InclinationFilter:
+    """The filter over samples as they come; its heading starts at zero by definition."""
 
-    Parameters
-    ----------
-    samples : Samples
-        One stretch without a pause.
-    settings : FusionSettings
-    kept : structured ndarray
-        The filter at the end of the stretch before, or a fresh one; changed in place.
-    pause_s : float
-        Time since the end of that stretch; `GOES_ON` if this one continues it.
-    covariances : bool
-        Keep what smoothing needs.
-    whole : bool
-        These are the samples of one increment.
-    """
-    per_block = max(1, round(settings.block_s / float(np.mean(samples.step_s))))
-    last = np.arange(per_block, len(samples), per_block)
-    last = np.append([] if whole else last, len(samples)).astype(np.int64)
-    n = len(last)
-    wide = (n if covariances else 0, kernel.SIZE, kernel.SIZE)
-    steps = FilterSteps(last, np.zeros(n, kernel.STEP), np.empty(wide), np.empty(wide))
-    kernel.run_filter(
-        _plain(samples.step_s),
-        _plain(samples.rate_rad_s),
-        _plain(samples.force_m_s2),
-        _plain(samples.field_au),
-        _plain(samples.lost_rad2),
-        last,
-        pause_s,
-        kept,
-        _limits(settings),
-        steps.rows,
-        steps.covariance,
-        steps.transition,
-    )
-    return steps
+    def __init__(self, settings: FusionSettings) -> None:
+        self._settings = settings
+        self._filter, self._unfinished = np.zeros(1, kernel.FILTER), np.zeros(1, kernel.STEP)
+        tilt = 2.0 * settings.speed_m_s / settings.gravity_m_s2  # of the mean force over a second
+        deviations = [tilt, tilt, 1e-6, *3 * [settings.bias_sd_rad_s], *3 * [2.0 * settings.speed_m_s]]
+        self._filter["fresh"] = np.square(deviations)
 
+    def begin(self, pause_s: float) -> None:
+        """Find up again with the next sample, so long after the one before."""
+        self._filter["pause_s"] = pause_s
 
-def _plain(values: FloatArray) -> FloatArray:
-    """Values as kernels are compiled for."""
-    return np.ascontiguousarray(values)
+    def run(self, samples: Samples, to_end: bool, covariances: bool = False) -> FilterSteps:
+        """Run the filter over samples without a pause.
 
-
-def within_steps(
-    samples: Samples,
-    steps: FilterSteps,
-    starts: FloatArray,
-    biases_rad_s: FloatArray,
-    ends: FloatArray | None = None,
-) -> FloatArray:
-    """World from sensor at every sample, by the gyroscope from the steps' starts; quaternions, scalar last.
-
-    Parameters
-    ----------
-    samples : Samples
-    steps : FilterSteps
-    starts, biases_rad_s : ndarray, shapes (n, 4) and (n, 3)
-        Of each step; a resting sensor stays at its step's start.
-    ends : ndarray, shape (n, 4), optional
-        At the end of each step; the gyroscope's error there is spread over the step.
-    """
-    xyzw, there = np.empty((len(samples), 4)), np.empty((0, 4)) if ends is None else ends
-    step_s, rate, still = map(_plain, (samples.step_s, samples.rate_rad_s, steps.rows["resting"]))
-    kernel.orient_samples(step_s, rate, steps.last, still, starts, _plain(biases_rad_s), there, xyzw)
-    return xyzw
+        Parameters
+        ----------
+        samples : Samples
+        to_end : bool
+            The last one completes an increment, however short.
+        covariances : bool
+            Keep what smoothing needs.
+        """
+        m = len(samples)
+        most = min(m, int(2.0 * samples.step_s.sum() / self._settings.block_s) + 2)
+        last, rows, xyzw = np.empty(most, np.int64), np.zeros(most, kernel.STEP), np.empty((m, 4))
+        covariance, transition = np.empty((2, most if covariances else 0, kernel.SIZE, kernel.SIZE))
+        readings = map(np.ascontiguousarray, vars(samples).values())
+        kept = (self._filter, _limits(self._settings), self._unfinished)
+        n = kernel.run_filter(*readings, to_end, *kept, rows, last, covariance, transition, xyzw)
+        return FilterSteps(last[:n], rows[:n], covariance[:n], transition[:n], xyzw)
 
 
 @dataclass(frozen=True)
@@ -141,23 +93,30 @@ class Smoothed:
     ----------
     levels : ndarray, shape (steps + 1, 4)
         World from sensor; the heading starts at zero.
-    bias_rad_s, bias_sd_rad_s : ndarray, shape (steps + 1, 3)
-    sd_rad : ndarray, shape (steps + 1, 3)
-        Standard deviation about the world's axes.
+    bias_rad_s : ndarray, shape (steps + 1, 3)
+    sd : ndarray, shape (steps + 1, 6)
+        Standard deviation about the world's axes, rad, and of the bias.
     """
 
     levels: FloatArray
     bias_rad_s: FloatArray
-    bias_sd_rad_s: FloatArray
-    sd_rad: FloatArray
+    sd: FloatArray
 
 
 def smooth(samples: Samples, settings: FusionSettings) -> tuple[FilterSteps, Smoothed]:
     """Smooth one stretch, which must be longer than the filter's start, one second."""
-    steps = forward(samples, settings, fresh_filter(settings), covariances=True)
+    steps = InclinationFilter(settings).run(samples, to_end=True, covariances=True)
     n, first = len(steps.last), int(np.argmax(steps.rows["started"]))
     levels, biases = np.empty((n + 1, 4)), np.empty((n + 1, 3))
     kernel.smooth_steps(steps.rows, steps.covariance, steps.transition, first, levels, biases)
-    variance = np.diagonal(steps.covariance, axis1=1, axis2=2)[np.maximum(np.arange(-1, n), first)]
-    sd = np.sqrt(np.maximum(variance, 0.0))
-    return steps, Smoothed(levels, biases, sd[:, 3:6], sd[:, :3])
+    variance = np.diagonal(steps.covariance, axis1=1, axis2=2)[np.maximum(np.arange(-1, n), first), :6]
+    return steps, Smoothed(levels, biases, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def within_steps(samples: Samples, steps: FilterSteps, nodes: FloatArray, biases: FloatArray) -> FloatArray:
+    """World from sensor at every sample, between nodes at the ends of steps; quaternions, scalar last."""
+    xyzw = np.empty((len(samples), 4))
+    still = np.ascontiguousarray(steps.rows["resting"])
+    rates = np.ascontiguousarray(samples.rate_rad_s)
+    kernel.orient_samples(samples.step_s, rates, steps.last, still, nodes, biases, xyzw)
+    return xyzw

@@ -13,10 +13,7 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
-from speckle3d.kernels.orientation.inclination import GOES_ON
-from xsens.fusion.bins import filtered_bins, steps_per_bin
-from xsens.fusion.heading import HeadingFilter
-from xsens.fusion.inclination import CLAIMED, forward, fresh_filter
+from xsens.fusion.engines import Filter
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, lost_variance, require_metres
 from xsens.fusion.samples import Samples
 from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
@@ -83,19 +80,14 @@ class OnlineFilter:
 
     def __init__(self, settings: FusionSettings | None = None) -> None:
         self._settings = settings or FusionSettings()
-        self._level, self._heading = fresh_filter(self._settings), HeadingFilter(self._settings)
-        self._rows: list[Any] = []
-        self._last: Any = None
-        self._turn_rad, self._heading_sd_rad = 0.0, math.pi
-        self._field = (False, math.nan, math.nan)
-        self._pending: list[tuple[float, FloatArray, FloatArray, FloatArray, float]] = []
-        self._before: FloatArray | None = None
-        self._pending_s = self._skipped_s = self._pause_s = self._forceless_s = 0.0
-        self._usual_s = math.nan
-        self._force = np.full(3, np.nan)
-        self._first: list[FloatArray] = []
-        self._judged_s = 0.0
+        self._filter = Filter(self._settings)
         self._live = LiveFaults()
+        self._state: OnlineState | None = None
+        self._rate: FloatArray | None = None
+        self._force = np.full(3, np.nan)
+        self._skipped_s = self._forceless_s = self._judged_s = 0.0
+        self._usual_s = math.nan
+        self._first: list[FloatArray] = []
 
     def push(
         self,
@@ -126,27 +118,42 @@ class OnlineFilter:
             first second, the accelerometer is not in m/s^2.
         """
         steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
-        for step, rate, force, field in zip(steps, rates, forces, fields, strict=True):
-            self._judge(float(step), force)
-            self._take(float(step), rate, force, field)
+        pending: list[tuple[Any, ...]] = []
+        for step_s, rate, force, field in zip(steps.tolist(), rates, forces, fields, strict=True):
+            self._judge(step_s, force)
+            reading = self._measured(step_s, rate, force, field)
+            if reading is None:
+                continue
+            if reading[0] > PAUSE_S:
+                self._run(pending)
+                pending = []
+                # The turn in a pause is not known, nor is the first sample's own step.
+                self._filter.begin(0.0 if self._rate is None else reading[0])
+                reading = (self._settings.block_s, *reading[1:])
+            self._rate = reading[1]
+            pending.append(reading)
+        self._run(pending)
+
+    def _run(self, pending: list[tuple[Any, ...]]) -> None:
+        if not pending:
+            return
+        found = self._filter.run(Samples(*map(np.array, zip(*pending, strict=True))))
+        if len(last := self._filter.last):
+            self._state = OnlineState(
+                Rotation.from_quat(found.xyzw[-1]),
+                found.sd_rad[-1],
+                found.bias_rad_s[-1],
+                bool(found.disturbed[-1]),
+                bool(found.resting[-1]),
+                bool(last["started"][0]),
+                float(found.field_stray[-1]),
+                float(found.field_iron[-1]),
+            )
 
     @property
     def state(self) -> OnlineState | None:
         """Estimate after the last sample; None before the first whole increment."""
-        last = self._last
-        if last is None:
-            return None
-        bias, resting = last["bias"].copy(), bool(last["resting"])
-        rotation = Rotation.from_euler("z", self._turn_rad) * Rotation.from_quat(last["level"])
-        if not resting:
-            for step_s, rate, *_ in self._pending:
-                rotation *= Rotation.from_rotvec((rate - bias) * step_s)
-        sd_rad = last["sd"][:3] * CLAIMED
-        if self._settings.use_magnetometer:
-            sd_rad[2] = self._heading_sd_rad
-        started = bool(last["started"])
-        disturbed, stray, iron = self._field
-        return OnlineState(rotation, sd_rad, bias, disturbed, resting, started, stray, iron)
+        return self._state
 
     def _judge(self, step_s: float, force: FloatArray) -> None:
         """Raise if the accelerometer is in other units, after a second of it."""
@@ -163,63 +170,26 @@ class OnlineFilter:
             finally:
                 self._first = []
 
-    def _take(self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
+    def _measured(
+        self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray
+    ) -> tuple[Any, ...] | None:
+        """A sample as `Samples` has it, its step from the last one; None of what is no measurement."""
         rate, force, field = self._live.measured(rate, force, field)
         self._forceless_s += step_s
+        self._skipped_s += step_s
         if np.isfinite(force).all():
             self._force, self._forceless_s = force, 0.0
         if not (np.isfinite(rate).all() and self._forceless_s <= PAUSE_S and np.isfinite(self._force).all()):
-            self._skipped_s += step_s
-            return
-        step_s += self._skipped_s
-        self._skipped_s = 0.0
-        if step_s > PAUSE_S and self._last is not None:
-            self._advance()
-            self._pause_s = step_s
-            self._before = None
-        # The turn in a pause is not known, nor is the first sample's own step.
-        step_s = step_s if step_s <= PAUSE_S else self._settings.block_s
-        usual_s = step_s if self._before is None and self._last is None else self._usual_s
+            return None
+        step_s, self._skipped_s = self._skipped_s, 0.0
         lost = 0.0
-        if self._before is not None and step_s > LOST * usual_s:
-            lost = float(lost_variance(np.array([0.0, step_s]), np.array([self._before, rate]), usual_s)[0])
-        self._usual_s = usual_s + _FOLLOWS * (min(step_s, LOST * usual_s) - usual_s)
-        self._before = rate
-        self._pending.append((step_s, rate, self._force, field, lost))
-        self._pending_s += step_s
-        # Half a sample too short is as near to the block's length as half a sample too long.
-        if self._pending_s + 0.5 * step_s >= self._settings.block_s:
-            self._advance()
-
-    def _advance(self) -> None:
-        """Make an increment of the pending samples."""
-        if not self._pending:
-            return
-        samples = Samples(*(np.array(column) for column in zip(*self._pending, strict=True)))
-        self._pending, self._pending_s = [], 0.0
-        pause_s = GOES_ON
-        if self._last is None or self._pause_s:
-            self._find_north()
-            self._heading.resume()
-            self._heading_sd_rad = math.pi  # until the first bin after it
-            pause_s = self._pause_s
-        rows = forward(samples, self._settings, self._level, pause_s, whole=True).rows
-        self._pause_s = 0.0
-        self._last = rows[0]
-        self._rows.append(rows)
-        if len(self._rows) == steps_per_bin(self._settings):
-            self._find_north()
-
-    def _find_north(self) -> None:
-        """Make a bin of the increments since the last one."""
-        if not self._rows:
-            return
-        rows = np.concatenate(self._rows)
-        self._rows = []
-        if self._settings.use_magnetometer:
-            found = self._heading.follow(filtered_bins(rows, self._settings), rows["bias"][-1:])
-            self._turn_rad, self._heading_sd_rad = float(found.turn_rad[0]), float(found.sd_rad[0])
-            self._field = (bool(found.disturbed[0]), float(found.stray[0]), float(found.iron[0]))
+        if self._rate is None:
+            self._usual_s = min(step_s, PAUSE_S)
+        elif step_s > LOST * self._usual_s:
+            steps, rates = np.array([0.0, step_s]), np.array([self._rate, rate])
+            lost = float(lost_variance(steps, rates, self._usual_s)[0])
+        self._usual_s += _FOLLOWS * (min(step_s, LOST * self._usual_s) - self._usual_s)
+        return step_s, rate, self._force, field, lost
 
 
 def _checked(

@@ -164,7 +164,7 @@ def _stretches(
     samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method, notes: list[str]
 ) -> list[Estimate]:
     """Each stretch by the method asked for, or by its on-line twin if it is short."""
-    from xsens.fusion.stretch import StretchFilter, smoothed  # which loads numba
+    from xsens.fusion.engines import Filter, smoothed  # which loads numba
 
     engine = None
     if method.is_vqf:
@@ -172,17 +172,17 @@ def _stretches(
 
         engine = VqfEngine(settings.use_magnetometer)
     results: list[Estimate] = []
-    kept = StretchFilter(settings)
+    kept = Filter(settings)
     step_s = float(np.median(samples.step_s))
     for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
         if first == last:
             continue
         stretch = samples[first:last]
-        pause_s = float(stretch.step_s[0])
         if first:
-            stretch = replace(stretch, step_s=np.concatenate([[step_s], stretch.step_s[1:]]))
+            kept.begin(float(stretch.step_s[0]))
+            stretch = replace(stretch, step_s=np.append(step_s, stretch.step_s[1:]))
         offline = method.offline and float(stretch.step_s.sum()) > _SHORTEST_S
-        own = smoothed(stretch, settings) if offline else kept.run(stretch, pause_s)
+        own = smoothed(stretch, settings) if offline else kept.run(stretch, to_end=True)
         results.append(own if engine is None else engine.run(stretch, own, offline))
     if engine is not None:
         notes += engine.notes

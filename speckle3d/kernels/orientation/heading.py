@@ -24,12 +24,11 @@ BIN = np.dtype(
         ("seen", "?"),  # whether it has a reading of the field
         ("slip_rad2", "f8"),  # variance of the level axes' turn about up
         ("bias_variance", "f8"),  # of the gyroscope, rad^2/s^2
-        ("bias_change", "f8", 3),  # by which the filter of inclination changed it, rad/s
+        ("bias", "f8", 3),  # that the level axes are turned without, at its end, rad/s
         ("field", "f8", 3),  # mean in the level axes
         ("field_rate", "f8", 3),  # its derivative by the magnetometer's lag, 1/s
         ("level", "f8", (3, 3)),  # mean level axes from the sensor's
         ("tilt_rad2", "f8"),  # variance of the level axes' tilt
-        ("correction", "f8", (3, 3)),  # turn by which corrections of the tilt turned the level axes
     ],
     align=True,
 )
@@ -45,6 +44,7 @@ MODEL = np.dtype(
         ("white_sqrt_s", "f8"),  # of a reading's noise
         ("lag_s", "f8"),
         ("first_stray", "f8"),  # of the first reading's stray, a fraction of the stray's
+        ("memory_s", "f8"),  # time over which evidence is weighed
     ],
     align=True,
 )
@@ -54,6 +54,10 @@ FILTER = np.dtype(
     [
         ("x", "f8", SIZE),
         ("p", "f8", (SIZE, SIZE)),
+        ("norm", "f8"),  # of the first reading, the unit of all
+        ("bias", "f8", 3),  # that of the last bin
+        ("evidence", "f8"),
+        ("doubt", "f8"),
         ("stray", "f8"),  # deviation now
         ("begun", "?"),  # in this stretch
         ("ran", "?"),  # ever
@@ -66,7 +70,8 @@ FILTER = np.dtype(
 
 HEADING = np.dtype([(name, "f8") for name in ("turn_rad", "variance", "evidence", "doubt", "trust", "stray")])
 """Angle from the level axes to north at the end of a bin, and its variance; logarithm of the density of the
-reading; of the odds that the first place was beside iron; the reading's weight, 0 to 1; the stray."""
+readings in movement; of the odds that the first place was beside iron; the reading's weight, 0 to 1; the
+stray."""
 
 _LEAST_STRAY, _MOST_STRAY = 0.005, 0.3
 
@@ -110,35 +115,35 @@ def find_headings(
     transitions: FloatArray,
     noises: FloatArray,
 ) -> None:
-    """Run one model's filter over bins.
+    """Run every model's filter over bins.
 
     Parameters
     ----------
     bins : structured ndarray, shape (n,), of `BIN`
-    models : structured ndarray, shape (1,), of `MODEL`
-    filters : structured ndarray, shape (1,), of `FILTER`
+    models : structured ndarray, shape (k,), of `MODEL`
+    filters : structured ndarray, shape (k,), of `FILTER`
         Changed in place.
-    headings : structured ndarray, shape (n,), of `HEADING`
+    headings : structured ndarray, shape (n, k), of `HEADING`
         Filled.
-    states, covariances, transitions, noises : ndarray, shapes (n, SIZE) and (n, SIZE, SIZE), or n = 0
+    states, covariances, transitions, noises : ndarray, shapes (k, n, SIZE) and (k, n, SIZE, SIZE), or k = 0
         Filled: after each bin, and from the one before to it.
     """
-    s, m = filters[0], models[0]
     rows, f, q = np.zeros((3, SIZE)), np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
-    for k in range(bins.shape[0]):
-        b, out = bins[k], headings[k]
-        out.evidence, out.doubt, out.trust, out.turn_rad, out.variance = 0.0, 0.0, 0.0, 0.0, math.pi**2
-        if not s.begun and b.seen:
-            _begin(s, b, m)
-        out.stray = s.stray
-        if not s.begun:
-            continue
-        _predict(s, b, m, f, q)
-        if b.seen:
-            _correct(s, b, m, rows, f, q, out)
-        out.turn_rad, out.variance = turn_to_north(s.x, s.p)
-        if states.shape[0] > 0:
-            states[k], covariances[k], transitions[k], noises[k] = s.x, s.p, f, q
+    for j in range(models.shape[0]):
+        s, m = filters[j], models[j]
+        for k in range(bins.shape[0]):
+            b, out = bins[k], headings[k, j]
+            out.trust, out.turn_rad, out.variance = 0.0, 0.0, math.pi**2
+            if not s.begun and b.seen:
+                _begin(s, b, m)
+            if s.begun:
+                _predict(s, b, m, f, q)
+                if b.seen:
+                    _correct(s, b, m, rows, f, q, out)
+                out.turn_rad, out.variance = turn_to_north(s.x, s.p)
+                if states.shape[0] > 0:
+                    states[j, k], covariances[j, k], transitions[j, k], noises[j, k] = s.x, s.p, f, q
+            out.stray, out.evidence, out.doubt = s.stray, s.evidence, s.doubt
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -156,13 +161,15 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
 def _begin(s: Any, b: Any, m: Any) -> None:
     """Begin with the bin's reading; after a pause with the iron and lag found so far."""
     if not s.ran:
+        s.norm = math.sqrt(b.field[0] ** 2 + b.field[1] ** 2 + b.field[2] ** 2)
         _forget(s, IRON, 3, m.iron)
         _forget(s, LAG, 1, m.lag_s)
     _forget(s, ROOM, 3, 1.0)
     _forget(s, BIAS, 3, math.sqrt(b.bias_variance))
     _forget(s, PLACE, 3, m.place if s.ran else m.first_place)
     _forget(s, STRAY, 3, m.first_stray * s.stray)
-    s.x[ROOM : ROOM + 3] = b.field - b.level @ s.x[IRON : IRON + 3]
+    s.x[ROOM : ROOM + 3] = b.field / s.norm - b.level @ s.x[IRON : IRON + 3]
+    s.bias[:] = b.bias
     s.holding_s, s.beside = 0.0, m.beside_iron and not s.ran
     s.begun, s.ran, s.rested = True, True, b.resting
 
@@ -177,25 +184,21 @@ def _forget(s: Any, first: int, count: int, sd: float) -> None:
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
-    """Predict over a bin; fill its transition and noise.
-
-    Fields stay where they are as the level axes are corrected.
-    """
+    """Predict over a bin; fill its transition and noise."""
     span, across, along = b.span_s, s.x[ROOM], s.x[ROOM + 1]
     moving, moves_on = 0.0 if b.resting else 1.0, b.resting != s.rested
     keep_bias, keep_stray = math.exp(-span / _BIAS_S), math.exp(-moving * span / _STRAY_S)
     s.rested = b.resting
-    s.x[BIAS : BIAS + 3] -= b.bias_change
+    s.x[BIAS : BIAS + 3] -= b.bias - s.bias
+    s.bias[:] = b.bias
     f[:], q[:] = 0.0, 0.0
     f[LAG, LAG] = 1.0
     for i in range(3):
         turn = moving * span * keep_bias * b.level[2, i]
         f[ROOM, BIAS + i], f[ROOM + 1, BIAS + i] = -turn * along, turn * across
         f[IRON + i, IRON + i], f[BIAS + i, BIAS + i] = 1.0, keep_bias
-        for j in range(3):
-            f[ROOM + i, ROOM + j] = b.correction[i, j]
-            f[PLACE + i, PLACE + j] = 0.0 if moves_on and not s.beside else b.correction[i, j]
-            f[STRAY + i, STRAY + j] = keep_stray * b.correction[i, j]
+        f[ROOM + i, ROOM + i], f[STRAY + i, STRAY + i] = 1.0, keep_stray
+        f[PLACE + i, PLACE + i] = 0.0 if moves_on and not s.beside else 1.0
         q[ROOM + i, ROOM + i] = _WALK_SQRT_S**2 * span
         q[BIAS + i, BIAS + i] = (1.0 - keep_bias**2) * b.bias_variance
         q[IRON + i, IRON + i] = m.iron_put_on**2 if s.holding_s > 0.0 else 0.0
@@ -220,21 +223,22 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
     """
     for i in range(3):
         rows[i, ROOM + i] = rows[i, PLACE + i] = rows[i, STRAY + i] = 1.0
-        rows[i, LAG] = b.field_rate[i]
+        rows[i, LAG] = b.field_rate[i] / s.norm
         rows[i, IRON : IRON + 3] = b.level[i]
-    off, cross, total = _innovation(s, b, m, rows)
-    weight, determinant = inverse(total)
-    misfit = float(off @ (weight @ off))
-    if not b.resting:
-        _adapt(s, b, off, misfit, weight)
-    if misfit > _OUTLIER and _changed(s, m, f, q, off, total):
+    for known in (False, True):
         off, cross, total = _innovation(s, b, m, rows)
         weight, determinant = inverse(total)
         misfit = float(off @ (weight @ off))
+        if not (known or b.resting):
+            _adapt(s, b, off, misfit, weight)
+        if known or misfit <= _OUTLIER or not _changed(s, m, f, q, off, total):
+            break
     v = _FREEDOM
-    out.evidence = -0.5 * math.log(determinant) - 0.5 * (v + 3.0) * math.log(1.0 + misfit / v)
     out.trust = min((v + 3.0) / (v + misfit), 1.0)
-    out.doubt = b.span_s * ((1.0 - out.trust) / _DOUBT_S + (1.0 / _BESIDE_S if s.beside else 0.0))
+    if not b.resting:  # a sensor at rest repeats itself and proves nothing
+        s.evidence *= math.exp(-b.span_s / m.memory_s)
+        s.evidence -= 0.5 * math.log(determinant) + 0.5 * (v + 3.0) * math.log(1.0 + misfit / v)
+        s.doubt += b.span_s * ((1.0 - out.trust) / _DOUBT_S + (1.0 / _BESIDE_S if s.beside else 0.0))
     if misfit > _OUTLIER:
         out.trust = 0.0
         return
@@ -278,7 +282,7 @@ def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, F
     across, up = s.x[ROOM] ** 2 + s.x[ROOM + 1] ** 2, s.x[ROOM + 2] ** 2
     for i in range(3):
         total[i, i] += m.white_sqrt_s**2 / b.span_s + b.tilt_rad2 * (up if i < 2 else across)
-    return b.field - rows @ s.x, cross, total
+    return b.field / s.norm - rows @ s.x, cross, total
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

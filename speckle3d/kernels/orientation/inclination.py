@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.kernels.orientation.rotations import (
     Quaternion,
     Vector,
@@ -47,6 +47,7 @@ LIMITS = np.dtype(
     [
         (name, "f8")
         for name in (
+            "block_s",
             "gravity_m_s2",
             "gyro_noise_rad_sqrt_s",
             "gyro_scale_noise_sqrt_s",
@@ -65,6 +66,7 @@ LIMITS = np.dtype(
 
 FILTER = np.dtype(
     [
+        ("pause_s", "f8"),  # before the next sample, after which up is found anew; negative if it goes on
         ("running", "?"),
         ("starting", "?"),
         ("resting", "?"),
@@ -90,6 +92,7 @@ STEP = np.dtype(
         ("duration_s", "f8"),
         ("rate", "f8", 3),  # mean reading of the gyroscope
         ("field", "f8", 3),  # mean, in the axes at the start; NaN where there is none
+        ("fields", "f8"),  # how many readings that is of
         ("force", "f8", 3),  # integral of the specific force, likewise
         ("turn", "f8", 4),  # start from end
         ("lost_rad2", "f8"),  # variance of the turn over lost samples
@@ -108,9 +111,6 @@ STEP = np.dtype(
     align=True,
 )
 """One increment, and the filter before and after it."""
-
-GOES_ON = -1.0
-"""Pause before a stretch that is none: the stretch goes on from the last one."""
 
 _SHOCK_M_S2 = 60.0
 """Mean force of an increment beyond which it is not believed: a board shaken by hand in BROAD reads 51."""
@@ -149,15 +149,17 @@ def run_filter(
     force_m_s2: FloatArray,
     field_au: FloatArray,
     lost_rad2: FloatArray,
-    last: IntArray,
-    pause_s: float,
+    to_end: bool,
     filters: Any,
     limits: Any,
+    unfinished: Any,
     steps: Any,
+    last: IntArray,
     covariance: FloatArray,
     transition: FloatArray,
-) -> None:
-    """Run the filter over a stretch.
+    xyzw: FloatArray,
+) -> int:
+    """Run the filter over samples; return how many increments they complete.
 
     Parameters
     ----------
@@ -165,85 +167,81 @@ def run_filter(
     rate_rad_s, force_m_s2, field_au : ndarray, shape (m, 3)
     lost_rad2 : ndarray, shape (m,)
         Variance of the turn over lost readings before each sample.
-    last : ndarray of int, shape (n,)
-        Sample after each increment's last.
-    pause_s : float
-        Time since the stretch before, at whose end the filter is; `GOES_ON` if there was no pause.
+    to_end : bool
+        The last sample completes an increment, however short.
     filters, limits : structured ndarray, shape (1,), of `FILTER` and `LIMITS`
         The filter is changed in place.
+    unfinished : structured ndarray, shape (1,), of `STEP`
+        The increment that is not complete, from one call to the next.
     steps : structured ndarray, shape (n,), of `STEP`
-        Filled.
+        Filled, as many as are completed, as are the following.
+    last : ndarray of int, shape (n,)
+        Sample after each increment's last.
     covariance, transition : ndarray, shape (n, 9, 9), or (0, 9, 9) if they are not wanted
-        Filled.
+    xyzw : ndarray, shape (m, 4)
+        Level axes from the sensor's at every sample, by what came before it.
     """
-    s, r, f = filters[0], limits[0], np.zeros((SIZE, SIZE))
-    first = 0
-    for n in range(last.shape[0]):
-        step = steps[n]
-        step.start_bias[:] = s.bias
-        _sum_samples(step_s, rate_rad_s, force_m_s2, field_au, first, last[n], step)
-        step.lost_rad2 = lost_rad2[first : last[n]].sum()
-        first = last[n]
-        if n == 0 and pause_s != GOES_ON:
-            _set_up(s, r, step, pause_s)
-        step.start[:] = s.level
-        _predict(s, r, step, f)
-        if s.starting:
-            _begin(s, step)
-        else:
-            _correct_by_speed(s, r, step)
-            if s.resting:
-                off = step.rate - s.bias
-                gain = _correct(s.p, BIAS, _REST_BIAS_RAD**2 / step.duration_s, _LEVEL)
-                _inject(s, gain @ off)
-        step.level[:], step.speed[:], step.bias[:] = s.level, s.speed, s.bias
-        step.resting, step.started = s.resting, not s.starting
-        for i in range(6):
-            step.sd[i] = math.sqrt(s.p[i, i])
-        if covariance.shape[0] > 0:
-            covariance[n], transition[n] = s.p, f
-
-
-# -- increments
+    s, r, step, f, n = filters[0], limits[0], unfinished[0], np.zeros((SIZE, SIZE)), 0
+    for k in range(step_s.shape[0]):
+        if s.pause_s >= 0.0:
+            _set_up(s, r, force_m_s2[k])
+            _open(s, step)
+        _add(step, step_s[k], rate_rad_s[k], force_m_s2[k], field_au[k])
+        step.lost_rad2 += lost_rad2[k]
+        whole = step.duration_s + 0.5 * step_s[k] >= r.block_s or (to_end and k == step_s.shape[0] - 1)
+        if whole:
+            _complete(s, r, step, f)
+            if covariance.shape[0] > 0:
+                covariance[n], transition[n] = s.p, f
+            steps[n], last[n] = unfinished[0], k + 1
+            n += 1
+            _open(s, step)
+        level = quaternion(s.level)
+        xyzw[k] = level if s.resting else product(level, quaternion(step.turn))
+    return n
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _sum_samples(
-    step_s: FloatArray,
-    rate: FloatArray,
-    force: FloatArray,
-    field: FloatArray,
-    first: int,
-    last: int,
-    step: Any,
-) -> None:
-    """Sum the samples from `first` to before `last`, with the step's bias."""
-    q = (0.0, 0.0, 0.0, 1.0)
-    step.duration_s = 0.0
-    step.rate[:], step.field[:], step.force[:] = 0.0, 0.0, 0.0
-    fields = 0
-    for k in range(first, last):
-        dt = step_s[k]
-        for i in range(3):
-            step.rate[i] += dt * rate[k, i]
-        half = _turn(rate[k], step.start_bias, 0.5 * dt)
-        q = product(q, half)
-        x, y, z = rotated(q, (force[k, 0], force[k, 1], force[k, 2]))
-        step.force[0] += dt * x
-        step.force[1] += dt * y
-        step.force[2] += dt * z
-        q = product(q, half)
-        if math.isfinite(field[k, 0] + field[k, 1] + field[k, 2]):
-            x, y, z = rotated(q, (field[k, 0], field[k, 1], field[k, 2]))
-            step.field[0] += x
-            step.field[1] += y
-            step.field[2] += z
-            fields += 1
-        step.duration_s += dt
+def _open(s: Any, step: Any) -> None:
+    """Begin an increment."""
+    step.duration_s = step.fields = step.lost_rad2 = 0.0
+    step.rate[:], step.field[:], step.force[:], step.turn[:] = 0.0, 0.0, 0.0, _NO_TURN
+    step.start[:], step.start_bias[:] = s.level, s.bias
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
+    """Add a sample to an increment, with the increment's bias."""
+    half = _turn(rate, step.start_bias, 0.5 * dt)
+    q = product(quaternion(step.turn), half)
+    step.force += dt * np.array(rotated(q, _three(force)))
+    q = product(q, half)
+    if math.isfinite(field[0] + field[1] + field[2]):
+        step.field += np.array(rotated(q, _three(field)))
+        step.fields += 1.0
+    step.rate += dt * rate
     step.turn[:] = q
-    for i in range(3):
-        step.rate[i] /= step.duration_s
-        step.field[i] = step.field[i] / fields if fields > 0 else math.nan
+    step.duration_s += dt
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _complete(s: Any, r: Any, step: Any, f: FloatArray) -> None:
+    """Predict over an increment, and correct; fill what it leaves behind, and its transition."""
+    step.rate /= step.duration_s
+    step.field /= step.fields if step.fields > 0.0 else math.nan
+    _predict(s, r, step, f)
+    if s.starting:
+        _begin(s, step)
+    else:
+        _correct_by_speed(s, r, step)
+        if s.resting:
+            off = step.rate - s.bias
+            gain = _correct(s.p, BIAS, _REST_BIAS_RAD**2 / step.duration_s, _LEVEL)
+            _inject(s, gain @ off)
+    step.level[:], step.speed[:], step.bias[:] = s.level, s.speed, s.bias
+    step.resting, step.started = s.resting, not s.starting
+    for i in range(6):
+        step.sd[i] = math.sqrt(s.p[i, i])
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -258,39 +256,36 @@ def orient_samples(
     step_s: FloatArray,
     rate_rad_s: FloatArray,
     last: IntArray,
-    resting: FloatArray,
-    starts: FloatArray,
+    resting: BoolArray,
+    nodes: FloatArray,
     biases: FloatArray,
-    ends: FloatArray,
     xyzw: FloatArray,
 ) -> None:
-    """Fill the orientation of every sample, by the gyroscope from the start of its step.
+    """Fill the orientation of every sample, by the gyroscope, whose error is spread over each step.
 
     Parameters
     ----------
     step_s, rate_rad_s : ndarray, shapes (m,) and (m, 3)
     last, resting : ndarray, shape (n,)
         Sample after each step's last; whether the sensor stays at its step's start.
-    starts, biases : ndarray, shapes (n, 4) and (n, 3)
-        At the start of each step.
-    ends : ndarray, shape (n, 4) or (0, 4)
-        At the end of each step: the error there is spread over the step. Empty: it is left.
+    nodes : ndarray, shape (n + 1, 4)
+        At the start and at the end of each step.
+    biases : ndarray, shape (n + 1, 3)
     xyzw : ndarray, shape (m, 4)
     """
     first = 0
     for n in range(last.shape[0]):
-        q, whole_s, span_s = quaternion(starts[n]), 0.0, 0.0
+        q, span_s = quaternion(nodes[n]), 0.0
         for k in range(first, last[n]):
             if not resting[n]:
                 q = product(q, _turn(rate_rad_s[k], biases[n], step_s[k]))
             xyzw[k] = q
-            whole_s += step_s[k]
-        if ends.shape[0] > 0:
-            x, y, z = vector_of(product(quaternion(ends[n]), inverted(q)))
-            for k in range(first, last[n]):
-                span_s += step_s[k]
-                share = span_s / whole_s
-                xyzw[k] = product(quaternion_of(share * x, share * y, share * z), quaternion(xyzw[k]))
+        x, y, z = vector_of(product(quaternion(nodes[n + 1]), inverted(q)))
+        whole_s = step_s[first : last[n]].sum()
+        for k in range(first, last[n]):
+            span_s += step_s[k]
+            share = span_s / whole_s
+            xyzw[k] = product(quaternion_of(share * x, share * y, share * z), quaternion(xyzw[k]))
         first = last[n]
 
 
@@ -309,17 +304,18 @@ def _upright(force: FloatArray) -> Quaternion:
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
-def _set_up(s: Any, r: Any, step: Any, pause_s: float) -> None:
-    """Begin before the first increment of a stretch: anew, or after a pause with the bias found so far."""
+def _set_up(s: Any, r: Any, force: FloatArray) -> None:
+    """Begin before the first sample: anew, or after a pause with the bias found so far."""
     kept = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
     s.p[:] = np.diag(s.fresh)
     if s.running:
-        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = kept + r.bias_walk_rad_s_sqrt_s**2 * pause_s * np.eye(3)
+        s.p[BIAS : BIAS + 3, BIAS : BIAS + 3] = kept + r.bias_walk_rad_s_sqrt_s**2 * s.pause_s * np.eye(3)
     s.running = s.starting = True
     s.resting = s.rest_known = False
     s.still_s = s.start_s = 0.0
+    s.pause_s = -1.0
     s.start_force[:], s.speed[:] = 0.0, 0.0
-    s.level[:] = _upright(step.force)
+    s.level[:] = _upright(force)
     s.start_turn[:] = s.level  # in level axes: those of a sensor upside down would turn with every reading
 
 
@@ -327,10 +323,7 @@ def _set_up(s: Any, r: Any, step: Any, pause_s: float) -> None:
 def _begin(s: Any, step: Any) -> None:
     """Set up from the mean force since the start."""
     turn = quaternion(s.start_turn)
-    x, y, z = rotated(turn, _three(step.force))
-    s.start_force[0] += x
-    s.start_force[1] += y
-    s.start_force[2] += z
+    s.start_force += np.array(rotated(turn, _three(step.force)))
     turn = product(turn, quaternion(step.turn))
     s.start_turn[:] = turn
     s.start_s += step.duration_s
@@ -388,10 +381,8 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     s.p[:] = f @ s.p @ f.T
     for i in range(SIZE):
         s.p[i, i] += step.noise[i]
-    x, y, z = rotated(level, _three(step.force))
-    s.speed[0] += x
-    s.speed[1] += y
-    s.speed[2] += z - r.gravity_m_s2 * duration
+    s.speed += np.array(rotated(level, _three(step.force)))
+    s.speed[2] -= r.gravity_m_s2 * duration
     if not s.resting:
         s.level[:] = product(level, quaternion(step.turn))
     step.predicted[:], step.predicted_speed[:] = s.level, s.speed
@@ -410,7 +401,7 @@ def _correct_by_speed(s: Any, r: Any, step: Any) -> None:
     _inject(s, -gain @ s.speed)
 
 
-_LEVEL = np.zeros(3)
+_LEVEL, _NO_TURN = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")

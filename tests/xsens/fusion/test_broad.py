@@ -1,13 +1,10 @@
 """Orientation on BROAD trials beside VQF's own, on-line beside on-line and off-line beside off-line."""
 
-import subprocess
-import sys
 from functools import cache
 
 import numpy as np
 import pytest
 from broad import OFFLINE, ONLINE, coverage, errors_deg, errors_rad, estimate, read_trial, trials_in
-from field_scenes import recorded, scene
 from scipy.spatial.transform import Rotation
 
 GAIN = 0.8
@@ -107,21 +104,6 @@ def test_claimed_sigma_fits_the_errors(folder, methods, part):
     assert least >= SHARES[0]
 
 
-@pytest.mark.realdata
-@pytest.mark.slow
-@kinds
-@pytest.mark.parametrize("name", ["15_undisturbed_fast_translation_A", "28_disturbed_stationary_magnet_A"])
-def test_a_recording_that_begins_in_movement_is_no_worse_than_with_vqf(folder, methods, name):
-    begun = scene(recorded(folder, name), "cut", 15.0, None)
-    theirs, ours = (
-        errors_deg(estimate(begun.log, method).wxyz, begun.true_wxyz, begun.moving)[0] for method in methods
-    )
-    assert ours <= MOVED_ALREADY.get(name, WORSE) * theirs
-
-
-# -- the scores themselves
-
-
 def attitudes(count=4000):
     return Rotation.random(count, np.random.default_rng(3))
 
@@ -139,9 +121,3 @@ def test_errors_are_told_apart_by_axis():
     steady = errors_rad(wxyz(found), wxyz(true), np.ones(len(true), dtype=bool), steady=True)
     np.testing.assert_allclose(steady.heading, 0.0, atol=1e-9)
     np.testing.assert_allclose(steady.total, np.hypot(0.02, 0.01))
-
-
-def test_the_benchmark_finds_the_packages(project):
-    bench = project / "tests" / "benchmarks" / "bench_fusion.py"
-    told = subprocess.run([sys.executable, bench, "--help"], capture_output=True, text=True, check=True)
-    assert "--leave-one-out" in told.stdout

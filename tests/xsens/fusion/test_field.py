@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from broad import read_trial
-from field_scenes import EARTH_UT, scene, simulated, with_readings
+from field_scenes import scene, simulated, with_readings
 
-from xsens.fusion.field import POOR, ROUGH, FieldFound, Trust, dip_rad, field_of
+from xsens.fusion.field import POOR, ROUGH, FieldFound, Trust, field_of
 from xsens.fusion.orient import orient
 
 GOOD = FieldFound(np.radians(1.4), 0.02, 0.01, 0.0, np.radians(3.2), 186.0)
@@ -31,16 +31,6 @@ def test_an_even_field_is_trusted_and_none_is_not_judged():
     assert judged(with_readings(log, magnetometer_au=None)).trust is Trust.UNKNOWN
 
 
-@pytest.mark.parametrize(
-    ("kind", "amount", "trust", "words"),
-    [("attached", 30.0, Trust.CARE, "iron on the probe"), ("walk", 0.3, Trust.CARE, "turns with the sensor")],
-)
-def test_iron_on_the_probe_and_in_the_room_are_told_apart(kind, amount, trust, words):
-    found = judged(made(kind, amount))
-    assert found.trust is trust
-    assert words in found.sentence()
-
-
 VECTORS = ("gyroscope_rad_s", "accelerometer_m_s2", "magnetometer_au")
 
 
@@ -62,10 +52,6 @@ def test_each_doubt_counts_and_is_said(changes, trust):
     assert ("gyroscope alone does better" in found.sentence()) == (
         trust is not Trust.UNKNOWN and found.drift_rad < found.heading_sd_rad
     )
-
-
-def test_the_dip_is_below_the_horizontal():
-    assert np.degrees(dip_rad(EARTH_UT[None])) == pytest.approx(np.degrees(np.arctan2(45, 18)))
 
 
 @pytest.mark.realdata

@@ -4,7 +4,7 @@ from contextlib import closing
 import pytest
 
 from speckle3d.core.errors import FileError
-from xsens.live.device import DeviceError, DeviceSettings, connect, prepare
+from xsens.live.device import DeviceSettings, connect, prepare
 from xsens.messages.control import Configuration, MessageId
 
 pytest.importorskip("serial", reason="needs pyserial")
@@ -55,16 +55,3 @@ class TestDevice:
         with pytest.raises(FileError, match="none") as caught:
             connect(str(tmp_path / "none"))
         assert "\n" not in str(caught.value)
-
-    def test_a_refusal_names_the_message_and_the_error(self, sensor):
-        with (
-            closing(connect(str(sensor.path), BAUD)) as device,
-            pytest.raises(DeviceError, match=r"0xa4.*error 4"),
-        ):
-            device.request(0xA4, b"\0\1")
-
-    def test_an_unplugged_port_is_a_device_error(self, sensor):
-        with closing(connect(str(sensor.path), BAUD)) as device:
-            sensor.unplug()
-            with pytest.raises(DeviceError, match="port: "):
-                device.request(MessageId.REQ_DID)

@@ -121,22 +121,6 @@ class TestRecording:
         ]
         assert 0.3 < (stamps[1] - stamps[0]).total_seconds() < 8.0
 
-    def test_silence_is_noticed_and_asked_about(self, sensor, path, monkeypatch):
-        monkeypatch.setattr("xsens.live.recording.SILENCE_S", 0.3)
-        with Recorder(str(sensor.path), path, FAST) as recorder:
-            wait_until(lambda: len(sensor.run) > 20)
-            sensor.mute = True
-            wait_until(lambda: not recorder.state().connected)
-            sensor.mute = False
-            wait_until(lambda: recorder.state().connected)
-            assert recorder.state().interruptions == 1
-
-    def test_a_file_that_is_there_is_left_alone(self, sensor, path):
-        path.write_bytes(b"precious")
-        with pytest.raises(FileError, match=r"recording\.mtb"):
-            Recorder(str(sensor.path), path, FAST)
-        assert path.read_bytes() == b"precious"
-
     def test_a_full_disk_ends_the_recording_with_a_file_error(self, sensor, path, monkeypatch):
         with Recorder(str(sensor.path), path, FAST) as recorder:
             wait_until(lambda: recorder.state().samples > 5)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import Stamps, timeline, timeline_of_times
+from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.samples import ImuLog
 
 PERIOD_S = 1 / 256
@@ -22,13 +22,6 @@ def test_lost_samples_are_found_wherever_the_counter_wraps(first, lost, stride):
     for gap in line.gaps:
         assert gap.lost == taken[gap.after_index + 1] - taken[gap.after_index] - 1
         assert gap.duration_s == pytest.approx((gap.lost + 1) * PERIOD_S)
-
-
-def test_repeated_samples_are_kept_once():
-    line = timeline(Stamps(counter=np.array([5, 6, 6, 7]), period_s=0.01))
-    assert line.rows.tolist() == [0, 1, 3]
-    np.testing.assert_allclose(line.time_s, [0.0, 0.01, 0.02])
-    assert [note.split()[0] for note in line.notes] == ["1"]
 
 
 def test_a_new_start_is_as_long_as_the_computers_clock_says():
@@ -64,7 +57,7 @@ def trembling(samples=2000, lost=()):
 
 
 @pytest.mark.parametrize(
-    "read", [timeline_of_times, lambda t: timeline(Stamps(ticks=np.round(1e4 * t + 50)))]
+    "read", [lambda t: timeline(Stamps(time_s=t)), lambda t: timeline(Stamps(ticks=np.round(1e4 * t + 50)))]
 )
 def test_a_clock_that_trembles_much_is_irregular_and_has_lost_nothing(read):
     times = trembling()

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from xsens.logs.read import read_log
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Message, encode, find_frames
-from xsens.messages.mtdata2 import columns, kind_of
+from xsens.messages.mtdata2 import read_items
 
 pytestmark = pytest.mark.realdata
 
@@ -65,13 +65,10 @@ NAMES = {
 
 def decoded_rows(frames):
     """Values of the items of every message by name."""
-    table, damaged = columns(frames)
-    assert damaged == 0
-    rows = [{} for _ in range(len(frames))]
-    for identifier, column in table.items():
-        for row, values in zip(column.rows, column.values, strict=True):
-            rows[row][kind_of(identifier).name] = values
-    return rows
+    values, _, _, damaged = read_items(frames)
+    assert not damaged.any()
+    rows = [{name: column[row] for name, column in values.items()} for row in range(len(frames))]
+    return [{name: v for name, v in row.items() if np.isfinite(v).all()} for row in rows]
 
 
 def golden_items(text):

@@ -2,7 +2,6 @@ import math
 from datetime import UTC, datetime
 
 import pytest
-from imu_messages import configuration_message
 
 from xsens.messages.control import (
     Configuration,
@@ -22,17 +21,6 @@ def test_the_configuration_of_a_real_unit():
     assert len(payload) == 118
     c = Configuration.from_message(Message(MessageId.CONFIGURATION, payload))
     assert (c.rate_hz, c.units) == (100.0, ((0, 1),))
-
-
-@pytest.mark.parametrize(
-    ("period", "skip", "rate_hz"),
-    [(450, 0, 256.0), (576, 3, 50.0), (0, 0, math.nan), (450, 0xFFFF, math.nan)],
-)
-def test_configurations_of_several_units_come_back(period, skip, rate_hz):
-    units = ((0xFFFF, 0), (2, 0xFFFFFFFF), (0, 1))
-    c = Configuration.from_message(configuration_message(units, period, skip))
-    assert c.units == units
-    assert c.rate_hz == pytest.approx(rate_hz, nan_ok=True)
 
 
 def test_the_time_is_told_as_the_sensors_tell_it():

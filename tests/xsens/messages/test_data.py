@@ -5,7 +5,7 @@ from imu_messages import mtdata_payloads
 
 from xsens.messages.framing import decode, find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode
-from xsens.messages.mtdata2 import columns
+from xsens.messages.mtdata2 import read_items
 
 FEW = settings(deadline=None, max_examples=60)
 
@@ -84,9 +84,9 @@ def test_every_mode_and_manner_comes_back(mode, manner, seed):
 
 def test_a_packet_of_a_real_mti():
     data = "faff3626102002468210600401c4fc3e2010103f71ce6cbea56bcf3c613bd8bd691d25e020040040000312"
-    table, damaged = columns(find_frames(bytes.fromhex(data)))
-    assert (sorted(table), damaged) == ([0x1020, 0x1060, 0x2010], 0)
-    assert table[0x1020].values.tolist() == [[18050.0]]
-    assert table[0x1060].values.tolist() == [[29686846.0]]
+    values, world, measured, damaged = read_items(find_frames(bytes.fromhex(data)))
+    assert (sorted(values), world) == (["packet_counter", "quaternion_wxyz", "sample_time_fine"], "ENU")
+    assert (measured.all(), damaged.any()) == (True, False)
+    assert (values["packet_counter"].item(), values["sample_time_fine"].item()) == (18050.0, 29686846.0)
     quaternion = [[0.944556, -0.323088, 0.013747, -0.056913]]
-    np.testing.assert_allclose(table[0x2010].values, quaternion, atol=5e-7)
+    np.testing.assert_allclose(values["quaternion_wxyz"], quaternion, atol=5e-7)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from xsens.messages.control import MessageId
-from xsens.messages.framing import MOST_PAYLOAD, Framer, Message, decode, encode, find_frames
+from xsens.messages.framing import Framer, Message, decode, encode, find_frames
 
 FEW = settings(deadline=None, max_examples=40)
 
@@ -14,14 +14,6 @@ messages = st.builds(
     payload=st.binary(max_size=300),
     bid=st.integers(0, 255),
 )
-
-
-@pytest.mark.parametrize("size", [0, 1, 254, 255, 256, 1320, MOST_PAYLOAD])
-def test_every_length_comes_back_and_255_bytes_need_the_long_form(size):
-    message = Message(0x91, bytes(size))
-    data = encode(message)
-    assert len(data) == size + (5 if size < 255 else 7)
-    assert decode(data) == [message]
 
 
 @pytest.mark.parametrize(
