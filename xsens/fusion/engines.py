@@ -104,7 +104,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
         sd[:, 2] = np.pi
     xyzw = within_steps(samples, steps, nodes, level.bias_rad_s)
     of_step = np.repeat(np.arange(count), np.diff(steps.last, prepend=0))
-    of_steps = (sd[1:], level.bias_rad_s[1:], disturbed, rows["resting"], stray, iron)
+    of_steps: tuple[Any, ...] = (sd[1:], level.bias_rad_s[1:], disturbed, rows["resting"], stray, iron)
     return Estimate(xyzw, *(values[of_step] for values in of_steps))
 
 

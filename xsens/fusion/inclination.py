@@ -79,9 +79,10 @@ class InclinationFilter:
         most = min(m, int(2.0 * samples.step_s.sum() / self._settings.block_s) + 2)
         last, rows, xyzw = np.empty(most, np.int64), np.zeros(most, kernel.STEP), np.empty((m, 4))
         covariance, transition = np.empty((2, most if covariances else 0, kernel.SIZE, kernel.SIZE))
-        readings = map(np.ascontiguousarray, vars(samples).values())
-        kept = (self._filter, _limits(self._settings), self._unfinished)
-        n = kernel.run_filter(*readings, to_end, *kept, rows, last, covariance, transition, xyzw)
+        arguments: list[Any] = [np.ascontiguousarray(values) for values in vars(samples).values()]
+        arguments += [to_end, self._filter, _limits(self._settings), self._unfinished]
+        run: Any = kernel.run_filter
+        n = run(*arguments, rows, last, covariance, transition, xyzw)
         return FilterSteps(last[:n], rows[:n], covariance[:n], transition[:n], xyzw)
 
 

@@ -119,7 +119,7 @@ class OnlineFilter:
         """
         steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
         pending: list[tuple[Any, ...]] = []
-        for step_s, rate, force, field in zip(steps.tolist(), rates, forces, fields, strict=True):
+        for step_s, rate, force, field in zip(map(float, steps), rates, forces, fields, strict=True):
             self._judge(step_s, force)
             reading = self._measured(step_s, rate, force, field)
             if reading is None:
@@ -162,13 +162,9 @@ class OnlineFilter:
         self._first.append(force)
         self._judged_s += min(step_s, BRIDGED_S)
         if self._judged_s >= _JUDGED_S:
-            try:
-                require_metres(np.array(self._first), "accelerometer_m_s2")
-            except InvalidInputError:
-                self._judged_s = 0.0  # so that the next second is judged too
-                raise
-            finally:
-                self._first = []
+            first, self._first, self._judged_s = np.array(self._first), [], 0.0
+            require_metres(first, "accelerometer_m_s2")
+            self._judged_s = _JUDGED_S  # else the next second is judged too
 
     def _measured(
         self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray

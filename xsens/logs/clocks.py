@@ -138,16 +138,15 @@ def _repeats(stamps: Stamps) -> BoolArray:
 
 def _order(stamps: Stamps) -> IntArray | None:
     """Indices that put samples which came late, by time, counter or clock, in order; None if none did."""
-    if stamps.time_s is not None:
-        key = stamps.time_s
-    else:
-        values, span = stamps.counter, stamps.counter_span
-        if values is None:
-            values, span = stamps.ticks, _TICK_SPAN
+    key: Any = stamps.time_s
+    if key is None:
+        values: Any = stamps.counter if stamps.counter is not None else stamps.ticks
+        span = stamps.counter_span if stamps.counter is not None else _TICK_SPAN
         steps = (np.diff(values) + span // 2) % span - span // 2
         late = int(_LATE * (np.median(steps[steps > 0]) if (steps > 0).any() else 0))
-        anew = False if stamps.starts is None else stamps.starts[1:]
-        steps[(steps < -late) | (steps > span // 4) | anew] = late
+        steps[(steps < -late) | (steps > span // 4)] = late
+        if stamps.starts is not None:
+            steps[stamps.starts[1:]] = late
         key = np.append(0, np.cumsum(steps))
     return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
 
@@ -194,7 +193,7 @@ def _unwrapped(stamps: Stamps, notes: list[str]) -> Timeline:
         first_s = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
         time_s = first_s + np.append(0.0, np.cumsum(seconds))
     counter = None
-    if stamps.counter is not None:
+    if stamps.counter is not None and counts is not None:
         counter = stamps.counter[0] + np.append(0, np.cumsum(counts))
     return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
 

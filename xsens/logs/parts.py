@@ -98,9 +98,12 @@ def assembled(parts: Parts, hints: Hints, source: str) -> ImuLog:
         if not there.all():
             notes.append(f"{int((~there).sum())} samples lack the sensor's own orientation")
     line = timeline(stamps)
+    force, rate, field = (None if vectors is None else vectors[line.rows] for vectors in parts.vectors)
     log = ImuLog(
         line.time_s,
-        *(None if vectors is None else vectors[line.rows] for vectors in parts.vectors),
+        force,
+        rate,
+        field,
         own[line.rows] if own is not None and there.any() else None,
         line.counter if counted else None,
         line.gaps,

@@ -48,7 +48,7 @@ class TextTable:
         for column, values in zip(self.columns, self.values.T, strict=False):
             if column.key == key and np.isfinite(values).any():
                 with np.errstate(over="ignore"):  # damage, which is left out as no measurement
-                    return values if column.scale in (None, 1.0) else values * column.scale
+                    return np.asarray(values * (column.scale or 1.0))
         return None
 
     def group(self, quantity: str, axes: Iterable[str]) -> FloatArray | None:

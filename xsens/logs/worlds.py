@@ -90,7 +90,7 @@ def quaternions_of(
             off = np.abs(np.sqrt(np.einsum("ij,ij->i", numbers, numbers)) - 1.0)
         return np.where((off < _WORST_NORM)[:, None], numbers, np.nan), ()
     if numbers.shape[1] == 3:
-        good = (np.abs(numbers) <= _WORST_ANGLE_DEG).all(axis=1)
+        good = np.asarray((np.abs(numbers) <= _WORST_ANGLE_DEG).all(axis=1))
         return _where(good, Rotation.from_euler("xyz", numbers[good], degrees=True)), ()
     rows = numbers.reshape(-1, 3, 3)
     by_rows, by_columns = (_of_matrices(each) for each in (rows, rows.swapaxes(1, 2)))
@@ -121,7 +121,7 @@ def _where(good: BoolArray, turns: Rotation) -> FloatArray:
 
 def seen_from_north(wxyz: FloatArray, world: str) -> tuple[Rotation, BoolArray]:
     """``nwu_from_world`` times the rotations, the identity where there is none; and where there is one."""
-    there = np.isfinite(wxyz).all(axis=1)
+    there = np.asarray(np.isfinite(wxyz).all(axis=1))
     turns = Rotation.from_quat(np.where(there[:, None], wxyz, [1.0, 0.0, 0.0, 0.0]), scalar_first=True)
     xyzw = (nwu_from(world) * turns).as_quat()
     xyzw[~there] = [0.0, 0.0, 0.0, 1.0]
