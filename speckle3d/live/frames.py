@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
+from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.io.igtl.messages import ImageReceived
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 
@@ -68,20 +68,14 @@ class ImageLayout:
                 f"got {pixels.dtype}"
             )
         try:
-            grid, signal = (
-                _of_echoes(pixels.T.shape, settings, where)
-                if of_rf
-                else _of_grey(pixels.shape, image.spacing_mm, settings, where)
-            )
+            example = _echoes(pixels, settings, where) if of_rf else _grey(pixels, image, settings, where)
         except MissingSettingsError as error:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in error.settings)
             raise MissingSettingsError(
                 f"{where}: its messages do not say what {'RF' if of_rf else 'B-mode'} needs, so give "
                 f"{options} (`speckle3d live --help` tells what they are)"
             ) from None
-        black = np.zeros((1, grid.vectors, grid.samples), pixels.dtype)
-        example = Sweep(black, grid, signal, np.zeros(1), name=name, probe=settings.probe or "")
-        return cls(image.device, example, of_rf)
+        return cls(image.device, replace(example, name=name, probe=settings.probe or ""), of_rf)
 
     def frame(self, image: ImageReceived) -> npt.NDArray[Any]:
         """Frame of an image, shape (vector, sample).
@@ -128,47 +122,36 @@ def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
     return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
 
 
-def _of_echoes(
-    shape: tuple[int, ...], settings: ImportSettings, where: str
-) -> tuple[ImageGrid, RFSettings | BModeSettings]:
+def _echoes(pixels: npt.NDArray[Any], settings: ImportSettings, where: str) -> Sweep:
     if settings.demodulation_frequency_hz is not None:
         raise InvalidInputError(
             f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz"
         )
-    s = settings.over(
-        where,
-        sampling_rate_hz=None,
-        vector_pitch_mm=None,
-        speed_of_sound_m_s=None,
-        centre_frequency_hz=None,
-        bandwidth_hz=None,
-        first_sample_depth_mm=0.0,
+    needed = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz", "bandwidth_hz")
+    known = settings.over(where, **dict.fromkeys((*needed, "vector_pitch_mm")), first_sample_depth_mm=0.0)
+    return Sweep.from_arrays(
+        np.zeros_like(pixels)[None],
+        pitch_mm=known["vector_pitch_mm"],
+        frame_time_s=[0.0],
+        signal=RFSettings(*(known[name] for name in needed)),
+        first_row_depth_mm=known["first_sample_depth_mm"],
     )
-    signal = RFSettings(
-        s["sampling_rate_hz"], s["speed_of_sound_m_s"], s["centre_frequency_hz"], tuple(s["bandwidth_hz"])
-    )
-    grid = ImageGrid(
-        shape[0], shape[1], s["vector_pitch_mm"], signal.sample_spacing_mm, s["first_sample_depth_mm"]
-    )
-    return grid, signal
 
 
-def _of_grey(
-    shape: tuple[int, ...], spacing_mm: FloatArray, settings: ImportSettings, where: str
-) -> tuple[ImageGrid, RFSettings | BModeSettings]:
-    said = spacing_mm if np.all(spacing_mm[:2] > 0) and not np.all(spacing_mm[:2] == 1.0) else [None, None]
-    s = settings.over(
+def _grey(pixels: npt.NDArray[Any], image: ImageReceived, settings: ImportSettings, where: str) -> Sweep:
+    spacing_mm = image.spacing_mm[:2]
+    said = spacing_mm if np.all(spacing_mm > 0) and not np.all(spacing_mm == 1.0) else [None, None]
+    known = settings.over(
         where,
         column_pitch_mm=said[0],
         row_spacing_mm=said[1],
         dynamic_range_db=None,
         first_sample_depth_mm=0.0,
     )
-    grid = ImageGrid(
-        shape[0],
-        shape[1],
-        float(s["column_pitch_mm"]),
-        float(s["row_spacing_mm"]),
-        s["first_sample_depth_mm"],
+    return Sweep.from_arrays(
+        np.zeros_like(pixels.T)[None],
+        pitch_mm=(float(known["column_pitch_mm"]), float(known["row_spacing_mm"])),
+        frame_time_s=[0.0],
+        dynamic_range_db=known["dynamic_range_db"],
+        first_row_depth_mm=known["first_sample_depth_mm"],
     )
-    return grid, BModeSettings(s["dynamic_range_db"])

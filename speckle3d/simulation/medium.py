@@ -7,13 +7,10 @@ media that presets name are at the end: a uniform phantom, a phantom with inclus
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from threading import Lock
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from functools import lru_cache
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -45,8 +42,6 @@ _CELL_MM = 0.5
 Box = tuple[FloatArray, FloatArray]
 """Opposite corners of a box of the image, the lower first, mm."""
 
-Tile = TypeVar("Tile")
-
 
 class Medium(Protocol):
     """Anything that can list its scatterers in a box."""
@@ -57,44 +52,6 @@ class Medium(Protocol):
 
     def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Blocks of scatterers, in the medium, that include all those in a box of the image."""
-
-
-class Tiles(Generic[Tile]):
-    """The tiles asked for last, each made once: threads that need the same ones share the work.
-
-    Parameters
-    ----------
-    make : callable
-        Makes a tile from its two indices, the same whenever it is called.
-    """
-
-    def __init__(self, make: Callable[[int, int], Tile]) -> None:
-        self._make = make
-        self._kept: OrderedDict[tuple[int, int], Future[Tile]] = OrderedDict()
-        self._lock = Lock()
-
-    def __reduce__(self) -> tuple[type[Tiles[Tile]], tuple[Callable[[int, int], Tile]]]:
-        """Copies make their own tiles."""
-        return type(self), (self._make,)
-
-    def __call__(self, indices: IntArray) -> list[Tile]:
-        """Tiles of indices, shape (n, 2)."""
-        return [tile.result() for tile in [self._tile(i, j) for i, j in indices.tolist()]]
-
-    def _tile(self, i: int, j: int) -> Future[Tile]:
-        with self._lock:
-            kept = self._kept.pop((i, j), None)
-            tile = self._kept[i, j] = kept or Future()
-            if len(self._kept) > _KEPT_TILES:
-                self._kept.popitem(last=False)
-        if kept is None:
-            try:
-                tile.set_result(self._make(i, j))
-            except BaseException as error:
-                self._kept.pop((i, j), None)
-                tile.set_exception(error)
-                raise
-        return tile
 
 
 def tiles_near(medium_from_image: RigidTransform, box: Box) -> IntArray:
@@ -212,7 +169,7 @@ class Clusters(NamedTuple):
         return position.reshape(-1, 3), strength.ravel().astype(np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TiledMedium:
     """A slab without sides, made on demand in square columns.
 
@@ -243,22 +200,15 @@ class TiledMedium:
 
     def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Tiles that together hold all scatterers in a box of the image."""
-        return self._tiles(tiles_near(medium_from_image, box))
+        return [_tile(self, i, j) for i, j in tiles_near(medium_from_image, box).tolist()]
 
-    @cached_property
-    def _tiles(self) -> Tiles[Scatterers]:
-        return Tiles(self._make)
-
-    @cached_property
-    def _families(self) -> Tiles[Scatterers]:
-        return Tiles(self._draw)
-
-    def _make(self, i: int, j: int) -> Scatterers:
+    def make_tile(self, i: int, j: int) -> Scatterers:
+        """Make the scatterers of one tile."""
         parts = [self._background(i, j)]
         parts += [self._fascia(layer, n, i, j) for n, layer in enumerate(self.layers) if layer.fascia]
         # Children of a neighbouring tile's parents may lie in this tile.
         around = np.indices((3, 3)).reshape(2, -1).T + np.array([i - 1, j - 1])
-        for position, strength in self._families(around) if self.clusters else ():
+        for position, strength in [_family(self, *tile) for tile in around.tolist()] if self.clusters else ():
             inside = (np.floor(position[:, [0, 2]] / TILE_MM) == [i, j]).all(axis=1)
             parts.append((position[inside], strength[inside]))
         position, strength = _joined(parts)
@@ -306,9 +256,17 @@ class TiledMedium:
         position[:, 1] = layer.top_mm + wave_sum(layer.undulation, position) + rng.normal(0.0, 0.015, n)
         return position, np.full(n, layer.fascia / _FASCIA_PER_MM2, np.float32)
 
-    def _draw(self, i: int, j: int) -> Scatterers:
-        """Children of all parents in a tile; some lie outside it."""
-        return _joined([kind.draw(self.entropy, n, i, j) for n, kind in enumerate(self.clusters)])
+
+@lru_cache(maxsize=_KEPT_TILES)
+def _tile(medium: TiledMedium, i: int, j: int) -> Scatterers:
+    """Scatterers in one tile, made once."""
+    return medium.make_tile(i, j)
+
+
+@lru_cache(maxsize=_KEPT_TILES)
+def _family(medium: TiledMedium, i: int, j: int) -> Scatterers:
+    """Children of all parents in a tile; some lie outside it."""
+    return _joined([kind.draw(medium.entropy, n, i, j) for n, kind in enumerate(medium.clusters)])
 
 
 def _joined(parts: Sequence[Scatterers]) -> Scatterers:

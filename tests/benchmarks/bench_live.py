@@ -86,10 +86,10 @@ def main():
         count, delays = told.get()
         kept = len(s3.load_sweep(settings.recording))
     playing.join()
-    middle, late, last = 1e3 * np.quantile(delays, [0.5, 0.9, 1.0])
+    middle, late, last = 1e3 * np.quantile(delays, [0.5, 0.95, 1.0])
     grid = sweep.grid
     print(f"{grid.vectors} x {grid.samples}: {count} frames sent, {kept} recorded, {len(delays)} placed")
-    print(f"delay of poses, ms: median {middle:.0f}, 90 % {late:.0f}, largest {last:.0f}")
+    print(f"delay of poses, ms: median {middle:.0f}, 95 % {late:.0f}, largest {last:.0f}")
 
 
 if __name__ == "__main__":

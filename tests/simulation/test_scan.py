@@ -1,8 +1,5 @@
 """Simulated frames: determinism, statistics, invariance."""
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 from points import PointMedium
@@ -11,7 +8,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.simulation.beam import tabulate_beam
-from speckle3d.simulation.medium import Tiles, fully_developed, tissue
+from speckle3d.simulation.medium import fully_developed, tissue
 from speckle3d.simulation.scan import SimulatedFrames
 
 STILL = RigidTransform.from_matrix(np.eye(4)[None])
@@ -83,17 +80,3 @@ def test_tissue_has_cysts_layers_and_a_poorly_filled_depth():
     assert by_depth[0] < 0.6 * by_depth[2]
     for cyst in medium.spheres:
         assert (np.linalg.norm(position - cyst.centre_mm, axis=1) >= cyst.radius_mm).all()
-
-
-def test_threads_that_need_the_same_tiles_share_the_work():
-    calls, both = [], threading.Barrier(2, timeout=20)
-
-    def make(i, j):
-        calls.append((i, j))
-        both.wait()  # passed only if two threads make a tile each at the same time
-        return i + j
-
-    tiles, wanted = Tiles(make), np.array([(0, 1), (2, 3)])
-    with ThreadPoolExecutor(2) as pool:
-        assert list(pool.map(tiles, [wanted, wanted])) == [[1, 5]] * 2
-    assert sorted(calls) == [(0, 1), (2, 3)]
