@@ -97,8 +97,7 @@ def reconstruct(
     $ speckle3d reconstruct data/phantom.h5 -o out --drift orientation --drift pose
     """
     from speckle3d.io.curves import curves_beside, read_curves, trust_words, write_curves
-    from speckle3d.io.load import load_sweep
-    from speckle3d.io.sweeps import unfinished_note
+    from speckle3d.io.load import load_sweep, open_recording
     from speckle3d.io.voxels.volume_writer import require_suffix
     from speckle3d.study.job import run_job
 
@@ -106,9 +105,9 @@ def reconstruct(
         consistent_subset=consistent_subset, drift_curves=drift_curves, region=region
     )
     modes, calibrations = list[str](dict.fromkeys(drift or ())), calibration or ()
-    sweep = load_sweep(sweep_file)
-    if (unfinished := unfinished_note(sweep_file)) is not None:
-        note(unfinished)
+    recording = open_recording(sweep_file)
+    sweep = recording.sweep
+    notes(recording.remarks)
     used = curves_file or curves_beside(sweep_file)
     curves = read_curves(used)
     if curves_file is None:

@@ -34,7 +34,7 @@ from speckle3d.io.hdf5 import (
     require_group,
     sha256_of,
 )
-from speckle3d.io.records import HDF5Writer, read_record
+from speckle3d.io.records import put, put_fields, put_text, read_record, written
 
 FORMAT = "speckle3d.calibration"
 
@@ -57,19 +57,17 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         If the file cannot be written.
     """
     frames, rows = calibration.frames, calibration.parameters
-    with HDF5Writer(path, FORMAT) as writer:
-        root = writer.file
-        writer.put_fields(root, calibration, skip=("rotation", "translation_mm", "parameters", "frames"))
+    with written(path, FORMAT) as file:
+        put_fields(file, calibration, skip=("rotation", "translation_mm", "parameters", "frames"))
         is_turn = calibration.translation_mm is None
-        pose = calibration.rotation if is_turn else calibration.sensor_from_image
-        writer.put(root, "sensor_from_image", pose)
+        put(file, "sensor_from_image", calibration.rotation if is_turn else calibration.sensor_from_image)
         columns = {name: np.array([getattr(row, name) for row in rows], float) for name in _NUMBERS}
-        writer.put(root, "parameters", columns)
+        put(file, "parameters", columns)
         for name in _WORDS:
-            writer.put_text(root["parameters"], name, [getattr(row, name) for row in rows])
+            put_text(file["parameters"], name, [getattr(row, name) for row in rows])
         used, dropped = (np.array([*numbers], dtype=np.int64) for numbers in (frames.used, frames.dropped))
-        writer.put(root, "frames", {"given": frames.given, "used": used, "dropped": dropped})
-        writer.put_text(root["frames"], "reason", list(frames.dropped.values()))
+        put(file, "frames", {"given": frames.given, "used": used, "dropped": dropped})
+        put_text(file["frames"], "reason", list(frames.dropped.values()))
 
 
 def read_calibration(path: PathLike) -> Calibration:

@@ -29,12 +29,11 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.sweep import Tracker
-from speckle3d.io.frames import FileFrames, HDF5Slices
+from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import (
     PathLike,
     find_member,
     has_member,
-    hdf5_claim,
     locate,
     open_hdf5,
     read_checked,
@@ -97,8 +96,8 @@ def open_scan(scan: Path, _: ImportSettings) -> Recording:
     with reading(scan), open_hdf5(scan) as file:
         node = require_dataset(file, "frames")
         n, height, width = node.shape
-        slices = HDF5Slices(scan.absolute(), "frames", np.transpose, n)
-        frames = FileFrames(scan, slices, (n, width, height), node.dtype)
+        slices = HDF5Slices(scan.absolute(), ("frames",), np.transpose)
+        frames = slices.frames((n, width, height), node.dtype)
     tracker, remarks = None, list[str]()
     source = _transforms_file(scan) or scan
     with reading(source), open_hdf5(source) as file:
@@ -193,5 +192,5 @@ def _landmark_file(scan: Path) -> Path | None:
 
 
 READER = Reader(
-    FORMAT, hdf5_claim(is_challenge_scan), open_scan, companions=companion_files, takes_settings=False
+    FORMAT, None, open_scan, companion_files, takes_settings=False, claims_hdf5=is_challenge_scan
 )

@@ -11,7 +11,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import RFSettings
 from speckle3d.io.hdf5 import PathLike, opened, read_text
-from speckle3d.io.records import HDF5Writer, read_record
+from speckle3d.io.records import put, put_fields, read_record, written
 from speckle3d.io.sweeps import SIGNALS
 
 FORMAT = "speckle3d.curves"
@@ -54,12 +54,12 @@ def write_curves(path: PathLike, curves: DecorrelationCurves) -> None:
     FileError
         If the file cannot be written.
     """
-    with HDF5Writer(path, FORMAT, 1 if curves.spectrum is None else 2) as writer:
-        root, signal = writer.file, curves.key.signal
-        writer.put_fields(root, curves, skip=["key"])
-        writer.put_fields(root, curves.key, skip=["signal"])
-        writer.put_fields(root, signal)
-        writer.put(root, "signal", "rf" if isinstance(signal, RFSettings) else "bmode")
+    signal = curves.key.signal
+    with written(path, FORMAT, 1 if curves.spectrum is None else 2) as file:
+        put_fields(file, curves, skip=["key"])
+        put_fields(file, curves.key, skip=["signal"])
+        put_fields(file, signal)
+        put(file, "signal", "rf" if isinstance(signal, RFSettings) else "bmode")
 
 
 def read_curves(path: PathLike) -> DecorrelationCurves:

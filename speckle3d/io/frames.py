@@ -13,17 +13,13 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import open_hdf5, reading, require_dataset
 
 ReadFrame: TypeAlias = Callable[[int], npt.NDArray[Any]]
 """Reads frame i of an open file, shape (vector, sample)."""
-
-Turn: TypeAlias = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
-"""Makes a frame (vector, sample) of what the file holds of it; a top-level function, so that frames can be
-sent to another process."""
 
 
 class FileFrames:
@@ -89,107 +85,81 @@ class FileFrames:
             self._read = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        shape = (len(self.chosen), *self.shape[1:])
-        return type(self), (self.path, self.open_file, shape, self.dtype, self.stored_dtype, self.chosen)
-
-
-@dataclass(frozen=True)
-class RawFile:
-    """Opens frames that lie one after the other in a plain file.
-
-    Attributes
-    ----------
-    start, step : int
-        Byte of the first frame's first number, and bytes from frame to frame.
-    dtype : dtype
-        Of the numbers in the file.
-    shape : tuple of int
-        Of a frame's numbers in the file.
-    turn : callable
-        Makes (vector, sample) of them.
-    """
-
-    path: Path
-    start: int
-    step: int
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-    turn: Turn
-
-    def __call__(self) -> ReadFrame:
-        """Open nothing: the file is open only while a frame is read."""
-        return self.read
-
-    def read(self, i: int) -> npt.NDArray[Any]:
-        """Read frame i.
-
-        Raises
-        ------
-        FileError
-            If the file ends before.
-        """
-        count = int(np.prod(self.shape))
-        values = np.fromfile(self.path, self.dtype, count, offset=self.start + i * self.step)
-        if values.size != count:
-            raise FileError(f"{self.path}: frame {i}: expected {count} samples, got {values.size}: truncated")
-        return self.turn(values.reshape(self.shape))
+        return type(self), (
+            self.path,
+            self.open_file,
+            self.shape,
+            self.dtype,
+            self.stored_dtype,
+            self.chosen,
+        )
 
 
 @dataclass(frozen=True)
 class HDF5Slices:
-    """Opens frames that are slices of a data set along its first axis.
+    """Opens frames that are slices of data sets.
 
     Attributes
     ----------
-    count : int
-        Frames there must be.
-    grows : bool
-        Whether the data set may hold more, which are not looked at.
+    names : tuple of str
+        Data sets that hold a part of each frame each, as real and imaginary parts.
+    turn : callable
+        Makes a frame (vector, sample) of the data sets' slices; a top-level function or a dataclass, so that
+        frames can be sent to another process.
+    axis : int, optional
+        Of the data sets: the frames. None where there is one frame and no axis for it.
     """
 
     path: Path
-    name: str
-    turn: Turn
-    count: int
-    grows: bool = False
+    names: tuple[str, ...]
+    turn: Callable[..., npt.NDArray[Any]]
+    axis: int | None = 0
 
     def __call__(self) -> ReadFrame:
-        """Open the file.
-
-        HDF5's handles are made once: h5py frees one in a callback, where Python drops a Ctrl-C, the one
-        pressed while a frame was read.
-
-        Raises
-        ------
-        InvalidInputError
-            If there are fewer frames than there must be, or more.
-        """
+        """Open the file."""
         file = open_hdf5(self.path)
-        data = require_dataset(file, self.name)
-        count = data.shape[0] if data.ndim else 0
-        if count < self.count or (count > self.count and not self.grows):
-            raise InvalidInputError(f"/{self.name}: expected {self.count} frames, got shape {data.shape}")
-        shape, dtype = data.shape[1:], data.dtype.newbyteorder("=")
-        on_disk, in_memory = data.id.get_space(), h5py.h5s.create_simple(shape or (1,))
-        kind = h5py.h5t.py_create(dtype)
-        # As they lie in the file, twice as fast as by way of HDF5's cache of chunks.
-        is_plain = (
-            data.chunks == (1, *shape)
-            and not data.id.get_create_plist().get_nfilters()
-            and data.dtype == dtype
-        )
+        nodes = [require_dataset(file, name) for name in self.names]
+        reads = [_chunk_reader(node) if self.axis == 0 else None for node in nodes]
+        before = (slice(None),) * (self.axis or 0)
 
-        def read(i: int) -> npt.NDArray[Any]:
-            values, start = np.empty(shape, dtype), (i, *(0,) * len(shape))
-            if not is_plain:
-                on_disk.select_hyperslab(start, (1, *shape))
-                data.id.read(in_memory, on_disk, values, kind)
-            elif data.id.get_chunk_info_by_coord(start).byte_offset is None:
-                raise InvalidInputError(
-                    f"/{self.name}: expected samples in the file, got none: never written"
-                )
-            else:
-                data.id.read_direct_chunk(start, out=values.reshape(-1).view(np.uint8))
-            return self.turn(values)
+        def part(i: int, node: h5py.Dataset, read: ReadFrame | None) -> npt.NDArray[Any]:
+            if read is not None:
+                return read(i)
+            return np.asarray(node[()] if self.axis is None else node[(*before, i)])
 
-        return read
+        def frame(i: int) -> npt.NDArray[Any]:
+            return self.turn(*(part(i, *one) for one in zip(nodes, reads, strict=True)))
+
+        return frame
+
+    def frames(self, shape: tuple[int, int, int], dtype: npt.DTypeLike, **more: Any) -> FileFrames:
+        """Frames of a shape (frame, vector, sample)."""
+        return FileFrames(self.path, self, shape, dtype, **more)
+
+
+def _chunk_reader(data: h5py.Dataset) -> ReadFrame | None:
+    """Reader of slices along the first axis; None where h5py's own has to do.
+
+    HDF5's handles are made once: h5py frees one in a callback, where Python drops a Ctrl-C, the one pressed
+    while a frame was read.
+    """
+    if data.ndim < 2 or data.dtype.kind not in "iuf":
+        return None
+    shape, dtype = data.shape[1:], data.dtype.newbyteorder("=")
+    on_disk, in_memory = data.id.get_space(), h5py.h5s.create_simple(shape)
+    kind = h5py.h5t.py_create(dtype)
+    # As they lie in the file, twice as fast as by way of HDF5's cache of chunks.
+    is_plain = (
+        data.chunks == (1, *shape) and not data.id.get_create_plist().get_nfilters() and data.dtype == dtype
+    )
+
+    def read(i: int) -> npt.NDArray[Any]:
+        values, start = np.empty(shape, dtype), (i, *(0,) * len(shape))
+        if is_plain:
+            data.id.read_direct_chunk(start, out=values.reshape(-1).view(np.uint8))
+        else:
+            on_disk.select_hyperslab(start, (1, *shape))
+            data.id.read(in_memory, on_disk, values, kind)
+        return values
+
+    return read

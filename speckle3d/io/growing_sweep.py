@@ -24,7 +24,7 @@ from speckle3d.core.parts import cannot_write
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
 from speckle3d.io.hdf5 import PathLike, require_target
 from speckle3d.io.meanings import label
-from speckle3d.io.records import Room
+from speckle3d.io.records import reserve, trim
 from speckle3d.io.sweep_writer import Compression, FrameSet, mounting_attribute
 from speckle3d.io.sweeps import FORMAT, GROWING
 
@@ -35,7 +35,7 @@ _ROWS_PER_CHUNK = 128
 class GrowingSweep:
     """Write a sweep file frame by frame; what was appended is in it even if the process is killed.
 
-    A block that ends without an error leaves a file as `SweepWriter` does; one with an error, a file that
+    A block that ends without an error leaves a file as `write_sweep` does; one with an error, a file that
     says that its recording was not closed. Without a frame there is no file.
 
     Parameters
@@ -47,7 +47,7 @@ class GrowingSweep:
         Decides whether frames become ``/rf``, ``/iq`` or ``/bmode``.
     dtype : dtype, optional
     compression : {None, "gzip", "lzf"}
-        As for `SweepWriter`.
+        As for `FrameSet`.
     probe : str
         Name of probe and preset.
     sensor_from_image : RigidTransform or Rotation, optional
@@ -95,20 +95,24 @@ class GrowingSweep:
 
     def __enter__(self) -> Self:
         target = require_target(self.path)
-        with self._writing(), ExitStack() as undo:
+        with self._writing():
             try:
                 # Made here, so that a file that is there is never opened.
                 os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             except FileExistsError as error:
                 raise FileError(f"{self.path}: there already; expected a new file") from error
-            undo.callback(target.unlink, missing_ok=True)
-            self._room = undo.enter_context(Room(target))
-            file = undo.enter_context(h5py.File(target, "w", libver="latest"))
-            self._room.require(0)
-            self._begin(file)
-            file.swmr_mode = True
+            try:
+                file = h5py.File(target, "w", libver="latest")
+                with ExitStack() as undo:
+                    undo.callback(file.close)
+                    reserve(file.id)
+                    self._begin(file)
+                    file.swmr_mode = True
+                    undo.pop_all()
+            except BaseException:
+                target.unlink(missing_ok=True)
+                raise
             self._file = file
-            undo.pop_all()
         return self
 
     def __exit__(
@@ -133,7 +137,7 @@ class GrowingSweep:
         """
         self._clock.require_after(time_s)
         with self._writing():
-            self._frames.append(frame, self._room)
+            self._frames.append(frame)
             self._frames.flush()
             self._clock.append(time_s)
 
@@ -176,7 +180,7 @@ class GrowingSweep:
                 raise
         finally:
             file.close()
-            self._room.__exit__(None)
+            trim(self.path)
             if not len(self):  # no sweep is without frames
                 self.path.unlink(missing_ok=True)
 
@@ -185,11 +189,11 @@ class GrowingSweep:
         if self._probe:
             file.attrs["probe"] = self._probe
         self._frames.create(file)
-        self._clock = _Stream(file, self._room, {"frame_time_s": ()})
+        self._clock = _Stream(file, {"frame_time_s": ()})
         tracker, orientation = (file.create_group(name) for name in ("tracker", "orientation"))
         # Times last: what has a time is whole.
-        self._tracker = _Stream(tracker, self._room, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
-        self._orientation = _Stream(orientation, self._room, {"quaternion_wxyz": (4,), "time_s": ()})
+        self._tracker = _Stream(tracker, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
+        self._orientation = _Stream(orientation, {"quaternion_wxyz": (4,), "time_s": ()})
         for group in (tracker, orientation):
             group.attrs["time_offset_s"] = self._offset_s
         if self._mounting is not None:
@@ -212,8 +216,8 @@ class GrowingSweep:
 class _Stream:
     """Data sets of a group that grow row by row, the last data set last."""
 
-    def __init__(self, group: h5py.Group, room: Room, shapes: dict[str, tuple[int, ...]]) -> None:
-        self._where, self._room, self._file = f"{group.file.filename}: {group.name}", room, group.file.id
+    def __init__(self, group: h5py.Group, shapes: dict[str, tuple[int, ...]]) -> None:
+        self._where, self._file = f"{group.file.filename}: {group.name}", group.file.id
         self._nodes = [
             group.create_dataset(
                 name, (0, *shape), "?" if name == "valid" else "f8", maxshape=(None, *shape),
@@ -231,7 +235,7 @@ class _Stream:
     def append(self, *values: Any) -> None:
         """Write a row, its time last, and hand it to the operating system."""
         self.require_after(values[-1])
-        self._room.require(self._file.get_filesize())
+        reserve(self._file)
         for node, value in zip(self._nodes, values, strict=True):
             node.resize(len(node) + 1, axis=0)
             node[-1] = value

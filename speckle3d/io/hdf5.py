@@ -5,10 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import re
-import struct
-import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -30,23 +27,8 @@ Node: TypeAlias = h5py.Group | h5py.Dataset
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
 
-_READ_FAILURES = (
-    OSError,
-    RuntimeError,
-    LookupError,
-    ValueError,
-    TypeError,
-    MemoryError,
-    ArithmeticError,
-    EOFError,
-    zlib.error,
-)
-"""What h5py, NumPy and zlib raise when the bytes of a file do not make sense."""
-
 _HAS_WRITER = ("already open for write", "unable to lock file")
 """HDF5's words for a file that is being written, or whose writer was killed."""
-
-_HEAPS_BYTES = 2**19
 
 _READ_ATTEMPTS = 20
 """Of what may be half written: a millisecond in all."""
@@ -129,38 +111,12 @@ def open_hdf5(path: PathLike) -> h5py.File:
     with reading(path):
         if not h5py.is_hdf5(path):
             raise FileError(f"{path}: expected an HDF5 file, got something else")
-        _require_sound_texts(path)
         try:
             return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
         except OSError as error:
             if not any(words in str(error) for words in _HAS_WRITER):
                 raise
             return _opened_beside_writer(path)
-
-
-def _require_sound_texts(path: PathLike) -> None:
-    """Refuse a file whose texts have zeros over them, as a broken copy leaves: HDF5 would search without end.
-
-    Texts lie in heaps, which begin with GCOL and go on from length to length [1]_; HDF5 2.0 does not check
-    that a length is above zero. Looked at are those near both ends of a file, where attributes are.
-
-    References
-    ----------
-    .. [1] HDF5 File Format Specification 3.0, III.E.
-    """
-    with open_regular(path) as stream:
-        size = stream.seek(0, os.SEEK_END)
-        for start in {0, max(0, size - _HEAPS_BYTES)}:
-            stream.seek(start)
-            content = stream.read(_HEAPS_BYTES)
-            for heap in re.finditer(rb"GCOL\x01\x00{3}", content):
-                at, stop = heap.end() + 8, heap.start() + int.from_bytes(content[heap.end() :][:8], "little")
-                while at + 16 <= min(stop, len(content)):
-                    index, length = struct.unpack_from("<H6xQ", content, at)
-                    step = 16 + -(-length // 8) * 8 if index else length
-                    if step < 16:
-                        raise FileError(f"{path}: cannot be read: damaged texts at byte {start + at}")
-                    at += step
 
 
 def _opened_beside_writer(path: PathLike) -> h5py.File:
@@ -191,7 +147,8 @@ def reading(where: PathLike) -> Iterator[None]:
         yield
     except Speckle3DError:
         raise
-    except _READ_FAILURES as error:
+    # What is damaged shows in whatever its library happens to stumble over.
+    except Exception as error:
         raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 
@@ -201,7 +158,7 @@ def opened(path: PathLike, format_name: str, versions: Sequence[int] = (1,)) -> 
     with reading(path), open_hdf5(path) as file:
         got_format = file_format(file)
         if got_format != format_name:
-            raise InvalidInputError(f"{path}: expected format {format_name!r}, got {got_format!r}")
+            raise InvalidInputError(f"{path}: expected format {format_name!r}, got {got_format or 'none'!r}")
         version = read_attribute(file, "version")
         if version not in versions:
             known = " or ".join(map(str, versions))
@@ -209,35 +166,11 @@ def opened(path: PathLike, format_name: str, versions: Sequence[int] = (1,)) -> 
         yield file
 
 
-def hdf5_claim(is_ours: Callable[[h5py.File], bool]) -> Callable[[Path, bytes], bool]:
-    """Make a reader's claim of a question about an open HDF5 file; other files are not claimed."""
-
-    def claims(path: Path, start: bytes) -> bool:
-        if not start.startswith(SIGNATURE):
-            return False
-        with reading(path), open_hdf5(path) as file:
-            return is_ours(file)
-
-    return claims
-
-
 def file_format(file: h5py.File) -> str:
-    """Return the attribute ``format`` of an open file.
-
-    Raises
-    ------
-    InvalidInputError
-        If it has none, as another program's.
-    """
-    if "format" not in file.attrs:
-        raise InvalidInputError(f"{file.filename}: HDF5, but none of ours: it has no attribute format")
-    return read_text(file, "format")
-
-
-def has_format(file: h5py.File, name: str) -> bool:
-    """Whether an open file is of the family, and of one format."""
-    raw = plain_attribute(file, "format")
-    return isinstance(raw, str | bytes) and raw in (name, name.encode())
+    """Kind of a file of the family, by its attribute ``format``; empty of other programs' files."""
+    raw = file.attrs.get("format")
+    text = raw.decode("utf-8", "replace") if isinstance(raw, bytes) else raw
+    return text if isinstance(text, str) else ""
 
 
 def locate(node: Node, name: str = "") -> str:
@@ -269,11 +202,6 @@ def find_member(group: h5py.Group, name: str) -> Any:
 def has_member(group: h5py.Group, name: str) -> bool:
     """Whether a group holds a name; a link to nothing, or out of the file, is an error and not absence."""
     return find_member(group, name) is not None
-
-
-def find_group(group: h5py.Group, name: str) -> h5py.Group | None:
-    """Return a group inside `group`, None if there is none of that name."""
-    return require_group(group, name) if has_member(group, name) else None
 
 
 def require_group(group: h5py.Group, name: str) -> h5py.Group:
@@ -350,12 +278,6 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
         return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 
 
-def plain_attribute(node: Node, name: str) -> Any:
-    """Value of an attribute, None if there is none."""
-    with reading(f"{locate(node)} attribute {name}"):
-        return node.attrs.get(name)
-
-
 def read_attribute(node: Node, name: str, default: float | None = None) -> float:
     """Read a finite number; `default` stands in for a missing one unless it is None."""
     if default is not None and name not in node.attrs:
@@ -365,7 +287,7 @@ def read_attribute(node: Node, name: str, default: float | None = None) -> float
 
 def read_vector_attribute(node: Node, name: str, size: int, finite: bool = True) -> FloatArray:
     """Read an attribute of `size` numbers, finite ones by default, as a flat array."""
-    raw = plain_attribute(node, name)
+    raw = node.attrs.get(name)
     value = np.asarray(raw)
     is_right = value.dtype.kind in "fiu" and value.size == size
     if not is_right or np.isnan(value).any() or (finite and np.isinf(value).any()):
@@ -376,7 +298,7 @@ def read_vector_attribute(node: Node, name: str, size: int, finite: bool = True)
 
 def read_text(node: Node, name: str) -> str:
     """Read a text attribute."""
-    raw = plain_attribute(node, name)
+    raw = node.attrs.get(name)
     if isinstance(raw, bytes):
         raw = raw.decode("utf-8", errors="replace")
     if not isinstance(raw, str):

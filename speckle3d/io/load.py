@@ -13,15 +13,7 @@ from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import (
-    SIGNATURE,
-    file_format,
-    open_hdf5,
-    plain_attribute,
-    reading,
-    require_file,
-    sha256_of,
-)
+from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file, sha256_of
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
 from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
@@ -29,8 +21,6 @@ from speckle3d.io.recordings import Recording
 
 IMAGE = _IMAGES.format
 """Kind of MetaImage and NRRD files."""
-
-_GZIP = b"\x1f\x8b"
 
 SIZED = (sweeps.FORMAT, challenge.FORMAT)
 """Kinds that always say how large their pixels are."""
@@ -80,8 +70,8 @@ def open_recording(path: PathLike, settings: ImportSettings | None = None) -> Re
     """
     reader = find_reader(path)
     if reader is None:
-        kind_of(path)  # names a file of no known kind
-        return Recording(Path(path), ready=sweeps.read_sweep(path))  # refuses the family's other formats
+        kind = family_format(path)
+        raise InvalidInputError(f"{path}: expected format {sweeps.FORMAT!r}, got {kind!r}")
     return recording_of(reader, Path(path), settings_for(path, settings))
 
 
@@ -103,7 +93,8 @@ def load_landmarks(path: PathLike) -> Landmarks | None:
 
 def import_notes(path: PathLike, settings: ImportSettings | None = None) -> list[str]:
     """Tell what `load_sweep` assumed, measured or left out of a recording."""
-    return [] if find_reader(path) is None else open_recording(path, settings).notes
+    reader = find_reader(path)
+    return [] if reader is None else recording_of(reader, Path(path), settings_for(path, settings)).notes
 
 
 def import_record(path: PathLike) -> ImportRecord | None:
@@ -152,8 +143,17 @@ def kind_of(path: PathLike) -> str:
         If it is of no known kind.
     """
     reader = find_reader(path)
-    if reader is not None:
-        return reader.format
+    return family_format(path) if reader is None else reader.format
+
+
+def family_format(path: PathLike) -> str:
+    """Format of a file of the family that no reader claims.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is of no known kind.
+    """
     known = ", ".join(reader.format for reader in readers())
     if Path(path).is_dir():
         raise FileError(f"{path}: expected a recording ({known}), got a folder that none of them is in")
@@ -161,15 +161,15 @@ def kind_of(path: PathLike) -> str:
     start = first_bytes(path)
     if not start.startswith(SIGNATURE):
         got = "something else" if start else "an empty file"
-        if start.startswith(_GZIP):
+        if start.startswith(b"\x1f\x8b"):
             got = "a file packed by gzip: unpack it first"
         raise InvalidInputError(f"{path}: expected a recording ({known}), got {got}")
     with reading(path), open_hdf5(path) as file:
-        raw = plain_attribute(file, "format")
-        if not isinstance(raw, str | bytes) or "speckle3d." not in str(raw):
+        kind = file_format(file)
+        if not kind.startswith("speckle3d."):
             held = ", ".join(printable(str(name)) for name in file) or "nothing"
             raise InvalidInputError(
                 f"{path}: HDF5, but none of the kinds that are read: it holds {held[:200]}: "
                 "`speckle3d convert` reads zea, USTB and MATLAB 7.3"
             )
-        return file_format(file)
+        return kind

@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
+
+import h5py
 
 from speckle3d.core.errors import FileError
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.sweep import Sweep
+from speckle3d.io.hdf5 import SIGNATURE, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.recordings import Recording
 from speckle3d.io.recordings import Row as Row
@@ -42,7 +47,7 @@ class Reader:
     ----------
     format : str
         What `speckle3d info` calls it.
-    claims : callable
+    claims : callable, optional
         Whether a recording is of this format, from its path and its first `START_BYTES` bytes, which are
         none for a folder. It raises nothing.
     read : callable
@@ -52,13 +57,16 @@ class Reader:
         Other files that the sweep's content depends on.
     takes_settings : bool
         Whether `read` uses its settings; false of formats that say all themselves.
+    claims_hdf5 : callable, optional
+        In place of `claims`: whether an open HDF5 file is of this format.
     """
 
     format: str
-    claims: Callable[[Path, bytes], bool]
+    claims: Callable[[Path, bytes], bool] | None
     read: Callable[[Path, ImportSettings], Sweep | Recording]
     companions: Callable[[Path], Sequence[Path]] = _nothing_beside
     takes_settings: bool = True
+    claims_hdf5: Callable[[h5py.File], bool] | None = None
 
 
 def find_reader(path: PathLike) -> Reader | None:
@@ -70,16 +78,20 @@ def find_reader(path: PathLike) -> Reader | None:
         If there is no such file or folder, or it cannot be read.
     """
     place, start = Path(path), first_bytes(path)
-    for reader in readers():
-        try:
-            if reader.claims(place, start):
-                return reader
-        except Exception as error:
-            if reader in _own():
-                raise
-            # A lab's own code must not stop all others.
-            fault = f"it fails: {type(error).__name__}: {error}"
-            warnings.warn(f"reader of {reader.format}: left out for {path}: {fault}", stacklevel=2)
+    opened: Any = open_hdf5(path) if start.startswith(SIGNATURE) else nullcontext()
+    with reading(path), opened as file:
+        for reader in readers():
+            try:
+                if reader.claims is not None and reader.claims(place, start):
+                    return reader
+                if reader.claims_hdf5 is not None and file is not None and reader.claims_hdf5(file):
+                    return reader
+            except Exception as error:
+                if reader in _own():
+                    raise
+                # A lab's own code must not stop all others.
+                fault = f"it fails: {type(error).__name__}: {error}"
+                warnings.warn(f"reader of {reader.format}: left out for {path}: {fault}", stacklevel=2)
     return None
 
 
@@ -116,12 +128,10 @@ def _others() -> tuple[Reader, ...]:
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         try:
             reader = entry.load()
+            if not isinstance(reader, Reader):
+                raise TypeError(f"expected a Reader, got {type(reader).__name__}")
+            loaded.append(reader)
         except Exception as error:  # noqa: BLE001 - a lab's own code must not stop all others
             fault = f"it cannot be loaded: {type(error).__name__}: {error}"
-        else:
-            if isinstance(reader, Reader):
-                loaded.append(reader)
-                continue
-            fault = f"expected a Reader, got {type(reader).__name__}"
-        warnings.warn(f"entry point {entry.name} of {GROUP}: left out: {fault}", stacklevel=2)
+            warnings.warn(f"entry point {entry.name} of {GROUP}: left out: {fault}", stacklevel=2)
     return tuple(loaded)

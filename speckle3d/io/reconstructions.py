@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
 
 import h5py
 import numpy as np
@@ -26,7 +28,6 @@ from speckle3d.core.reconstruction import (
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import (
     PathLike,
-    find_group,
     has_member,
     locate,
     opened,
@@ -39,7 +40,7 @@ from speckle3d.io.hdf5 import (
     require_dataset,
     require_group,
 )
-from speckle3d.io.records import HDF5Writer, put, read_record
+from speckle3d.io.records import put, put_fields, put_text, read_record, written
 
 FORMAT = "speckle3d.reconstruction"
 
@@ -47,7 +48,7 @@ _PAIR_ROWS = ("first", "second", "first_from_second", "covariance", "distance_mm
 """Data sets of /pairs with a row for each pair."""
 
 
-class ReconstructionWriter(HDF5Writer):
+class ReconstructionWriter:
     """Write a reconstruction file: open it before the work, append pairs as they come, finish it.
 
     It appears whole when the block ends, or not at all. Opening it first shows an unwritable place before
@@ -62,25 +63,18 @@ class ReconstructionWriter(HDF5Writer):
     """
 
     def __init__(self, path: PathLike, frame_time_s: npt.ArrayLike, grid: ImageGrid) -> None:
-        super().__init__(path, FORMAT)
-        self._grid = grid
+        self._path, self._grid, self._whole = path, grid, written(path, FORMAT)
         self._times = require_increasing(frame_time_s, f"{path}: /frame_time_s")
         self._pairs: list[FramePairs] = []
-        self._is_finished = False
 
-    def _begin(self) -> None:
-        self.put(self.file, "frame_time_s", self._times)
-        self.put_fields(self.file, self._grid)
+    def __enter__(self) -> Self:
+        self._file = self._whole.__enter__()
+        return self
 
-    def _finish(self) -> None:
-        if not self._is_finished:
-            raise InvalidInputError(f"{self.path}: expected finish() before the end, got none")
-        if self._pairs:
-            group = self.file.create_group("pairs")
-            self.put(group, "patch_centre_mm", self._pairs[0].patch_centre_mm)
-            for name in _PAIR_ROWS:
-                rows = np.concatenate([getattr(pairs, name) for pairs in self._pairs])
-                put(group, name, rows, self.room, compression="lzf", shuffle=True)
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._whole.__exit__(kind, error, trace)
 
     def append_pairs(self, pairs: FramePairs) -> None:
         """Append frame pairs; their patches must be those of the pairs before.
@@ -88,12 +82,9 @@ class ReconstructionWriter(HDF5Writer):
         Raises
         ------
         InvalidInputError
-            If they are of other patches, or a frame index is out of range.
+            If a frame index is out of range.
         """
-        where = f"{self.path}: /pairs"
-        _check_pairs(pairs, self._times.size, where)
-        if self._pairs and not np.array_equal(self._pairs[0].patch_centre_mm, pairs.patch_centre_mm):
-            raise InvalidInputError(f"{where}/patch_centre_mm: expected the patches of the pairs before")
+        _check_pairs(pairs, self._times.size, f"{self._path}: /pairs")
         self._pairs.append(pairs)
 
     def finish(
@@ -104,27 +95,33 @@ class ReconstructionWriter(HDF5Writer):
         trust: Trust | None = None,
     ) -> None:
         """Write the poses by mode, where they came from, the configuration and how far to trust them."""
-        file = self.file
-        with naming(str(self.path)):
+        file = self._file
+        with naming(str(self._path)):
             # Checked by the container before anything is written.
             Reconstruction(self._times, self._grid, dict(poses), provenance, config_toml, None, trust)
-        self.put(file, "poses", poses)
+        put(file, "frame_time_s", self._times)
+        put_fields(file, self._grid)
+        put(file, "poses", poses)
         if trust is not None:
             modes = {"image": trust.covariance} | {mode: of.covariance for mode, of in trust.modes.items()}
-            self.put(file, "pose_covariance", modes)
-            self.put(file, "frame_flags", trust.flags)
+            put(file, "pose_covariance", modes)
+            put(file, "frame_flags", trust.flags)
             if trust.shared is not None:
                 file["pose_covariance/image"].attrs.update(vars(trust.shared))
             for mode, errors in trust.modes.items():
                 file[f"pose_covariance/{mode}"].attrs["length_sigma"] = errors.length_sigma
-        self.put_fields(file, provenance, skip=["calibrations", "imported"])
+        put_fields(file, provenance, skip=["calibrations", "imported"])
         for used in provenance.calibrations:
-            self.put(file, f"calibrations/{used.sensor}", SourceFile(used.path, used.sha256))
+            put(file, f"calibrations/{used.sensor}", SourceFile(used.path, used.sha256))
         if provenance.imported is not None:
-            self.put(file, "import", {"name": provenance.imported.name})
-            self.put_text(file["import"], "settings_json", provenance.imported.settings_json)
-        self.put_text(file, "config_toml", config_toml)
-        self._is_finished = True
+            put(file, "import", {"name": provenance.imported.name})
+            put_text(file["import"], "settings_json", provenance.imported.settings_json)
+        put_text(file, "config_toml", config_toml)
+        if self._pairs:
+            put(file, "pairs", {"patch_centre_mm": self._pairs[0].patch_centre_mm})
+            for name in _PAIR_ROWS:
+                rows = np.concatenate([getattr(pairs, name) for pairs in self._pairs])
+                put(file["pairs"], name, rows, compression="lzf", shuffle=True)
 
 
 def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstruction:
@@ -181,10 +178,11 @@ def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
 
 def _read_provenance(file: h5py.File) -> Provenance:
     """Where a reconstruction came from; files of versions before 0.1 lack some groups."""
-    files, group = find_group(file, "calibrations") or {}, find_group(file, "import")
+    files = require_group(file, "calibrations") if has_member(file, "calibrations") else {}
     used = [read_record(require_group(files, sensor), CalibrationFile, sensor=sensor) for sensor in files]
     imported = None
-    if group is not None:
+    if has_member(file, "import"):
+        group = require_group(file, "import")
         imported = ImportRecord(read_text(group, "name"), read_texts(group, "settings_json", ()))
     return read_record(file, Provenance, calibrations=tuple(used), imported=imported)
 
@@ -195,9 +193,9 @@ def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:
-    group = find_group(file, "pose_covariance")
-    if group is None or not has_member(file, "frame_flags"):
+    if not (has_member(file, "pose_covariance") and has_member(file, "frame_flags")):
         return None
+    group = require_group(file, "pose_covariance")
     covariances = {
         mode: read_checked(group, mode, (frames, 6, 6)) for mode in MODES if has_member(group, mode)
     }
@@ -216,9 +214,9 @@ def _read_trust(file: h5py.File, frames: int) -> Trust | None:
 
 
 def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:
-    group = find_group(file, "pairs")
-    if group is None:
+    if not has_member(file, "pairs"):
         return None
+    group = require_group(file, "pairs")
     pairs = read_record(group, FramePairs)
     _check_pairs(pairs, frames, locate(group))
     transforms_from_matrices(pairs.first_from_second, locate(group, "first_from_second"))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from types import NoneType, TracebackType
-from typing import Any, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import h5py
 import numpy as np
@@ -34,99 +34,54 @@ _AHEAD_BYTES, _SPARE_BYTES = 16 * 2**20, 2**18
 Record = TypeVar("Record")
 
 
-class Room:
-    """Room on the disk taken before HDF5 needs it, so that a full disk is an error before HDF5 meets it.
+def reserve(file: h5py.h5f.FileID, more_bytes: int = 0) -> None:
+    """Take room on the disk before HDF5 needs it, so that a full disk is an error before HDF5 meets it.
 
     HDF5 cannot close a file whose last bytes it cannot write, and takes the interpreter down with it. Without
     ``posix_fallocate``, as on Windows and macOS, nothing is taken.
+
+    Raises
+    ------
+    OSError
+        If there is none.
     """
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._taken = path, 0
-        self._file = os.open(path, os.O_RDWR)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        os.close(self._file)
-        if kind is None:
-            self.trim(self._path)
-
-    @staticmethod
-    def trim(path: Path) -> None:
-        """Give back what a closed file did not need: HDF5 cuts off what lies behind its end."""
-        with h5py.File(path, "r+", locking=False):  # somebody may be reading it
-            pass
-
-    def require(self, file_bytes: int, more_bytes: int = 0) -> None:
-        """Take room for a file of a length and what is to be added; raises `OSError` if there is none."""
-        stop = file_bytes + more_bytes + _SPARE_BYTES
-        if stop > self._taken and hasattr(os, "posix_fallocate"):
-            stop += min(stop, _AHEAD_BYTES)
-            os.posix_fallocate(self._file, self._taken, stop - self._taken)
-            self._taken = stop
+    handle, stop = file.get_vfd_handle(), file.get_filesize() + more_bytes + _SPARE_BYTES
+    if hasattr(os, "posix_fallocate") and os.fstat(handle).st_size < stop:
+        os.posix_fallocate(handle, 0, stop + min(stop, _AHEAD_BYTES))
 
 
-class HDF5Writer:
-    """Write a file of the family in a block; it appears whole when the block ends, or not at all.
-
-    Attributes
-    ----------
-    file : h5py.File
-        Open within the block.
-    """
-
-    file: h5py.File
-
-    def __init__(self, path: PathLike, format_name: str, version: int = 1) -> None:
-        self.path, self._format = path, {"format": format_name, "version": version}
-
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            part = stack.enter_context(atomic_path(self.path))
-            self.room = stack.enter_context(Room(part))
-            self.file = stack.enter_context(h5py.File(part, "w", locking=False))
-            self.file.attrs.update(self._format)
-            self.room.require(0)
-            stack.push(self._finish_unless)
-            self._begin()
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.__exit__(kind, error, trace)
-
-    def put(self, group: h5py.Group, name: str, value: Any) -> None:
-        """Write a value under a name by its type, as the function `put`."""
-        put(group, name, value, self.room)
-
-    def put_fields(self, group: h5py.Group, record: object, skip: Sequence[str] = ()) -> None:
-        """Write each field of a dataclass by its name, but those to skip."""
-        for name, value in vars(record).items():
-            if name not in skip:
-                self.put(group, name, value)
-
-    def put_text(self, group: h5py.Group, name: str, text: str | Sequence[str]) -> None:
-        """Write a text, or a list of them, as a data set: it may be more than an attribute holds."""
-        plain = _unicode(text) if isinstance(text, str) else [_unicode(line) for line in text]
-        group.create_dataset(name, data=plain, dtype=h5py.string_dtype())
-
-    def _begin(self) -> None:
-        """Write what is known before the block."""
-
-    def _finish(self) -> None:
-        """Write what is known when the block has ended without an error."""
-
-    def _finish_unless(self, _: object, error: BaseException | None, __: object) -> None:
-        if error is None:
-            self._finish()
-            label(self.file)
+def trim(path: Path) -> None:
+    """Give back what a closed file did not need: HDF5 cuts off what lies behind its end."""
+    with h5py.File(path, "r+", locking=False):  # somebody may be reading it
+        pass
 
 
-def put(group: h5py.Group, name: str, value: Any, room: Room, **layout: Any) -> None:
+@contextmanager
+def written(path: PathLike, format_name: str, version: int = 1) -> Iterator[h5py.File]:
+    """Yield a new file of the family; it appears whole when the block ends, or not at all."""
+    with atomic_path(path) as part:
+        with h5py.File(part, "w", locking=False) as file:
+            file.attrs.update({"format": format_name, "version": version})
+            reserve(file.id)
+            yield file
+            label(file)
+        trim(part)
+
+
+def put_fields(group: h5py.Group, record: object, skip: Sequence[str] = ()) -> None:
+    """Write each field of a dataclass by its name, but those to skip."""
+    for name, value in vars(record).items():
+        if name not in skip:
+            put(group, name, value)
+
+
+def put_text(group: h5py.Group, name: str, text: str | Sequence[str]) -> None:
+    """Write a text, or a list of them, as a data set: it may be more than an attribute holds."""
+    plain = _unicode(text) if isinstance(text, str) else [_unicode(line) for line in text]
+    group.create_dataset(name, data=plain, dtype=h5py.string_dtype())
+
+
+def put(group: h5py.Group, name: str, value: Any, **layout: Any) -> None:
     """Write a value under a name by its type; `layout` is of a data set, as h5py has it.
 
     Numbers, texts and tuples of numbers become attributes, arrays and rigid transforms data sets, rotations
@@ -140,16 +95,16 @@ def put(group: h5py.Group, name: str, value: Any, room: Room, **layout: Any) -> 
     if isinstance(value, Mapping):
         inner = group.require_group(name)
         for key, item in value.items():
-            put(inner, key, item, room)
+            put(inner, key, item)
     elif isinstance(value, str):
         group.attrs[name] = _unicode(value)
     elif isinstance(value, int | float | tuple):
         group.attrs[name] = value
     elif isinstance(value, Rotation):
-        put(group, f"{name}_wxyz", value.as_quat(scalar_first=True), room)
+        put(group, f"{name}_wxyz", value.as_quat(scalar_first=True))
     else:
         values = np.asarray(value.as_matrix() if isinstance(value, RigidTransform) else value)
-        room.require(group.file.id.get_filesize(), values.nbytes)
+        reserve(group.file.id, values.nbytes)
         group.create_dataset(name, data=values, **layout)
 
 
@@ -159,7 +114,7 @@ def _unicode(text: str) -> str:
 
 
 def read_record(group: h5py.Group, kind: type[Record], **values: Any) -> Record:
-    """Read a dataclass that `HDF5Writer.put_fields` wrote; older files may lack fields with a default.
+    """Read a dataclass that `put_fields` wrote; older files may lack fields with a default.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.geometry import require_finite, require_increasing
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import (
     INERTIAL,
@@ -27,7 +27,7 @@ from speckle3d.core.sweep import (
 )
 from speckle3d.core.threads import ahead
 from speckle3d.io.hdf5 import PathLike, atomic_path, find_member, has_member, open_hdf5, opened, reading
-from speckle3d.io.records import HDF5Writer, Room, put
+from speckle3d.io.records import put, reserve, trim, written
 from speckle3d.io.sweeps import (
     FORMAT,
     IQ_VERSION,
@@ -55,9 +55,12 @@ class FrameSet:
         For messages.
     grid : ImageGrid
     signal : RFSettings or BModeSettings
-    dtype : dtype or None
-    compression : {"gzip", "lzf", None}
-        As of `SweepWriter`.
+        Decides which of them.
+    dtype : dtype, optional
+        int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
+    compression : {None, "gzip", "lzf"}
+        HDF5 filter, with byte shuffling. None is as fast as the disk; gzip saves a third of echoes and takes
+        some 16 ms for a frame of 1 MB; lzf saves a fifth in 10 ms.
     """
 
     def __init__(
@@ -65,8 +68,8 @@ class FrameSet:
         path: PathLike,
         grid: ImageGrid,
         signal: RFSettings | BModeSettings,
-        dtype: npt.DTypeLike | None,
-        compression: Compression,
+        dtype: npt.DTypeLike | None = None,
+        compression: Compression = None,
     ) -> None:
         self.name = "bmode"
         if isinstance(signal, RFSettings):
@@ -102,7 +105,7 @@ class FrameSet:
         self._file, self._node, self._memory = file.id, node.id, h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
 
-    def append(self, frame: npt.NDArray[Any], room: Room) -> None:
+    def append(self, frame: npt.NDArray[Any]) -> None:
         """Write the next frame, shape (vector, sample).
 
         Raises
@@ -111,7 +114,7 @@ class FrameSet:
             If its shape or type is another, or it holds NaN.
         """
         stored = self._stored(frame)
-        room.require(self._file.get_filesize(), stored.nbytes)
+        reserve(self._file, stored.nbytes)
         start = (self.count, *(0,) * stored.ndim)
         self._node.set_extent((self.count + 1, *stored.shape))
         if self._compression is None:
@@ -146,66 +149,6 @@ class FrameSet:
         return np.ascontiguousarray(frame, self._dtype)
 
 
-class SweepWriter(HDF5Writer):
-    """Write a sweep file frame by frame; it appears whole when the block ends, or not at all.
-
-    Parameters
-    ----------
-    path : path
-    grid : ImageGrid
-    signal : RFSettings or BModeSettings
-        Decides whether frames become ``/rf``, ``/iq`` or ``/bmode``.
-    dtype : dtype
-        int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
-    compression : {None, "gzip", "lzf"}
-        HDF5 filter, with byte shuffling. None is as fast as the disk; gzip saves a third of echoes and takes
-        some 16 ms for a frame of 1 MB; lzf saves a fifth in 10 ms.
-    """
-
-    def __init__(
-        self,
-        path: PathLike,
-        grid: ImageGrid,
-        signal: RFSettings | BModeSettings,
-        dtype: npt.DTypeLike | None = None,
-        compression: Compression = None,
-    ) -> None:
-        self._frames = FrameSet(path, grid, signal, dtype, compression)
-        super().__init__(path, FORMAT, self._frames.version)
-        self._time_s: list[float] = []
-
-    def _begin(self) -> None:
-        self._frames.create(self.file)
-
-    def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
-        """Write the next frame, shape (vector, sample), taken at image time `time_s`.
-
-        Raises
-        ------
-        InvalidInputError
-            If its shape or type is another, it holds NaN, or its time is not after the one before.
-        """
-        self._frames.append(frame, self.room)
-        self._time_s.append(float(time_s))
-
-    def copy_unknown(self, source: PathLike) -> None:
-        """Copy what another sweep file holds beyond this version of the format."""
-        with reading(source), naming(str(source)), open_hdf5(source) as other:
-            for name in other:
-                if name not in KNOWN and name not in self.file:
-                    other.copy(find_member(other, name), self.file, name)
-            for name, value in other.attrs.items():
-                if name not in self.file.attrs:
-                    self.file.attrs[name] = value
-
-    def _finish(self) -> None:
-        with naming(str(self.path)):
-            times = require_increasing(np.asarray(self._time_s, dtype=float), "/frame_time_s")
-            if times.size == 0:
-                raise InvalidInputError(f"/{self._frames.name}: expected at least one frame, got none")
-        self.put(self.file, "frame_time_s", times)
-
-
 def write_sweep(
     path: PathLike,
     sweep: Sweep,
@@ -225,7 +168,7 @@ def write_sweep(
         HDF5 file to write.
     sweep : Sweep
     compression : {None, "gzip", "lzf"}
-        As of `SweepWriter`.
+        As of `FrameSet`.
 
     Raises
     ------
@@ -245,26 +188,38 @@ def write_sweep(
     3
     """
     frames = sweep.frames
+    images = FrameSet(path, sweep.grid, sweep.signal, stored_dtype(frames), compression)
     # Frames that are computed when they are read are made on all cores.
     made = (ahead if getattr(frames, "computed", False) else map)(frames.__getitem__, range(len(sweep)))
-    with SweepWriter(path, sweep.grid, sweep.signal, stored_dtype(frames), compression) as writer:
-        for i, (frame, time_s) in enumerate(zip(made, sweep.frame_time_s, strict=True)):
-            writer.append(frame, time_s)
+    with written(path, FORMAT, images.version) as file:
+        images.create(file)
+        for i, frame in enumerate(made):
+            images.append(frame)
             if progress is not None:
                 progress(i + 1, len(sweep))
+        put(file, "frame_time_s", sweep.frame_time_s)
         for sensor in (sweep.orientation, sweep.tracker):
             if sensor is not None:
-                _write_sensor(writer.file, sensor, writer.room)
+                _write_sensor(file, sensor)
         if sweep.truth is not None:
-            writer.put(writer.file, "truth", {"world_from_image": sweep.truth})
-        writer.put(writer.file, "probe", sweep.probe or None)
+            put(file, "truth", {"world_from_image": sweep.truth})
+        put(file, "probe", sweep.probe or None)
         for name, value in (simulation or {}).items():
             plain = value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
-            writer.put(writer.file, "simulation", {name: plain})
-        if hasattr(frames, "write_more"):
-            frames.write_more(writer.file)
+            put(file, "simulation", {name: plain})
         if isinstance(source := getattr(frames, "open_file", None), SweepSlices):
-            writer.copy_unknown(source.path)
+            _copy_unknown(source.path, file)
+
+
+def _copy_unknown(source: PathLike, file: h5py.File) -> None:
+    """Copy what another sweep file holds beyond this version of the format."""
+    with reading(source), naming(str(source)), open_hdf5(source) as other:
+        for name in other:
+            if name not in KNOWN and name not in file:
+                other.copy(find_member(other, name), file, name)
+        for name, value in other.attrs.items():
+            if name not in file.attrs:
+                file.attrs[name] = value
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
@@ -283,13 +238,15 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
         has_one = has_member(file, "orientation")
     with atomic_path(path) as part:
         shutil.copyfile(path, part)
-        with Room(part) as room, h5py.File(part, "r+", locking=False) as file:
+        with h5py.File(part, "r+", locking=False) as file:
+            reserve(file.id)
             if has_one:
                 del file["orientation"]
-            _write_sensor(file, sensor, room)
+            _write_sensor(file, sensor)
+        trim(part)
 
 
-def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker, room: Room) -> None:
+def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
     readings, mounting = sensor.readings, sensor.sensor_from_image
     values: dict[str, Any] = {"time_s": readings.time_s, "time_offset_s": sensor.time_offset_s}
     if isinstance(sensor, Tracker):
@@ -300,7 +257,7 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker, room: Ro
         values["quaternion"] = readings.world_from_sensor
         values |= {name: getattr(sensor, name) for name in INERTIAL}
     name = "tracker" if isinstance(sensor, Tracker) else "orientation"
-    put(file, name, values, room)
+    put(file, name, values)
     if mounting is not None:
         file[name].attrs.update(mounting_attribute(mounting))
 

@@ -28,23 +28,20 @@ from speckle3d.core.sweep import (
     Sweep,
     Tracker,
 )
-from speckle3d.io.frames import FileFrames, HDF5Slices, Turn
+from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     PathLike,
-    find_group,
-    has_format,
+    file_format,
     has_member,
-    hdf5_claim,
     locate,
-    open_hdf5,
     opened,
     read_attribute,
     read_checked,
     read_text,
     read_transforms,
     read_vector_attribute,
-    reading,
     require_dataset,
+    require_group,
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
@@ -95,13 +92,18 @@ def read_sweep(path: PathLike) -> Sweep:
     InvalidInputError
         Naming the file, the data set and the first bad index.
     """
+    return _read(path)[0]
+
+
+def _read(path: PathLike) -> tuple[Sweep, str | None]:
+    """A sweep, and words if its recording goes on or was not closed."""
     with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
         times = _read_times(file, "frame_time_s")
         if not times.size:
             raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
         frames, grid, signal = _read_image(file, times.size)
-        truth = find_group(file, "truth")
-        return Sweep(
+        truth = require_group(file, "truth") if has_member(file, "truth") else None
+        sweep = Sweep(
             frames=frames,
             grid=grid,
             signal=signal,
@@ -112,9 +114,14 @@ def read_sweep(path: PathLike) -> Sweep:
             name=printable(Path(path).stem),
             probe=read_text(file, "probe") if "probe" in file.attrs else "",
         )
+        note = (
+            f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far, "
+            "of which speckle3d convert makes a whole file"
+        )
+        return sweep, note if _is_growing(file) else None
 
 
-def is_growing(file: h5py.File) -> bool:
+def _is_growing(file: h5py.File) -> bool:
     """Whether an open file's recording goes on, or has ended without being closed."""
     return file.swmr_mode or (has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_)))
 
@@ -122,7 +129,7 @@ def is_growing(file: h5py.File) -> bool:
 def _read_times(group: h5py.Group, name: str = "time_s") -> FloatArray:
     """Read times that increase; of a file that grows those before NaN, as many as there are whole rows."""
     times = read_checked(group, name, ("row",))
-    if is_growing(group.file) and np.isnan(times).any():
+    if _is_growing(group.file) and np.isnan(times).any():
         times = times[: np.argmax(np.isnan(times))]
     return require_increasing(times, locate(group, name))
 
@@ -131,14 +138,8 @@ def _read_rows(
     group: h5py.Group, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64
 ) -> npt.NDArray[Any]:
     """Read a data set of a shape; a file that grows may have more rows, which are left out."""
-    values = read_checked(group, name, ("row", *shape[1:]), dtype)
-    _require_count(group, name, len(values), shape[0])
-    return values[: shape[0]]
-
-
-def _require_count(group: h5py.Group, name: str, got: int, count: int) -> None:
-    if got < count or (got > count and not is_growing(group.file)):
-        raise InvalidInputError(f"{locate(group, name)}: expected {count} rows, one for each time, got {got}")
+    is_growing = _is_growing(group.file)
+    return read_checked(group, name, ("row", *shape[1:]) if is_growing else shape, dtype)[: shape[0]]
 
 
 def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:
@@ -147,19 +148,17 @@ def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFS
     if name is None:
         raise InvalidInputError(f"{locate(file)}: expected a data set rf, iq or bmode, got none of them")
     node, where = require_dataset(file, name), locate(file, name)
-    dtype, grows = node.dtype.newbyteorder("="), is_growing(file)
+    dtype, is_growing = node.dtype.newbyteorder("="), _is_growing(file)
     require_sample_type(name, dtype, where)
     in_pairs = name == "iq" and dtype == np.int16
-    if node.ndim != 3 + in_pairs or (in_pairs and node.shape[3] != 2) or 0 in node.shape:
-        expected = f"(frame, vector, sample{', 2' if in_pairs else ''})"
-        raise InvalidInputError(f"{where}: expected shape {expected}, got {node.shape}")
-    _require_count(file, name, node.shape[0], count)
-    _, vectors, samples = node.shape[:3]
-    turn: Turn = from_pairs if in_pairs else np.asarray
-    slices = SweepSlices(Path(file.filename).absolute(), name, turn, count, grows)
-    frames = FileFrames(
-        file.filename, slices, (count, vectors, samples), np.complex64 if in_pairs else dtype, dtype
-    )
+    is_shaped = node.ndim == 3 + in_pairs and node.shape[3:] in ((), (2,)) and 0 not in node.shape
+    if not is_shaped or node.shape[0] < count or (node.shape[0] > count and not is_growing):
+        expected = f"({count}, vector, sample{', 2' if in_pairs else ''})"
+        raise InvalidInputError(f"{where}: expected shape {expected}, one frame a time, got {node.shape}")
+    vectors, samples = node.shape[1:3]
+    slices = SweepSlices(Path(file.filename).absolute(), (name,), from_pairs if in_pairs else np.asarray)
+    kind = np.complex64 if in_pairs else dtype
+    frames = slices.frames((count, vectors, samples), kind, stored_dtype=dtype)
     with naming(where):
         if name == "iq":
             read_attribute(node, "demodulation_frequency_hz")
@@ -180,7 +179,7 @@ def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
 
 
 def _read_orientation(file: h5py.File) -> OrientationSensor | None:
-    group = find_group(file, "orientation")
+    group = require_group(file, "orientation") if has_member(file, "orientation") else None
     if group is None or not (time_s := _read_times(group)).size:
         return None
     quaternions = _read_rows(group, "quaternion_wxyz", (time_s.size, 4))
@@ -200,9 +199,9 @@ def _read_orientation(file: h5py.File) -> OrientationSensor | None:
 
 
 def _read_tracker(file: h5py.File) -> Tracker | None:
-    group = find_group(file, "tracker")
-    if group is None:
+    if not has_member(file, "tracker"):
         return None
+    group = require_group(file, "tracker")
     time_s = _read_times(group)
     valid = np.ones(time_s.size, dtype=bool)
     if has_member(group, "valid"):
@@ -222,26 +221,14 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
         return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
 
 
-def unfinished_note(path: PathLike) -> str | None:
-    """Words for a sweep file whose recording goes on or was not closed; None for any other file."""
-    if not Path(path).is_file() or not h5py.is_hdf5(path):
-        return None
-    with reading(path), open_hdf5(path) as file:
-        if not has_format(file, FORMAT) or not is_growing(file):
-            return None
-        count = _read_times(file, "frame_time_s").size
-    return (
-        f"{path}: the recording goes on, or was ended without being closed: {count} frames so far, of "
-        "which speckle3d convert makes a whole file"
-    )
-
-
 def _open(path: Path, _: ImportSettings) -> Recording:
-    sweep, note = read_sweep(path), unfinished_note(path)
+    sweep, note = _read(path)
     if note is None:
         return Recording(path, ready=sweep)
     rows = (("recording", "goes on, or was ended without being closed", ""),)
     return Recording(path, ready=sweep, rows=rows, remarks=(note,))
 
 
-READER = Reader(FORMAT, hdf5_claim(lambda file: has_format(file, FORMAT)), _open, takes_settings=False)
+READER = Reader(
+    FORMAT, None, _open, claims_hdf5=lambda file: file_format(file) == FORMAT, takes_settings=False
+)

@@ -19,10 +19,8 @@ MATLAB, ``RcvData{1}`` or ``Trans.spacing`` or ``Receive(3).endSample``, counted
 from __future__ import annotations
 
 import re
-import struct
 import warnings
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,13 +30,14 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
-from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, text_attribute
-from speckle3d.io.hdf5 import SIGNATURE, find_member, one_line, open_hdf5, reading
+from speckle3d.io.formats.hdf5_values import Grid, text_of
+from speckle3d.io.frames import HDF5Slices
+from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Row, Value, step_of
@@ -52,14 +51,14 @@ _POSITIONS = ("x_mm", "z_mm", "time_s")
 _SCALED = re.compile(r"(?P<name>[^*/]+?)\s*(?:(?P<sign>[*/])\s*(?P<factor>[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?))?")
 _MOST_SHOWN, _MOST_LEVELS, _MOST_ELEMENTS = 12, 4, 8
 """Arrays that are listed; structs within each other, and elements of each, in which they are looked for."""
-_MARK, _ORDERS = b"MATLAB", {b"\0\1IM": "<", b"\1\0MI": ">"}
-_COMPRESSED, _MATRIX, _NUMERIC, _COMPLEX_FLAG = 15, 14, range(6, 16), 0x800
-"""Of the format of version 5: types of elements, classes of matrices of numbers, and their flag."""
+
+
+def _is_new(start: bytes) -> bool:
+    return start[USER_BLOCK : USER_BLOCK + len(SIGNATURE)] == SIGNATURE
 
 
 def _claims(_: Path, start: bytes) -> bool:
-    is_new = start[USER_BLOCK : USER_BLOCK + len(SIGNATURE)] == SIGNATURE
-    return start.startswith(_MARK) and (is_new or start[124:128] in _ORDERS)
+    return start.startswith(b"MATLAB") and (_is_new(start) or start[126:128] in (b"IM", b"MI"))
 
 
 def open_matlab(path: Path, settings: ImportSettings) -> Recording:
@@ -84,9 +83,8 @@ class _Variables:
     def __init__(self, path: Path) -> None:
         self.path = path
         with open_regular(path) as stream:
-            start = stream.read(USER_BLOCK + len(SIGNATURE))
-        self.is_new = start[USER_BLOCK:] == SIGNATURE
-        self.root: Any = open_hdf5(path) if self.is_new else _loaded(path, _ORDERS[start[124:128]])
+            self.is_new = _is_new(stream.read(USER_BLOCK + len(SIGNATURE)))
+        self.root: Any = open_hdf5(path) if self.is_new else _loaded(path)
 
     def array(self, name: str) -> Any:
         """The array of a name as MATLAB's; the only struct may be counted or not.
@@ -97,10 +95,9 @@ class _Variables:
             If there is none of numbers.
         """
         plain = name.replace(" ", "")
-        with reading(self.path):
-            for wanted in (plain, re.sub(r"[({]1[)}]", "", plain)):
-                if (node := dict(self.arrays(wanted)).get(wanted)) is not None:
-                    return node
+        for wanted in (plain, re.sub(r"[({]1[)}]", "", plain)):
+            if (node := dict(self.arrays(wanted)).get(wanted)) is not None:
+                return node
         known = ", ".join(printable(label) for label, _ in self.arrays()) or "none"
         raise InvalidInputError(f"{self.path}: expected an array {printable(name)}, got {known}")
 
@@ -145,38 +142,13 @@ class _Variables:
         return self.root[node[()].ravel()[k]]
 
 
-def _loaded(path: Path, order: str) -> dict[str, Any]:
+def _loaded(path: Path) -> dict[str, Any]:
     """Variables of versions 5 to 7, read whole by SciPy."""
     from scipy.io import loadmat
 
-    damage = (IndexError, AttributeError, SystemError, AssertionError, NameError, struct.error)
     with warnings.catch_warnings(), reading(path):
         warnings.simplefilter("ignore")
-        try:
-            _require_sound(path.read_bytes()[128:], order)
-            variables = loadmat(path)
-        except damage as error:
-            raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
-    return {name: value for name, value in variables.items() if not name.startswith("__")}
-
-
-def _require_sound(content: bytes, order: str, is_matrix: bool = False) -> None:
-    """Refuse matrices whose flags do not fit their parts: SciPy would read past them, and crash."""
-    at, parts = 0, list[tuple[int, bytes]]()
-    while at + 8 <= len(content):
-        kind, size = struct.unpack_from(f"{order}II", content, at)
-        is_short = bool(kind >> 16)  # few bytes lie where the size stands
-        begin, size = (at + 4, kind >> 16) if is_short else (at + 8, size)
-        parts.append((kind & 0xFFFF, content[begin : begin + size]))
-        at += 8 if is_short else 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
-    for kind, part in parts:
-        if kind in (_MATRIX, _COMPRESSED):
-            _require_sound(zlib.decompress(part) if kind == _COMPRESSED else part, order, kind == _MATRIX)
-    if is_matrix and parts:
-        (flags,), kinds = struct.unpack_from(f"{order}I", parts[0][1]), [kind for kind, _ in parts[3:]]
-        is_short = bool(flags & _COMPLEX_FLAG) and len(kinds) != 2
-        if flags & 0xFF in _NUMERIC and (_MATRIX in kinds or is_short):
-            raise ValueError(f"expected a real part and an imaginary one, got {len(kinds)} part(s)")
+        return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
 
 
 def _is_numeric(node: Any) -> bool:
@@ -192,7 +164,7 @@ def _is_list(node: Any) -> bool:
 
 
 def _class(node: h5py.Dataset) -> str:
-    return text_attribute(node, "MATLAB_class")
+    return text_of(node.attrs.get("MATLAB_class"))
 
 
 @dataclass(frozen=True)
@@ -201,9 +173,9 @@ class _Greys:
 
     grid: Grid
 
-    def __call__(self, parts: Sequence[npt.NDArray[Any]]) -> npt.NDArray[Any]:
+    def __call__(self, *parts: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Make a frame."""
-        made = self.grid(parts).astype(np.float64)
+        made = self.grid(*parts).astype(np.float64)
         if not np.array_equal(made, np.rint(np.clip(made, 0, 255))):
             raise InvalidInputError("bmode: expected grey levels, whole numbers from 0 to 255, got others")
         return made.astype(np.uint8)
@@ -277,11 +249,11 @@ def _frames(
     place = nodes[0].ndim - 1 - names.index("frame") if "frame" in names else -1
     axis = place if place >= 0 else None
     if variables.is_new:
-        stored = tuple(dataset(variables.root, node.name).name for node in nodes)
-        return HDF5File(variables.path, stored, axis, turn).frames(shape, dtype)
+        stored = tuple(node.name for node in nodes)
+        return HDF5Slices(variables.path, stored, turn, axis).frames(shape, dtype)
     made = np.empty(shape, dtype)
     for i in range(shape[0]):
-        made[i] = turn([node if axis is None else node.take(i, axis) for node in nodes])
+        made[i] = turn(*(node if axis is None else node.take(i, axis) for node in nodes))
     if made.dtype.kind in "fc":
         require_finite(made, f"{variables.path}: {data[0]}")
     return made

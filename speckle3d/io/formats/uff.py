@@ -25,9 +25,18 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, flat, single, text_attribute
-from speckle3d.io.frames import FileFrames
-from speckle3d.io.hdf5 import find_member, has_member, hdf5_claim, locate, open_hdf5, reading
+from speckle3d.io.formats.hdf5_values import Grid, flat, grey_frames, single, text_of
+from speckle3d.io.frames import FileFrames, HDF5Slices
+from speckle3d.io.hdf5 import (
+    file_format,
+    find_member,
+    has_member,
+    locate,
+    open_hdf5,
+    reading,
+    require_dataset,
+    require_group,
+)
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Row, Value, speed_of, step_of
@@ -39,7 +48,7 @@ _BEAMFORMED, _CHANNELS, _LINEAR = "uff.beamformed_data", "uff.channel_data", "uf
 
 def is_uff(file: h5py.File) -> bool:
     """Whether an open file holds objects of USTB."""
-    return "format" not in file.attrs and any(kind.startswith("uff.") for kind in _objects(file).values())
+    return not file_format(file) and any(kind.startswith("uff.") for kind in _objects(file).values())
 
 
 def open_uff(path: Path, settings: ImportSettings) -> Recording:
@@ -51,22 +60,20 @@ def open_uff(path: Path, settings: ImportSettings) -> Recording:
 
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
     name = _chosen(file, path, settings)
-    group = file[name]
+    group = require_group(file, name)
     x_mm, z_mm = _axes(group)
     data = f"{name}/data"
     is_complex = isinstance(find_member(file, data), h5py.Group)
     parts = (f"{data}/real", f"{data}/imag") if is_complex else (data,)
-    shapes = {dataset(file, part).shape for part in parts}
-    pixels = x_mm.size * z_mm.size
-    axis, count = _frame_axis(locate(file, data), shapes.pop() if len(shapes) == 1 else (), pixels)
-    spacing = step_of(z_mm, locate(group, "scan/z_axis"))
+    axis, count = _frame_axis(require_dataset(file, parts[0]), x_mm.size * z_mm.size)
+    spacing, where = step_of(z_mm, locate(group, "scan/z_axis")), f"in {name}/scan/z_axis"
     if (video := single(group, "frame_rate")) is not None:
         rows.append(("frame rate of videos made of it, not used", f"{video:g}", "frames/s"))
     pitch = Value(step_of(x_mm, locate(group, "scan/x_axis")), f"in {name}/scan/x_axis")
     modulation_hz = single(group, "modulation_frequency") or 0.0
     values = {
         "vector_pitch_mm": pitch,
-        "first_sample_depth_mm": Value(float(z_mm[0]), f"in {name}/scan/z_axis"),
+        "first_sample_depth_mm": Value(float(z_mm[0]), where),
         "demodulation_frequency_hz": Value(modulation_hz, f"in {name}/modulation_frequency"),
         **_pulse(group, f"in {name}", modulation_hz),
     }
@@ -74,19 +81,18 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         if kind == _CHANNELS and (speed := single(file, f"{other}/sound_speed")):
             values["speed_of_sound_m_s"] = Value(speed, f"{other}/sound_speed")
     grid, shape = Grid((x_mm.size, z_mm.size), (0, 1)), (count, x_mm.size, z_mm.size)
-    source = HDF5File(path, parts, axis, grid)
+    source = HDF5Slices(path, parts, grid, axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
     if is_complex and count and settings.demodulation_frequency_hz is None:
         rate_hz = 1e3 * speed_of(settings, values) / (2.0 * spacing)
         with naming(str(path)):
             _require_phase(frames, values, modulation_hz, rate_hz)
     elif count and not is_complex and (kind := _kind_of(frames)) != "RF":
-        given = settings.dynamic_range_db
-        frames, top, span = source.grey_frames(shape, grid, kind == "decibels", given)
+        frames, top, span = grey_frames(source, shape, kind == "decibels", settings.dynamic_range_db)
         rows.append(("data", f"of one sign: {kind}, made grey levels here", ""))
         values |= {
             "column_pitch_mm": pitch,
-            "row_spacing_mm": Value(spacing, f"in {name}/scan/z_axis"),
+            "row_spacing_mm": Value(spacing, where),
             "dynamic_range_db": Value(span, f"of grey levels made here below {top:g}"),
         }
     return Recording(path, settings, frames, values, sample_spacing_mm=spacing)
@@ -94,12 +100,8 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
 
 def _objects(file: h5py.File) -> dict[str, str]:
     """Classes of the root's groups, by their names."""
-    groups = {str(name): find_member(file, name) for name in file}
-    kinds = {
-        printable(name): text_attribute(group, "class")
-        for name, group in groups.items()
-        if isinstance(group, h5py.Group)
-    }
+    nodes = {printable(str(name)): find_member(file, name) for name in file}
+    kinds = {name: text_of(node.attrs.get("class")) for name, node in nodes.items() if node is not None}
     return {name: kind for name, kind in kinds.items() if kind}
 
 
@@ -144,8 +146,8 @@ def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> str:
 
 def _axes(group: h5py.Group) -> tuple[FloatArray, FloatArray]:
     """Lateral positions and depths, mm; pixels must be in USTB's order where the file lists their places."""
-    scan, where = find_member(group, "scan"), locate(group, "scan")
-    kind = text_attribute(scan, "class") if isinstance(scan, h5py.Group) else ""
+    scan, where = require_group(group, "scan"), locate(group, "scan")
+    kind = text_of(scan.attrs.get("class"))
     if kind != _LINEAR:
         raise InvalidInputError(
             f"{where}: expected a {_LINEAR}, got {kind or 'none'}: beamform onto a {_LINEAR}, whose lines "
@@ -162,24 +164,23 @@ def _axes(group: h5py.Group) -> tuple[FloatArray, FloatArray]:
     return 1e3 * x, 1e3 * z
 
 
-def _frame_axis(where: str, shape: tuple[int, ...], pixels: int) -> tuple[int | None, int]:
+def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:
     """Axis of the frames in the file, None where it has none, and their number.
 
     MATLAB leaves out axes of length 1 at its end, which is the beginning in the file; pyuff keeps MATLAB's
     order.
     """
+    shape = node.shape
     full = len(shape) == 4
     reverse = shape[-1:] == (pixels,) and set(shape[1:-1] if full else shape[:-1]) <= {1}
     forward = shape[:1] == (pixels,) and set(shape[1:3]) <= {1}
     if len(shape) > 4 or not (reverse or forward) or (full and reverse and forward):
         raise InvalidInputError(
-            f"{where}: expected {pixels} pixels of one channel and one wave, summed, got (MATLAB's order) "
-            f"{shape[::-1]}"
+            f"{locate(node)}: expected {pixels} pixels of one channel and one wave, summed, got (MATLAB's "
+            f"order) {shape[::-1]}"
         )
-    if not full:
-        return None, 1
     axis = 0 if reverse else 3
-    return axis, shape[axis]
+    return (axis, shape[axis]) if full else (None, 1)
 
 
 def _pulse(group: h5py.Group, where: str, modulation_hz: float) -> dict[str, Value]:
@@ -196,4 +197,4 @@ def _pulse(group: h5py.Group, where: str, modulation_hz: float) -> dict[str, Val
     return values
 
 
-READER = Reader(FORMAT, hdf5_claim(is_uff), open_uff)
+READER = Reader(FORMAT, None, open_uff, claims_hdf5=is_uff)

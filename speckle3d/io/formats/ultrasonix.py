@@ -15,12 +15,14 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
-from speckle3d.io.frames import FileFrames, RawFile
+from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Row, Value
@@ -55,10 +57,6 @@ class _Header:
         return cls(*values[:5], *values[13:18])
 
     @property
-    def name(self) -> str:
-        return _READ[self.kind][0] if self.kind in _READ else f"type {self.kind}"
-
-    @property
     def frame_bytes(self) -> int:
         return self.width * self.height * self.bits // 8
 
@@ -67,10 +65,31 @@ class _Header:
         is_type = 0 < self.kind <= _LAST_TYPE and self.kind.bit_count() == 1
         return is_type and 0 <= self.frames <= _MOST_FRAMES and sides and self.bits in (8, 16, 24, 32)
 
-    def tag_bytes(self, size: int) -> int | None:
-        """Bytes before each frame, by the file's size; None if it fits neither."""
-        sizes = {_HEADER.size + self.frames * (tag + self.frame_bytes): tag for tag in (_TAG_BYTES, 0)}
-        return sizes.get(size)
+    def step_bytes(self, size: int) -> int | None:
+        """Bytes from frame to frame, with the frames' numbers or not, by the file's size; None if neither."""
+        steps = (self.frame_bytes + _TAG_BYTES, self.frame_bytes)
+        return next((step for step in steps if size == _HEADER.size + self.frames * step), None)
+
+
+@dataclass(frozen=True)
+class _File:
+    """Opens frames that lie one after the other."""
+
+    path: Path
+    header: _Header
+    step_bytes: int
+
+    def __call__(self) -> ReadFrame:
+        """Open nothing: the file is open only while a frame is read."""
+        return self.read
+
+    def read(self, i: int) -> npt.NDArray[Any]:
+        """Read frame i, the last bytes of its step."""
+        header, dtype = self.header, "<i2" if self.header.kind == _RF else "u1"
+        offset = _HEADER.size + (i + 1) * self.step_bytes - header.frame_bytes
+        values = np.fromfile(self.path, dtype, header.width * header.height, offset=offset)
+        is_image = header.kind == _BMODE
+        return values.reshape(header.height, -1).T if is_image else values.reshape(header.width, -1)
 
 
 def _claims(path: Path, start: bytes) -> bool:
@@ -78,7 +97,7 @@ def _claims(path: Path, start: bytes) -> bool:
         return False
     header = _Header.unpacked(start)
     is_named = path.suffix.lower() in _SUFFIXES
-    return header.is_sound() and (is_named or header.tag_bytes(path.stat().st_size) is not None)
+    return header.is_sound() and (is_named or header.step_bytes(path.stat().st_size) is not None)
 
 
 def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:
@@ -89,8 +108,9 @@ def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:
     with open_regular(path) as stream:
         header = _Header.unpacked(stream.read(_HEADER.size))
         size = stream.seek(0, 2)
+    name, bits = _READ.get(header.kind, (f"type {header.kind}", 0))
     rows: list[Row] = [
-        ("recorded", header.name, ""),
+        ("recorded", name, ""),
         ("probe's number", str(header.probe), ""),
         ("line density", str(header.line_density), "lines"),
     ]
@@ -100,32 +120,23 @@ def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:
         "frame_rate_hz": Value(max(header.frame_rate_hz, 0) or None, "in the header"),
     }
     lines = () if header.kind == _BMODE else ("parallel lines",)
-    return Recording.of(
-        path, settings, rows,
-        lambda: Recording(path, settings, _frames(path, header, size), values, assumptions=lines),
-    )  # fmt: skip
 
+    def recording() -> Recording:
+        if header.bits != bits or not header.frames:
+            raise InvalidInputError(
+                f"{path}: expected frames of RF, of 16 bits, or B-mode, of 8, got {header.frames} of {name}, "
+                f"of {header.bits} bits"
+            )
+        if (step := header.step_bytes(size)) is None:
+            whole = min((size - _HEADER.size) // header.frame_bytes, header.frames)
+            got = f"{whole} of {header.frames} frames" if whole < header.frames else f"{size} bytes"
+            raise FileError(f"{path}: ends early, or is longer than its frames: {got}")
+        dtype = np.int16 if header.kind == _RF else np.uint8
+        shape = header.frames, header.width, header.height
+        frames = FileFrames(path, _File(path, header, step), shape, dtype)
+        return Recording(path, settings, frames, values, assumptions=lines)
 
-def _frames(path: Path, header: _Header, size: int) -> FileFrames:
-    _, bits = _READ.get(header.kind, ("", 0))
-    if header.bits != bits or not header.frames:
-        raise InvalidInputError(
-            f"{path}: expected frames of RF, of 16 bits, or B-mode, of 8, got {header.frames} of "
-            f"{header.name}, of {header.bits} bits"
-        )
-    if (tag := header.tag_bytes(size)) is None:
-        expected = _HEADER.size + header.frames * header.frame_bytes
-        if size < expected:
-            whole = (size - _HEADER.size) // header.frame_bytes
-            raise FileError(f"{path}: ends early: {whole} of {header.frames} frames")
-        longer = expected + header.frames * _TAG_BYTES
-        raise FileError(f"{path}: expected {expected} bytes, or {longer} with frame numbers, got {size}")
-    is_image = header.kind == _BMODE
-    shape = (header.height, header.width) if is_image else (header.width, header.height)
-    dtype = np.dtype("<i2" if header.kind == _RF else "u1")
-    turn = np.transpose if is_image else np.asarray
-    source = RawFile(path, _HEADER.size + tag, tag + header.frame_bytes, dtype, shape, turn)
-    return FileFrames(path, source, (header.frames, header.width, header.height), dtype.newbyteorder("="))
+    return Recording.of(path, settings, rows, recording)
 
 
 READER = Reader(FORMAT, _claims, open_ultrasonix)

@@ -19,6 +19,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import h5py
@@ -30,8 +31,18 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, HDF5File, dataset, single, text_attribute, text_of
-from speckle3d.io.hdf5 import find_member, has_member, hdf5_claim, locate, open_hdf5, read_checked, reading
+from speckle3d.io.formats.hdf5_values import Grid, grey_frames, single, text_of
+from speckle3d.io.frames import HDF5Slices
+from speckle3d.io.hdf5 import (
+    file_format,
+    find_member,
+    has_member,
+    locate,
+    open_hdf5,
+    read_checked,
+    reading,
+    require_dataset,
+)
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
@@ -74,7 +85,7 @@ class _Array:
 def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
     names = (*_READ, *_NOT_BEAMFORMED)
-    return "format" not in file.attrs and any(
+    return not file_format(file) and any(
         has_member(file, f"{home}data/{name}") for home in _homes(file) for name in names
     )
 
@@ -82,16 +93,17 @@ def is_zea(file: h5py.File) -> bool:
 def open_zea(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
     with reading(path), open_hdf5(path) as file:
-        facts = {"zea_version": "written by zea", "us_machine": "scanner"}
-        rows: list[Row] = [(words, text_attribute(file, name), "") for name, words in facts.items()]
-        rows = [*filter(lambda row: row[1], rows), ("holds", _contents(file), "")]
+        facts = {"written by zea": "zea_version", "scanner": "us_machine"}
+        told = {words: text_of(file.attrs.get(name)) for words, name in facts.items()}
+        rows: list[Row] = [(words, text, "") for words, text in told.items() if text]
+        rows.append(("holds", _contents(file), ""))
         return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
 
 
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
     array = _chosen(file, path, settings)
     rows.append(("read", array.values, ""))
-    node, values = dataset(file, array.values), _scan(file, array)
+    node, values = require_dataset(file, array.values), _scan(file, array)
     is_beamformed = array.kind == "beamformed_data"
     channels = node.shape[3] if is_beamformed and node.ndim == 4 else 1
     is_number = node.dtype.kind == "f" or (array.kind.startswith("image") and node.dtype == np.uint8)
@@ -102,37 +114,39 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         )
     count, first, second = node.shape[:3]
     places = f"{array.group}/coordinates"
-    x_mm = z_mm = spacing = None
+    left_mm = spacing = None
     x_first = False
     if array.values != array.group and has_member(file, places):
-        x_mm, z_mm, x_first = _pixels(dataset(file, places), (count, first, second))
-        spacing, source_text = step_of(z_mm, f"{locate(file, places)} z"), "of the coordinates"
-        pitch = Value(step_of(x_mm, f"{locate(file, places)} x"), source_text)
+        x_mm, z_mm, x_first = _pixels(require_dataset(file, places), (count, first, second))
+        left_mm, told_by = float(x_mm[0]), "of the coordinates"
+        spacing = step_of(z_mm, f"{locate(file, places)} z")
+        pitch = Value(step_of(x_mm, f"{locate(file, places)} x"), told_by)
         values |= {
             "vector_pitch_mm": pitch,
             "column_pitch_mm": pitch,
-            "row_spacing_mm": Value(spacing, source_text),
-            "first_sample_depth_mm": Value(float(z_mm[0]), source_text),
+            "row_spacing_mm": Value(spacing, told_by),
+            "first_sample_depth_mm": Value(float(z_mm[0]), told_by),
         }
     trailing = node.shape[3:] if channels == 1 else ()
     grid = Grid((first, second, *trailing), (0, 1) if x_first else (1, 0), channels == 2)
     shape = (count, first, second) if x_first else (count, second, first)
-    source = HDF5File(path, (array.values,), 0, grid)
+    source = HDF5Slices(path, (array.values,), grid)
     if is_beamformed or node.dtype == np.uint8:
         dtype = np.complex64 if channels == 2 else np.uint8 if node.dtype == np.uint8 else np.float32
         frames = source.frames(shape, dtype)
     else:
-        decibels, given = array.kind != "envelope_data", settings.dynamic_range_db
-        frames, top, span = source.grey_frames(shape, grid, decibels, given)
+        is_db = array.kind != "envelope_data"
+        frames, top, span = grey_frames(source, shape, is_db, settings.dynamic_range_db)
         values["dynamic_range_db"] = Value(span, f"of grey levels made here below {top:g}")
     shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
     shift_hz = shifts.pop() if len(shifts) == 1 else None
     if channels == 2 and shift_hz and spacing and settings.demodulation_frequency_hz is None:
         with naming(str(path)):
             by_phase = demodulation_of(frames, shift_hz, 1e3 * speed_of(settings, values) / (2 * spacing))
-        told_by = "of scan/demodulation_frequency and the phase of the data"
-        values["demodulation_frequency_hz"] = Value(by_phase, told_by)
-    tracker, remarks = _tracker(file, None if x_mm is None else float(x_mm[0]))
+        words = "of scan/demodulation_frequency and the phase of the data"
+        values["demodulation_frequency_hz"] = Value(by_phase, words)
+    tracker, remarks = _tracker(file, left_mm)
+    attributes = file.attrs
     return Recording(
         path,
         settings,
@@ -142,7 +156,7 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         time_s=_times(file, array, count),
         tracker=tracker,
         chain=_POSES,
-        probe=settings.probe or text_attribute(file, "probe_name") or text_attribute(file, "probe"),
+        probe=settings.probe or text_of(attributes.get("probe_name", attributes.get("probe"))),
         assumptions=("parallel lines",) if spacing is None else (),
         remarks=tuple(remarks),
     )
@@ -159,13 +173,13 @@ def _homes(file: h5py.File) -> list[str]:
 def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> _Array:
     """What to read: the earliest product, where not given by name."""
     arrays = []
-    for home in _homes(file):
-        for kind in _READ:
-            group = f"{home}data/{kind}"
-            if isinstance(find_member(file, group), h5py.Dataset):
-                arrays.append(_Array(group, home, kind, group))
-            elif has_member(file, f"{group}/values"):
-                arrays.append(_Array(group, home, kind, f"{group}/values"))
+    for home, kind in product(_homes(file), _READ):
+        group = f"{home}data/{kind}"
+        arrays += [
+            _Array(group, home, kind, values)
+            for values in (group, f"{group}/values")
+            if isinstance(find_member(file, values), h5py.Dataset)
+        ]
     asked = settings.arrays.get("data")
     if asked is not None:
         arrays = [one for one in arrays if asked.strip("/") in (one.values, one.group)]
@@ -198,21 +212,17 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, int, int]) -> tuple[FloatArray
 
     It must be the same in all frames.
     """
-    if node.shape != (*shape, 3) or node.dtype.kind != "f" or not shape[0]:
-        raise InvalidInputError(
-            f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape} {node.dtype}"
-        )
-    places = node.astype(np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        start = 1e3 * places[0]
-        apart = [np.abs(1e3 * places[i] - start).max() for i in {shape[0] // 2, shape[0] - 1}]
-        x, y, z = start.transpose(2, 0, 1)
-        for x_first in (False, True):
-            columns, depths = (x.T, z.T) if x_first else (x, z)
-            x_mm, z_mm = columns[0], depths[:, 0]
-            off = [np.abs(columns - x_mm).max(), np.abs(depths.T - z_mm).max(), np.ptp(y), *apart]
-            if np.less_equal(off, _TOLERANCE_MM).all() and np.ptp(x_mm) > 0 and np.ptp(z_mm) > 0:
-                return x_mm, z_mm, x_first
+    if node.shape != (*shape, 3) or not shape[0]:
+        raise InvalidInputError(f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape}")
+    start, middle, end = (1e3 * node[i].astype(np.float64) for i in (0, shape[0] // 2, shape[0] - 1))
+    x, y, z = start.transpose(2, 0, 1)
+    for x_first in (False, True):
+        columns, depths = (x.T, z.T) if x_first else (x, z)
+        x_mm, z_mm = columns[0], depths[:, 0]
+        off = [columns - x_mm, depths.T - z_mm, y - y[0, 0], middle - start, end - start]
+        is_flat = all(np.abs(one).max() <= _TOLERANCE_MM for one in off)
+        if is_flat and np.ptp(x_mm) > 0 and np.ptp(z_mm) > 0:
+            return x_mm, z_mm, x_first
     raise InvalidInputError(
         f"{locate(node)}: expected pixels on a Cartesian grid in one plane, the same in all frames, got "
         "others, as of a polar image: beamform onto zea's cartesian_pixel_grid, or scan-convert it"
@@ -257,34 +267,34 @@ def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:
 
 def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, list[str]]:
     """The probe's poses, with the image on the probe where the file says where its pixels lie."""
-    node = find_member(file, _POSES)
-    if node is None:
+    if (node := find_member(file, _POSES)) is None:
         return None, []
-    kind_node = find_member(node, "rotation_representation")
-    kind = text_of(kind_node[()]) if isinstance(kind_node, h5py.Dataset) else ""
+    named = find_member(node, "rotation_representation")
+    kind = text_of(None if named is None else named[()])
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
+    is_euler = kind == "euler_xyz"
     places = read_checked(node, "translation", ("pose", 3))
     rate, count = single(node, "sampling_frequency"), len(places)
-    turns = read_checked(node, "rotation", (count, 3 if kind == "euler_xyz" else 4))
+    turns = read_checked(node, "rotation", (count, 3 if is_euler else 4))
     stamps = np.arange(count) / rate if rate else read_checked(node, "timestamps", (count,))
     matrices = np.full((count, 4, 4), np.nan)
     matrices[:, :3, 3], matrices[:, 3] = 1e3 * places, [0.0, 0.0, 0.0, 1.0]
-    sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | (kind == "euler_xyz"))
-    remarks = []
-    if kind == "euler_xyz":
+    sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | is_euler)
+    if is_euler:
         turned = Rotation.from_euler("xyz", turns[sound])
-        remarks.append(f"{_POSES}: euler_xyz is taken for radians about fixed axes x, y, z: zea does not say")
     else:
         turned = Rotation.from_quat(turns[sound], scalar_first=kind == "quaternion_wxyz")
     matrices[sound, :3, :3] = turned.as_matrix()
     readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
     if readings is None:
         return None, [*notes, f"{_POSES}: no pose is of use"]
+    if is_euler:
+        notes.append(f"{_POSES}: euler_xyz is taken for radians about fixed axes x, y, z: zea does not say")
     mounting = None
     if left_mm is not None:
         mounting = RigidTransform.from_components([left_mm, 0.0, 0.0], Rotation.from_matrix(_TIP_FROM_IMAGE))
-    return Tracker(readings, mounting), [*notes, *remarks]
+    return Tracker(readings, mounting), notes
 
 
-READER = Reader(FORMAT, hdf5_claim(is_zea), open_zea)
+READER = Reader(FORMAT, None, open_zea, claims_hdf5=is_zea)

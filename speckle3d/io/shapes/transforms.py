@@ -22,7 +22,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.records import Room
+from speckle3d.io.records import reserve, trim
 
 SUFFIXES = (".tfm", ".h5")
 
@@ -104,8 +104,8 @@ def transform_paths(path: PathLike, count: int) -> list[Path]:
 
 
 def _write_hdf5(part: Path, parameters: FloatArray) -> None:
-    with Room(part) as room, h5py.File(part, "w", locking=False) as file:
-        room.require(0)
+    with h5py.File(part, "w", locking=False) as file:
+        reserve(file.id)
         names = {
             "ITKVersion": "5.4",
             "HDFVersion": h5py.version.hdf5_version,
@@ -115,3 +115,4 @@ def _write_hdf5(part: Path, parameters: FloatArray) -> None:
             file.create_dataset(name, data=[value], dtype=h5py.string_dtype("ascii"))
         file["TransformGroup/0/TransformParameters"] = parameters
         file["TransformGroup/0/TransformFixedParameters"] = np.zeros(3)
+    trim(part)
