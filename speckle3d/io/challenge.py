@@ -191,6 +191,4 @@ def _landmark_file(scan: Path) -> Path | None:
     return _nearby(scan, f"landmark/{name}", f"landmarks/{name}")
 
 
-READER = Reader(
-    FORMAT, None, open_scan, companion_files, takes_settings=False, claims_hdf5=is_challenge_scan
-)
+READER = Reader(FORMAT, None, open_scan, companion_files, takes_settings=False, claims_hdf5=is_challenge_scan)

@@ -43,7 +43,7 @@ from speckle3d.core.geometry import RIGID_TOLERANCE
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.clarius.sidecars import fields_of
+from speckle3d.io.clarius.sidecars import parsed
 from speckle3d.io.pose_paths import usable
 from speckle3d.io.recordings import Row
 
@@ -51,7 +51,6 @@ G_M_S2 = 9.80665
 MEANING = "scalar first, world from sensor"
 
 _NAMES = [f"{name} {axis}" for name in ("accelerometer", "gyroscope", "magnetometer") for axis in "xyz"]
-_BREAK = re.compile(r"^---.*$", re.MULTILINE)
 _MOST_OFF_DEG = 10.0
 """A hand's accelerations of a tenth of g tilt what is measured by 6 deg."""
 _LEAST_G, _MOST_G = 0.8, 1.2
@@ -81,9 +80,6 @@ class SensorSamples:
     magnetometer_gauss: FloatArray | None
     quaternion: FloatArray | None
     remarks: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return int(self.time_s.size)
 
     @cached_property
     def fit(self) -> Fit | None:
@@ -122,7 +118,7 @@ class SensorSamples:
         """Tell what the sensor recorded, and whether its quaternion agrees with gravity."""
         fit = self.fit
         rows = [
-            ("sensor samples", str(len(self)), ""),
+            ("sensor samples", str(self.time_s.size), ""),
             ("sensor, longest pause", f"{np.diff(self.time_s).max(initial=0.0):.3f}", "s"),
             ("accelerometer, median norm", f"{_norm(self.accelerometer_g):.3f}", "g"),
         ]
@@ -130,18 +126,12 @@ class SensorSamples:
             words = "none in the file" if self.quaternion is None else "none that agrees with gravity"
             return [*rows, ("quaternion", f"{words}: see `speckle3d imu orient`", "")]
         sign = "specific force" if fit.vertical > 0 else "gravity (against the world's z): negated"
-        rows += [
+        return [
+            *rows,
             ("quaternion", f"{MEANING} (checked against the accelerometer)", ""),
             ("quaternion, off the vertical", f"{fit.off_vertical_deg:.2f}", "deg RMS"),
             ("accelerometer taken as", sign, ""),
         ]
-        if self.magnetometer_gauss is not None:
-            x, y, z = fit.world_from_sensor.apply(self.magnetometer_gauss).mean(axis=0)
-            rows += [
-                ("magnetic field, from the world's x", f"{np.rad2deg(np.arctan2(y, x)):.0f}", "deg"),
-                ("magnetic field, dip", f"{np.rad2deg(np.arctan2(-z, np.hypot(x, y))):.0f}", "deg"),
-            ]
-        return rows
 
 
 @dataclass(frozen=True)
@@ -171,41 +161,41 @@ def read_samples(member: Member) -> SensorSamples:
     InvalidInputError
         If no sample is of use.
     """
-    where = member.where
-    documents = [text for text in _BREAK.split(member.text()) if text.strip()]
-    table = np.full((len(documents), 13), np.nan)
-    stamps, faults, first = np.full(len(documents), np.nan), [""] * len(documents), ""
+    documents = [text for text in re.split(r"^---.*$", member.text(), flags=re.MULTILINE) if text.strip()]
+    table, stamps = np.full((len(documents), 13), np.nan), np.full(len(documents), np.nan)
+    faults, before = [""] * len(documents), np.zeros(13)
     for i, text in enumerate(documents):
         try:
-            fields = fields_of(text, f"{where}: sample {i}")
-            turn = fields.below("orientation")
-            values = [fields.optional(name) for name in _NAMES] + [turn.optional(f"q{k}") for k in range(4)]
-            table[i], stamps[i] = values, fields.whole("timestamp") / 1e9
-        except InvalidInputError as error:
-            faults[i], first = "that cannot be read", first or f": {error}"
+            fields = parsed(text, member.where)
+            turn = fields.get("orientation") or {}
+            values = [fields.get(name) for name in _NAMES] + [turn.get(f"q{k}") for k in range(4)]
+            table[i] = [float(value or "nan") for value in values]
+            stamps[i] = int(fields["timestamp"]) / 1e9
+        except (InvalidInputError, ValueError, TypeError, LookupError, AttributeError):
+            faults[i] = "that cannot be read"
     wanted = np.isfinite(table).mean(axis=0) > 0.5  # a magnetometer and a quaternion are in some files alone
     table[:, ~wanted] = 0.0
     sound = np.isfinite(table).all(axis=1)
     if wanted[9:].all():
         sound &= np.abs(np.linalg.norm(table[:, 9:], axis=1) - 1.0) < RIGID_TOLERANCE
-    before = np.zeros(13)
     for i in [i for i, fault in enumerate(faults) if not fault]:
-        same = np.array_equal(table[i], before)
-        faults[i] = "with the values of the one before" if same else ""
-        faults[i] = faults[i] if sound[i] else "without a value, or a quaternion of unit length"
-        before = table[i] if sound[i] else before
+        if not sound[i]:
+            faults[i] = "without a value, or a quaternion of unit length"
+        elif np.array_equal(table[i], before):
+            faults[i] = "with the values of the one before"
+        else:
+            before = table[i]
     rows, remarks = usable("samples of the sensor", stamps, faults)
     if not rows.size or not wanted[:6].all():
-        raise InvalidInputError(f"{where}: expected samples of the sensor, got none of use{first}")
-    table = table[rows]
-    norm_g = _norm(table[:, :3])
+        raise InvalidInputError(f"{member.where}: expected samples of the sensor, got none of use")
+    accelerometer, gyroscope, magnetometer, quaternion = np.split(table[rows], [3, 6, 9], axis=1)
+    norm_g = _norm(accelerometer)
     if not _LEAST_G <= norm_g <= _MOST_G:
         guess = " (in m/s^2?)" if _LEAST_G <= norm_g / G_M_S2 <= _MOST_G else ""
         remarks.append(
             f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale "
             f"is another than assumed{guess}"
         )
-    accelerometer, gyroscope, magnetometer, quaternion = np.split(table, [3, 6, 9], axis=1)
     return SensorSamples(
         stamps[rows],
         accelerometer,

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import re
 import tarfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
-from speckle3d.io.hdf5 import one_line, reading
+from speckle3d.io.hdf5 import reading
 
 _NAME = re.compile(
     r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<what>raw|tgc|ya?ml)(?:(?<=raw)\.lzo|(?<=tgc)\.yml)?"
@@ -38,12 +38,21 @@ class Member:
         Of the member.
     start, size : int
         First byte in the file, and number of bytes.
+    recording : tuple of str
+        Folder and name of the recording that it is of.
+    kind : str
+        rf, iq, env or imu.
+    what : str
+        raw, yml or tgc.
     """
 
     path: Path
     name: str
     start: int
     size: int
+    recording: tuple[str, str] = ("", "")
+    kind: str = ""
+    what: str = ""
 
     @property
     def where(self) -> str:
@@ -51,22 +60,9 @@ class Member:
         return str(self.path) if self.path.name == Path(self.name).name else f"{self.path}: {self.name}"
 
     @property
-    def recording(self) -> tuple[str, str]:
-        """Folder and name of the recording that it is of."""
-        match = _NAME.fullmatch(Path(self.name).name)
-        return str(Path(self.name).parent), (match and match["name"]) or ""
-
-    @property
-    def role(self) -> tuple[str, str]:
-        """Kind (rf, iq, env or imu), and what it holds: raw, yml or tgc."""
-        match = _NAME.fullmatch(Path(self.name).name)
-        assert match is not None
-        return match["kind"], match["what"].replace("yaml", "yml")
-
-    @property
     def is_own(self) -> bool:
         """Whether the scanner wrote it, unlike others' ``my_env.yml``."""
-        return self.role[1] == "raw" or _FIELD.search(self.read(0, _START_BYTES)) is not None
+        return self.what == "raw" or _FIELD.search(self.read(0, _START_BYTES)) is not None
 
     def read(self, start: int = 0, size: int | None = None) -> bytes:
         """Read bytes from `start` on, all by default; fewer where the member ends."""
@@ -77,10 +73,8 @@ class Member:
 
     def text(self) -> str:
         """All of it as text in UTF-8."""
-        try:
+        with reading(self.where):
             return self.read().decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise InvalidInputError(f"{self.where}: expected text in UTF-8, got other bytes") from error
 
 
 @dataclass(frozen=True)
@@ -94,7 +88,7 @@ class Files:
     name : str
         What the names of all its files begin with; a time stamp.
     members : mapping of (str, str) to Member
-        By kind and content, as `Member.role`.
+        By kind and content.
     """
 
     path: Path
@@ -109,9 +103,12 @@ class Files:
 def is_package(path: Path, start: bytes) -> bool:
     """Whether a file or folder looks like a package, or one file of one."""
     try:
-        if _NAME.fullmatch(path.name) and path.is_file():
-            member, roles = _whole(path), {other.role for other in _members(path)}
-            return member.is_own and (member.role[1] != "raw" or (member.role[0], "yml") in roles)
+        if path.is_file() and (match := _NAME.fullmatch(path.name)):
+            members = _members(path)
+            described = any((one.kind, one.what) == (match["kind"], "yml") for one in members)
+            return any(one.path == path and one.is_own for one in members) and (
+                match["what"] != "raw" or described
+            )
         if path.is_dir() or path.suffix.lower() == ".tar" or start[257:262] == b"ustar":
             return any(member.is_own for member in _members(path))
     except (OSError, ValueError):
@@ -143,52 +140,41 @@ def find_files(path: Path) -> Files:
             f"{len(own)}: {names}: give the raw file of one (of a tar file: unpack it first)"
         )
     (recording,) = own
-    roles: dict[tuple[str, str], Member] = {}
-    for member in members:
-        if member.recording == recording and roles.setdefault(member.role, member) != member:
-            first = roles[member.role].name
-            raise InvalidInputError(f"{path}: expected one of {first} and {member.name}, got both")
+    roles = {(one.kind, one.what): one for one in members if one.recording == recording}
     return Files(path, recording[1], roles)
 
 
 def _members(path: Path) -> list[Member]:
     if path.is_dir():
-        return _folder_members(path)
-    if not _NAME.fullmatch(path.name):
-        return _tar_members(path)
-    asked = _whole(path)
-    kinds = {asked.role[0], "imu"} if asked.role[0] != "imu" else {"rf", "iq", "env", "imu"}
+        with reading(path):
+            return _named((file, file.name, 0, file.stat().st_size) for file in sorted(path.iterdir()))
+    if (match := _NAME.fullmatch(path.name)) is None:
+        return _named((path, *entry) for entry in _tar_entries(path))
+    kinds = {"rf", "iq", "env", "imu"} if match["kind"] == "imu" else {match["kind"], "imu"}
     return [
         member
-        for member in _folder_members(path.parent)
-        if member.recording == asked.recording and (member.role[0] in kinds or member.role[1] == "tgc")
+        for member in _members(path.parent)
+        if member.recording[1] == (match["name"] or "") and (member.kind in kinds or member.what == "tgc")
     ]
 
 
-def _whole(path: Path) -> Member:
-    with open_regular(path) as stream:
-        return Member(path, path.name, 0, stream.seek(0, 2))
-
-
-def _folder_members(folder: Path) -> list[Member]:
-    with reading(folder):
-        return [_whole(file) for file in sorted(folder.iterdir()) if _NAME.fullmatch(file.name)]
-
-
-def _tar_members(path: Path) -> list[Member]:
-    with open_regular(path) as stream:
-        size = stream.seek(0, 2)
-        stream.seek(0)
-        try:
-            with tarfile.open(fileobj=stream, mode="r:") as archive:
-                entries = [entry for entry in archive if entry.isfile()]
-        except (tarfile.TarError, EOFError, ValueError, OverflowError) as error:
-            raise FileError(f"{path}: expected a tar file, got a damaged one: {one_line(error)}") from error
+def _named(places: Iterable[tuple[Path, str, int, int]]) -> list[Member]:
+    """Members of the places whose names are those of a package."""
     members = []
-    for entry in entries:
-        if _NAME.fullmatch(Path(entry.name).name):
-            if entry.offset_data + entry.size > size:
-                got = f"{size - entry.offset_data} of {entry.size} bytes"
-                raise FileError(f"{path}: {entry.name}: ends early: {got}")
-            members.append(Member(path, entry.name, entry.offset_data, entry.size))
+    for path, name, start, size in places:
+        if match := _NAME.fullmatch(Path(name).name):
+            recording = str(Path(name).parent), match["name"] or ""
+            what = match["what"].replace("yaml", "yml")
+            members.append(Member(path, name, start, size, recording, match["kind"], what))
     return members
+
+
+def _tar_entries(path: Path) -> list[tuple[str, int, int]]:
+    """Name, first byte and size of each file in a tar file."""
+    with reading(path), open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
+        entries = [(one.name, one.offset_data, one.size) for one in archive if one.isfile()]
+        length = stream.seek(0, 2)
+    for name, start, size in entries:
+        if start + size > length:
+            raise FileError(f"{path}: {name}: ends early: {length - start} of {size} bytes")
+    return entries

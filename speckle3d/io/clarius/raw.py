@@ -29,6 +29,7 @@ from speckle3d.core.extras import extra_module
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.clarius.sidecars import Curve, Description
 from speckle3d.io.frames import ReadFrame
+from speckle3d.io.hdf5 import reading
 
 HEADER = struct.Struct("<5I")
 _TIME_BYTES = 8
@@ -69,14 +70,9 @@ class ClariusFile:
         dtype, parts = _SAMPLES[self.kind]
         return np.dtype(dtype).itemsize * parts
 
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of a frame's samples."""
-        return self.lines * self.samples * self.sample_bytes
-
     def place(self, i: int) -> int:
         """Byte at which frame i, its time first, begins."""
-        return HEADER.size + i * (_TIME_BYTES + self.frame_bytes)
+        return HEADER.size + i * (_TIME_BYTES + self.lines * self.samples * self.sample_bytes)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -97,9 +93,8 @@ class ClariusFile:
         dtype, parts = _SAMPLES[self.kind]
 
         def frame(i: int) -> npt.NDArray[Any]:
-            content = read(self.place(i) + _TIME_BYTES, self.frame_bytes)
-            if len(content) < self.frame_bytes:
-                raise FileError(f"{self.member.where}: ends early: {i} of {self.frames} frames")
+            start = self.place(i) + _TIME_BYTES
+            content = read(start, self.place(i + 1) - start)
             kept: Any = np.frombuffer(content, dtype).reshape(self.lines, self.samples, parts)[self.kept]
             kept = kept.astype(np.float32).view(np.complex64)[..., 0] if parts == 2 else kept[..., 0]
             kept = kept if self.turns is None else kept * self.turns
@@ -147,8 +142,8 @@ def read_header(member: Member, said: Description) -> tuple[ClariusFile, npt.NDA
     head = read(0, HEADER.size)
     if len(head) < HEADER.size:
         raise FileError(f"{where}: expected a header of {HEADER.size} bytes, got {len(head)}")
-    file = ClariusFile(member, said.kind, said.fields.whole("frames"), said.lines, said.samples)
-    size_bytes = said.fields.below("size").whole("sample size", "bytes")
+    file = ClariusFile(member, said.kind, said.whole("frames"), said.lines, said.samples)
+    size_bytes = said.below("size").whole("sample size", "bytes")
     expected = (file.frames, file.lines, file.samples, size_bytes)
     got = HEADER.unpack(head)[1:]
     if got != expected or size_bytes != file.sample_bytes or 0 in got:
@@ -156,12 +151,11 @@ def read_header(member: Member, said: Description) -> tuple[ClariusFile, npt.NDA
             f"{where}: header: expected frames, lines, samples and bytes of a sample of {said.kind} "
             f"({file.sample_bytes}) as in the yml, {expected}, got {got}"
         )
-    stamps = [read(file.place(i), _TIME_BYTES) for i in range(file.frames)]
-    ends = [file.place(i + 1) - 1 for i in range(file.frames)]
-    if not read(ends[-1], 1):
-        whole = sum(len(read(end, 1)) for end in ends)
+    whole = sum(len(read(file.place(i + 1) - 1, 1)) for i in range(file.frames))
+    if whole < file.frames:
         raise FileError(f"{where}: ends early: {whole} of {file.frames} frames")
-    return file, np.frombuffer(b"".join(stamps), dtype="<u8").astype(np.int64)
+    stamps = b"".join(read(file.place(i), _TIME_BYTES) for i in range(file.frames))
+    return file, np.frombuffer(stamps, dtype="<u8").astype(np.int64)
 
 
 class _Unpacker:
@@ -169,26 +163,24 @@ class _Unpacker:
 
     def __init__(self, member: Member) -> None:
         self._member = member
-        self._lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)")
-        head = member.read(0, 1024)
-        try:
-            at = len(_MAGIC)
-            is_newer = struct.unpack_from(">H", head, at)[0] >= 0x0940
-            at += 8 if is_newer else 5
-            (self._flags,) = struct.unpack_from(">I", head, at)
-            at += 4 + (4 if self._flags & 0x800 else 0) + (12 if is_newer else 8)
-            at += 1 + head[at] + 4
-        except (struct.error, IndexError):
-            head = b""
+        self._lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)").LZOCompressor
+        head, at = member.read(0, 1024), len(_MAGIC)
         if not head.startswith(_MAGIC):
             raise FileError(f"{member.where}: expected a file of lzop (.lzo), got another")
-        plain, packs = (sum(bool(self._flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
-        self._firsts, self._blocks, first = list[int](), list[tuple[int, int, int, bytes]](), 0
+        with reading(member.where):
+            is_newer = struct.unpack_from(">H", head, at)[0] >= 0x0940
+            at += 8 if is_newer else 5
+            (flags,) = struct.unpack_from(">I", head, at)
+            at += 4 + (4 if flags & 0x800 else 0) + (12 if is_newer else 8)
+            at += 1 + head[at] + 4
+        plain, packs = (sum(bool(flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
+        self._check = zlib.adler32 if flags & 0x1 else zlib.crc32 if flags & 0x100 else None
+        self._firsts, self._blocks, first = list[int](), list[tuple[int, int, int, int]](), 0
         while any((lengths := member.read(at, 12).ljust(12, b"\0"))[:4]):
-            unpacked, packed = struct.unpack_from(">II", lengths)
-            at += 8 + 4 * (plain + (packs if packed < unpacked else 0))
+            unpacked, packed, check = struct.unpack(">III", lengths)
+            at += 8 + 4 * (plain + (packs if packed < unpacked else 0))  # behind the check sums
             self._firsts.append(first)
-            self._blocks.append((at, packed, unpacked, lengths[8:]))
+            self._blocks.append((at, packed, unpacked, check))
             first, at = first + unpacked, at + packed
         self._block = lru_cache(_KEPT_BLOCKS)(self._unpacked)
 
@@ -205,13 +197,9 @@ class _Unpacker:
 
     def _unpacked(self, k: int) -> bytes:
         place, packed, unpacked, check = self._blocks[k]
-        content, where = self._member.read(place, packed), f"{self._member.where}: block {k}"
-        try:
-            plain = content if packed == unpacked else self._lzo.LZOCompressor.decompress(content, unpacked)
-        except (self._lzo.LZOError, ValueError, MemoryError) as error:
-            raise FileError(f"{where}: expected packed bytes, got damaged ones: {error}") from error
-        method = zlib.adler32 if self._flags & 0x1 else zlib.crc32
-        is_right = not self._flags & 0x101 or struct.pack(">I", method(plain)) == check
-        if len(plain) != unpacked or not is_right:
-            raise FileError(f"{where}: expected {unpacked} bytes unpacked, got damaged ones")
-        return bytes(plain)
+        content = self._member.read(place, packed)
+        with reading(f"{self._member.where}: block {k}"):
+            plain = content if packed == unpacked else bytes(self._lzo.decompress(content, unpacked))
+            if self._check is not None and self._check(plain) != check:
+                raise ValueError("damaged: its check sum is another")
+        return plain

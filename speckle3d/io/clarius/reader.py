@@ -1,7 +1,28 @@
-"""Sweeps from Clarius raw packages: one object, read once, that says what the files do."""
+"""Sweeps from Clarius raw packages: one object, read once, that says what the files do.
+
+Trusted for the line pitch is the yml's ``rx element``, the place of a line in elements of the array, times
+the distance between elements. That is given by ``element_pitch_mm``, by the yml's probe where it says, or by
+the probe's model, in this order; ``vector_pitch_mm`` replaces the product. Lines that are steered, unevenly spaced, or repeated
+(several packets a line, as in Doppler modes) are refused. The first line is taken as the left of the image.
+
+The first sample's depth is (``delay samples`` / ``sampling rate`` - 1 us) x c / 2. The maker calls the
+samples "leading samples before the first valid sample (acquisition delay)" [1]_. In every B-mode recording
+at hand they are 1.00 to 1.07 us, whatever the sampling rate, while the samples after them alone make up the
+imaging depth (780 of its region of interest x 0.0513 mm = 40.04 mm of 40; 585: 30.03 of 30; RF, 3120: 40.04
+of 40): depth is counted from the first sample, and 1 us passes before, as in the lens. A Doppler recording
+has 7.2 us: its region begins at 4.8 mm. That the microsecond is not depth is concluded from these, not
+documented: were it depth, all samples lay 0.77 mm deeper. Lengths do not depend on it;
+``first_sample_depth_mm`` replaces it.
+
+References
+----------
+.. [1] clariusdev/research, "Raw Data Format" (docs/raw-data-format.md).
+.. [2] clariusdev/research, "Beamformed RF Acquisition" (docs/rf-frame-rate.md), "Probe reference".
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -15,30 +36,34 @@ from speckle3d.core.arrays import ComplexArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
-from speckle3d.io.clarius.lines import differing, element_pitches, first_depth_mm, place_of, probe_name
 from speckle3d.io.clarius.package import Files, find_files
 from speckle3d.io.clarius.raw import ClariusFile, Gain, read_header
-from speckle3d.io.clarius.sidecars import Curve, Description, read_description, read_gains
-from speckle3d.io.clarius.spectrum import Echoes
+from speckle3d.io.clarius.sidecars import Curve, Description, read_gains
+from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.recordings import Recording, Row, Value
 
 FORMAT = "Clarius raw package"
 
+ELEMENT_PITCH_MM = {"L20HD3": 0.13, "L15HD3": 0.26, "L7HD3": 0.2, "PALHD3": 0.26}
+"""Of the linear arrays in the maker's table of HD3 probes [2]_; of the PAL, its linear side."""
+
+CONVEX = ("C3", "C7", "EC7", "PH", "PA2", "PA", "TV")
+"""Models whose lines are not parallel."""
+
+BEFORE_DEPTH_S = 1e-6
+"""Delay that is not depth; see above."""
+
+_EVEN = 1e-3
+"""How far a line may be from its place, in pitches; places are written to 17 digits."""
+
 _ORDER = ("RF", "IQ", "envelope")
 _SAID = (
     "type", "frames", "frame rate", "sampling rate", "delay samples", "transmit frequency", "imaging depth",
     "vsound", "speed of sound",
 )  # fmt: skip
-_MOST_RISE, _MOST_ABOVE = 1.05, 1.15
-"""Of the echoes' centre: far from the probe over near, and near over what was sent. On a simulated phantom
-0.91 and 0.79; with the other sign of Q 1.05 and 1.22; with another phase of a falling oscillator 1.16 and
-0.87."""
-_SAME_DB = 0.005
-"""Gains are written to 0.01 dB."""
-_DEPTH = 0.1
-"""Share by which the samples may miss the imaging depth untold: 1.3 % in every recording at hand."""
+_OWN = "its yml"
 
 
 def open_package(path: Path, settings: ImportSettings) -> Recording:
@@ -70,14 +95,13 @@ class Package:
     """A package and the settings over it; each of its files is read once, when it is needed."""
 
     def __init__(self, files: Files, settings: ImportSettings) -> None:
-        self.files, self.settings = files, settings
-        self.raw, self.gains = files.of("raw"), files.of("tgc")
+        self.files, self.settings, self.raw = files, settings, files.of("raw")
 
     @cached_property
     def descriptions(self) -> dict[str, Description]:
         """What the yml files say, by kind."""
         members = self.files.of("yml")
-        return {kind: read_description(member) for kind, member in members.items() if kind != "imu"}
+        return {kind: Description.of(member) for kind, member in members.items() if kind != "imu"}
 
     @cached_property
     def chosen(self) -> str:
@@ -92,7 +116,7 @@ class Package:
                 raise InvalidInputError(f"{member.where}: expected its yml beside it, got none")
         return min(self.raw, key=lambda kind: _ORDER.index(self.descriptions[kind].kind))
 
-    @property
+    @cached_property
     def said(self) -> Description:
         """What the yml of the sweep's raw file says."""
         return self.descriptions[self.chosen]
@@ -109,36 +133,82 @@ class Package:
         return None if member is None else read_samples(member)
 
     @cached_property
-    def is_padded(self) -> bool:
-        """Whether what lies outside the region of interest is empty, in the first, middle and last frame."""
+    def kept(self) -> tuple[slice, slice]:
+        """Lines and samples that are kept: the region of interest, if there is nothing beside it in 3 frames."""
+        whole, region = (slice(0, self.said.lines), slice(0, self.said.samples)), self.said.region
+        if region is None:
+            return whole
         file = self.header[0]
-        if self.said.roi is None:
-            return False
         for i in {0, file.frames // 2, file.frames - 1}:
             frame = np.array(file()(i))
-            frame[self.said.roi] = 0
+            frame[region] = 0
             if frame.any():
-                return False
-        return True
-
-    @cached_property
-    def kept(self) -> tuple[slice, slice]:
-        """Lines and samples that are kept."""
-        whole = slice(0, self.said.lines), slice(0, self.said.samples)
-        return self.said.roi if self.said.roi and self.is_padded else whole
+                return whole
+        return region
 
     @cached_property
     def place(self) -> tuple[float, float]:
-        """Place of the first line, and the distance between lines, in elements."""
-        try:
-            return place_of(self.said, self.kept[0])
-        except InvalidInputError as error:
-            others = [member.name for kind, member in self.raw.items() if kind != self.chosen]
-            if not others:
-                raise
+        """Place of the first kept line in the array, and the distance between lines, in elements.
+
+        Raises
+        ------
+        InvalidInputError
+            Naming the line that is steered, unevenly spaced or repeated, or a curved array.
+        """
+        said, first = self.said, self.kept[0].start
+        others = [member.name for kind, member in self.raw.items() if kind != self.chosen]
+        advice = f"; or give another of its raw files: {', '.join(others)}" if others else ""
+        if radius_mm := said.of_probe("radius"):
+            raise InvalidInputError(self._polar(f"a curved array of {radius_mm:g} mm radius") + advice)
+        elements, angle_deg = said.places.T
+        if (steered := np.flatnonzero(angle_deg)).size:
+            i = int(steered[0])
             raise InvalidInputError(
-                f"{error}; or give another of its raw files: {', '.join(others)}"
-            ) from error
+                f"{said.where}: lines[{i}]: angle: expected 0 (lines that are not steered), got "
+                f"{angle_deg[i]:g} deg, and {steered.size} of {said.lines} lines steered: record without "
+                f"steering and Doppler{advice}"
+            )
+        elements = elements[self.kept[0]]
+        step = float((elements[-1] - elements[0]) / max(elements.size - 1, 1))
+        off = np.abs(elements - elements[0] - step * np.arange(elements.size))
+        if elements.size < 2 or not (np.diff(elements) > 0).all() or off.max() > _EVEN * step:
+            i = int(np.argmax(off > _EVEN * abs(step)))
+            raise InvalidInputError(
+                f"{said.where}: lines[{first + i}]: rx element: expected lines evenly spaced from the lowest "
+                f"element up, one a place, got {elements[i]:g} where {elements[0] + step * i:g} is even: "
+                f"packets of a Doppler mode are no image{advice}"
+            )
+        return float(elements[0]), step
+
+    def _polar(self, what: str) -> str:
+        return (
+            f"{self.said.where}: expected parallel lines, got {what}: its lines fan out, and a sweep has one "
+            "distance between them. Needed would be the radius of the array, the angle between its lines, "
+            "and resampling"
+        )
+
+    @cached_property
+    def pitch(self) -> Value:
+        """Distance between lines, mm: of the elements' as given, by the yml, or by the maker's table.
+
+        Raises
+        ------
+        InvalidInputError
+            If the model's lines are not parallel.
+        """
+        per_line, model = self.place[1], _model(named := self.settings.probe or self.said.probe)
+        if model.startswith(CONVEX):
+            raise InvalidInputError(self._polar(f"the probe {named}"))
+        pitches = {
+            "as given": self.settings.element_pitch_mm,
+            _OWN: self.said.of_probe("pitch"),
+            f"the maker's table, {model}": ELEMENT_PITCH_MM.get(model),
+        }
+        for source, element_mm in pitches.items():
+            if element_mm is not None:
+                words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
+                return Value(element_mm * per_line, words, _OWN)
+        return Value()
 
     @cached_property
     def file(self) -> ClariusFile:
@@ -148,13 +218,12 @@ class Package:
     @cached_property
     def rate_hz(self) -> float:
         """Sampling rate."""
-        return self.settings.sampling_rate_hz or self.said.fields.number("sampling rate", "Hz", 1.0)
+        return self.settings.sampling_rate_hz or self.said.number("sampling rate", "Hz", 1.0)
 
     @cached_property
     def speed_m_s(self) -> float | None:
         """Speed of sound that the yml says."""
-        said = self.said.fields
-        return said.optional("vsound", "m/s") or said.optional("speed of sound", "m/s")
+        return self.said.optional("vsound", "m/s") or self.said.optional("speed of sound", "m/s")
 
     @cached_property
     def spacing_mm(self) -> float:
@@ -164,14 +233,19 @@ class Package:
 
     @cached_property
     def first_mm(self) -> float | None:
-        """Depth of the first kept sample as the scanner counts it."""
-        return first_depth_mm(self.said, self.kept[1].start, self.rate_hz, self.spacing_mm)
+        """Depth of the first kept sample as the scanner counts it; None where it is not said, or above 0.
+
+        Less than a sample above is 0: the delay is a whole number of samples.
+        """
+        if (delay := self.said.optional("delay samples")) is None:
+            return None
+        after = delay + self.kept[1].start - BEFORE_DEPTH_S * self.rate_hz
+        return max(after, 0.0) * self.spacing_mm if after > -1.0 else None
 
     @cached_property
     def depths_mm(self) -> FloatArray:
         """Depth of each kept sample as the scanner counts it, or else as it is given."""
-        most_mm = self.said.fields.optional("imaging depth", "mm") or np.inf
-        first_mm = self.first_mm
+        most_mm, first_mm = self.said.optional("imaging depth", "mm") or np.inf, self.first_mm
         if first_mm is None or first_mm > most_mm:
             first_mm = self.settings.first_sample_depth_mm or 0.0
         count = self.kept[1].stop - self.kept[1].start
@@ -194,30 +268,25 @@ class Package:
         but it is not documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths 10 %
         off, and turned back 0.001 % from those of RF.
         """
-        receive = self.said.receive
-        is_one = receive is None or receive.shallow_hz == receive.deep_hz
-        if (
-            receive is None
-            or self.shift_hz is None
-            or is_one
-            or self.settings.demodulation_frequency_hz is not None
-        ):
+        receive, shift = self.said.receive, self.shift_hz
+        if receive is None or shift is None or receive.shallow_hz == receive.deep_hz:
             return None
-        apart = receive.at_hz(self.depths_mm) - self.shift_hz
+        if self.settings.demodulation_frequency_hz is not None:
+            return None
+        apart = receive.at_hz(self.depths_mm) - shift
         cycles = np.concatenate([[0.0], np.cumsum((apart[1:] + apart[:-1]) / 2)]) / self.rate_hz
         return np.asarray(np.exp(2j * np.pi * cycles))
 
     @cached_property
-    def echoes(self) -> Echoes | None:
-        """Spectrum of the echoes; None of an envelope, and where frequencies are not known."""
-        given = self.settings
-        centre = given.centre_frequency_hz or self.said.fields.optional("transmit frequency", "Hz")
-        is_iq = self.said.kind == "IQ"
+    def band_hz(self) -> tuple[float, float] | None:
+        """Band of the echoes; None of an envelope, where frequencies are not known, or if it is not clear."""
+        given, is_iq = self.settings, self.said.kind == "IQ"
+        centre = given.centre_frequency_hz or self.said.optional("transmit frequency", "Hz")
         shift = self.shift_hz if given.demodulation_frequency_hz is None else given.demodulation_frequency_hz
         if self.said.kind == "envelope" or not centre or (is_iq and shift is None):
             return None
         frames = FileFrames(self.files.path, self.file, self.file.shape, self.file.dtype)
-        return Echoes(frames, self.rate_hz, centre, shift if is_iq else None)
+        return band_hz(frames, self.rate_hz, centre, shift if is_iq else None)
 
     @cached_property
     def curves(self) -> tuple[Curve, ...]:
@@ -227,16 +296,12 @@ class Package:
         (answers of the maker in clariusdev/research).
         """
         times_ns = self.header[1].tolist()
-        for kind, member in sorted(self.gains.items(), key=lambda one: one[0] != self.chosen):
+        for kind, member in sorted(self.files.of("tgc").items(), key=lambda one: one[0] != self.chosen):
             curves = read_gains(member)
-            lacking = [time_ns for time_ns in times_ns if time_ns not in curves]
-            if curves and not lacking:
+            if curves and {*times_ns} <= {*curves}:
                 return tuple(curves[time_ns] or self.said.gain for time_ns in times_ns)
             if curves and kind == self.chosen:
-                raise InvalidInputError(
-                    f"{member.where}: expected the gain of the frame at {lacking[0]} ns, got none "
-                    f"({len(lacking)} of {len(times_ns)} frames)"
-                )
+                raise InvalidInputError(f"{member.where}: expected the gain of every frame, got others")
         return ()
 
     @cached_property
@@ -245,48 +310,35 @@ class Package:
         if len(set(self.curves)) < 2 or self.said.kind == "envelope":
             return None
         if () in self.curves:
-            where = f"{self.said.fields.where}: frame {self.curves.index(())}"
+            where = f"{self.said.where}: frame {self.curves.index(())}"
             raise InvalidInputError(f"{where}: expected a gain curve as other frames have, got none")
-        gain = Gain(self.depths_mm, self.curves)
-        firsts = {curve: i for i, curve in reversed(list(enumerate(self.curves)))}.values()
-        off_db = max(np.abs(20 * np.log10(gain.factors(i))).max() for i in firsts)
-        return gain if off_db >= _SAME_DB else None
+        return Gain(self.depths_mm, self.curves)
 
     def recording(self) -> Recording:
         """What the package holds, as a recording."""
-        said, own, file = self.said, "its yml", replace(self.file, gain=self.gain)
-        fields, per_line = said.fields, self.place[1]
-        pitches = element_pitches(said, self.settings, per_line)
-        pitch = Value()
-        for source, element_mm in list(pitches.items())[:1]:
-            pitch = Value(
-                element_mm * per_line,
-                f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})",
-                own,
-            )
+        said, pitch = self.said, self.pitch
+        file = replace(self.file, gain=self.gain)
         delay = "delay samples, less 1 us before depth 0 (assumed)"
+        centre_hz = said.optional("transmit frequency", "Hz")
         values = {
-            "first_sample_depth_mm": Value(self.first_mm, delay, own),
+            "first_sample_depth_mm": Value(self.first_mm, delay, _OWN),
             "vector_pitch_mm": pitch,
             "column_pitch_mm": pitch,
-            "row_spacing_mm": Value(self.spacing_mm, f"of {self.rate_hz / 1e6:g} MHz", own),
-            "sampling_rate_hz": Value(fields.number("sampling rate", "Hz", 1.0), "", own),
-            "centre_frequency_hz": Value(
-                fields.optional("transmit frequency", "Hz"), "transmit frequency", own
-            ),
-            "demodulation_frequency_hz": Value(self.shift_hz, "of the lines' middle", own),
+            "row_spacing_mm": Value(self.spacing_mm, f"of {self.rate_hz / 1e6:g} MHz", _OWN),
+            "sampling_rate_hz": Value(said.number("sampling rate", "Hz", 1.0), "", _OWN),
+            "centre_frequency_hz": Value(centre_hz, "transmit frequency", _OWN),
+            "demodulation_frequency_hz": Value(self.shift_hz, "of the lines' middle", _OWN),
         }
         if self.speed_m_s is not None:
-            values["speed_of_sound_m_s"] = Value(self.speed_m_s, "", own)
-        remarks = [*differing(pitches), *self._remarks()]
-        if self.echoes is not None and self.settings.bandwidth_hz is None:
-            band = self.echoes.band_hz
-            values["bandwidth_hz"] = Value(band, "measured at -6 dB in this recording", "the spectrum")
-            if band is not None:
-                remarks.append(
-                    "the band is measured in this recording: recordings that share curves need "
-                    f"--bandwidth-hz {band[0]:.4g} {band[1]:.4g}"
-                )
+            values["speed_of_sound_m_s"] = Value(self.speed_m_s, "", _OWN)
+        remarks = self._remarks()
+        if self.settings.bandwidth_hz is None and (band := self.band_hz) is not None:
+            words = "measured at -6 dB in this recording"
+            values["bandwidth_hz"] = Value(band, words, "the spectrum")
+            remarks.append(
+                "the band is measured in this recording: recordings that share curves need "
+                f"--bandwidth-hz {band[0]:.4g} {band[1]:.4g}"
+            )
         is_plain = file.turns is None and file.gain is None
         narrow = np.int16 if said.kind == "IQ" and is_plain else None
         asked = "element_pitch_mm" if self.settings.probe or said.probe else "probe"
@@ -297,7 +349,7 @@ class Package:
             values,
             time_s=self.header[1] / 1e9,
             orientation=None if self.sensor is None else self.sensor.orientation,
-            probe=probe_name(said, self.settings.probe),
+            probe=_probe_name(self.settings.probe or said.probe),
             name=self.files.name or self.files.path.stem,
             asked=dict.fromkeys(("vector_pitch_mm", "column_pitch_mm"), asked),
             assumptions=("parallel lines of a linear array",),
@@ -306,28 +358,7 @@ class Package:
 
     def _remarks(self) -> list[str]:
         """What was turned, undone or is odd where the sweep is made."""
-        said, given, notes = self.said, self.settings, list[str]()
-        depth_mm = said.fields.optional("imaging depth", "mm")
-        first_mm = (
-            given.first_sample_depth_mm if given.first_sample_depth_mm is not None else self.first_mm or 0.0
-        )
-        start = first_mm - self.kept[1].start * self.spacing_mm
-        low_mm, high_mm = (start + count * self.spacing_mm for count in (
-            said.roi[1].stop if said.roi else said.samples, said.samples))  # fmt: skip
-        if depth_mm and not (low_mm <= (1 + _DEPTH) * depth_mm and high_mm >= (1 - _DEPTH) * depth_mm):
-            notes.append(
-                f"the samples reach {high_mm:.4g} mm, and the imaging depth in the yml is {depth_mm:g} mm: "
-                "the region of interest is another, or the sampling rate"
-            )
-        per_line = self.place[1]
-        if given.vector_pitch_mm and round(per_line, 3) != 1:
-            notes.append(
-                f"lines are {per_line:.4g} elements apart: {given.vector_pitch_mm:g} mm between lines is an "
-                f"element pitch of {given.vector_pitch_mm / per_line:.4g} mm; if the first is that of the "
-                "data sheet, give --element-pitch-mm"
-            )
-        if given.probe and said.probe and probe_name(said, None) != probe_name(said, given.probe):
-            notes.append(f"probe {given.probe} as given, {printable(said.probe)} in its yml")
+        said, notes = self.said, list[str]()
         if (receive := said.receive) is not None and self.turns is not None:
             notes.append(
                 f"demodulation frequency from its yml: {receive.shallow_hz / 1e6:g} to "
@@ -336,15 +367,6 @@ class Package:
             )
         if len(set(self.curves)) > 1:
             notes.append(self._gain_words())
-        if said.kind == "IQ" and self.echoes is not None and (centres := self.echoes.centres_hz) is not None:
-            near, far = centres
-            if far > _MOST_RISE * near or near > _MOST_ABOVE * self.echoes.transmit_hz:
-                notes.append(
-                    f"the echoes' centre goes from {near / 1e6:.2f} to {far / 1e6:.2f} MHz with depth, "
-                    f"{self.echoes.transmit_hz / 1e6:g} MHz were sent, and tissue takes high frequencies "
-                    "away: I/Q were shifted down otherwise than is said, Q has the other sign, or it is a "
-                    "harmonic image"
-                )
         if self.sensor is not None:
             notes += self.sensor.remarks
             if self.sensor.fit is None:
@@ -358,11 +380,8 @@ class Package:
     def _gain_words(self) -> str:
         if len(set(self.curves)) < 2:
             return "gain the same in all frames" if self.curves else "gain not told: taken as the same"
-        undone = (
-            "left in the grey levels"
-            if self.said.kind == "envelope"
-            else "undone relative to the first frame"
-        )
+        is_grey = self.said.kind == "envelope"
+        undone = "left in the grey levels" if is_grey else "undone relative to the first frame"
         return f"gain differs between frames: {undone}"
 
     def rows(self) -> list[Row]:
@@ -371,15 +390,12 @@ class Package:
         with suppress(InvalidInputError, FileError):  # which is told where the sweep is
             for kind, said in self.descriptions.items():
                 rows.append((f"{kind}: raw file", "yes" if kind in self.raw else "none", ""))
-                rows += [
-                    (f"{kind}: {name}", printable(str(said.fields.values[name]))[:60], "")
-                    for name in _SAID
-                    if name in said.fields.values
-                ]
+                held = [name for name in _SAID if name in said.values]
+                rows += [(f"{kind}: {name}", printable(str(said.values[name]))[:60], "") for name in held]
                 rows.append((f"{kind}: lines x samples", f"{said.lines} x {said.samples}", ""))
             rows.append(("sweep is made from", self.chosen, ""))
-            if self.said.roi is not None:
-                outside = "empty, left out" if self.is_padded else "not empty, kept"
+            if (region := self.said.region) is not None:
+                outside = "empty, left out" if self.kept == region else "not empty, kept"
                 rows.append(("outside the region of interest", outside, ""))
             rows += [
                 ("elements per line", f"{self.place[1]:.6g}", ""),
@@ -391,3 +407,12 @@ class Package:
         except (InvalidInputError, FileError) as error:
             rows.append(("sensor", f"cannot be told: {error}", ""))
         return rows
+
+
+def _model(named: str) -> str:
+    return re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
+
+
+def _probe_name(named: str) -> str:
+    """Name a probe in one spelling, so that curves and calibrations of it are found to be of it."""
+    return f"Clarius {_model(named)}" if _model(named) in ELEMENT_PITCH_MM else named

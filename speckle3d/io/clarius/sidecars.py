@@ -43,10 +43,10 @@ _UNITS = {
     "deg": {"°": 1.0, "deg": 1.0},
 }
 _LONGEST = 60
-"""Letters of a value that a message shows, and that a number has at most."""
+"""Letters of a value that a message shows."""
 
 
-def fields_of(text: str, where: str) -> Fields:
+def parsed(text: str, where: str) -> dict[str, Any]:
     """Parse a YAML document of fields; their values are text, lists, or mappings.
 
     Raises
@@ -62,7 +62,7 @@ def fields_of(text: str, where: str) -> Fields:
         raise InvalidInputError(f"{where}: expected YAML, got an error: {words}") from error
     if not isinstance(document, dict):
         raise InvalidInputError(f"{where}: expected fields, got {_shown(document)}")
-    return Fields(document, where)
+    return document
 
 
 @dataclass(frozen=True)
@@ -74,23 +74,23 @@ class Fields:
 
     def below(self, name: str) -> Fields:
         """Fields of a field; none where it is missing."""
-        inner = self.values.get(name) or {}
-        if not isinstance(inner, dict):
-            raise InvalidInputError(f"{self.where}: {name}: expected fields, got {_shown(inner)}")
-        return Fields(inner, f"{self.where}: {name}")
+        return self._fields(self.values.get(name) or {}, name)
 
     def listed(self, name: str) -> list[Fields]:
         """Fields of each entry of a list; none where it is missing."""
         entries = self.values.get(name)
-        named = {
-            f"{name}[{i}]": entry for i, entry in enumerate(entries if isinstance(entries, list) else ())
-        }
-        return [Fields(named, self.where).below(entry) for entry in named]
+        listed = entries if isinstance(entries, list) else []
+        return [self._fields(entry, f"{name}[{i}]") for i, entry in enumerate(listed)]
+
+    def _fields(self, inner: Any, name: str) -> Fields:
+        if not isinstance(inner, dict):
+            raise InvalidInputError(f"{self.where}: {name}: expected fields, got {_shown(inner)}")
+        return Fields(inner, f"{self.where}: {name}")
 
     def number(self, name: str, unit: str = "", least: float = -math.inf) -> float:
         """A number with its unit, as ``"60 MHz"``, in the base unit `unit`."""
         value = self.values.get(name)
-        parts = _NUMBER.fullmatch(value) if isinstance(value, str) and len(value) < _LONGEST else None
+        parts = _NUMBER.fullmatch(value) if isinstance(value, str) else None
         factor = None if parts is None else _UNITS[unit].get(parts[2].lower())
         if parts is None or factor is None or not least <= float(parts[1]) < math.inf:
             above = f" from {least:g}" if least > -math.inf else ""
@@ -130,71 +130,95 @@ class Receive:
 
 
 @dataclass(frozen=True)
-class Description:
+class Description(Fields):
     """The yml of a raw file.
 
     Attributes
     ----------
-    fields : Fields
-        Of all that is asked for by name.
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
-    receive_element, angle_deg : ndarray, shape (line,)
-        Where lines are received, in elements of the array, and how they are steered.
     gain : Curve
-    roi : pair of slice, optional
-        Lines and samples that hold data.
-    receive : Receive, optional
-        None in older files, and where it differs between foci or filters.
     """
 
-    fields: Fields
     kind: str
     lines: int
     samples: int
-    receive_element: FloatArray
-    angle_deg: FloatArray
     gain: Curve
-    roi: tuple[slice, slice] | None
-    receive: Receive | None
+
+    @classmethod
+    def of(cls, member: Member) -> Description:
+        """Read the yml of a raw file.
+
+        Raises
+        ------
+        FileError
+            If it cannot be read.
+        InvalidInputError
+            Naming the field that is missing or has another unit.
+        """
+        where, text = member.where, member.text()
+        fields = Fields(parsed(_GAIN_LINE.sub("", text), where), where)
+        kind = _KINDS.get(str(fields.values.get("type")).strip().lower())
+        packing = fields.values.get("compression", "none")
+        if kind is None or str(packing).lower() != "none":
+            raise InvalidInputError(
+                f"{where}: type, compression: expected RF, IQ or B pre-scan, and none, got "
+                f"{_shown(fields.values.get('type'))} and {_shown(packing)}"
+            )
+        size, gain = fields.below("size"), _knots("".join(_GAIN_LINE.findall(text)), where)
+        return cls(
+            fields.values, where, kind, size.whole("number of lines"), size.whole("samples per line"), gain
+        )
 
     @property
     def probe(self) -> str:
         """Model of the probe; empty where only its measures, or nothing, is said."""
-        named = self.fields.values.get("probe")
+        named = self.values.get("probe")
         return named if isinstance(named, str) else ""
 
     def of_probe(self, name: str) -> float | None:
         """A measure of the probe in mm."""
-        return None if self.probe else self.fields.below("probe").optional(name, "mm")
+        return None if self.probe else self.below("probe").optional(name, "mm")
 
+    @property
+    def places(self) -> FloatArray:
+        """Element where each line is received and its angle in degrees, shape (line, 2).
 
-def read_description(member: Member) -> Description:
-    """Read the yml of a raw file.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read.
-    InvalidInputError
-        Naming the field that is missing or has another unit.
-    """
-    where, text = member.where, member.text()
-    gain = _knots("".join(_GAIN_LINE.findall(text)), where)
-    fields = fields_of(_GAIN_LINE.sub("", text), where)
-    kind = _KINDS.get(str(fields.values.get("type")).strip().lower())
-    packing = fields.values.get("compression", "none")
-    if kind is None or str(packing).lower() != "none":
-        raise InvalidInputError(
-            f"{where}: type, compression: expected RF, IQ or B pre-scan, and none, got "
-            f"{_shown(fields.values.get('type'))} and {_shown(packing)}"
+        Files may give the first and the last alone.
+        """
+        rows = np.array(
+            [(line.number("rx element"), line.number("angle", "deg")) for line in self.listed("lines")]
         )
-    size = fields.below("size")
-    lines, samples = size.whole("number of lines"), size.whole("samples per line")
-    return Description(
-        fields, kind, lines, samples, *_lines(fields, lines), gain, _roi(fields, lines, samples),
-        _receive(fields),
-    )  # fmt: skip
+        if len(rows) not in (2, self.lines) or not self.lines:
+            raise InvalidInputError(f"{self.where}: lines: expected {self.lines} lines, got {len(rows)}")
+        if len(rows) == self.lines:
+            return rows
+        return np.asarray(rows[0] + np.linspace(0.0, 1.0, self.lines)[:, None] * (rows[1] - rows[0]))
+
+    @property
+    def region(self) -> tuple[slice, slice] | None:
+        """Lines and samples of the region of interest."""
+        if not self.values.get("roi"):
+            return None
+        roi, parts = self.below("roi"), []
+        for name, length in (("line", self.lines), ("sample", self.samples)):
+            start, end = roi.whole(f"start {name}"), roi.whole(f"end {name}")
+            if not start < end < length:
+                got = f"{start} to {end}"
+                raise InvalidInputError(f"{roi.where}: expected {name}s within {length}, got {got}")
+            parts.append(slice(start, end + 1))
+        return parts[0], parts[1]
+
+    @property
+    def receive(self) -> Receive | None:
+        """Demodulation; None in older files, and where it differs between foci or filters."""
+        names = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
+        ends = {
+            Receive(*(part.number(name, unit, 1e-6) for name, unit in names))
+            for focus in self.listed("focus")
+            for part in focus.listed("receive")
+        }
+        return ends.pop() if len(ends) == 1 else None
 
 
 def read_gains(member: Member) -> dict[int, Curve]:
@@ -212,41 +236,6 @@ def read_gains(member: Member) -> dict[int, Curve]:
         int(stamp): _knots(part, f"{member.where}: timestamp {stamp}")
         for stamp, part in zip(parts[::2], parts[1::2], strict=True)
     }
-
-
-def _lines(fields: Fields, count: int) -> tuple[FloatArray, FloatArray]:
-    """Places and angles of the lines; files may give the first and the last alone."""
-    rows = np.array(
-        [(line.number("rx element"), line.number("angle", "deg")) for line in fields.listed("lines")]
-    )
-    if len(rows) not in (2, count) or not count:
-        raise InvalidInputError(f"{fields.where}: lines: expected {count} lines, got {len(rows)}")
-    if len(rows) != count:
-        rows = rows[0] + np.linspace(0.0, 1.0, count)[:, None] * (rows[1] - rows[0])
-    return rows[:, 0], rows[:, 1]
-
-
-def _roi(fields: Fields, lines: int, samples: int) -> tuple[slice, slice] | None:
-    if not fields.values.get("roi"):
-        return None
-    roi = fields.below("roi")
-    parts = []
-    for name, length in (("line", lines), ("sample", samples)):
-        start, end = roi.whole(f"start {name}"), roi.whole(f"end {name}")
-        if not start < end < length:
-            raise InvalidInputError(f"{roi.where}: expected {name}s within {length}, got {start} to {end}")
-        parts.append(slice(start, end + 1))
-    return parts[0], parts[1]
-
-
-def _receive(fields: Fields) -> Receive | None:
-    names = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
-    ends = {
-        Receive(*(part.number(name, unit, 1e-6) for name, unit in names))
-        for focus in fields.listed("focus")
-        for part in focus.listed("receive")
-    }
-    return ends.pop() if len(ends) == 1 else None
 
 
 def _knots(text: str, where: str) -> Curve:

@@ -9,9 +9,6 @@ RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise; at -10 dB no ba
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
@@ -29,11 +26,12 @@ _CLEAR = 10.0
 alone: a quarter of it, where the edges are, is then 2.5 of them."""
 
 
-@dataclass(frozen=True)
-class Echoes:
-    """Spectrum of a recording's echoes.
+def band_hz(
+    frames: Frames, sampling_rate_hz: float, transmit_hz: float, shift_hz: float | None = None
+) -> tuple[float, float] | None:
+    """Lowest and highest frequency of the -6 dB band of echoes; None where there is no clear band.
 
-    Attributes
+    Parameters
     ----------
     frames : Frames
         RF, or I/Q (complex).
@@ -42,79 +40,38 @@ class Echoes:
     shift_hz : float, optional
         Frequency that I/Q were shifted down by; None for RF.
     """
-
-    frames: Frames
-    sampling_rate_hz: float
-    transmit_hz: float
-    shift_hz: float | None = None
-
-    @cached_property
-    def band_hz(self) -> tuple[float, float] | None:
-        """Lowest and highest frequency of the -6 dB band; None where there is no clear band."""
-        spectrum = self._shared(0.0, 1.0)
-        if spectrum is None:
-            return None
-        frequency, power, top = spectrum
-        level = power[top] / 4
-        left, right = np.flatnonzero(power[:top] < level), np.flatnonzero(power[top:] < level) + top
-        if not (left.size and right.size):
-            return None
-        rise, fall = slice(left[-1], left[-1] + 2), slice(right[0], right[0] - 2, -1)
-        edges = (np.interp(level, power[edge], frequency[edge]) for edge in (rise, fall))
-        low, high = (_STEP_HZ * round(float(edge) / _STEP_HZ) for edge in edges)
-        return (low, high) if low > 0 else None
-
-    @cached_property
-    def centres_hz(self) -> tuple[float, float] | None:
-        """Centre of the spectrum in the nearest and in the farthest third of the lines; None if not clear.
-
-        Tissue lowers it with depth. In I/Q that carry the other sign of Q, or were shifted down otherwise
-        than is said, it may rise.
-        """
-        centres = []
-        for begin, end in ((0.0, 1 / 3), (2 / 3, 1.0)):
-            spectrum = self._shared(begin, end)
-            if spectrum is None:
-                return None
-            frequency, power, top = spectrum
-            heard = np.where(power > power[top] / 4, power, 0.0)
-            centres.append(float(np.sum(heard * frequency) / np.sum(heard)))
-        return centres[0], centres[1]
-
-    def _shared(self, begin: float, end: float) -> tuple[FloatArray, FloatArray, int] | None:
-        """Frequencies, what neighbouring lines share of each, and where that is highest; None if not clear.
-
-        Parameters
-        ----------
-        begin, end : float
-            Part of the lines' length.
-        """
-        length = max(2 ** round(np.log2(self.sampling_rate_hz / _RESOLUTION_HZ)), 16)
-        count, vectors, samples = self.frames.shape
-        window = np.hanning(length + 1)[:-1]
-        shared, power, spectra = np.zeros(length), np.zeros(length), 0
-        first = np.unique(np.linspace(0, vectors - 2, _PAIRS if vectors > 1 else 0).astype(int))
-        for i in sorted({0, count // 2, count - 1}):
-            frame = self.frames[i]
-            for start in range(round(begin * samples), round(end * samples) - length + 1, length // 2):
-                part = slice(start, start + length)
-                pair = [_spectrum(frame[lines, part], window) for lines in (first, first + 1)]
-                scale = np.sqrt([np.sum(np.abs(lines) ** 2, axis=1) for lines in pair]).prod(axis=0)
-                used = scale > 0
-                one, other = (lines[used] / np.sqrt(scale[used, None]) for lines in pair)
-                shared += (one * other.conj()).real.sum(axis=0)
-                power += 0.5 * (np.abs(one) ** 2 + np.abs(other) ** 2).sum(axis=0)
-                spectra += int(np.count_nonzero(used))
-        frequency = np.fft.fftfreq(length, 1 / self.sampling_rate_hz).astype(np.float64)
-        frequency += self.shift_hz or 0.0
-        # Real samples have each frequency twice.
-        order = np.argsort(frequency[: length // 2] if self.shift_hz is None else frequency)
-        frequency, shared, power = frequency[order], shared[order], power[order]
-        near = (frequency > 0.5 * self.transmit_hz) & (frequency < 2 * self.transmit_hz)
-        if not near.any() or spectra == 0:
-            return None
-        top = int(np.flatnonzero(near)[np.argmax(shared[near])])
-        return (frequency, shared, top) if shared[top] >= _CLEAR / np.sqrt(spectra) * power[top] else None
+    length = max(2 ** round(np.log2(sampling_rate_hz / _RESOLUTION_HZ)), 16)
+    count, vectors, samples = frames.shape
+    window = np.hanning(length + 1)[:-1]
+    shared, power, spectra = np.zeros(length), np.zeros(length), 0
+    first = np.unique(np.linspace(0, vectors - 2, _PAIRS if vectors > 1 else 0).astype(int))
+    for i in sorted({0, count // 2, count - 1}):
+        frame = frames[i]
+        for start in range(0, samples - length + 1, length // 2):
+            part = slice(start, start + length)
+            pair = [_spectrum(frame[lines, part], window) for lines in (first, first + 1)]
+            scale = np.sqrt([np.sum(np.abs(lines) ** 2, axis=1) for lines in pair]).prod(axis=0)
+            used = scale > 0
+            one, other = (lines[used] / np.sqrt(scale[used, None]) for lines in pair)
+            shared += (one * other.conj()).real.sum(axis=0)
+            power += 0.5 * (np.abs(one) ** 2 + np.abs(other) ** 2).sum(axis=0)
+            spectra += int(np.count_nonzero(used))
+    frequency = np.fft.fftfreq(length, 1 / sampling_rate_hz).astype(np.float64) + (shift_hz or 0.0)
+    # Real samples have each frequency twice.
+    order = np.argsort(frequency[: length // 2] if shift_hz is None else frequency)
+    frequency, shared, power = frequency[order], shared[order], power[order]
+    near = np.flatnonzero((frequency > 0.5 * transmit_hz) & (frequency < 2 * transmit_hz))
+    if not near.size or not spectra:
+        return None
+    top = int(near[np.argmax(shared[near])])
+    level = shared[top] / 4
+    left, right = np.flatnonzero(shared[:top] < level), np.flatnonzero(shared[top:] < level) + top
+    if shared[top] < _CLEAR / np.sqrt(spectra) * power[top] or not (left.size and right.size):
+        return None
+    rise, fall = slice(left[-1], left[-1] + 2), slice(right[0], right[0] - 2, -1)
+    edges = (np.interp(level, shared[edge], frequency[edge]) for edge in (rise, fall))
+    low, high = (_STEP_HZ * round(float(edge) / _STEP_HZ) for edge in edges)
+    return (low, high) if low > 0 else None
 
 
 def _spectrum(part: np.ndarray, window: FloatArray) -> np.ndarray:
