@@ -1,4 +1,4 @@
-"""What complex samples carry, told by how their phase turns along depth: their frequency, the sign of Q."""
+"""What frequency complex samples carry, told by how their phase turns along depth."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ _REMOVED, _CARRIED, _REVERSED = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
 def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
     """Frequency that complex samples were shifted down by: `frequency_hz`, or 0 where they still carry it.
 
+    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
+    spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.
+
     Returns
     -------
     float or None
@@ -31,52 +34,14 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     ------
     InvalidInputError
         If the carrier turns backwards: Q has the other sign.
-    """
-    share = _carried_share(frames, frequency_hz, sampling_rate_hz)
-    if share is not None and _REVERSED[0] <= share <= _REVERSED[1]:
-        turn = _turn(frequency_hz, sampling_rate_hz)
-        raise InvalidInputError(
-            f"expected I/Q whose phase turns by {turn:.2f} rad a sample, or by none, got {share * turn:.2f}: "
-            "Q has the other sign"
-        )
-    if share is not None and _CARRIED[0] <= share <= _CARRIED[1]:
-        return 0.0
-    return frequency_hz if share is not None and _REMOVED[0] <= share <= _REMOVED[1] else None
-
-
-def sign_of_q(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> int:
-    """Sign of Q of complex samples that still carry their frequency: 1, or -1 if it is the other way round.
-
-    Samples that are said to carry it can turn one way or the other, and not stand still as in
-    `demodulation_of`; so a reversed carrier may be as far lowered as one that is not.
-
-    Returns
-    -------
-    int
-        0 where the phase does not tell: noise, samples too far apart, or another carrier than `frequency_hz`.
-    """
-    share = _carried_share(frames, frequency_hz, sampling_rate_hz) or 0.0
-    return int(np.sign(share)) if _CARRIED[0] <= abs(share) <= _CARRIED[1] else 0
-
-
-def _carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
-    """Mean turn of the phase from sample to sample, over that of a carrier of `frequency_hz`.
-
-    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
-    spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.
-
-    Returns
-    -------
-    float or None
-        None where the phase does not tell: noise, or samples too far apart for the frequency.
 
     References
     ----------
     .. [1] C. Kasai et al., "Real-time two-dimensional blood flow imaging using an autocorrelation
        technique", IEEE Trans. Sonics Ultrason. 32, 1985.
     """
-    carried = _turn(frequency_hz, sampling_rate_hz)
-    if carried > _FASTEST:
+    turn = 2.0 * np.pi * frequency_hz / sampling_rate_hz
+    if turn > _FASTEST:
         return None
     lags, counts = np.zeros(_PARTS, dtype=complex), np.zeros(_PARTS)
     for i in sorted({0, frames.shape[0] // 2, frames.shape[0] - 1}):
@@ -93,9 +58,12 @@ def _carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float)
     lag, count = lags[seen].sum(), counts[seen].sum()
     if not abs(lag) > max(_LEAST_COHERENCE * count, _LEAST_SIGMAS * count**0.5):
         return None
-    return float(np.angle(lag)) / carried
-
-
-def _turn(frequency_hz: float, sampling_rate_hz: float) -> float:
-    """Turn of a carrier from sample to sample, rad."""
-    return 2.0 * np.pi * frequency_hz / sampling_rate_hz
+    share = float(np.angle(lag)) / turn
+    if _REVERSED[0] <= share <= _REVERSED[1]:
+        raise InvalidInputError(
+            f"expected I/Q whose phase turns by {turn:.2f} rad a sample, or by none, got {share * turn:.2f}: "
+            "Q has the other sign"
+        )
+    if _CARRIED[0] <= share <= _CARRIED[1]:
+        return 0.0
+    return frequency_hz if _REMOVED[0] <= share <= _REMOVED[1] else None

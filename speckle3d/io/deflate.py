@@ -16,9 +16,6 @@ except ImportError:
 ZLIB, GZIP, EITHER = 15, 31, 47
 """Windows of deflate, and by them what is around it; either is told when unpacking."""
 
-DAMAGE: tuple[type[Exception], ...] = (zlib.error, _library.error, OSError, EOFError, ValueError)
-"""What unpacking raises of damaged bytes."""
-
 
 def packer(window: int) -> Any:
     """Packer of level 1: at higher levels speckle hardly shrinks further, and takes several times as long."""

@@ -1,25 +1,23 @@
 """Files of one result: written in a hidden folder, then put in place so that old and new are never mixed.
 
 A set has one file that readers open, `primary`, and others that go with it. The new files are written into a
-hidden folder beside the old ones; giving that folder its second name is the moment from which the new result
-counts. Then the old other files are removed, `primary` is replaced in one step, and the new other files come
-to its side. Whenever the process is killed, what is there is of one result, and `primary` is there and whole;
-the next run into the place finishes what had been decided and removes what had not.
+hidden folder beside the old ones. Then the old other files are removed, `primary` is replaced in one step,
+and the new other files come to its side: whenever the process is killed, what is there is of one result, and
+`primary` is there and whole.
 """
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from speckle3d.core.errors import FileError, Speckle3DError
-from speckle3d.core.parts import cannot_write, clear_parts, locks
-from speckle3d.io.hdf5 import atomic_path, make_folder, require_target
+from speckle3d.core.parts import cannot_write, locks
+from speckle3d.io.hdf5 import make_folder, require_target
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class FileSet:
     def replaced(self, folder: Path) -> Iterator[Path]:
         """Yield an empty folder to write the set into; if the block succeeds, it takes the old set's place.
 
-        A folder that does not exist appears whole, with those above it; after a failure it still does not.
+        A folder that does not exist appears whole; after a failure it still does not.
 
         Raises
         ------
@@ -64,114 +62,56 @@ class FileSet:
         for name in self.names if existed else ():
             require_target(folder / name)
         base, name = (folder, self.primary) if existed else (folder.parent, folder.name)
-        above = [parent for parent in (base, *base.parents) if not parent.exists()]
         make_folder(base)
-        part = _part(base, name)
+        part = base / f".part-{name}"
         try:
-            part.mkdir(exist_ok=True)
             with _locked(part):
                 try:
-                    for left in part.iterdir():  # of a killed run
-                        shutil.rmtree(left) if left.is_dir() else left.unlink()
-                    self._finish_killed(folder)
                     yield part
-                    self._put_in_place(part, folder)
-                except BaseException:
+                    if existed:
+                        self._put_in_place(part, folder)
+                    else:
+                        os.rename(part, folder)
+                finally:
                     shutil.rmtree(part, ignore_errors=True)
-                    raise
         except BlockingIOError as error:
             raise FileError(
                 f"{given}: expected a place that no other run is at work in, got one that is taken"
             ) from error
         except Speckle3DError as error:
-            if str(part) not in str(error):
-                raise
             raise type(error)(str(error).replace(str(part), str(given))) from error
         except OSError as error:
             raise cannot_write(given, error) from error
-        finally:
-            for parent in above:
-                with suppress(OSError):  # it holds something by now
-                    parent.rmdir()
-
-    def _decided(self, folder: Path) -> Path:
-        """Where the new files of a set are from the moment that they count."""
-        return folder / f".done-{self.primary}"
 
     def _put_in_place(self, part: Path, folder: Path) -> None:
-        if not folder.exists():
-            os.rename(part, folder)
-            return
-        try:
-            os.rename(part, self._decided(folder))
-            self._move(folder)
-        except BaseException:  # Ctrl-C, too, comes too late
-            self._move(folder)
-            raise
-
-    def _finish_killed(self, folder: Path) -> None:
-        """Finish what a killed run had decided, and remove what it had not."""
-        if not folder.is_dir():
-            return
-        # A run that is at it needs a moment more.
-        with suppress(FileNotFoundError), _locked(self._decided(folder), wait=True):
-            self._move(folder)
-        before = _part(folder.parent, folder.name)  # of a run from before there was the folder
-        with suppress(FileNotFoundError, BlockingIOError), _locked(before):
-            shutil.rmtree(before)
-        for name in self.names:
-            clear_parts(folder / name)
-
-    def _move(self, folder: Path) -> None:
-        """Put decided files in place; can be broken off anywhere and done again."""
-        decided = self._decided(folder)
-        if not decided.is_dir():
-            return
-        if (decided / self.primary).exists():
-            for name in (*self.others, *self.derived):
-                (folder / name).resolve().unlink(missing_ok=True)
-            _replace(decided / self.primary, folder / self.primary)
-        for name in self.others:
-            if (decided / name).exists():
-                _replace(decided / name, folder / name)
-        shutil.rmtree(decided)
-
-
-def _replace(new: Path, target: Path) -> None:
-    """Put a file in place in one step, through a link if there is one."""
-    target = target.resolve()
-    try:
-        os.replace(new, target)
-    except OSError as error:
-        if error.errno != errno.EXDEV:  # the link leads to another disk
-            raise
-        with atomic_path(target) as part:
-            shutil.copyfile(new, part)
+        for name in (*self.others, *self.derived):
+            (folder / name).resolve().unlink(missing_ok=True)
+        for name in (self.primary, *self.others):
+            if (part / name).exists():
+                shutil.move(part / name, (folder / name).resolve())  # through a link if there is one
 
 
 @contextmanager
-def _locked(folder: Path, wait: bool = False) -> Iterator[None]:
-    """Lock a folder for the block, where there are locks; the system releases it however the process ends.
+def _locked(folder: Path) -> Iterator[None]:
+    """Make an empty folder of this process, where there are locks; they end however the process does.
 
     Raises
     ------
     BlockingIOError
         If another process holds it.
     """
-    fcntl = locks()
-    file = None if fcntl is None else os.open(folder, os.O_RDONLY)
+    folder.mkdir(exist_ok=True)
+    file = os.open(folder, os.O_RDONLY) if (fcntl := locks()) is not None else None
     try:
-        if file is not None:
+        if fcntl is not None:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
                 if isinstance(error, BlockingIOError):
                     raise  # else a file system without locks
+        for left in folder.iterdir():  # of a killed run
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
         yield
     finally:
         if file is not None:
             os.close(file)
-
-
-def _part(base: Path, name: str) -> Path:
-    return base / f".part-{name}"

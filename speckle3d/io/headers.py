@@ -1,4 +1,8 @@
-"""Text headers of MetaImage and NRRD files, with the per-frame fields that PLUS writes into them.
+"""MetaImage and NRRD files: headers, with the per-frame fields that PLUS writes into them, and pixels.
+
+They are read here and not by pynrrd, which reads all of a raw sequence into memory, drops letters beyond
+ASCII (names of segments, micrometres) and stops at the first member of packed pixels; nor by SimpleITK,
+for which frames have no fields.
 
 References
 ----------
@@ -8,9 +12,10 @@ References
 
 from __future__ import annotations
 
+import bz2
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,12 +26,11 @@ import numpy.typing as npt
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
+from speckle3d.io.deflate import unpacker
 from speckle3d.io.hdf5 import reading
-from speckle3d.io.pixels import Pixels, map_pixels, number_type
 from speckle3d.io.text import numbers
 
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
-_LONGEST_LINE = 2**24
 _MM_PER = {
     "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "millimeters": 1.0,
     "cm": 10.0, "centimeter": 10.0, "centimeters": 10.0, "m": 1e3, "meter": 1e3, "meters": 1e3, "um": 1e-3,
@@ -36,12 +40,28 @@ _S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
 _PACKINGS = {"raw": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "as": "text"}
 """By how NRRD's words for them begin, as bzip2 or bz2; raw is whole."""
+_TYPES = {
+    "i1": "char int8",
+    "u1": "uchar uint8",
+    "i2": "short int16",
+    "u2": "ushort uint16",
+    "i4": "int long int32",
+    "u4": "uint ulong uint32",
+    "i8": "long_long longlong int64",
+    "u8": "ulong_long ulonglong uint64",
+    "f4": "float",
+    "f8": "double",
+}
+"""Types of numbers: first as MetaImage writes them, whose LONG has four bytes, last as NRRD does."""
 
 NRRD_NAMES = {
     "ultrasound image orientation": "UltrasoundImageOrientation",
     "ultrasound image type": "UltrasoundImageType",
 }
 """PLUS's fields by what it calls them in NRRD."""
+
+_SIZE_FIELD, _SIZE_PLACE = "CompressedDataSize = ", 20
+"""Characters kept in a MetaImage's header for the size of the packed pixels, which is known after them."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +80,6 @@ class SequenceHeader:
         What they say in NRRD's words, whatever the format.
     frames : tuple of dict
         Fields of each frame, without the ``Seq_FrameNNNN_`` before their names; empty for a plain image.
-    pixels : Pixels
-        Where they lie; there may be none, as in recordings of a tracker alone.
     stored : tuple of int
         Lengths of all axes in the file, fastest first.
     frame_axis : int, optional
@@ -70,19 +88,31 @@ class SequenceHeader:
         Numbers a pixel.
     index_s : ndarray, shape (n,), optional
         Times of the frames by their axis.
+    dtype : dtype
+        Of the numbers in the file.
+    data : path
+        Of the file that holds the pixels: the header's own, or one in its folder.
+    start : int
+        First byte of the pixels, or of `skipped_lines` lines of text before them; -1 where they are last.
+    packing : str
+        ``"raw"``, ``"deflate"``, ``"bzip2"`` or ``"text"``.
     """
 
     path: str
     size: tuple[int, ...]
-    spacing_mm: tuple[float, float] | None
+    spacing_mm: tuple[float, ...] | None
     fields: dict[str, str]
     said: dict[str, str]
     frames: tuple[dict[str, str], ...]
-    pixels: Pixels
     stored: tuple[int, ...]
-    frame_axis: int | None = 2
-    channels: int = 1
-    index_s: FloatArray | None = None
+    frame_axis: int | None
+    channels: int
+    index_s: FloatArray | None
+    dtype: np.dtype[Any]
+    data: Path
+    start: int
+    packing: str
+    skipped_lines: int
 
     @property
     def frame_count(self) -> int:
@@ -115,15 +145,67 @@ class SequenceHeader:
         FileError
             If pixels are damaged or missing.
         """
-        try:
-            values = map_pixels(self.pixels).reshape(self.stored[::-1])
-        except FileError as error:
-            if self.path in str(error):
-                raise
-            raise FileError(f"{self.path}: expected its pixels in a file beside it: {error}") from error
+        values = self.numbers().reshape(self.stored[::-1])
         if self.frame_axis is not None:
             values = np.moveaxis(values, len(self.stored) - 1 - self.frame_axis, 0)
         return values.reshape(self.frame_count, self.size[1], self.size[0])
+
+    def numbers(self) -> npt.NDArray[Any]:
+        """Map or unpack the numbers, in one row; raw ones of the machine's byte order stay on the disk.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read, is damaged, or holds fewer.
+        """
+        count = math.prod(self.stored) * int(self.said.get("channels", "1"))
+        size_bytes = count * self.dtype.itemsize
+        with reading(self.path), open_regular(self.data) as stream:
+            length = stream.seek(0, 2)
+            stream.seek(max(length - size_bytes, 0) if self.start < 0 else self.start)
+            for _ in range(self.skipped_lines):
+                stream.readline()
+            if self.packing == "text":
+                values = np.array(stream.read().split(), dtype=np.float64).astype(self.dtype)
+            elif self.packing == "raw" and count and stream.tell() + size_bytes <= length:
+                values = np.memmap(self.data, self.dtype, "r", stream.tell(), (count,))
+            else:
+                content = stream.read() if self.packing == "raw" else _unpacked(stream.read(), self.packing)
+                values = np.frombuffer(content, self.dtype, len(content) // self.dtype.itemsize)
+        if values.size < count:
+            whole = values.size * self.frame_count // count
+            raise FileError(f"{self.path}: ends early: {whole} of {self.frame_count} frames")
+        return values[:count].astype(self.dtype.newbyteorder("="), copy=False)
+
+
+def _unpacked(packed: bytes, packing: str) -> bytes:
+    """Unpack all; members of gzip that follow one another are one stream."""
+    content = bytearray()
+    while packed:
+        stream = bz2.BZ2Decompressor() if packing == "bzip2" else unpacker()
+        content += stream.decompress(packed)
+        packed = stream.unused_data if stream.unused_data[:2] == b"\x1f\x8b" else b""
+    return bytes(content)
+
+
+def meta_type(dtype: np.dtype[Any]) -> str:
+    """Word for a type of numbers behind MetaImage's MET_."""
+    return _TYPES[dtype.newbyteorder("=").str[1:]].split()[0].upper()
+
+
+def nrrd_type(dtype: np.dtype[Any]) -> str:
+    """NRRD's word for a type of numbers."""
+    return _TYPES[dtype.newbyteorder("=").str[1:]].split()[-1]
+
+
+def _number_type(word: str, is_big: bool, where: str) -> np.dtype[Any]:
+    """Type of numbers by a word of either format, as ``MET_UCHAR`` or ``unsigned char``."""
+    plain = word.lower().removeprefix("met_").removesuffix("_t").replace("unsigned ", "u")
+    plain = plain.replace("signed ", "").removesuffix(" int").replace(" ", "")
+    for kind, words in _TYPES.items():
+        if plain in words.split():
+            return np.dtype((">" if is_big else "<") + kind)
+    raise InvalidInputError(f"{where}: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
 
 
 def is_metaimage(start: bytes) -> bool:
@@ -173,7 +255,7 @@ def mm_per(unit: str, where: str) -> float:
 
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
-    while line := stream.readline(_LONGEST_LINE):
+    while line := stream.readline():
         try:
             yield line.decode("utf-8").rstrip("\r\n")
         except UnicodeDecodeError:
@@ -237,21 +319,21 @@ def _in_words_of_nrrd(fields: dict[str, str]) -> dict[str, str]:
 
 def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int) -> SequenceHeader:
     """Tell axes of the image, of frames and of colours by their kinds; without, as PLUS orders them."""
-    stored, channels = _sizes(path, said.get("sizes", "")), int(said.get("channels", "1"))
-    count = math.prod(stored) * channels
+    stored = tuple(map(int, said.get("sizes", "").split()))
+    colours = int(said.get("channels", "1"))
     kinds = said.get("kinds", "").lower().split()
     if len(kinds) != len(stored):
         kinds = ["domain"] * len(stored)
     spatial = [i for i, kind in enumerate(kinds) if kind in _SPACE]
     frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
     for i in {*range(len(stored))} - {*spatial, frame_axis}:
-        channels *= stored[i]
+        colours *= stored[i]
     if frame_axis is None and len(spatial) == 3:
         frame_axis = spatial.pop()
     if len(spatial) == 3:  # images of 3D Slicer are a pixel thick
         thin = next((i for i in reversed(spatial) if stored[i] == 1), None)
         spatial = [i for i in spatial if i != thin]
-    if len(spatial) != 2:
+    if len(spatial) != 2 or min(stored) < 0:
         raise InvalidInputError(
             f"{path}: sizes: expected images on two axes and at most one of frames, got lengths "
             f"{' '.join(map(str, stored))} of kinds {' '.join(kinds)}"
@@ -261,34 +343,28 @@ def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int
     if spacing is not None and (not all(map(math.isfinite, spacing)) or spacing == (1.0, 1.0)):
         spacing = None  # PLUS and ITK write 1 where nobody told them
     own, frames = _split(fields)
-    times, one_by_one = None, 1
-    size = tuple(stored[i] for i in spatial)
+    times, size = None, tuple(stored[i] for i in spatial)
     if frame_axis is not None:
-        length = stored[frame_axis]
-        size, times = (*size, length), _frame_times(said, frame_axis, stored)
-        one_by_one = max(length, 1) if frame_axis == len(stored) - 1 else 1
-        if len(frames) == length + 1 and not frames[0]:
+        size, times = (*size, stored[frame_axis]), _frame_times(said, frame_axis, stored)
+        if len(frames) == stored[frame_axis] + 1 and not frames[0]:
             frames = frames[1:]  # of a writer that counts from 1
-    pixels = _pixels(path, said, start, count, one_by_one)
-    return SequenceHeader(
-        str(path), size, spacing, own, said, frames, pixels, stored, frame_axis, channels, times
-    )
-
-
-def _pixels(path: Path, said: dict[str, str], start: int, count: int, frames: int) -> Pixels:
-    word = said.get("type", "") if count else "uchar"  # a tracker's recording may name no type
-    dtype = number_type(word, said.get("endian", "").lower() == "big", f"{path}: type")
+    word = said.get("type", "") if math.prod(stored) else "uchar"  # a tracker's recording may name no type
+    dtype = _number_type(word, said.get("endian", "").lower() == "big", f"{path}: type")
     encoding = said.get("encoding", "").lower()
     packing = _PACKINGS.get(encoding if encoding == "raw" else encoding[:2])
     if packing is None:
         raise InvalidInputError(f"{path}: encoding: expected raw, gzip, bzip2 or text, got {encoding!r}")
-    source = path
+    data = path
     if "data file" in said:
-        source, start = _beside(path, said["data file"]), 0
+        data, start = _beside(path, said["data file"]), 0
     lines, skipped = (
         int(said.get(f"{what} skip", said.get(f"{what}skip", "0"))) for what in ("line", "byte")
     )
-    return Pixels(source, -1 if skipped < 0 else start + skipped, dtype, count, packing, lines, frames)
+    return SequenceHeader(
+        str(path), size, spacing, own, said, frames, stored, frame_axis,
+        colours, times, dtype, data,
+        -1 if skipped < 0 else start + skipped, packing, lines,
+    )  # fmt: skip
 
 
 def axes_mm(path: PathLike, said: dict[str, str], count: int) -> FloatArray | None:
@@ -356,13 +432,6 @@ def _split(lines: dict[str, str]) -> tuple[dict[str, str], tuple[dict[str, str],
     return fields, tuple(frames.get(i, {}) for i in range(max(frames, default=-1) + 1))
 
 
-def _sizes(path: Path, text: str) -> tuple[int, ...]:
-    sizes = numbers(text, None, f"{path}: sizes")
-    if any(length != int(length) or not 0 <= length < 2**40 for length in sizes):
-        raise InvalidInputError(f"{path}: sizes: expected whole numbers from 0, got {text}")
-    return tuple(map(int, sizes))
-
-
 def _beside(path: Path, name: str) -> Path:
     """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
     if name.split()[:1] == ["LIST"] or ("%" in name and len(name.split()) > 1):
@@ -375,3 +444,36 @@ def _beside(path: Path, name: str) -> Path:
     if not name or Path(name).is_absolute() or not data.is_relative_to(folder):
         raise InvalidInputError(f"{path}: expected pixels in a file in the header's own folder, got {name!r}")
     return data
+
+
+def header_bytes(lines: Iterable[str]) -> bytes:
+    """Lines of a header as bytes that are read back as the same text."""
+    return "".join(f"{line}\n" for line in lines).encode("utf-8", "backslashreplace")
+
+
+def meta_start(packed_size: int | None) -> list[str]:
+    """First lines of the header of a MetaImage of three axes.
+
+    Parameters
+    ----------
+    packed_size : int or None
+        Bytes of the packed pixels, 0 if `put_packed_size` tells them later; None if they are not packed.
+    """
+    return [
+        "ObjectType = Image",
+        "NDims = 3",
+        "BinaryData = True",
+        "BinaryDataByteOrderMSB = False",
+        f"CompressedData = {packed_size is not None}",
+        *([] if packed_size is None else [_packed_size_line(packed_size)]),
+    ]
+
+
+def put_packed_size(file: BinaryIO, header: bytes, size: int) -> None:
+    """Write the size of the packed pixels where a file, which begins with the header, has room for it."""
+    file.seek(header.index(_SIZE_FIELD.encode()))
+    file.write(_packed_size_line(size).encode())
+
+
+def _packed_size_line(size: int) -> str:
+    return f"{_SIZE_FIELD}{str(size).ljust(_SIZE_PLACE)}"

@@ -16,7 +16,6 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.io.carrier import sign_of_q
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.import_settings import ImportSettings
@@ -43,7 +42,6 @@ _SIZE_TOLERANCE = 0.1
 one were seen to differ by 8 %."""
 _DEVICE = "the device set"
 _OWN, _NO_VALUES = "as this package wrote it", ("probe", "full_scale")
-_CARRIER = {1: "told by the phase", -1: "turned, as told by the phase", 0: "as stored, not told by the phase"}
 
 
 @dataclass(frozen=True)
@@ -133,29 +131,20 @@ class _Sequence:
         return cls(header, settings, device, own, Layout.of(header, device.image_orientation))
 
     def recording(self) -> Recording:
-        header, images, times, rows = self.header, self._images(), self.times, list[Row]()
-        first_mm = self.settings.first_sample_depth_mm
-        depth_mm = self.own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm
-        values, frames = self._values(), self._frames(images, self.layout)
-        if self.layout.is_complex:
-            sign = self._sign_of_q(frames, values)
-            rows.append(("sign of Q", _CARRIER[sign], ""))
-            if sign == -1:
-                frames = self._frames(images, replace(self.layout, conjugated=True))
-        tracker = self.tracker(depth_mm)
+        images, first_mm = self._images(), self.settings.first_sample_depth_mm
+        tracker = self.tracker(self.own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm)
         return Recording(
-            Path(header.path),
+            Path(self.header.path),
             self.settings,
-            frames,
-            values,
-            time_s=None if times is None else times[images],
+            self._frames(images),
+            self._values(),
+            time_s=None if self.times is None else self.times[images],
             tracker=tracker,
             orientation=self._orientation(),
             chain="" if tracker is None else " * ".join(self._chain()),
-            probe=self.settings.probe or self.own.get("probe") or self.device.scan.probe,
+            probe=self.settings.probe or self.own.get("probe") or self.device.probe,
             full_scale=self.own.get("full_scale", 255.0),
             assumptions=("parallel lines",) if self.layout.is_rf and not self.own else (),
-            rows=tuple(rows),
             remarks=tuple(self._remarks()),
         )
 
@@ -177,7 +166,7 @@ class _Sequence:
 
     @property
     def _count(self) -> int:
-        images = self.header.frame_count if self.header.pixels.count else 0
+        images = self.header.frame_count if 0 not in self.header.stored else 0
         return max(images, len(self.header.frames))
 
     @cached_property
@@ -200,10 +189,9 @@ class _Sequence:
                 "by its Kinds; if it is time, say so by --frame-rate-hz"
             )
         self.layout.require_lines(header)
-        if header.pixels.packing == "raw":
+        if header.packing == "raw":
             header.images()  # maps them, and refuses a file that ends early
-        images = self._chosen[0]
-        if not images.size:
+        if not (images := self._chosen[0]).size:
             raise InvalidInputError(
                 f"{header.path}: ImageStatus: expected a valid frame with a time, got none"
             )
@@ -225,13 +213,12 @@ class _Sequence:
             valid[i] = {frame.get("ImageStatus", "OK"), frame.get("Status", "OK")} == {"OK"}
         return valid
 
-    def _frames(self, images: IntArray, layout: Layout) -> FileFrames:
+    def _frames(self, images: IntArray) -> FileFrames:
         """Frames of the pixels' type; wider whole numbers as int16 where it holds them, else float32."""
-        header = self.header
-        dtype, stored = header.pixels.dtype.newbyteorder("="), None
+        header, layout = self.header, self.layout
+        dtype, stored = header.dtype.newbyteorder("="), None
         if layout.is_complex:
-            fits = dtype == np.int16 and not layout.conjugated  # the opposite of -32768 is none
-            dtype, stored = np.dtype(np.complex64), dtype if fits else None
+            dtype, stored = np.dtype(np.complex64), dtype if dtype == np.int16 else None
         elif layout.is_rf and dtype != np.int16:
             limits = np.iinfo(np.int16)
             fits = dtype.kind in "iu" and all(
@@ -244,26 +231,25 @@ class _Sequence:
     def _values(self) -> dict[str, Value]:
         """What a sweep of this kind needs, and where file or device set have it."""
         own = {name: Value(value, _OWN) for name, value in self.own.items() if name not in _NO_VALUES}
-        values, sizes, scan = {}, self._pixel_mm(), self.device.scan
+        values, sizes, device = dict[str, Value](), self._pixel_mm(), self.device
         if self.stamps is not None and (rate := rate_of(self.stamps[np.isfinite(self.stamps)])):
             values["frame_rate_hz"] = Value(rate, "of its time stamps")
         across, down = (replace(sizes, value=size) for size in sizes.value or (None, None))
         if not self.layout.is_rf:
             return values | {"column_pitch_mm": across, "row_spacing_mm": down} | own
-        if scan.is_curved and self.settings.vector_pitch_mm is None and "vector_pitch_mm" not in own:
+        if device.is_curved and self.settings.vector_pitch_mm is None and "vector_pitch_mm" not in own:
             raise InvalidInputError(
-                f"{self.header.path}: expected lines of a linear transducer, got a {scan.geometry.lower()} "
+                f"{self.header.path}: expected lines of a linear transducer, got a {device.geometry.lower()} "
                 "one, whose lines spread, by the device set: give its scan-converted B-mode, or parallel "
                 "lines with --vector-pitch-mm"
             )
         if down.value is not None:
             speed = self.settings.speed_of_sound_m_s or self.own.get("speed_of_sound_m_s", 1540.0)
-            source = f"of samples {down.value:.6g} mm apart, by {sizes.source}, at {speed:g} m/s"
-            rate = 1e3 * speed / (2.0 * down.value)
-            values["sampling_rate_hz"] = Value(rate, source, sizes.said_by)
-        elif scan.width_mm is not None:
+            words = f"of samples {down.value:.6g} mm apart, by {sizes.source}, at {speed:g} m/s"
+            values["sampling_rate_hz"] = replace(down, value=1e3 * speed / (2.0 * down.value), source=words)
+        elif device.width_mm is not None:
             vectors, _ = self.layout.shape(self.header.size)
-            across = Value(scan.width_mm / vectors, "ScanConversion of the device set", _DEVICE)
+            across = Value(device.width_mm / vectors, "ScanConversion of the device set", _DEVICE)
         return values | {"vector_pitch_mm": across} | own
 
     def _pixel_mm(self) -> Value:
@@ -317,10 +303,8 @@ class _Sequence:
         if self.poses is None:
             return []
         is_calibrated = self.poses.pixels is None and self.image_to_probe() is not None
-        return [
-            *([f"{self.device.names.image}To{self.poses.tool}"] if is_calibrated else []),
-            *self.poses.chain,
-        ]
+        first = [f"{self.device.names.image}To{self.poses.tool}"] if is_calibrated else []
+        return [*first, *self.poses.chain]
 
     def tracker(self, first_sample_depth_mm: float) -> Tracker | None:
         """The tracker, with the image on it if that is known; None without a pose that has a time."""
@@ -359,10 +343,10 @@ class _Sequence:
             notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
         if len(header.frames) not in (0, count):
             notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")
-        if device.scan.is_curved:
+        if device.is_curved:
             lines = "its lines spread and are taken for parallel"
             what = lines if self.layout.is_rf else "images are taken for scan-converted"
-            notes.append(f"the device set calls the transducer {device.scan.geometry}: {what}")
+            notes.append(f"the device set calls the transducer {device.geometry}: {what}")
         if device.clip is not None and device.clip.is_part_of(header.size):
             notes.append(
                 f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
@@ -395,8 +379,8 @@ class _Sequence:
             ("spacing", _shown(header.spacing_mm or ()) or "unknown", "mm" if header.spacing_mm else ""),
             ("image type", kind, ""),
             ("image orientation", orientation, ""),
-            ("pixel type", header.pixels.dtype.name, ""),
-            ("packing", header.pixels.packing, ""),
+            ("pixel type", header.dtype.name, ""),
+            ("packing", header.packing, ""),
             ("transforms", ", ".join(header.transforms) or "none", ""),
             ("time stamps", "yes" if any("Timestamp" in frame for frame in header.frames) else "no", ""),
         ]
@@ -409,21 +393,6 @@ class _Sequence:
         if self.settings.plus_config is not None:
             rows.append(("device set", self.settings.plus_config, ""))
         return rows
-
-    def _sign_of_q(self, frames: FileFrames, values: dict[str, Value]) -> int:
-        """Sign of Q as it is stored: 1, -1, or 0 where the phase does not tell, as of I/Q shifted down.
-
-        In lines that are stored from the far end on, depth runs backwards and so does the phase, unless the
-        writer thought of it.
-        """
-
-        def value(name: str) -> Any:
-            given = getattr(self.settings, name)
-            return values.get(name, Value()).value if given is None else given
-
-        centre, rate = value("centre_frequency_hz"), value("sampling_rate_hz")
-        is_analytic = value("demodulation_frequency_hz") == 0 and centre and rate
-        return sign_of_q(frames, centre, rate) if is_analytic else 0
 
 
 def _shown(lengths: Sequence[float]) -> str:
@@ -438,8 +407,8 @@ def _number(text: str | None) -> float:
 
 
 def _companions(path: Path) -> Sequence[Path]:
-    pixels = read_header(path).pixels.path
-    return () if pixels == path else (pixels,)
+    data = read_header(path).data
+    return () if data == path else (data,)
 
 
 READER = Reader(

@@ -23,7 +23,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
-from speckle3d.io.plus.xml import read_xml, vector
+from speckle3d.io.plus.device_set import read_xml, vector
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
 """How many wires a pattern of each type has."""

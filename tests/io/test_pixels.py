@@ -7,12 +7,12 @@ import zlib
 import numpy as np
 import pytest
 from image_examples import grey, tracked, write_mha
+from speckle3d.io.pixels import map_pixels
 
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage
-from speckle3d.io.pixels import map_pixels
 from speckle3d.io.voxels.volumes import read_volume
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)

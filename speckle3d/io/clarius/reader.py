@@ -2,8 +2,9 @@
 
 Trusted for the line pitch is the yml's ``rx element``, the place of a line in elements of the array, times
 the distance between elements. That is given by ``element_pitch_mm``, by the yml's probe where it says, or by
-the probe's model, in this order; ``vector_pitch_mm`` replaces the product. Lines that are steered, unevenly spaced, or repeated
-(several packets a line, as in Doppler modes) are refused. The first line is taken as the left of the image.
+the probe's model, in this order; ``vector_pitch_mm`` replaces the product. Lines that are steered, unevenly
+spaced, or repeated (several packets a line, as in Doppler modes) are refused. The first line is taken as the
+left of the image.
 
 The first sample's depth is (``delay samples`` / ``sampling rate`` - 1 us) x c / 2. The maker calls the
 samples "leading samples before the first valid sample (acquisition delay)" [1]_. In every B-mode recording
@@ -134,7 +135,7 @@ class Package:
 
     @cached_property
     def kept(self) -> tuple[slice, slice]:
-        """Lines and samples that are kept: the region of interest, if there is nothing beside it in 3 frames."""
+        """Lines and samples kept: the region of interest, if there is nothing beside it in three frames."""
         whole, region = (slice(0, self.said.lines), slice(0, self.said.samples)), self.said.region
         if region is None:
             return whole

@@ -1,6 +1,7 @@
-"""What a device set of PLUS says about images: their place on the probe, their pixels, their clip.
+"""Documents of PLUS: what a device set says about images, and what other documents are for.
 
-A result of PLUS's probe calibration, whose transforms are in ``CalibrationResults``, is read alike.
+A device set tells the place of the images on the probe, their pixels and their clip. A result of PLUS's probe
+calibration, whose transforms are in ``CalibrationResults``, is read alike.
 
 References
 ----------
@@ -11,26 +12,67 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.files import PathLike
+from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.io.hdf5 import reading
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import Names, pixel_axes
-from speckle3d.io.plus.xml import read_xml, vector
+from speckle3d.io.readers import Reader
+from speckle3d.io.recordings import Recording, Row
+from speckle3d.io.text import numbers
 
 _PLACES = (".//CoordinateDefinitions/Transform", ".//CalibrationResults/Transform")
-_INVERSE_TOLERANCE = 0.1
-"""How far the product of a transform and its inverse, both of some digits, may be from the identity, mm or
-pixels."""
 _ALGORITHMS = (".//vtkPlusProbeCalibrationAlgo", ".//vtkProbeCalibrationAlgo", ".//fCal")
 _HAIR = 0.1
 """Pixels by which a rectangle is wider, so that rounding loses none of its own."""
 _ARC_POINTS = 128
 """Of a fan's arc in a polygon: 0.02 pixels off the circle at a radius of 1,000 pixels and 90 degrees."""
+_DOCUMENTS = {
+    "PlusConfiguration": "a device set",
+    "ProbeCalibrationResult": "the result of a probe calibration",
+    "TemporalCalibrationResults": "a tracker's delay",
+    "LineSegmentationResults": "lines found in images",
+}
+
+
+def read_xml(path: PathLike) -> Element:
+    """Read a document's first element.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If it is no XML, or has a type declaration: the entities it may declare can grow without bounds.
+    """
+    with reading(path), open_regular(path) as stream:
+        text = stream.read()
+    try:
+        return ElementTree.fromstring(text, ElementTree.XMLParser(target=_PlainTree()))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InvalidInputError(f"{path}: expected well-formed XML, got: {error}") from error
+
+
+class _PlainTree(ElementTree.TreeBuilder):
+    """The tree of a document without a type declaration, so that it has no entities of its own."""
+
+    def doctype(self, name: str, *_: object) -> None:
+        raise ValueError(f"a document type declaration ({name})")
+
+
+def vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
+    """Read an attribute of `count` numbers."""
+    label = element.get("Name") or element.get("From") or ""
+    where = f"{element.tag}{f' {label}' if label else ''}: {attribute}"
+    return numbers(element.get(attribute, ""), count, where)
 
 
 @dataclass(frozen=True)
@@ -90,34 +132,6 @@ class Clip:
 
 
 @dataclass(frozen=True)
-class ScanConversion:
-    """How PLUS makes an image of lines.
-
-    Attributes
-    ----------
-    probe : str
-        Model of the transducer.
-    geometry : str
-        Of the transducer, as LINEAR; empty where the set does not say.
-    width_mm : float, optional
-        Of the transducer.
-    output_size, output_mm : tuple, optional
-        Pixels along x and y of the image, and their distances.
-    """
-
-    probe: str = ""
-    geometry: str = ""
-    width_mm: float | None = None
-    output_size: tuple[float, ...] | None = None
-    output_mm: tuple[float, float] | None = None
-
-    @property
-    def is_curved(self) -> bool:
-        """Whether the transducer's lines spread."""
-        return self.geometry not in ("", "LINEAR")
-
-
-@dataclass(frozen=True)
 class DeviceSet:
     """What a device set says; by default, what PLUS takes for granted.
 
@@ -131,7 +145,14 @@ class DeviceSet:
         Fixed transforms, shape (4, 4), by the frames from which and to which they lead.
     image_orientation : str, optional
         Of the machine's own images, as UF.
-    scan : ScanConversion
+    probe : str
+        Model of the transducer.
+    geometry : str
+        Of the transducer, as LINEAR; empty where the set does not say.
+    width_mm : float, optional
+        Of the transducer.
+    output_size, output_mm : tuple, optional
+        Pixels along x and y of the image that PLUS makes of lines, and their distances.
     clip : Clip, optional
     """
 
@@ -140,38 +161,36 @@ class DeviceSet:
     origin_frame: str = "TransducerOrigin"
     transforms: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
     image_orientation: str | None = None
-    scan: ScanConversion = ScanConversion()
+    probe: str = ""
+    geometry: str = ""
+    width_mm: float | None = None
+    output_size: tuple[float, ...] | None = None
+    output_mm: tuple[float, ...] | None = None
     clip: Clip | None = None
 
-    def transform(self, start: str, end: str) -> FloatArray | None:
-        """Product of the transforms, or their inverses, on the shortest way between two frames, if any.
+    @property
+    def is_curved(self) -> bool:
+        """Whether the transducer's lines spread."""
+        return self.geometry not in ("", "LINEAR")
 
-        Raises
-        ------
-        InvalidInputError
-            If a transform on the way that is needed the other way round has no inverse.
-        """
+    def transform(self, start: str, end: str) -> FloatArray | None:
+        """Product of the transforms, or their inverses, on the shortest way between two frames, if any."""
         reached, waiting = {start: np.eye(4)}, [start]
         for place in waiting:
             for (a, b), matrix in self.transforms.items():
                 target = b if a == place else a
-                if place not in (a, b) or target in reached:
-                    continue
-                if b == place and not np.linalg.det(matrix):
-                    where = f"{self.path}: Transform {a} to {b}"
-                    raise InvalidInputError(f"{where}: expected a matrix with an inverse, got a singular one")
-                reached[target] = (matrix if a == place else np.linalg.inv(matrix)) @ reached[place]
-                waiting.append(target)
+                if place in (a, b) and target not in reached:
+                    reached[target] = (matrix if a == place else np.linalg.inv(matrix)) @ reached[place]
+                    waiting.append(target)
         return reached.get(end)
 
-    def pixel_mm(self, size: tuple[float, ...] | None) -> tuple[float, float] | None:
+    def pixel_mm(self, size: tuple[float, ...] | None) -> tuple[float, ...] | None:
         """Distances of columns and rows of the image, whose size is (x, y), mm; None if unknown."""
         for end in (self.names.probe, self.origin_frame):
             if (matrix := self.transform(self.names.image, end)) is not None:
                 return pixel_axes(matrix, f"{self.path}: {self.names.image} to {end}")
-        made = self.scan.output_size
-        is_of_size = made is None or (size is not None and tuple(size[:2]) == made)
-        return self.scan.output_mm if is_of_size else None
+        is_of_size = self.output_size is None or (size is not None and tuple(size[:2]) == self.output_size)
+        return self.output_mm if is_of_size else None
 
 
 def read_device_set(path: PathLike) -> DeviceSet:
@@ -185,68 +204,43 @@ def read_device_set(path: PathLike) -> DeviceSet:
         Naming the element that is wrong, or if the document is another.
     """
     root = read_xml(path)
-    if root.tag not in ("PlusConfiguration", "ProbeCalibrationResult"):
+    if root.tag not in [*_DOCUMENTS][:2]:
         raise InvalidInputError(
             f"{path}: expected a device set of PLUS (PlusConfiguration), or a ProbeCalibrationResult, "
             f"got {root.tag}"
         )
     with naming(str(path)):
-        usual, named = Names(), dict[str, str]()
-        for place in _ALGORITHMS:
-            for element in root.iterfind(place):
-                named |= element.attrib
-        return DeviceSet(
-            str(path),
-            Names(
-                named.get("ImageCoordinateFrame", usual.image),
-                named.get("ProbeCoordinateFrame", usual.probe),
-                _attribute(root, "ToolReferenceFrame") or usual.tracker,
-            ),
-            named.get("TransducerOriginCoordinateFrame", "TransducerOrigin"),
-            _transforms(root),
-            _attribute(root, "PortUsImageOrientation"),
-            _scan_conversion(root.find(".//ScanConversion")),
-            _clip(root.find(".//VolumeReconstruction")),
-        )
+        return _device_set(str(path), root)
 
 
-def _transforms(root: Element) -> dict[tuple[str, str], FloatArray]:
-    """Transforms by their ends; what is said twice, or both ways round, must be said alike."""
-    transforms: dict[tuple[str, str], FloatArray] = {}
-    for element in (one for place in _PLACES for one in root.iterfind(place)):
-        a, b = element.get("From", ""), element.get("To", "")
-        matrix = np.reshape(vector(element, "Matrix", 16), (4, 4))
-        same, back = transforms.get((a, b), matrix), transforms.get((b, a))
-        is_inverse = back is None or np.allclose(back @ matrix, np.eye(4), 0, _INVERSE_TOLERANCE)
-        if not np.array_equal(same, matrix) or not is_inverse:
-            expected = f"the inverse of From={b} To={a}, " if is_inverse is False else ""
-            other = same if is_inverse or back is None else back
-            raise InvalidInputError(
-                f"Transform From={a} To={b}: expected {expected}what is said of it before, {_text(other)}, "
-                f"got {_text(matrix)}"
-            )
-        transforms[a, b] = matrix
-    return transforms
-
-
-def _text(matrix: FloatArray) -> str:
-    return " ".join(f"{value:g}" for value in matrix.ravel())
-
-
-def _scan_conversion(element: Element | None) -> ScanConversion:
-    if element is None:
-        return ScanConversion()
-    width = _values(element, 1, "TransducerWidthMm")
-    spacing = _values(element, 2, "OutputImageSpacingMmPerPixel")
-    size = _values(element, 2, "OutputImageSizePixel")
-    if min((*(width or ()), *(spacing or ()), *(size or ())), default=1.0) <= 0:
-        raise InvalidInputError("ScanConversion: width, spacing and size: expected above zero, got others")
-    return ScanConversion(
-        element.get("TransducerName", ""),
-        element.get("TransducerGeometry", "").upper(),
+def _device_set(path: str, root: Element) -> DeviceSet:
+    usual, named = Names(), dict[str, str]()
+    for place in _ALGORITHMS:
+        for element in root.iterfind(place):
+            named |= element.attrib
+    scan = root.find(".//ScanConversion")
+    scan = Element("none") if scan is None else scan
+    width = _values(scan, 1, "TransducerWidthMm")
+    return DeviceSet(
+        path,
+        Names(
+            named.get("ImageCoordinateFrame", usual.image),
+            named.get("ProbeCoordinateFrame", usual.probe),
+            _attribute(root, "ToolReferenceFrame") or usual.tracker,
+        ),
+        named.get("TransducerOriginCoordinateFrame", "TransducerOrigin"),
+        {
+            (one.get("From", ""), one.get("To", "")): np.reshape(vector(one, "Matrix", 16), (4, 4))
+            for place in _PLACES
+            for one in root.iterfind(place)
+        },
+        _attribute(root, "PortUsImageOrientation"),
+        scan.get("TransducerName", ""),
+        scan.get("TransducerGeometry", "").upper(),
         None if width is None else width[0],
-        size,
-        None if spacing is None else (spacing[0], spacing[1]),
+        _values(scan, 2, "OutputImageSizePixel"),
+        _values(scan, 2, "OutputImageSpacingMmPerPixel"),
+        _clip(root.find(".//VolumeReconstruction")),
     )
 
 
@@ -278,3 +272,53 @@ def _attribute(root: Element, name: str) -> str | None:
     """Value of an attribute that all elements with it share; None where none has it, or they differ."""
     values = {element.get(name) for element in root.iter() if name in element.attrib}
     return values.pop() if len(values) == 1 else None
+
+
+def _device_rows(path: Path, root: Element) -> list[Row]:
+    device = read_device_set(path)
+    pixel = device.pixel_mm(device.output_size)
+    devices = [
+        f"{element.get('Id', 'one without a name')} ({element.get('Type')})".removesuffix(" (None)")
+        for element in root.iterfind(".//Device")
+    ]
+    wires = len(root.findall(".//PhantomDefinition/Geometry/Pattern/Wire"))
+    return [
+        ("devices", ", ".join(devices) or "none", ""),
+        *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
+        ("pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""),
+        ("image orientation", device.image_orientation or "not said", ""),
+        ("transducer", f"{device.probe} {device.geometry}".strip() or "not said", ""),
+        ("clip of volumes", "none" if device.clip is None else str(device.clip), ""),
+        ("wires of a phantom", str(wires), ""),
+        ("for", "--plus-config of convert" + (", --phantom of calibrate wires" if wires else ""), ""),
+    ]
+
+
+def _open(path: Path, settings: ImportSettings) -> Recording:
+    root = read_xml(path)
+    if (what := _DOCUMENTS.get(root.tag)) is None:
+        raise InvalidInputError(
+            f"{path}: expected a document of PLUS ({', '.join(_DOCUMENTS)}), got {root.tag}"
+        )
+    rows: list[Row]
+    if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
+        (lag_s,) = vector(root, "TrackerLagSec", 1)
+        rows = [("time offset of the tracker", f"{-lag_s:+.4f}", "s")]
+        rows.append(("for", "--time-offset-s of calibrate", ""))
+    elif root.tag == "LineSegmentationResults":
+        count = len(root.findall("Frame[@SegmentationStatus='OK']"))
+        rows = [("lines found", str(count), "frames")]
+        rows.append(("for", "comparison alone, as lines are found anew", ""))
+    else:
+        rows = _device_rows(path, root)
+    fault = InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {rows[-1][1]}")
+    return Recording(path, settings, rows=(("content", what, ""), *rows), fault=fault)
+
+
+def _claims(_: Path, start: bytes) -> bool:
+    return start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<") and any(
+        f"<{name}".encode() in start for name in _DOCUMENTS
+    )
+
+
+READER = Reader("PLUS document", _claims, _open)

@@ -34,13 +34,10 @@ class Layout:
         (a line of I, a line of Q).
     orientation : str
         As MF: columns to the marked side, rows away from the probe.
-    conjugated : bool
-        Whether Q has the other sign in the file.
     """
 
     kind: str
     orientation: str
-    conjugated: bool = False
 
     @classmethod
     def of(cls, header: SequenceHeader, machine: str | None = None) -> Layout:
@@ -49,7 +46,7 @@ class Layout:
         PLUS stores B-mode as MF and RF as FM. A machine's orientation, from a device set, replaces that for
         the kind of image whose lines run so.
         """
-        by_pixels = "BRIGHTNESS" if header.pixels.dtype == np.uint8 else "RF_REAL"
+        by_pixels = "BRIGHTNESS" if header.dtype == np.uint8 else "RF_REAL"
         kind = header.fields.get("UltrasoundImageType", by_pixels)
         usual = "FM" if kind in RF_TYPES else "MF"
         if machine is not None and (machine[:1].upper() in "FN") == (usual == "FM"):
@@ -78,7 +75,7 @@ class Layout:
         ------
         InvalidInputError
         """
-        path, size, dtype = header.path, header.size, header.pixels.dtype.newbyteorder("=")
+        path, size, dtype = header.path, header.size, header.dtype.newbyteorder("=")
         if header.channels > 1 or self.kind not in (*RF_TYPES, "BRIGHTNESS"):
             got = f"colour, {header.channels} numbers a pixel" if header.channels > 1 else f"type {self.kind}"
             raise InvalidInputError(
@@ -98,7 +95,7 @@ class Layout:
         if self.is_complex:
             pairs = np.moveaxis(pixels, self._pair_axis, 0)
             joined = pairs[0::2].astype(np.complex64)
-            joined.imag = -pairs[1::2].astype(np.float32) if self.conjugated else pairs[1::2]
+            joined.imag = pairs[1::2]
             pixels = np.moveaxis(joined, 0, self._pair_axis)
         return self._flipped(pixels if self.has_lines_in_rows else pixels.T)
 

@@ -22,10 +22,6 @@ SKEW_TOLERANCE = 0.1
 """How far the axes of a measured image calibration may be from square, as the cosine of their angle. PLUS's
 published calibrations reach 0.05, an error of the calibration and not of the image."""
 
-_INVERSE_TOLERANCE = 1.0
-"""How far the product of a pose and its inverse may be from the identity, mm in the last column: rotations
-rounded by up to `ROUNDING_TOLERANCE` move a place 1,000 mm off by so much."""
-
 _FIXED_TOLERANCE = 1e-4
 """How far entries of a transform that all frames share may differ: six written digits of tens of mm."""
 
@@ -76,8 +72,7 @@ def tracked_poses(
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
 
-    The tool may be the image itself, as in ``ImageToReference``: poses are then the nearest rigid ones. A
-    pose that is held both ways round, as two matrices that are not each other's inverses, is not valid.
+    The tool may be the image itself, as in ``ImageToReference``: poses are then the nearest rigid ones.
 
     Parameters
     ----------
@@ -108,17 +103,11 @@ def tracked_poses(
         if one not in there and _back(one) not in there:
             raise InvalidInputError(f"{path}: expected a transform {one}, got {', '.join(there) or 'none'}")
     matrices, faults = _column(path, frames, name)
-    pixels = None
+    pixels, chain = None, [name]
     if tool == names.image:
         matrices, own, pixels = _poses_of_pixels(path, name, matrices, faults)
     else:
         matrices, own = rigid(matrices)
-        if {name, _back(name)} <= {*there}:
-            back, _ = rigid(_column(path, frames, _back(name))[0])
-            off = np.abs(back @ matrices - np.eye(4)).max(axis=(1, 2))
-            own = [fault or ("" if ok else "that its inverse contradicts") for fault, ok in
-                   zip(own, off < _INVERSE_TOLERANCE, strict=True)]  # fmt: skip
-    chain = [name]
     if fixed != "none":
         world_from_reference, others = _column(path, frames, fixed)
         world_from_reference, odd = rigid(world_from_reference)
@@ -150,10 +139,9 @@ def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: s
     matrices = matrices[[not fault for fault in faults]]
     if not len(matrices):
         return None
-    off = np.abs(matrices - np.median(matrices, axis=0)).max(axis=(1, 2))
-    if off.max() > _FIXED_TOLERANCE * max(1.0, np.abs(matrices).max()):
-        where = f"{path}: {key}[{int(np.argmax(off))}]"
-        raise InvalidInputError(f"{where}: expected that of the other frames, got one {off.max():.3g} off")
+    off = np.ptp(matrices, axis=0).max()
+    if off > _FIXED_TOLERANCE * max(1.0, np.abs(matrices).max()):
+        raise InvalidInputError(f"{path}: {key}: expected one for all frames, got some {off:.3g} apart")
     first: FloatArray = matrices[0]
     return first
 
@@ -283,25 +271,23 @@ def _poses_of_pixels(
     path: str, name: str, matrices: FloatArray, missing: list[str]
 ) -> tuple[FloatArray, list[str], FloatArray | None]:
     """Split transforms of pixels to mm into the image's poses and its pixels, the same in all frames."""
-    poses, sizes = np.tile(np.eye(4), (len(matrices), 1, 1)), np.full((len(matrices), 3), np.nan)
-    faults, first = [""] * len(matrices), None
-    for i, matrix in enumerate(matrices):
-        if missing[i]:
-            continue
-        where = f"{path}: {name}Transform[{i}]"
+    poses, faults, first = np.tile(np.eye(4), (len(matrices), 1, 1)), [""] * len(matrices), None
+    for i in [i for i, fault in enumerate(missing) if not fault]:
         try:
-            poses[i] = sensor_from_image(matrix, 0.0, where).as_matrix()
-            sizes[i] = *pixel_axes(matrix, where), 1.0 + image_skew_rad(matrix, where)
+            poses[i] = sensor_from_image(matrices[i], 0.0, f"{path}: {name}Transform[{i}]").as_matrix()
         except InvalidInputError as error:
             faults[i], first = "whose pixels make no sense", first or error
-    held = np.isfinite(sizes).all(axis=1)
-    if not held.any():
+    rows = np.array([not (fault or other) for fault, other in zip(faults, missing, strict=True)])
+    if not rows.any():
         if first is not None:
             raise first
         return poses, faults, None
-    middle = np.median(sizes[held], axis=0)
-    held &= (np.abs(sizes / middle - 1.0) <= ROUNDING_TOLERANCE).all(axis=1)
+    sizes = np.linalg.norm(matrices[:, :3, :2], axis=1)
+    middle = np.median(sizes[rows], axis=0)
+    odd = rows & (np.abs(sizes / middle - 1.0) > ROUNDING_TOLERANCE).any(axis=1)
     other = f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
-    faults = [fault or ("" if same else other) for fault, same in zip(faults, held, strict=True)]
-    column_mm, row_mm, leaning = sizes[held].mean(axis=0).tolist()
-    return poses, faults, image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning - 1.0)
+    faults = [fault or (other if is_odd else "") for fault, is_odd in zip(faults, odd, strict=True)]
+    same = rows & ~odd
+    leaning = np.mean([image_skew_rad(matrix, path) for matrix in matrices[same]])
+    column_mm, row_mm = sizes[same].mean(axis=0).tolist()
+    return poses, faults, image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, float(leaning))

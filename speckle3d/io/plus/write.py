@@ -9,10 +9,7 @@ References
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -20,17 +17,23 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.parts import cannot_write
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
+from speckle3d.io.deflate import GZIP, ZLIB, packer
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
-from speckle3d.io.headers import NRRD_NAMES, read_header
+from speckle3d.io.headers import (
+    NRRD_NAMES,
+    header_bytes,
+    meta_start,
+    meta_type,
+    nrrd_type,
+    put_packed_size,
+    read_header,
+)
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.pixels import meta_type, nrrd_type
 from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
 from speckle3d.io.text import numbers
@@ -40,12 +43,6 @@ SUFFIXES = (".mha", ".mhd", ".nrrd")
 
 _OF_SLICER = ".seq.nrrd"
 """With four axes, the last of them the frames, as 3D Slicer reads it [3]_; other NRRD files have three."""
-
-_LEVEL = 1
-"""Speckle hardly compresses further at higher levels, which cost several times the time."""
-
-_ZLIB, _GZIP = 15, 31
-"""Windows of deflate, and by them what is around it."""
 
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 
@@ -73,28 +70,6 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
             values = numbers(text, count, f"{path}: {key}")
             own[name] = values if count == 2 else values[0]
     return own
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Fields of the header to be written: of the whole file, and of each frame."""
-
-    fields: dict[str, str]
-    frames: list[dict[str, str]]
-
-    @classmethod
-    def of_times(cls, times_s: FloatArray) -> _Rows:
-        return cls({}, [{"Timestamp": _text(time)} for time in times_s.tolist()])
-
-    def add(self, name: str, matrices: FloatArray, valid: BoolArray | None = None) -> None:
-        """Give each frame a transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
-        if matrices.shape != (len(self.frames), 4, 4):
-            raise InvalidInputError(
-                f"{name}: expected shape ({len(self.frames)}, 4, 4), got {matrices.shape}"
-            )
-        for i, (frame, matrix) in enumerate(zip(self.frames, matrices, strict=True)):
-            frame[f"{name}Transform"] = " ".join(map(_text, matrix.ravel()))
-            frame[f"{name}TransformStatus"] = "OK" if valid is None or valid[i] else "INVALID"
 
 
 def write_sequence(
@@ -137,24 +112,47 @@ def write_sequence(
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}, got {suffix!r}")
-    rows, omitted = _rows_of(sweep)
+    fields, frames = _standard_fields(sweep), _timed(sweep.frame_time_s)
+    omitted = _add_sensors(frames, sweep)
     for name, matrices in (transforms or {}).items():
-        rows.add(name, matrices)
-        rows.fields["ElementSpacing"] = "1 1 1"
-    layout = Layout(rows.fields["UltrasoundImageType"], rows.fields["UltrasoundImageOrientation"])
-    images = _Images(sweep, layout, progress)
+        _add(frames, name, matrices)
+        fields["ElementSpacing"] = "1 1 1"
+    layout = Layout(fields["UltrasoundImageType"], fields["UltrasoundImageOrientation"])
+    dtype = sweep.frames.dtype
+    if dtype.kind == "c":
+        dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
+    y, x = layout.pixels(sweep.frames[0]).shape
+    shape, kind = (x, y, len(sweep)), meta_type(dtype)
+
+    def write_images(file: BinaryIO, window: int) -> int:
+        """Write all images and return how many bytes that took."""
+        pack, size = packer(window) if compressed else None, 0
+        for i in range(len(sweep)):
+            raw = layout.pixels(sweep.frames[i]).astype(dtype.newbyteorder("<"), order="C").data.cast("B")
+            size += file.write(raw if pack is None else pack.compress(raw))
+            if progress is not None:
+                progress(i + 1, len(sweep))
+        return size + (0 if pack is None else file.write(pack.flush()))
+
     if suffix == ".mhd":
-        _write_two_files(target, images, rows, compressed)
+        beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
+        data = target.with_name(beside)
+        if data.exists() and not (target.exists() and read_header(target).data == data.resolve()):
+            raise InvalidInputError(f"{data}: is there and no part of {target.name}: give another name")
+        with FileSet(target.name, (beside,)).replaced(target.parent) as part:
+            with (part / beside).open("wb") as file:
+                size = write_images(file, ZLIB)
+            packed = size if compressed else None
+            (part / target.name).write_bytes(_meta_header(fields, frames, shape, kind, beside, packed))
         return omitted
-    is_slicers = target.name.lower().endswith(_OF_SLICER)
+    head = _meta_header(fields, frames, shape, kind, "LOCAL", 0 if compressed else None)
     if suffix == ".nrrd":
-        head = _nrrd_header(images, rows, "gzip" if compressed else "raw", is_slicers)
-    else:
-        kind = meta_type(images.dtype)
-        head = _meta_header(rows, images.shape, kind, "LOCAL", 0 if compressed else None)
-    with atomic_path(target) as part, part.open("wb") as file:
+        is_slicers = target.name.lower().endswith(_OF_SLICER)
+        encoding = "gzip" if compressed else "raw"
+        head = _nrrd_header(fields, frames, shape, nrrd_type(dtype), encoding, is_slicers)
+    with atomic_path(target) as place, place.open("wb") as file:
         file.write(head)
-        size = images.write(file, (_GZIP if suffix == ".nrrd" else _ZLIB) if compressed else None)
+        size = write_images(file, GZIP if suffix == ".nrrd" else ZLIB)
         if compressed and suffix == ".mha":
             put_packed_size(file, head, size)
     return omitted
@@ -176,18 +174,31 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     FileError
         If the file cannot be written.
     """
-    rows = _Rows.of_times(times_s)
+    frames = _timed(times_s)
     for name, matrices in transforms.items():
-        rows.add(name, matrices)
+        _add(frames, name, matrices)
     with atomic_path(path) as part:
-        part.write_bytes(_meta_header(rows, (0, 0, len(rows.frames)), "UCHAR", "LOCAL", None))
+        part.write_bytes(_meta_header({}, frames, (0, 0, len(frames)), "UCHAR", "LOCAL", None))
 
 
-def _rows_of(sweep: Sweep) -> tuple[_Rows, list[str]]:
-    """Fields of a sweep's sequence, and what a sequence does not hold of it."""
-    times, grid, count = sweep.frame_time_s, sweep.grid, len(sweep)
-    rows, omitted = _Rows.of_times(times), list[str]()
-    for frame in rows.frames:
+def _timed(times_s: FloatArray) -> list[dict[str, str]]:
+    """Fields of each frame, with its time."""
+    return [{"Timestamp": _text(time)} for time in times_s.tolist()]
+
+
+def _add(
+    frames: list[dict[str, str]], name: str, matrices: FloatArray, valid: BoolArray | None = None
+) -> None:
+    """Give each frame a transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
+    for i, (frame, matrix) in enumerate(zip(frames, matrices, strict=True)):
+        frame[f"{name}Transform"] = " ".join(map(_text, matrix.ravel()))
+        frame[f"{name}TransformStatus"] = "OK" if valid is None or valid[i] else "INVALID"
+
+
+def _add_sensors(frames: list[dict[str, str]], sweep: Sweep) -> list[str]:
+    """Give each frame the sensors' poses, and tell what a sequence does not hold of the sweep."""
+    times, grid, omitted = sweep.frame_time_s, sweep.grid, list[str]()
+    for frame in frames:
         frame["ImageStatus"] = "OK"
     sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
     sensors: tuple[tuple[Tracker | OrientationSensor | None, str, str], ...] = (
@@ -197,27 +208,24 @@ def _rows_of(sweep: Sweep) -> tuple[_Rows, list[str]]:
         if sensor is None:
             continue
         at = times - sensor.time_offset_s
-        covered = sensor.readings.covers(at)
-        matrices = np.tile(np.eye(4), (count, 1, 1))
+        covered, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (len(frames), 1, 1))
         if covered.any():
             posed = sensor.readings.at(at[covered]).as_matrix()
             size = posed.shape[-1]  # 3 of rotations
             matrices[np.flatnonzero(covered), :size, :size] = posed
-        rows.add(f"{own}To{world}", matrices, covered)
+        _add(frames, f"{own}To{world}", matrices, covered)
         if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[covered]):
             omitted.append(
                 f"the {sensor.label}'s {len(sensor.readings)} readings with all that it measured: "
-                f"{np.count_nonzero(covered)} interpolated ones are at the times of {count} frames"
+                f"{np.count_nonzero(covered)} interpolated ones are at the times of {len(frames)} frames"
             )
         if (mounting := sensor.sensor_from_image) is not None:
             if isinstance(mounting, Rotation):
                 mounting = RigidTransform.from_rotation(mounting)
             skew_rad = sensor.image_skew_rad if isinstance(sensor, Tracker) else 0.0
-            rows.add(f"{IMAGE}To{own}", np.tile(image_matrix(mounting, *sizes, skew_rad), (count, 1, 1)))
-    if sweep.truth is not None:
-        omitted.append("the true poses")
-    rows.fields.update(_standard_fields(sweep))
-    return rows, omitted
+            pixels = image_matrix(mounting, *sizes, skew_rad)
+            _add(frames, f"{IMAGE}To{own}", np.tile(pixels, (len(frames), 1, 1)))
+    return omitted if sweep.truth is None else [*omitted, "the true poses"]
 
 
 def _standard_fields(sweep: Sweep) -> dict[str, str]:
@@ -254,111 +262,49 @@ def _text(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
-@dataclass(frozen=True)
-class _Images:
-    """Pixels to write."""
-
-    sweep: Sweep
-    layout: Layout
-    progress: Progress | None
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the numbers, of I and Q each."""
-        dtype = self.sweep.frames.dtype
-        if dtype.kind != "c":
-            return dtype
-        return np.dtype(np.int16 if stored_dtype(self.sweep.frames) == np.int16 else np.float32)
-
-    @cached_property
-    def shape(self) -> tuple[int, int, int]:
-        """Lengths of the axes, fastest first."""
-        y, x = self.layout.pixels(self.sweep.frames[0]).shape
-        return x, y, len(self.sweep)
-
-    def write(self, file: BinaryIO, window: int | None) -> int:
-        """Write all images, packed if there is a window, and return how many bytes that took."""
-        packer = None if window is None else _packer(window)
-        size = 0
-        for i in range(len(self.sweep)):
-            image = self.layout.pixels(self.sweep.frames[i])
-            raw = image.astype(self.dtype.newbyteorder("<"), order="C").data.cast("B")
-            size += file.write(raw if packer is None else packer.compress(raw))
-            if self.progress is not None:
-                self.progress(i + 1, len(self.sweep))
-        return size if packer is None else size + file.write(packer.flush())
+def _frame_lines(frames: list[dict[str, str]], sign: str) -> list[str]:
+    return [
+        f"Seq_Frame{i:04d}_{name}{sign}{value}"
+        for i, frame in enumerate(frames)
+        for name, value in frame.items()
+    ]
 
 
-def _packer(window: int) -> Any:
-    """Return ISA-L's packer, or zlib's where that has no wheel."""
-    try:
-        from isal import isal_zlib
-    except ImportError:
-        return zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
-    return isal_zlib.compressobj(_LEVEL, zlib.DEFLATED, window)
-
-
-def _write_two_files(target: Path, images: _Images, rows: _Rows, compressed: bool) -> None:
-    """Write a header and the file of its pixels, both or none."""
-    beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
-    data = target.with_name(beside)
-    if data.exists() and not (target.exists() and read_header(target).pixels.path == data.resolve()):
-        raise InvalidInputError(f"{data}: is there and no part of {target.name}: give another name")
-    others = {f"{target.stem}.{suffix}" for suffix in ("raw", "zraw")} - {beside}
-    old = tuple(others & ({read_header(target).pixels.path.name} if target.exists() else set()))
-    with FileSet(target.name, (beside,), old).replaced(target.parent) as part:
-        try:
-            with (part / beside).open("wb") as file:
-                size = images.write(file, _ZLIB if compressed else None)
-            packed = size if compressed else None
-            head = _meta_header(rows, images.shape, meta_type(images.dtype), beside, packed)
-            (part / target.name).write_bytes(head)
-        except Speckle3DError:
-            raise
-        except OSError as error:
-            raise cannot_write(target, error) from error
-
-
-def _frame_lines(rows: _Rows, sign: str) -> Iterator[str]:
-    for i, frame in enumerate(rows.frames):
-        yield from (f"Seq_Frame{i:04d}_{name}{sign}{value}" for name, value in frame.items())
-
-
-def _meta_header(rows: _Rows, shape: tuple[int, int, int], kind: str, data: str, packed: int | None) -> bytes:
-    fields = {"ElementSpacing": "1 1 1", **rows.fields}
+def _meta_header(
+    fields: dict[str, str],
+    frames: list[dict[str, str]],
+    shape: tuple[int, int, int],
+    kind: str,
+    data: str,
+    packed: int | None,
+) -> bytes:
     lines = [
-        *meta_start(3, packed),
+        *meta_start(packed),
         f"DimSize = {_spaced(shape)}",
         f"ElementType = MET_{kind}",
         "Kinds = domain domain list",
-        *(f"{name} = {value}" for name, value in fields.items()),
-        *_frame_lines(rows, " = "),
+        *(f"{name} = {value}" for name, value in {"ElementSpacing": "1 1 1", **fields}.items()),
+        *_frame_lines(frames, " = "),
         f"ElementDataFile = {data}",
     ]
     return header_bytes(lines)
 
 
-def _nrrd_header(images: _Images, rows: _Rows, encoding: str, is_slicers: bool) -> bytes:
-    fields = dict(rows.fields)
-    x, y, *_ = fields.pop("ElementSpacing").split()
-    lines = [
-        "NRRD0004",
-        f"type: {nrrd_type(images.dtype)}",
-        *(_slicers_axes if is_slicers else _axes)(images.shape, x, y),
-        "endian: little",
-        f"encoding: {encoding}",
-        *(f"{_NRRD_NAMES.get(name, name)}:={value}" for name, value in fields.items()),
-        *_frame_lines(rows, ":="),
-        # Slicer reads the transforms up to the first line of more than 1,000 characters.
-        *(_slicers_index(rows) if is_slicers else ()),
-        "",
-    ]
-    return header_bytes(lines)
+def _nrrd_header(
+    fields: dict[str, str],
+    frames: list[dict[str, str]],
+    shape: tuple[int, int, int],
+    kind: str,
+    encoding: str,
+    is_slicers: bool,
+) -> bytes:
+    """Header of images with an axis of frames: in a plane, as PLUS writes them, or as Slicer's.
 
-
-def _axes(shape: tuple[int, int, int], x: str, y: str) -> list[str]:
-    """Axes of an image, and one of frames, in a plane: as PLUS writes them."""
-    return [
+    Slicer's are one pixel thick in space; transforms count pixels from its origin.
+    """
+    plain = dict(fields)
+    x, y, *_ = plain.pop("ElementSpacing").split()
+    axes = [
         "dimension: 3",
         "space dimension: 2",
         f"sizes: {_spaced(shape)}",
@@ -366,32 +312,42 @@ def _axes(shape: tuple[int, int, int], x: str, y: str) -> list[str]:
         "kinds: domain domain list",
         "space origin: (0,0)",
     ]
-
-
-def _slicers_axes(shape: tuple[int, int, int], x: str, y: str) -> list[str]:
-    """Axes of images one pixel thick in space, and one of frames; transforms count pixels from its origin."""
-    return [
-        "dimension: 4",
-        "space: right-anterior-superior",
-        f"sizes: {shape[0]} {shape[1]} 1 {shape[2]}",
-        f"space directions: ({x},0,0) (0,{y},0) (0,0,1) none",
-        "kinds: domain domain domain list",
-        'labels: "" "" "" "time"',
-        'units: "" "" "" "s"',
-        "space origin: (0,0,0)",
+    index = []
+    if is_slicers:
+        axes = [
+            "dimension: 4",
+            "space: right-anterior-superior",
+            f"sizes: {shape[0]} {shape[1]} 1 {shape[2]}",
+            f"space directions: ({x},0,0) (0,{y},0) (0,0,1) none",
+            "kinds: domain domain domain list",
+            'labels: "" "" "" "time"',
+            'units: "" "" "" "s"',
+            "space origin: (0,0,0)",
+        ]
+        # Slicer finds what belongs together by frames' times; it rounds those of transforms to 1 ms.
+        times = [f"{float(frame['Timestamp']):.3f}" for frame in frames]
+        told = _spaced(times if len({*times}) == len(times) else range(len(times)))
+        # Up to version 5.6 Slicer knew the axis of frames as the first.
+        index = [
+            line
+            for axis in (3, 0)
+            for line in (f"axis {axis} index type:=numeric", f"axis {axis} index values:={told}")
+        ]
+        index.insert(0, "DataNodeClassName:=vtkMRMLScalarVolumeNode")
+    lines = [
+        "NRRD0004",
+        f"type: {kind}",
+        *axes,
+        "endian: little",
+        f"encoding: {encoding}",
+        *(f"{_NRRD_NAMES.get(key, key)}:={value}" for key, value in plain.items()),
+        *_frame_lines(frames, ":="),
+        # Slicer reads the transforms up to the first line of more than 1,000 characters.
+        *index,
+        "",
     ]
+    return header_bytes(lines)
 
 
 def _spaced(values: Iterable[object]) -> str:
     return " ".join(map(str, values))
-
-
-def _slicers_index(rows: _Rows) -> Iterator[str]:
-    """Frames' times, by which Slicer finds what belongs together; it rounds those of transforms to 1 ms."""
-    yield "DataNodeClassName:=vtkMRMLScalarVolumeNode"
-    times = [f"{float(frame['Timestamp']):.3f}" for frame in rows.frames]
-    index = " ".join(times if len({*times}) == len(times) else map(str, range(len(times))))
-    # Up to version 5.6 Slicer knew the axis of frames as the first.
-    for axis in (3, 0):
-        yield f"axis {axis} index type:=numeric"
-        yield f"axis {axis} index values:={index}"

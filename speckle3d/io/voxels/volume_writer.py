@@ -11,24 +11,19 @@ References
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import InvalidInputError, MismatchError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
-from speckle3d.core.labels import LabelMap, Segment
+from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.deflate import GZIP, ZLIB, packer
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.header_text import header_bytes, meta_start, put_packed_size
-from speckle3d.io.pixels import meta_type, nrrd_type
+from speckle3d.io.headers import header_bytes, meta_start, meta_type, nrrd_type, put_packed_size
 from speckle3d.io.text import unescaped
 from speckle3d.io.voxels.nifti import nifti_header
 from speckle3d.io.voxels.segments import segment_fields
@@ -47,7 +42,8 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     """Write a volume whole or not at all; the suffix chooses the format.
 
-    As `VolumeWriter` does it, with what the labels of a `LabelMap` mean.
+    World axes are written as left, posterior, superior, in mm: NRRD says so, MetaImage means it, and NIfTI
+    has the first two reversed (right, anterior, superior). Numbers are little-endian.
 
     Parameters
     ----------
@@ -91,103 +87,8 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
                 put_packed_size(file, header, file.tell() - len(header))
 
 
-class VolumeWriter:
-    """Takes the planes of a volume in a block and writes it as `write_volume` does when the block ends.
-
-    World axes are written as left, posterior, superior, in mm: NRRD says so, MetaImage means it, and NIfTI
-    has the first two reversed (right, anterior, superior). Numbers are little-endian.
-
-    Parameters
-    ----------
-    path : path
-        With a suffix of `SUFFIXES`.
-    shape : tuple of int
-        Number of voxels along i, j and k.
-    spacing_mm : tuple of float
-        Distance between neighbouring voxel centres along i, j and k.
-    world_from_grid : RigidTransform
-        Pose of the grid; its origin is the centre of voxel ``[0, 0, 0]``; mm.
-    dtype : dtype
-        uint8, int16, uint16 or float32.
-    fields : mapping of str to str, optional
-        What the file says of the voxels; `read_volume` gives it back.
-    compress : bool
-        Whether voxels are packed with deflate; of .nii.gz, they always are, of .nii never.
-    segments : sequence of Segment, optional
-        What labels mean; voxels are labels if this is given, even if it is empty.
-
-    Raises
-    ------
-    InvalidInputError
-        If an argument is not what it must be, naming the file.
-    FileError
-        If the file cannot be written; `NoSpaceError` if the disk is full.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from speckle3d.io.voxels.volumes import read_volume
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = f"{folder}/v.nrrd"
-    ...     with VolumeWriter(file, (4, 3, 2), (1, 1, 1), RigidTransform.identity(), "uint8") as writer:
-    ...         for k in range(2):
-    ...             writer.append(np.full((1, 3, 4), k, np.uint8))
-    ...     read_volume(file).voxels[0, 0].tolist()
-    [0, 1]
-    """
-
-    def __init__(
-        self,
-        path: PathLike,
-        shape: tuple[int, int, int],
-        spacing_mm: tuple[float, float, float],
-        world_from_grid: RigidTransform,
-        dtype: npt.DTypeLike,
-        fields: Mapping[str, str] | None = None,
-        compress: bool = True,
-        segments: Sequence[Segment] | None = None,
-    ) -> None:
-        self._path, self._compress, self._planes = Path(path), compress, 0
-        require_suffix(self._path, segments is not None)
-        with naming(str(path)):
-            voxels = np.zeros(shape, np.dtype(dtype).newbyteorder("="), order="F")
-            place = voxels, spacing_mm, world_from_grid, dict(fields or {})
-            self._volume = Volume(*place) if segments is None else LabelMap(*place, tuple(segments))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is None:
-            if self._planes != self._volume.shape[2]:
-                raise MismatchError(
-                    f"{self._path}: expected {self._volume.shape[2]} planes, got {self._planes}"
-                )
-            write_volume(self._path, self._volume, self._compress)
-
-    def append(self, planes: npt.NDArray[Any]) -> None:
-        """Take the next planes along k, shape (k, j, i), of the volume's type.
-
-        Raises
-        ------
-        MismatchError
-            If they are of another shape or type, or more than are left.
-        """
-        after = self._planes + len(planes)
-        target = self._volume.voxels.T[self._planes : after]
-        if planes.shape != target.shape or planes.dtype.newbyteorder("=") != target.dtype:
-            expected = f"planes of shape {target.shape}, {target.dtype}"
-            raise MismatchError(f"{self._path}: expected {expected}, got {planes.shape}, {planes.dtype}")
-        target[:] = planes
-        self._planes = after
-
-
 def _header(suffix: str, volume: Volume, is_packed: bool) -> bytes:
     """Header of a file up to its voxels."""
-    if not np.isfinite(volume.world_from_index).all():
-        raise InvalidInputError("world_from_grid: expected a finite pose, got another")
     for name in volume.fields:
         if not _NAME.fullmatch(name):
             raise InvalidInputError(
@@ -196,11 +97,7 @@ def _header(suffix: str, volume: Volume, is_packed: bool) -> bytes:
     plain = segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
     if ".nii" in suffix:
         return nifti_header(volume, {**volume.fields, **plain}, isinstance(volume, LabelMap))
-    matrix, shape, dtype = (
-        volume.world_from_index + 0.0,
-        volume.shape,
-        volume.voxels.dtype,
-    )  # no negative zeros
+    matrix, shape, dtype = volume.world_from_index + 0.0, volume.shape, volume.voxels.dtype  # no -0.0
     fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
     if suffix == ".nrrd":
         *steps, origin = (f"({_texts(column, ',')})" for column in matrix[:3].T)
@@ -221,7 +118,7 @@ def _header(suffix: str, volume: Volume, is_packed: bool) -> bytes:
         ]
         return header_bytes(lines)
     lines = [
-        *meta_start(3, 0 if is_packed else None),
+        *meta_start(0 if is_packed else None),
         f"TransformMatrix = {_texts((matrix[:3, :3] / volume.spacing_mm).T.ravel())}",
         f"Offset = {_texts(matrix[:3, 3])}",
         "CenterOfRotation = 0 0 0",

@@ -25,7 +25,6 @@ from speckle3d.io.headers import (
     read_header,
     space_unit_mm,
 )
-from speckle3d.io.pixels import map_pixels
 from speckle3d.io.text import numbers
 from speckle3d.io.voxels.nifti import is_nifti, read_nifti
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
@@ -105,7 +104,7 @@ def read_volume(path: PathLike) -> Volume:
             got = f"{len(header.size)} axes, {header.channels} number(s) a pixel"
             raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
         # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
-        voxels = np.array(map_pixels(header.pixels)).reshape(header.size[::-1]).T
+        voxels = np.array(header.numbers()).reshape(header.size[::-1]).T
         matrix = _world_from_index(header)
     else:
         raise InvalidInputError(
