@@ -23,13 +23,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite
 from speckle3d.io.hdf5 import PathLike, atomic_path
-from speckle3d.io.text import numbers, text_lines
-
-Row = tuple[int, tuple[float, float], int]
-"""Frame, column and row, wire."""
-
-_MOST_FRAMES = 2**31
-"""Two years at 30 frames/s."""
+from speckle3d.io.text import numbers, table
 
 _COLUMNS = ("frame", "column_px", "row_px")
 _WIRE = "wire"
@@ -94,35 +88,20 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
     InvalidInputError
         Naming the line.
     """
-    bare = ((number, line.partition("#")[0].strip()) for number, line in text_lines(path))
-    lines = ((number, [word.strip() for word in text.split(",")]) for number, text in bare if text)
-    number, heading = next(lines, (1, []))
-    columns, known = [word.lower() for word in heading], (*_COLUMNS, _WIRE)
-    if not set(_COLUMNS) <= set(columns) <= set(known) or len(set(columns)) < len(columns):
-        raise InvalidInputError(
-            f"{path}: line {number}: expected the heading {','.join(_COLUMNS)}[,{_WIRE}], got "
-            f"{','.join(heading)[:60]!r}"
-        )
-    rows: list[Row] = []
-    lines_seen: dict[tuple[int, int], int] = {}
-    for number, words in lines:
-        where = f"{path}: line {number}"
-        if len(words) != len(columns):
-            raise InvalidInputError(f"{where}: expected {len(columns)} values, got {len(words)}")
-        cell = dict(zip(columns, words, strict=True))
+    frames, pixels, wires = list[int](), list[tuple[float, float]](), list[int]()
+    for where, cell in table(path, _COLUMNS):
         frame, column, row = (numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS)
-        if not 0 <= frame < _MOST_FRAMES or frame != int(frame):
+        if frame < 0 or frame != int(frame):
             raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
-        wire = _wire(cell[_WIRE], wire_names, f"{where}: wire") if _WIRE in cell else 0
-        rows.append((int(frame), (column, row), wire))
-        seen = lines_seen.setdefault((int(frame), wire), number)
-        if seen != number and _WIRE in columns:
-            got = f"wire {wire} of frame {frame:g} as on line {seen}"
-            raise InvalidInputError(f"{where}: expected a wire once in a frame, got {got}")
-    if not rows:
+        frames.append(int(frame))
+        pixels.append((column, row))
+        if _WIRE in cell:
+            wires.append(_wire(cell[_WIRE], wire_names, f"{where}: wire"))
+            if (frames[-1], wires[-1]) in [*zip(frames, wires, strict=True)][:-1]:
+                raise InvalidInputError(f"{where}: expected a wire once in a frame, got {cell[_WIRE]} again")
+    if not frames:
         raise InvalidInputError(f"{path}: expected points below the heading, got none")
-    frames, pixels, wires = (np.array(column) for column in zip(*rows, strict=True))
-    return PickedPoints(frames, pixels, wires if _WIRE in columns else None)
+    return PickedPoints(np.array(frames), np.array(pixels), np.array(wires) if wires else None)
 
 
 def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str] = ()) -> None:
@@ -138,15 +117,17 @@ def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str]
     for name in wire_names:
         if name != name.strip() or not name or set(name) & set(",#\r\n"):
             raise InvalidInputError(f"wire: expected a name without comma, hash or line break, got {name!r}")
-    lines = [",".join(_COLUMNS if points.wire is None else (*_COLUMNS, _WIRE))]
+    named = _COLUMNS if points.wire is None else (*_COLUMNS, _WIRE)
+    if points.wire is not None and wire_names and points.wire.max(initial=0) >= len(wire_names):
+        raise InvalidInputError(
+            f"wire: expected one of {len(wire_names)} wires, got number {points.wire.max()}"
+        )
+    lines = [",".join(named)]
     for i, (frame, (column, row)) in enumerate(zip(points.frame, points.pixels, strict=True)):
-        words = [f"{frame}", f"{column:.3f}", f"{row:.3f}"]
+        line = f"{frame},{column:.3f},{row:.3f}"
         if points.wire is not None:
-            wire = int(points.wire[i])
-            if wire_names and wire >= len(wire_names):
-                raise InvalidInputError(f"wire: expected one of {len(wire_names)} wires, got number {wire}")
-            words.append(wire_names[wire] if wire_names else str(wire))
-        lines.append(",".join(words))
+            line += f",{wire_names[points.wire[i]] if wire_names else points.wire[i]}"
+        lines.append(line)
     with atomic_path(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import Sweep
@@ -29,9 +30,6 @@ _LEVER_MM = 50.0
 _MOST_JUMPING = 0.2
 """Share of poses after jumps, above which these are no faults of readings but how the probe was placed."""
 
-_MOST_PIECES = 2000
-"""Of a path cut at its jumps; with more it is no path."""
-
 _MOST_ALIKE, _MOST_TIMES = 3, 3
 """Poses in a row that are the same to the last digit: a tracker's noise alone changes them, and 2 of 5,000 at
 hand are alike. Of a tracker slower than the images, runs are regular: three times their median is odd."""
@@ -46,17 +44,13 @@ def rising(times: FloatArray) -> IntArray:
 
     Of equal times the first one stays (patience sorting).
     """
-    tails: list[float] = []
-    last: list[int] = []
-    before = np.full(times.size, -1)
+    tails, last, before = list[float](), list[int](), np.full(times.size + 1, -1)
     for i in np.flatnonzero(np.isfinite(times)).tolist():
-        place = int(np.searchsorted(tails, times[i])) if tails and times[i] <= tails[-1] else len(tails)
+        place = bisect_left(tails, times[i])
+        if place < len(tails) and tails[place] == times[i]:
+            continue
         before[i] = last[place - 1] if place else -1
-        if place == len(tails):
-            tails.append(times[i])
-            last.append(i)
-        elif times[i] < tails[place]:
-            tails[place], last[place] = times[i], i
+        tails[place : place + 1], last[place : place + 1] = [times[i]], [i]
     chosen, i = [], last[-1] if last else -1
     while i >= 0:
         chosen.append(i)
@@ -107,12 +101,14 @@ def timed_poses(
 def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
     """Make rounded rotations exact; a matrix farther off becomes the identity, with the reason."""
     r, bottom = matrices[:, :3, :3], matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2))
-        near = np.maximum(off, np.abs(bottom).max(axis=1)) < ROUNDING_TOLERANCE
     finite = np.isfinite(matrices).all(axis=(1, 2))
-    near &= finite
-    near[near] = np.linalg.det(r[near]) > 0
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.maximum(
+            np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)), np.abs(bottom).max(axis=1)
+        )
+        near = (
+            finite & (off < ROUNDING_TOLERANCE) & (np.linalg.det(np.where(finite[:, None, None], r, 0.0)) > 0)
+        )
     exact = np.tile(np.eye(4), (len(r), 1, 1))
     exact[near, :3, 3] = matrices[near, :3, 3]
     exact[near, :3, :3] = nearest_rotation(r[near])
@@ -171,57 +167,34 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     Where that leaves out more than a fifth, poses are single placements and not a path: all stay.
     """
     matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
-    points = _points(matrices)
-    moved, steps = _apart(points[1:], points[:-1]), np.diff(time_s)
-    jumps = np.flatnonzero(moved > _reach(steps))
+    origin = matrices[:, None, :3, 3]
+    points = np.concatenate([origin, origin + _LEVER_MM * matrices[:, :3, :3].transpose(0, 2, 1)], axis=1)
+
+    def is_jump(i: IntArray, k: IntArray) -> BoolArray:
+        moved = np.linalg.norm(points[i] - points[k], axis=-1).max(axis=-1)
+        return np.asarray(moved > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k]))
+
+    numbers = np.arange(len(readings))
+    jumps = numbers[1:][is_jump(numbers[1:], numbers[:-1])]
     if not jumps.size:
         return readings, []
-    worst = int(jumps[0])
-    told = f"{moved[worst]:.3g} mm in {1e3 * steps[worst]:.3g} ms at {time_s[worst + 1]:.3f} s"
     # A tool that is lost is often written as the identity: such pieces count for nothing.
-    weight = (matrices != np.eye(4)).any(axis=(1, 2)).astype(float)
-    rows = _largest_chain(points, time_s, np.split(np.arange(len(readings)), jumps + 1), weight)
+    pieces = [piece for piece in np.split(numbers, jumps) if (matrices[piece] != np.eye(4)).any()]
+    largest = max(range(len(pieces)), key=lambda k: pieces[k].size, default=-1)
+    rows = pieces[largest] if pieces else numbers[:0]
+    for piece in pieces[largest + 1 :]:
+        rows = rows if is_jump(piece[:1], rows[-1:]) else np.append(rows, piece)
+    for piece in pieces[:largest][::-1]:
+        rows = rows if is_jump(piece[-1:], rows[:1]) else np.append(piece, rows)
+    worst = int(jumps[0])
+    moved_mm = np.linalg.norm(points[worst] - points[worst - 1], axis=-1).max()
+    told = f"{moved_mm:.3g} mm in {1e3 * (time_s[worst] - time_s[worst - 1]):.3g} ms at {time_s[worst]:.3f} s"
     if rows.size < (1.0 - _MOST_JUMPING) * len(readings):
         return readings, [f"poses: {jumps.size} jumps that no hand makes, as {told}: all are kept"]
-    reasons = {f"after jumps, as {told}": len(readings) - rows.size}
-    notes = left_out("poses", len(readings), reasons, time_s[rows])
+    notes = left_out(
+        "poses", len(readings), {f"after jumps, as {told}": len(readings) - rows.size}, time_s[rows]
+    )
     return replace(readings, time_s=time_s[rows], world_from_sensor=readings.world_from_sensor[rows]), notes
-
-
-def _largest_chain(
-    points: FloatArray, time_s: FloatArray, pieces: list[IntArray], weight: FloatArray
-) -> IntArray:
-    """Rows of the pieces that follow each other within reach and weigh the most; none of too many."""
-    if len(pieces) > _MOST_PIECES:
-        return np.array([], dtype=int)
-    starts, ends = np.array([(piece[0], piece[-1]) for piece in pieces]).T
-    sizes = np.array([weight[piece].sum() for piece in pieces])
-    best, before = sizes.copy(), np.full(len(pieces), -1)
-    for k in range(1, len(pieces)):
-        apart = _apart(points[starts[k]], points[ends[:k]])
-        within = np.flatnonzero(apart <= _reach(time_s[starts[k]] - time_s[ends[:k]]))
-        if within.size:
-            before[k] = within[np.argmax(best[within])]
-            best[k] += best[before[k]]
-    chain, k = [np.array([], dtype=int)], int(np.argmax(best))
-    while k >= 0:
-        chain += [pieces[k]] if sizes[k] else []
-        k = int(before[k])
-    return np.concatenate(chain[::-1])
-
-
-def _points(matrices: FloatArray) -> FloatArray:
-    """The sensor's origin and three points beside it, shape (m, 4, 3)."""
-    origin = matrices[:, None, :3, 3]
-    return np.concatenate([origin, origin + _LEVER_MM * matrices[:, :3, :3].transpose(0, 2, 1)], axis=1)
-
-
-def _apart(points: FloatArray, others: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(points - others, axis=-1).max(axis=-1))
-
-
-def _reach(time_s: FloatArray) -> FloatArray:
-    return _SLACK_MM + _FASTEST_MM_S * time_s
 
 
 def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -42,6 +42,30 @@ def numbers(text: str, count: int | None, where: str) -> tuple[float, ...]:
         shown = text if len(text) <= 40 else f"{text[:37]}..."
         raise InvalidInputError(f"{where}: expected {count or 'some'} finite number(s), got {shown!r}")
     return values
+
+
+def table(path: PathLike, columns: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the place and the cells of every row of comma-separated text, by the names in its first line.
+
+    What follows a hash is a comment; columns may be more than those asked for, in any order.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        If a column is missing, or a row has more or fewer cells than the heading.
+    """
+    lines = ((number, line.partition("#")[0].strip()) for number, line in text_lines(path))
+    rows = ((number, [cell.strip() for cell in text.split(",")]) for number, text in lines if text)
+    _, heading = next(rows, (0, ["nothing"]))
+    if not {*columns} <= {*heading}:
+        raise InvalidInputError(f"{path}: expected columns {','.join(columns)}, got {','.join(heading)}")
+    for number, cells in rows:
+        where = f"{path}: line {number}"
+        if len(cells) != len(heading):
+            raise InvalidInputError(f"{where}: expected {len(heading)} values, got {len(cells)}")
+        yield where, dict(zip(heading, cells, strict=True))
 
 
 def unescaped(text: str) -> str:

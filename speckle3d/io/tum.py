@@ -17,7 +17,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path
 from speckle3d.io.pose_paths import usable
-from speckle3d.io.text import numbers, text_lines
+from speckle3d.io.text import text_lines
 
 LengthUnit = Literal["m", "mm"]
 
@@ -67,52 +67,47 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         If the file says another unit, or most lines are not eight finite numbers. Lines of no use, and poses
         whose time is not after the one before, are left out with a warning that counts them.
     """
-    lines, faults, first, said = list[tuple[float, ...]](), list[str](), None, None
-    # Line by line, so that an error names the line: 17 us each, where `np.loadtxt` takes 4.
-    for n, text in text_lines(path):
-        if _is_comment(text):
-            said = said or (None if lines else _unit_of(text))
-            continue
-        try:
-            lines.append(numbers(text, _COLUMNS, f"{path}: line {n}"))
-            faults.append("")
-        except InvalidInputError as error:
-            first = first or error
-            lines.append((np.nan,) * _COLUMNS)
-            faults.append("that are not eight finite numbers")
-    rows = np.array(lines).reshape(-1, _COLUMNS)
-    if 2 * faults.count("") <= len(faults):
-        raise first or InvalidInputError(f"{path}: expected lines of eight numbers, got none")
+    rows, said = list[list[float]](), None
+    for _, text in text_lines(path):
+        if text.startswith("#"):
+            said = said or (None if rows else _unit_of(text))
+        else:
+            rows.append(_eight(text))
+    table = np.array(rows).reshape(-1, _COLUMNS)
+    finite = np.isfinite(table).all(axis=1)
+    if 2 * np.count_nonzero(finite) <= len(table):
+        got = f"{np.count_nonzero(finite)} of {len(table)}"
+        raise InvalidInputError(f"{path}: expected lines of eight finite numbers, got {got}")
     if length_unit is not None and said is not None and said != length_unit:
         raise InvalidInputError(f"{path}: expected lengths in {length_unit}, got a file that says {said}")
-    with np.errstate(over="ignore"):
-        norms = np.linalg.norm(rows[:, 4:], axis=1)
-        places_mm = rows[:, 1:4] * _mm_per(length_unit or said or "m")
-    sound = (np.abs(norms - 1.0) <= _UNIT_TOLERANCE) & np.isfinite(places_mm).all(axis=1)
-    faults = [
-        fault or ("" if ok else "without a unit quaternion") for fault, ok in zip(faults, sound, strict=True)
-    ]
-    kept, notes = usable(f"{path}: poses", rows[:, 0], faults)
+    sound = np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1.0) <= _UNIT_TOLERANCE
+    words = np.where(finite, np.where(sound, "", "without a unit quaternion"), "that are not eight numbers")
+    kept, notes = usable(f"{path}: poses", table[:, 0], words.tolist())
     if not kept.size:
-        raise InvalidInputError(f"{path}: pose 0: expected a unit quaternion, got norm {norms[0]:.4g}")
+        raise InvalidInputError(f"{path}: expected poses with a time and a unit quaternion, got none")
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    poses = RigidTransform.from_components(places_mm[kept], Rotation.from_quat(rows[kept, 4:]))
-    return TimedPoses(rows[kept, 0].copy(), poses)
+    places_mm = table[kept, 1:4] * _mm_per(length_unit or said or "m")
+    poses = RigidTransform.from_components(places_mm, Rotation.from_quat(table[kept, 4:]))
+    return TimedPoses(table[kept, 0].copy(), poses)
 
 
 def is_tum(path: PathLike) -> bool:
     """Whether a file's first line that is no comment is eight numbers."""
     try:
-        number, first = next(line for line in text_lines(path) if not _is_comment(line[1]))
-        numbers(first, _COLUMNS, f"{path}: line {number}")
-    except (FileError, InvalidInputError, StopIteration):
+        first = next((text for _, text in text_lines(path) if not text.startswith("#")), "")
+    except (FileError, InvalidInputError):
         return False
-    return True
+    return bool(np.isfinite(_eight(first)).all())
 
 
-def _is_comment(line: str) -> bool:
-    return line.startswith("#")
+def _eight(text: str) -> list[float]:
+    """Numbers of a line; NaN where they are no eight."""
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    return values if len(values) == _COLUMNS else [np.nan] * _COLUMNS
 
 
 def _unit_of(comment: str) -> LengthUnit | None:

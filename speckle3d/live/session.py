@@ -93,7 +93,7 @@ class Session:
     Parameters
     ----------
     source : Source
-        As `speckle3d.io.igtl.connection.Connection`.
+        As `speckle3d.io.igtl.link.Connection`.
     send : sequence of callable
         Each is given every message to send; none may wait.
     curves : DecorrelationCurves

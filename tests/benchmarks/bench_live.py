@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 import speckle3d as s3
-from speckle3d.io.igtl.connection import Connection
+from speckle3d.io.igtl.link import Connection, Server
 from speckle3d.io.igtl.messages import TransformReceived, packed_image
-from speckle3d.io.igtl.server import Server
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.session import Session, SessionSettings
 from speckle3d.live.warming import warm_up

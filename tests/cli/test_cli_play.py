@@ -10,7 +10,7 @@ import pytest
 import sweep_examples
 from commands import command
 
-from speckle3d.io.igtl.connection import Connection
+from speckle3d.io.igtl.link import Connection
 from speckle3d.io.igtl.messages import ImageReceived
 from speckle3d.io.sweep_writer import write_sweep
 

@@ -12,13 +12,12 @@ from pyigtl.messages import MessageBase
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.igtl import link
-from speckle3d.io.igtl.connection import Connection
+from speckle3d.io.igtl.link import Connection, Server
 from speckle3d.io.igtl.messages import (
     MessageError,
     packed_image,
     packed_transform,
 )
-from speckle3d.io.igtl.server import Server
 
 WAIT_S = 60.0
 # Places are single precision in messages.

@@ -134,8 +134,7 @@ def live(
     """
     require_extra("live", "live", "pyigtl", "fastcrc")
     from speckle3d.io.curves import read_curves
-    from speckle3d.io.igtl.connection import Connection
-    from speckle3d.io.igtl.server import Server
+    from speckle3d.io.igtl.link import Connection, Server
     from speckle3d.io.import_settings import ImportSettings
     from speckle3d.io.load import load_sweep
     from speckle3d.live.crossing import CrossingCheck

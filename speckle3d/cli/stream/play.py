@@ -68,8 +68,8 @@ def play(
     $ speckle3d play sweep.h5 --loop
     """
     require_extra("live", "play", "pyigtl", "fastcrc")
+    from speckle3d.io.igtl.link import Server
     from speckle3d.io.igtl.played import Names, clock_shift_s, played
-    from speckle3d.io.igtl.server import Server
     from speckle3d.io.load import load_sweep
 
     read = load_sweep(images)

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import ComplexArray, FloatArray
+from speckle3d.core.arrays import ComplexArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.io.clarius.package import Member
-from speckle3d.io.clarius.sidecars import Curve, Description
+from speckle3d.io.clarius.sidecars import Description
 from speckle3d.io.frames import ReadFrame
 from speckle3d.io.hdf5 import reading
 
@@ -51,8 +51,6 @@ class ClariusFile:
         Lines and samples kept of each frame.
     turns : ndarray, shape (sample,), optional
         Complex factors of the samples kept, the same in all frames.
-    gain : Gain, optional
-        By which frames differ.
     """
 
     member: Member
@@ -62,7 +60,6 @@ class ClariusFile:
     samples: int
     kept: tuple[slice, slice] = (slice(None), slice(None))
     turns: ComplexArray | None = None
-    gain: Gain | None = None
 
     @property
     def sample_bytes(self) -> int:
@@ -85,7 +82,7 @@ class ClariusFile:
         """Type of the frames."""
         if self.kind == "IQ":
             return np.dtype(np.complex64)
-        return np.dtype(np.float32 if self.gain else np.uint8 if self.kind == "envelope" else np.int16)
+        return np.dtype(np.uint8 if self.kind == "envelope" else np.int16)
 
     def __call__(self) -> ReadFrame:
         """Open the file."""
@@ -97,30 +94,9 @@ class ClariusFile:
             content = read(start, self.place(i + 1) - start)
             kept: Any = np.frombuffer(content, dtype).reshape(self.lines, self.samples, parts)[self.kept]
             kept = kept.astype(np.float32).view(np.complex64)[..., 0] if parts == 2 else kept[..., 0]
-            kept = kept if self.turns is None else kept * self.turns
-            return np.asarray(kept if self.gain is None else kept * self.gain.factors(i))
+            return np.asarray(kept if self.turns is None else kept * self.turns)
 
         return frame
-
-
-@dataclass(frozen=True)
-class Gain:
-    """Gain that differs between frames.
-
-    Attributes
-    ----------
-    depth_mm : ndarray, shape (sample,)
-    curves : tuple of Curve
-        Of each frame.
-    """
-
-    depth_mm: FloatArray
-    curves: tuple[Curve, ...]
-
-    def factors(self, i: int) -> FloatArray:
-        """The first frame's gain over that of frame i, shape (sample,)."""
-        first, own = (np.interp(self.depth_mm, *np.array(self.curves[k]).T) for k in (0, i))
-        return np.asarray(10.0 ** ((first - own) / 20.0))
 
 
 def open_bytes(member: Member) -> Callable[[int, int], bytes]:

@@ -38,8 +38,8 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import Files, find_files
-from speckle3d.io.clarius.raw import ClariusFile, Gain, read_header
-from speckle3d.io.clarius.sidecars import Curve, Description, read_gains
+from speckle3d.io.clarius.raw import ClariusFile, read_header
+from speckle3d.io.clarius.sidecars import Description, read_gains
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
@@ -290,35 +290,16 @@ class Package:
         return band_hz(frames, self.rate_hz, centre, shift if is_iq else None)
 
     @cached_property
-    def curves(self) -> tuple[Curve, ...]:
-        """Gain curve of each frame; empty where the package does not tell.
-
-        The gain file of another kind of the same recording serves too: all kinds see the same analogue gain
-        (answers of the maker in clariusdev/research).
-        """
-        times_ns = self.header[1].tolist()
-        for kind, member in sorted(self.files.of("tgc").items(), key=lambda one: one[0] != self.chosen):
-            curves = read_gains(member)
-            if curves and {*times_ns} <= {*curves}:
-                return tuple(curves[time_ns] or self.said.gain for time_ns in times_ns)
-            if curves and kind == self.chosen:
-                raise InvalidInputError(f"{member.where}: expected the gain of every frame, got others")
-        return ()
-
-    @cached_property
-    def gain(self) -> Gain | None:
-        """Gain to undo relative to the first frame; None where it is the same, or of an envelope."""
-        if len(set(self.curves)) < 2 or self.said.kind == "envelope":
-            return None
-        if () in self.curves:
-            where = f"{self.said.where}: frame {self.curves.index(())}"
-            raise InvalidInputError(f"{where}: expected a gain curve as other frames have, got none")
-        return Gain(self.depths_mm, self.curves)
+    def gain_words(self) -> str:
+        """Whether all frames have one gain, by the files that tell: kinds see the same analogue gain."""
+        gains = {tuple(read_gains(member)) for member in self.files.of("tgc").values()}
+        if len({gain for of_frames in gains for gain in of_frames}) > 1:
+            return "gain differs between frames: left as it is, as patches are compared whatever their gain"
+        return "gain the same in all frames" if any(gains) else "gain not told: taken as the same"
 
     def recording(self) -> Recording:
         """What the package holds, as a recording."""
-        said, pitch = self.said, self.pitch
-        file = replace(self.file, gain=self.gain)
+        said, pitch, file = self.said, self.pitch, self.file
         delay = "delay samples, less 1 us before depth 0 (assumed)"
         centre_hz = said.optional("transmit frequency", "Hz")
         values = {
@@ -340,8 +321,7 @@ class Package:
                 "the band is measured in this recording: recordings that share curves need "
                 f"--bandwidth-hz {band[0]:.4g} {band[1]:.4g}"
             )
-        is_plain = file.turns is None and file.gain is None
-        narrow = np.int16 if said.kind == "IQ" and is_plain else None
+        narrow = np.int16 if said.kind == "IQ" and file.turns is None else None
         asked = "element_pitch_mm" if self.settings.probe or said.probe else "probe"
         return Recording(
             self.files.path,
@@ -366,8 +346,8 @@ class Package:
                 f"{receive.deep_hz / 1e6:g} MHz over {receive.filter_depth_mm:g} mm, turned to that of the "
                 "line's middle"
             )
-        if len(set(self.curves)) > 1:
-            notes.append(self._gain_words())
+        if "differs" in self.gain_words:
+            notes.append(self.gain_words)
         if self.sensor is not None:
             notes += self.sensor.remarks
             if self.sensor.fit is None:
@@ -377,13 +357,6 @@ class Package:
                     f"which `speckle3d imu orient {self.files.path} --into SWEEP.h5` finds"
                 )
         return notes
-
-    def _gain_words(self) -> str:
-        if len(set(self.curves)) < 2:
-            return "gain the same in all frames" if self.curves else "gain not told: taken as the same"
-        is_grey = self.said.kind == "envelope"
-        undone = "left in the grey levels" if is_grey else "undone relative to the first frame"
-        return f"gain differs between frames: {undone}"
 
     def rows(self) -> list[Row]:
         """Facts of the package, as far as they can be read."""
@@ -401,7 +374,7 @@ class Package:
             rows += [
                 ("elements per line", f"{self.place[1]:.6g}", ""),
                 ("first line at element", f"{self.place[0]:g}, taken as the image's left", ""),
-                ("gain by frame", self._gain_words(), ""),
+                ("gain by frame", self.gain_words, ""),
             ]
         try:
             rows += [] if self.sensor is None else self.sensor.rows()

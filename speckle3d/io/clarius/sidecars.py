@@ -1,6 +1,6 @@
 """Descriptions of raw files (yml) and their gain by frame (tgc).
 
-The yml is YAML but for its gain curve, ``tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }``, which is read apart.
+The yml is YAML but for its gain curve, ``tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }``, which is left out.
 Scalars stay the text that is in the file, so that ``010`` is ten, and every number is read with its unit.
 
 References
@@ -26,13 +26,8 @@ from speckle3d.core.extras import extra_module
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.package import Member
 
-Curve = tuple[tuple[float, float], ...]
-"""Depth in mm and gain in dB of each knot of a gain curve."""
-
 _KINDS = {"rf": "RF", "iq": "IQ", "b pre-scan": "envelope", "envelope": "envelope", "b": "envelope"}
-_KNOT = re.compile(r"\{\s*([-+.\deE]+)\s*mm\s*,\s*([-+.\deE]+)\s*dB\s*\}")
 _GAIN_LINE = re.compile(r"^tgc:.*(?:\n[ \t]+-.*)*$", re.MULTILINE)
-_STAMP = re.compile(r"timestamp:\s*(\d{1,19})(?!\d)")
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d]*)\s*")
 _UNITS = {
     "": {"": 1.0},
@@ -137,13 +132,11 @@ class Description(Fields):
     ----------
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
-    gain : Curve
     """
 
     kind: str
     lines: int
     samples: int
-    gain: Curve
 
     @classmethod
     def of(cls, member: Member) -> Description:
@@ -165,10 +158,8 @@ class Description(Fields):
                 f"{where}: type, compression: expected RF, IQ or B pre-scan, and none, got "
                 f"{_shown(fields.values.get('type'))} and {_shown(packing)}"
             )
-        size, gain = fields.below("size"), _knots("".join(_GAIN_LINE.findall(text)), where)
-        return cls(
-            fields.values, where, kind, size.whole("number of lines"), size.whole("samples per line"), gain
-        )
+        size = fields.below("size")
+        return cls(fields.values, where, kind, size.whole("number of lines"), size.whole("samples per line"))
 
     @property
     def probe(self) -> str:
@@ -221,31 +212,7 @@ class Description(Fields):
         return ends.pop() if len(ends) == 1 else None
 
 
-def read_gains(member: Member) -> dict[int, Curve]:
-    """Read the gain curve of each frame, by the frame's time in nanoseconds; empty where it was not changed.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
-    InvalidInputError
-        If a curve makes no sense.
-    """
-    _, *parts = _STAMP.split(member.text())
-    return {
-        int(stamp): _knots(part, f"{member.where}: timestamp {stamp}")
-        for stamp, part in zip(parts[::2], parts[1::2], strict=True)
-    }
-
-
-def _knots(text: str, where: str) -> Curve:
-    try:
-        knots = tuple((float(depth), float(gain)) for depth, gain in _KNOT.findall(text))
-    except ValueError:
-        knots = ()
-    depths = [depth for depth, _ in knots]
-    if len(knots) != text.count("{") or sorted(set(depths)) != depths:
-        raise InvalidInputError(
-            f"{where}: expected a gain as {{ 40.00mm, 26.00dB }} at depths that rise, got {text[:_LONGEST]!r}"
-        )
-    return knots
+def read_gains(member: Member) -> list[str]:
+    """Gain curves of the frames that a file tells of, as text; empty where it was not changed."""
+    parts = re.split(r"timestamp:\s*\d+", member.text())[1:]
+    return [" ".join(re.findall(r"\{.*?\}", part)) for part in parts]
