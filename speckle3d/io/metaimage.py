@@ -244,9 +244,7 @@ class _Sequence:
                 "lines with --vector-pitch-mm"
             )
         if down.value is not None:
-            speed = self.settings.speed_of_sound_m_s or self.own.get("speed_of_sound_m_s", 1540.0)
-            words = f"of samples {down.value:.6g} mm apart, by {sizes.source}, at {speed:g} m/s"
-            values["sampling_rate_hz"] = replace(down, value=1e3 * speed / (2.0 * down.value), source=words)
+            values["row_spacing_mm"] = replace(down, said_by="its spacing")
         elif device.width_mm is not None:
             vectors, _ = self.layout.shape(self.header.size)
             across = Value(device.width_mm / vectors, "ScanConversion of the device set", _DEVICE)

@@ -78,9 +78,8 @@ class Recording:
     frames : Frames, optional
         uint8 for B-mode, real for RF, complex for I/Q; a NumPy array, or with its method `take`.
     values : mapping of str to Value
-        By the name of a setting.
-    sample_spacing_mm : float, optional
-        Of RF and I/Q whose samples' depths the file gives, in place of a sampling rate.
+        By the name of a setting. A pitch of vectors is one of columns, too; a spacing of rows makes a
+        sampling rate where there is none.
     time_s : ndarray, shape (n,), optional
         NaN where a frame has none; frames whose time is not after the one before are left out. By default
         of the frame rate, from 0.
@@ -104,7 +103,6 @@ class Recording:
     settings: ImportSettings = field(default_factory=ImportSettings)
     frames: Any = None
     values: Mapping[str, Value] = field(default_factory=dict)
-    sample_spacing_mm: float | None = None
     time_s: FloatArray | None = None
     tracker: Tracker | None = None
     orientation: OrientationSensor | None = None
@@ -189,13 +187,12 @@ class Recording:
         times, given_rate = self._timed[0], self.settings.frame_rate_hz is not None
         if given_rate or (times is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
-        needed = {name: self.values.get(name, ASSUMED.get(name, Value())) for name in names}
+        own = {"column_pitch_mm": self.values.get("vector_pitch_mm", Value())} | ASSUMED | {**self.values}
+        needed = {name: own.get(name, Value()) for name in names}
         if given_rate and times is not None and "frame_rate_hz" not in self.values:
             needed["frame_rate_hz"] = Value(rate_of(times), "of its times")
-        if "sampling_rate_hz" in needed and self.sample_spacing_mm is not None:
-            speed = speed_of(self.settings, self.values)
-            source = f"of samples {self.sample_spacing_mm:.6g} mm apart at {speed:g} m/s"
-            needed["sampling_rate_hz"] = Value(1e3 * speed / (2.0 * self.sample_spacing_mm), source)
+        if "sampling_rate_hz" in needed and "sampling_rate_hz" not in own and "row_spacing_mm" in own:
+            needed["sampling_rate_hz"] = rate_by_spacing(own["row_spacing_mm"], self.settings, own)
         return needed
 
     @cached_property
@@ -273,10 +270,28 @@ class Recording:
         return words, f"{own} ({one.source})" if one.source else own, unit
 
 
-def speed_of(settings: ImportSettings, values: Mapping[str, Value]) -> float:
-    """Speed of sound that is given, that the recording says, or that is assumed."""
-    own = values.get("speed_of_sound_m_s", ASSUMED["speed_of_sound_m_s"]).value
-    return float(settings.speed_of_sound_m_s or own or SPEED_OF_SOUND_M_S)
+def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[str, Value]) -> Value:
+    """Sampling rate of samples so far apart, at the speed of sound that is given, said or assumed."""
+    own = values.get("speed_of_sound_m_s", Value()).value
+    speed = float(settings.speed_of_sound_m_s or own or SPEED_OF_SOUND_M_S)
+    by = f", by {spacing.source}," if spacing.said_by != "the file" else ""
+    words = f"of samples {spacing.value:.6g} mm apart{by} at {speed:g} m/s"
+    return replace(spacing, value=1e3 * speed / (2.0 * spacing.value), source=words)
+
+
+def grid_values(x_mm: FloatArray, z_mm: FloatArray, where: str, said: str) -> dict[str, Value]:
+    """What lateral positions and depths of samples say.
+
+    Raises
+    ------
+    InvalidInputError
+        If they are not evenly spaced.
+    """
+    return {
+        "vector_pitch_mm": Value(step_of(x_mm, f"{where}, x"), said),
+        "row_spacing_mm": Value(step_of(z_mm, f"{where}, z"), said),
+        "first_sample_depth_mm": Value(float(z_mm[0]), said),
+    }
 
 
 def differs(given: Any, own: Any) -> bool:

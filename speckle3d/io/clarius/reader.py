@@ -305,7 +305,6 @@ class Package:
         values = {
             "first_sample_depth_mm": Value(self.first_mm, delay, _OWN),
             "vector_pitch_mm": pitch,
-            "column_pitch_mm": pitch,
             "row_spacing_mm": Value(self.spacing_mm, f"of {self.rate_hz / 1e6:g} MHz", _OWN),
             "sampling_rate_hz": Value(said.number("sampling rate", "Hz", 1.0), "", _OWN),
             "centre_frequency_hz": Value(centre_hz, "transmit frequency", _OWN),

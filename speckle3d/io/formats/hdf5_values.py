@@ -15,6 +15,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_checked
+from speckle3d.io.recordings import Value
 
 ENVELOPE_RANGE_DB = 80.0
 """Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6
@@ -103,14 +104,8 @@ class Levels:
 
 def grey_frames(
     source: HDF5Slices, shape: tuple[int, int, int], decibels: bool, dynamic_range_db: float | None
-) -> tuple[FileFrames, float, float]:
-    """Frames of grey levels; all frames are read once to find the strongest echo, which becomes 255.
-
-    Returns
-    -------
-    frames : FileFrames
-    top, dynamic_range_db : float
-        What 255 stands for, and how far below it 0 is.
+) -> tuple[FileFrames, Value]:
+    """Frames of grey levels and their dynamic range; all frames are read once to find the strongest echo.
 
     Raises
     ------
@@ -122,5 +117,5 @@ def grey_frames(
     if not np.isfinite(top) or not (decibels or top > 0):
         raise InvalidInputError(f"{source.path}: expected echoes, got amplitudes up to {top:g}")
     span = dynamic_range_db or ENVELOPE_RANGE_DB
-    levels = Levels(source.turn, decibels, top, span)
-    return replace(source, turn=levels).frames(shape, np.uint8), top, span
+    frames = replace(source, turn=Levels(source.turn, decibels, top, span)).frames(shape, np.uint8)
+    return frames, Value(span, f"of grey levels made here below {top:g}")

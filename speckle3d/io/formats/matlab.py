@@ -205,12 +205,12 @@ def _recording(variables: _Variables, settings: ImportSettings, rows: list[Row])
     lengths = {"frame": 1} | {name: length for name, length in axes if name != "-"}
     shape = lengths["frame"], lengths["vector"], lengths["sample"]
     frames = _frames(variables, nodes, [name for name, _ in axes], shape, data)
-    values, spacing, times = _numbers(variables, arrays, shape)
+    values, times = _numbers(variables, arrays, shape)
     rows += [("read", f"{role}: {arrays[role]} {_size(nodes[0])}", _kind(nodes[0])) for role in data]
     rows.append(("axes", arrays["axes"], ""))
     if not variables.is_new:
         rows.append(("frames", "held in memory: MATLAB 7.3 files are read one by one", ""))
-    return Recording(path, settings, frames, values, sample_spacing_mm=spacing, time_s=times)
+    return Recording(path, settings, frames, values, time_s=times)
 
 
 def _axes(text: str, node: Any) -> list[tuple[str, int]]:
@@ -261,9 +261,9 @@ def _frames(
 
 def _numbers(
     variables: _Variables, arrays: Mapping[str, str], shape: tuple[int, int, int]
-) -> tuple[dict[str, Value], float | None, FloatArray | None]:
-    """Numbers that arrays give, the distance between samples if z_mm gives it, and times."""
-    values, times, spacing = dict[str, Value](), None, None
+) -> tuple[dict[str, Value], FloatArray | None]:
+    """Numbers that arrays give, and times."""
+    values, times = dict[str, Value](), None
     lengths = {"x_mm": shape[1], "z_mm": shape[2], "time_s": shape[0], "bandwidth_hz": 2}
     for name in sorted({*arrays} & {*_POSITIONS, *ImportSettings.model_fields}):
         numbers, where = _scaled(variables, name, arrays[name]), f"{variables.path}: {name}"
@@ -278,14 +278,13 @@ def _numbers(
         if name == "time_s":
             times = numbers
         elif name == "x_mm":
-            values["vector_pitch_mm"] = values["column_pitch_mm"] = Value(step_of(numbers, where), said)
+            values["vector_pitch_mm"] = Value(step_of(numbers, where), said)
         elif name == "z_mm":
-            spacing = step_of(numbers, where)
-            values["row_spacing_mm"] = Value(spacing, said)
+            values["row_spacing_mm"] = Value(step_of(numbers, where), said)
             values["first_sample_depth_mm"] = Value(float(numbers[0]), said)
         else:
             values[name] = Value(tuple(numbers.tolist()) if numbers.size > 1 else float(numbers[0]), said)
-    return values, spacing, times
+    return values, times
 
 
 def _scaled(variables: _Variables, name: str, text: str) -> FloatArray:

@@ -30,7 +30,6 @@ from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     file_format,
     find_member,
-    has_member,
     locate,
     open_hdf5,
     reading,
@@ -39,7 +38,7 @@ from speckle3d.io.hdf5 import (
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, speed_of, step_of
+from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing
 
 FORMAT = "USTB .uff"
 
@@ -66,36 +65,26 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
     is_complex = isinstance(find_member(file, data), h5py.Group)
     parts = (f"{data}/real", f"{data}/imag") if is_complex else (data,)
     axis, count = _frame_axis(require_dataset(file, parts[0]), x_mm.size * z_mm.size)
-    spacing, where = step_of(z_mm, locate(group, "scan/z_axis")), f"in {name}/scan/z_axis"
     if (video := single(group, "frame_rate")) is not None:
         rows.append(("frame rate of videos made of it, not used", f"{video:g}", "frames/s"))
-    pitch = Value(step_of(x_mm, locate(group, "scan/x_axis")), f"in {name}/scan/x_axis")
     modulation_hz = single(group, "modulation_frequency") or 0.0
-    values = {
-        "vector_pitch_mm": pitch,
-        "first_sample_depth_mm": Value(float(z_mm[0]), where),
-        "demodulation_frequency_hz": Value(modulation_hz, f"in {name}/modulation_frequency"),
-        **_pulse(group, f"in {name}", modulation_hz),
-    }
+    values = grid_values(x_mm, z_mm, locate(group, "scan"), f"in {name}/scan")
+    values["demodulation_frequency_hz"] = Value(modulation_hz, f"in {name}/modulation_frequency")
+    values |= _pulse(group, f"in {name}", modulation_hz)
     for other, kind in _objects(file).items():
         if kind == _CHANNELS and (speed := single(file, f"{other}/sound_speed")):
             values["speed_of_sound_m_s"] = Value(speed, f"{other}/sound_speed")
-    grid, shape = Grid((x_mm.size, z_mm.size), (0, 1)), (count, x_mm.size, z_mm.size)
-    source = HDF5Slices(path, parts, grid, axis)
+    shape = count, x_mm.size, z_mm.size
+    source = HDF5Slices(path, parts, Grid(shape[1:], (0, 1)), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
     if is_complex and count and settings.demodulation_frequency_hz is None:
-        rate_hz = 1e3 * speed_of(settings, values) / (2.0 * spacing)
         with naming(str(path)):
-            _require_phase(frames, values, modulation_hz, rate_hz)
+            _require_phase(frames, values, settings, modulation_hz)
     elif count and not is_complex and (kind := _kind_of(frames)) != "RF":
-        frames, top, span = grey_frames(source, shape, kind == "decibels", settings.dynamic_range_db)
+        is_db = kind == "decibels"
+        frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, settings.dynamic_range_db)
         rows.append(("data", f"of one sign: {kind}, made grey levels here", ""))
-        values |= {
-            "column_pitch_mm": pitch,
-            "row_spacing_mm": Value(spacing, where),
-            "dynamic_range_db": Value(span, f"of grey levels made here below {top:g}"),
-        }
-    return Recording(path, settings, frames, values, sample_spacing_mm=spacing)
+    return Recording(path, settings, frames, values)
 
 
 def _objects(file: h5py.File) -> dict[str, str]:
@@ -114,10 +103,11 @@ def _kind_of(frames: FileFrames) -> str:
 
 
 def _require_phase(
-    frames: FileFrames, values: dict[str, Value], modulation_hz: float, rate_hz: float
+    frames: FileFrames, values: dict[str, Value], settings: ImportSettings, modulation_hz: float
 ) -> None:
     """Refuse a modulation frequency that contradicts how the phase of the data turns."""
     carried = modulation_hz or values.get("centre_frequency_hz", Value()).value
+    rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
     shift_hz = demodulation_of(frames, carried, rate_hz) if carried else None
     if shift_hz is not None and bool(shift_hz) != bool(modulation_hz):
         says = f"shifted down by {carried:g} Hz" if shift_hz else f"still carrying {carried:g} Hz"
@@ -145,7 +135,7 @@ def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> str:
 
 
 def _axes(group: h5py.Group) -> tuple[FloatArray, FloatArray]:
-    """Lateral positions and depths, mm; pixels must be in USTB's order where the file lists their places."""
+    """Lateral positions and depths, mm."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
     kind = text_of(scan.attrs.get("class"))
     if kind != _LINEAR:
@@ -153,15 +143,7 @@ def _axes(group: h5py.Group) -> tuple[FloatArray, FloatArray]:
             f"{where}: expected a {_LINEAR}, got {kind or 'none'}: beamform onto a {_LINEAR}, whose lines "
             "are parallel"
         )
-    x, z = flat(scan, "x_axis"), flat(scan, "z_axis")
-    for name, expected in (("x", np.repeat(x, z.size)), ("z", np.tile(z, x.size))):
-        listed = flat(scan, name) if has_member(scan, name) else expected
-        scale = float(np.abs(expected).max(initial=0.0)) or 1.0
-        if listed.shape != expected.shape or np.abs(listed - expected).max(initial=0.0) > 1e-4 * scale:
-            raise InvalidInputError(
-                f"{where}/{name}: expected those of {x.size} x {z.size} pixels, z fastest, got others"
-            )
-    return 1e3 * x, 1e3 * z
+    return 1e3 * flat(scan, "x_axis"), 1e3 * flat(scan, "z_axis")
 
 
 def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:

@@ -46,7 +46,7 @@ from speckle3d.io.hdf5 import (
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.pose_paths import timed_poses
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, speed_of, step_of
+from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing
 
 FORMAT = "zea"
 
@@ -114,20 +114,11 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         )
     count, first, second = node.shape[:3]
     places = f"{array.group}/coordinates"
-    left_mm = spacing = None
-    x_first = False
+    left_mm, x_first, trailing = None, False, node.shape[3:] if channels == 1 else ()
     if array.values != array.group and has_member(file, places):
         x_mm, z_mm, x_first = _pixels(require_dataset(file, places), (count, first, second))
-        left_mm, told_by = float(x_mm[0]), "of the coordinates"
-        spacing = step_of(z_mm, f"{locate(file, places)} z")
-        pitch = Value(step_of(x_mm, f"{locate(file, places)} x"), told_by)
-        values |= {
-            "vector_pitch_mm": pitch,
-            "column_pitch_mm": pitch,
-            "row_spacing_mm": Value(spacing, told_by),
-            "first_sample_depth_mm": Value(float(z_mm[0]), told_by),
-        }
-    trailing = node.shape[3:] if channels == 1 else ()
+        left_mm = float(x_mm[0])
+        values |= grid_values(x_mm, z_mm, locate(file, places), "of the coordinates")
     grid = Grid((first, second, *trailing), (0, 1) if x_first else (1, 0), channels == 2)
     shape = (count, first, second) if x_first else (count, second, first)
     source = HDF5Slices(path, (array.values,), grid)
@@ -135,29 +126,27 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         dtype = np.complex64 if channels == 2 else np.uint8 if node.dtype == np.uint8 else np.float32
         frames = source.frames(shape, dtype)
     else:
-        is_db = array.kind != "envelope_data"
-        frames, top, span = grey_frames(source, shape, is_db, settings.dynamic_range_db)
-        values["dynamic_range_db"] = Value(span, f"of grey levels made here below {top:g}")
+        is_db, given_db = array.kind != "envelope_data", settings.dynamic_range_db
+        frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, given_db)
     shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
     shift_hz = shifts.pop() if len(shifts) == 1 else None
-    if channels == 2 and shift_hz and spacing and settings.demodulation_frequency_hz is None:
-        with naming(str(path)):
-            by_phase = demodulation_of(frames, shift_hz, 1e3 * speed_of(settings, values) / (2 * spacing))
+    if channels == 2 and shift_hz and left_mm is not None and settings.demodulation_frequency_hz is None:
+        rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
         words = "of scan/demodulation_frequency and the phase of the data"
+        with naming(str(path)):
+            by_phase = demodulation_of(frames, shift_hz, rate_hz)
         values["demodulation_frequency_hz"] = Value(by_phase, words)
     tracker, remarks = _tracker(file, left_mm)
-    attributes = file.attrs
     return Recording(
         path,
         settings,
         frames,
         values,
-        sample_spacing_mm=spacing,
         time_s=_times(file, array, count),
         tracker=tracker,
         chain=_POSES,
-        probe=settings.probe or text_of(attributes.get("probe_name", attributes.get("probe"))),
-        assumptions=("parallel lines",) if spacing is None else (),
+        probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe"))),
+        assumptions=("parallel lines",) if left_mm is None else (),
         remarks=tuple(remarks),
     )
 
