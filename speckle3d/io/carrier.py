@@ -15,15 +15,12 @@ _PARTS, _LEAST_SHARE = 10, 0.5
 """Parts of the depth, of which those count that are so coherent, by the most coherent."""
 _FASTEST = 0.85 * np.pi
 """Turn of a carrier from sample to sample, above which it may seem to turn backwards."""
-_REMOVED, _CARRIED, _REVERSED = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
+_REMOVED, CARRIED, _REVERSED = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
 """Measured over nominal turn. Attenuation lowers a carrier, by a fifth in 40 mm of tissue and more below."""
 
 
 def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
     """Frequency that complex samples were shifted down by: `frequency_hz`, or 0 where they still carry it.
-
-    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
-    spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.
 
     Returns
     -------
@@ -34,6 +31,30 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     ------
     InvalidInputError
         If the carrier turns backwards: Q has the other sign.
+    """
+    share = carried_share(frames, frequency_hz, sampling_rate_hz)
+    if share is None:
+        return None
+    if _REVERSED[0] <= share <= _REVERSED[1]:
+        raise InvalidInputError(
+            f"expected I/Q that carry {frequency_hz:g} Hz or nothing, got {share * frequency_hz:g} Hz: Q has "
+            "the other sign"
+        )
+    if CARRIED[0] <= share <= CARRIED[1]:
+        return 0.0
+    return frequency_hz if _REMOVED[0] <= share <= _REMOVED[1] else None
+
+
+def carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) -> float | None:
+    """Mean turn of the phase from sample to sample, over that of a carrier of `frequency_hz`.
+
+    The phase between neighbouring samples is the mean turn of what they carry, the first moment of the
+    spectrum [1]_: nothing, or 2 pi f / fs. The first, the middle and the last frame are looked at.
+
+    Returns
+    -------
+    float or None
+        None where the phase does not tell: noise, or samples too far apart for the frequency.
 
     References
     ----------
@@ -58,12 +79,4 @@ def demodulation_of(frames: Frames, frequency_hz: float, sampling_rate_hz: float
     lag, count = lags[seen].sum(), counts[seen].sum()
     if not abs(lag) > max(_LEAST_COHERENCE * count, _LEAST_SIGMAS * count**0.5):
         return None
-    share = float(np.angle(lag)) / turn
-    if _REVERSED[0] <= share <= _REVERSED[1]:
-        raise InvalidInputError(
-            f"expected I/Q whose phase turns by {turn:.2f} rad a sample, or by none, got {share * turn:.2f}: "
-            "Q has the other sign"
-        )
-    if _CARRIED[0] <= share <= _CARRIED[1]:
-        return 0.0
-    return frequency_hz if _REMOVED[0] <= share <= _REMOVED[1] else None
+    return float(np.angle(lag)) / turn

@@ -81,7 +81,7 @@ class FileSet:
         except Speckle3DError as error:
             raise type(error)(str(error).replace(str(part), str(given))) from error
         except OSError as error:
-            raise cannot_write(given, error) from error
+            raise cannot_write(given / self.primary, error) from error
 
     def _put_in_place(self, part: Path, folder: Path) -> None:
         for name in (*self.others, *self.derived):

@@ -16,6 +16,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.io.carrier import CARRIED, carried_share
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
 from speckle3d.io.import_settings import ImportSettings
@@ -131,13 +132,17 @@ class _Sequence:
         return cls(header, settings, device, own, Layout.of(header, device.image_orientation))
 
     def recording(self) -> Recording:
-        images, first_mm = self._images(), self.settings.first_sample_depth_mm
+        images, first_mm, remarks = self._images(), self.settings.first_sample_depth_mm, self._remarks()
+        frames, values = self._frames(images, self.layout), self._values()
+        if self.layout.is_complex and self._is_reversed(frames, values):
+            frames = self._frames(images, replace(self.layout, conjugated=True))
+            remarks.append("Q has the other sign in the file, as its phase tells: turned")
         tracker = self.tracker(self.own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm)
         return Recording(
             Path(self.header.path),
             self.settings,
-            self._frames(images),
-            self._values(),
+            frames,
+            values,
             time_s=None if self.times is None else self.times[images],
             tracker=tracker,
             orientation=self._orientation(),
@@ -145,7 +150,7 @@ class _Sequence:
             probe=self.settings.probe or self.own.get("probe") or self.device.probe,
             full_scale=self.own.get("full_scale", 255.0),
             assumptions=("parallel lines",) if self.layout.is_rf and not self.own else (),
-            remarks=tuple(self._remarks()),
+            remarks=tuple(remarks),
         )
 
     @cached_property
@@ -213,12 +218,26 @@ class _Sequence:
             valid[i] = {frame.get("ImageStatus", "OK"), frame.get("Status", "OK")} == {"OK"}
         return valid
 
-    def _frames(self, images: IntArray) -> FileFrames:
+    def _is_reversed(self, frames: FileFrames, values: dict[str, Value]) -> bool:
+        """Whether I/Q that are said to carry their frequency turn backwards.
+
+        In lines that are stored from the far end on, depth runs backwards and so does the phase, unless the
+        writer thought of it.
+        """
+        names = "demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz"
+        said = {name: one.value for name, one in values.items()}
+        demodulation, centre, rate = (getattr(self.settings, name) or said.get(name) for name in names)
+        if demodulation or not (centre and rate):
+            return False
+        return (carried_share(frames, centre, rate) or 0.0) <= -CARRIED[0]
+
+    def _frames(self, images: IntArray, layout: Layout) -> FileFrames:
         """Frames of the pixels' type; wider whole numbers as int16 where it holds them, else float32."""
-        header, layout = self.header, self.layout
+        header = self.header
         dtype, stored = header.dtype.newbyteorder("="), None
         if layout.is_complex:
-            dtype, stored = np.dtype(np.complex64), dtype if dtype == np.int16 else None
+            fits = dtype == np.int16 and not layout.conjugated  # the opposite of -32768 is none
+            dtype, stored = np.dtype(np.complex64), dtype if fits else None
         elif layout.is_rf and dtype != np.int16:
             limits = np.iinfo(np.int16)
             fits = dtype.kind in "iu" and all(
@@ -244,7 +263,7 @@ class _Sequence:
                 "lines with --vector-pitch-mm"
             )
         if down.value is not None:
-            values["row_spacing_mm"] = replace(down, said_by="its spacing")
+            values["row_spacing_mm"] = down
         elif device.width_mm is not None:
             vectors, _ = self.layout.shape(self.header.size)
             across = Value(device.width_mm / vectors, "ScanConversion of the device set", _DEVICE)

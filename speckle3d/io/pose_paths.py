@@ -103,12 +103,9 @@ def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
     r, bottom = matrices[:, :3, :3], matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]
     finite = np.isfinite(matrices).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
-        off = np.maximum(
-            np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)), np.abs(bottom).max(axis=1)
-        )
-        near = (
-            finite & (off < ROUNDING_TOLERANCE) & (np.linalg.det(np.where(finite[:, None, None], r, 0.0)) > 0)
-        )
+        off = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2))
+        near = finite & (np.maximum(off, np.abs(bottom).max(axis=1)) < ROUNDING_TOLERANCE)
+    near[near] = np.linalg.det(r[near]) > 0
     exact = np.tile(np.eye(4), (len(r), 1, 1))
     exact[near, :3, 3] = matrices[near, :3, 3]
     exact[near, :3, :3] = nearest_rotation(r[near])

@@ -274,8 +274,7 @@ def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[st
     """Sampling rate of samples so far apart, at the speed of sound that is given, said or assumed."""
     own = values.get("speed_of_sound_m_s", Value()).value
     speed = float(settings.speed_of_sound_m_s or own or SPEED_OF_SOUND_M_S)
-    by = f", by {spacing.source}," if spacing.said_by != "the file" else ""
-    words = f"of samples {spacing.value:.6g} mm apart{by} at {speed:g} m/s"
+    words = f"of samples {spacing.value:.6g} mm apart, {spacing.source}, at {speed:g} m/s"
     return replace(spacing, value=1e3 * speed / (2.0 * spacing.value), source=words)
 
 

@@ -58,7 +58,7 @@ def table(path: PathLike, columns: Sequence[str]) -> Iterator[tuple[str, dict[st
     """
     lines = ((number, line.partition("#")[0].strip()) for number, line in text_lines(path))
     rows = ((number, [cell.strip() for cell in text.split(",")]) for number, text in lines if text)
-    _, heading = next(rows, (0, ["nothing"]))
+    heading = [cell.lower() for cell in next(rows, (0, ["nothing"]))[1]]
     if not {*columns} <= {*heading}:
         raise InvalidInputError(f"{path}: expected columns {','.join(columns)}, got {','.join(heading)}")
     for number, cells in rows:

@@ -7,7 +7,6 @@ import pytest
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
-from speckle3d.io.challenge import read_challenge_calibration
 from speckle3d.io.describe import describe
 from speckle3d.io.load import load_landmarks, load_sweep, open_recording, recording_files
 
@@ -63,39 +62,6 @@ def test_a_test_scan_has_no_tracker_and_no_landmarks_and_needs_a_calibration(tmp
         load_sweep(path)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "words\n1,0,0,0\n",
-        "\n".join(["1,0,0,0", "0,1,0,0", "0,0,1,0", "0,0,nan,1"] * 2),
-        "\n".join(["1,0,0,0", "0,-1,0,0", "0,0,1,0", "0,0,0,1"] * 2),
-        "\n".join(["2,0,0,0", "0,2,0,0", "0,0,2,0", "0,0,0,1"] * 2),
-    ],
-)
-def test_a_wrong_calibration_is_named(tmp_path, content):
-    path = tmp_path / "calib_matrix.csv"
-    path.write_text(content)
-    with pytest.raises(InvalidInputError, match="calib_matrix"):
-        read_challenge_calibration(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("frames", np.zeros((12, 6, 8))),
-        ("frames", np.zeros((12, 8), dtype=np.uint8)),
-        ("tforms", np.tile(np.eye(4), (11, 1, 1))),
-    ],
-)
-def test_a_wrong_scan_is_named(tmp_path, name, values):
-    path, *_ = examples.write_data_set(tmp_path, split=False)
-    with h5py.File(path, "r+") as file:
-        del file[name]
-        file[name] = values
-    with pytest.raises(InvalidInputError, match=name):
-        load_sweep(path)
-
-
 @pytest.mark.parametrize("bad", [np.nan, 1.01, np.diag([-1.0, 1.0, 1.0])])
 def test_a_pose_of_no_use_is_left_out_and_told(tmp_path, bad):
     path, _, poses, _ = examples.write_data_set(tmp_path, split=False)
@@ -106,13 +72,3 @@ def test_a_pose_of_no_use_is_left_out_and_told(tmp_path, bad):
     assert len(recording.sweep.tracker.readings) == 11
     assert any("poses: 1 of 12 left out" in note for note in recording.notes)
     assert any("11 poses, 12 images, 12 matched" in note for note in recording.notes)
-
-
-def test_a_landmark_is_in_a_frame(tmp_path):
-    path, *_ = examples.write_data_set(tmp_path)
-    with h5py.File(tmp_path / "landmark" / "landmark_050.h5", "r+") as file:
-        del file[examples.SCAN]
-        file[examples.SCAN] = np.array([[1.5, 2.0, 2.0]])
-    with pytest.raises(InvalidInputError, match="landmark"):
-        load_landmarks(path)
-    assert len(load_sweep(path)) == 12

@@ -1,7 +1,5 @@
 """What is wrong in a file of the family is named by file and place in one line; the family's own ways."""
 
-from dataclasses import replace
-
 import h5py
 import numpy as np
 import old_files
@@ -64,12 +62,6 @@ def linked(node, link):
     return edit
 
 
-def elsewhere(file):
-    """Frame times whose bytes lie in another file."""
-    del file["frame_time_s"]
-    file.create_dataset("frame_time_s", (4,), "f8", external=[("/etc/hostname", 0, 32)])
-
-
 WRONG = {
     "rf": [
         (drop("rf"), "rf, iq or bmode"),
@@ -88,7 +80,6 @@ WRONG = {
         (attribute("/", "version", 3), "version"),
         (linked("frame_time_s", h5py.ExternalLink("/etc/passwd", "/x")), "/frame_time_s"),
         (linked("frame_time_s", h5py.SoftLink("/nowhere")), "/frame_time_s"),
-        (elsewhere, "/frame_time_s"),
     ],
     "calibration": [
         (drop("parameters/value"), "/parameters/value"),
@@ -152,15 +143,6 @@ def test_a_truncated_file_is_a_file_error_wherever_it_ends(kind, kept, tmp_path_
         READ[kind](path)
 
 
-def test_texts_with_zeros_over_them_are_refused_and_not_searched_without_end(tmp_path):
-    content = bytearray((old_files.FOLDER / "rf.h5").read_bytes())
-    at = content.index(b"GCOL") + 16
-    content[at : at + 64] = bytes(64)
-    (tmp_path / "zeros.h5").write_bytes(content)
-    with pytest.raises(FileError, match="damaged texts at byte"):
-        read_sweep(tmp_path / "zeros.h5")
-
-
 @pytest.mark.parametrize("kind", ["rf", "curves", "calibration"])
 def test_every_data_set_says_its_unit_and_what_it_holds(tmp_path, kind):
     WRITE[kind](tmp_path / "a.h5")
@@ -181,31 +163,3 @@ def test_curves_of_earlier_versions_are_read(tmp_path):
     curves = read_curves(path)
     assert (curves.key.correlation_of, curves.key.edge_fraction, curves.key.probe) == ("intensity", 0.1, "")
     assert (curves.origin, curves.tilt, curves.speckle) == ("phantom", None, None)
-
-
-def reconstruct(path, chunks, finish=True, poses=None, trust=None):
-    whole = old_files.reconstructions()["reconstruction"]
-    with ReconstructionWriter(path, whole.frame_time_s, whole.grid) as writer:
-        for chunk in chunks:
-            writer.append_pairs(chunk)
-        if finish:
-            writer.finish(poses or whole.poses, whole.provenance, "", trust or whole.trust)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"chunks": [replace(old_files.pairs(), second=np.array([4, 4, 4]))]}, r"/pairs\[0\].*4"),
-        ({"chunks": [replace(old_files.pairs(), used=np.ones((2, 2), bool))]}, "/pairs"),
-        (
-            {"chunks": [old_files.pairs(), replace(old_files.pairs(), patch_centre_mm=np.zeros((2, 2)))]},
-            "/patch_centre_mm",
-        ),
-        ({"poses": {"pose": old_files.POSES}}, "'image'"),
-        ({"finish": False}, "finish"),
-    ],
-)
-def test_what_makes_no_reconstruction_leaves_no_file(tmp_path, change, message):
-    with pytest.raises(InvalidInputError, match=message):
-        reconstruct(tmp_path / "r.h5", **{"chunks": (), **change})
-    assert list(tmp_path.iterdir()) == []

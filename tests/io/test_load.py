@@ -6,12 +6,10 @@ import pytest
 import sweep_examples
 from image_examples import grey, tracked, write_mha
 
-from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.reconstruction import Provenance
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import import_notes, import_record, load_sweep
-from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import write_sweep
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
@@ -26,51 +24,6 @@ def test_the_reader_is_chosen_by_content_not_by_name(tmp_path):
     write_mha(tmp_path / "images.h5", grey(), frames=tracked(3)[2])
     assert len(load_sweep(tmp_path / "sweep.mha")) == 6
     assert len(load_sweep(tmp_path / "images.h5", BMODE)) == 3
-
-
-@pytest.mark.parametrize("read", [load_sweep, describe])
-def test_what_is_of_no_known_kind_is_refused(tmp_path, read):
-    (tmp_path / "a.h5").write_bytes(b"")
-    with pytest.raises(InvalidInputError, match=r"a\.h5"):
-        read(tmp_path / "a.h5")
-    (tmp_path / "a.h5").write_bytes(np.random.default_rng(0).bytes(4000))
-    with pytest.raises(InvalidInputError, match="got something else"):
-        read(tmp_path / "a.h5")
-    with pytest.raises(FileError, match="expected a file, got none"):
-        read(tmp_path / "none.h5")
-    with pytest.raises(FileError, match="got a folder that none of them is in"):
-        read(tmp_path)
-
-
-def test_a_sweep_is_described(tmp_path):
-    write_sweep(tmp_path / "s.h5", sweep_examples.rf_sweep())
-    rows = values(tmp_path / "s.h5")
-    assert rows["format"] == ("speckle3d.sweep", "")
-    assert rows["frames"] == ("6", "")
-    assert rows["rate"] == ("25.00", "frames/s")
-    assert rows["vectors x samples"] == ("5 x 40", "")
-    assert rows["vector pitch"] == ("0.3", "mm")
-    assert rows["depth"] == ("2.00 to 2.75", "mm")  # 39 steps of 19.25 um below 2 mm
-    assert rows["bandwidth"] == ("4 to 8", "MHz")
-    assert rows["orientation sensor"] == ("18", "samples")
-    assert rows["orientation sensor rate"] == ("100.00", "samples/s")
-    # Readings at 10.015 to 10.185 s of image time miss the frames at 10.00 and 10.20 s.
-    assert rows["orientation sensor covers"] == ("4", "frames")
-    assert rows["tracker calibrated"] == ("yes", "")
-    assert rows["truth"] == ("yes", "")
-
-
-def test_a_reconstruction_is_described(tmp_path):
-    sweep = sweep_examples.rf_sweep()
-    with ReconstructionWriter(tmp_path / "r.h5", sweep.frame_time_s, sweep.grid) as writer:
-        writer.finish({"image": sweep.truth}, Provenance("in.h5", "ab", "0.1.0"))
-    rows = values(tmp_path / "r.h5")
-    centres = sweep.truth.apply(sweep.grid.centre_mm)
-    normals = sweep.truth.rotation[:-1].apply([0.0, 0.0, 1.0])
-    travel = abs(np.sum(np.diff(centres, axis=0) * normals))
-    assert rows["length, mode image"] == (f"{travel:.2f}", "mm")
-    assert rows["frame pairs"] == ("0", "")
-    assert rows["input"] == ("in.h5", "")
 
 
 def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import open_recording
 from speckle3d.io.metaimage import read_metaimage, read_poses
 
@@ -181,22 +181,6 @@ def test_transforms_are_chosen_by_name(tmp_path):
         read_poses(path, ImportSettings(tracker_transform="StylusToTracker"))
 
 
-def inverted(text):
-    return text_of(np.linalg.inv(np.reshape([float(x) for x in text.split()], (4, 4))))
-
-
-def test_poses_both_ways_round_are_inverses_or_left_out(tmp_path):
-    _, frames = path_of(3)
-    name = "ProbeToTrackerTransform"
-    both = [f | {"TrackerToProbeTransform": inverted(f[name])} for f in frames]
-    path = write_mha(tmp_path / "a.mha", grey(), frames=both)
-    assert len(read_poses(path).readings) == 3
-    both[1]["TrackerToProbeTransform"] = both[1][name]
-    path = write_mha(tmp_path / "a.mha", grey(), frames=both)
-    with pytest.warns(UserWarning, match="1 of 3 left out"):
-        assert len(read_poses(path).readings) == 2
-
-
 @given(
     scale=st.tuples(st.floats(0.01, 1), st.floats(0.01, 1)),
     seed=st.integers(0, 99),
@@ -227,35 +211,6 @@ def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(
     leaning = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
     got = sweep.tracker.sensor_from_image.as_matrix() @ leaning.image_from_sample
     np.testing.assert_allclose(got, matrix[:, [0, 1, 3]], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("spacing", "calibrations", "message"),
-    [
-        ("0.3 0.2 1", [np.diag([0.1, 0.2, 0.15, 1.0])] * 3, "ElementSpacing"),
-        ("1 1 1", [np.diag([0.1, 0.2, 0.15, 1.0])] * 2 + [np.diag([0.1, 0.3, 0.2, 1.0])], r"\[2\]"),
-        ("1 1 1", [np.diag([-0.2, 0.2, 0.2, 1.0])] * 3, "right-handed"),
-    ],
-)
-def test_calibrations_and_spacings_that_contradict_are_refused(tmp_path, spacing, calibrations, message):
-    _, frames = path_of(3)
-    for frame, matrix in zip(frames, calibrations, strict=False):
-        frame["ImageToProbeTransform"] = text_of(matrix)
-    path = write_mha(tmp_path / "a.mha", grey(), frames=frames, spacing=spacing)
-    with pytest.raises(InvalidInputError, match=message):
-        read_metaimage(path, LEVELS)
-
-
-def test_all_that_is_missing_is_asked_for_at_once(tmp_path):
-    path = write_mha(tmp_path / "a.mha", grey().astype(np.int16), frames=[])
-    with pytest.raises(MissingSettingsError) as caught:
-        read_metaimage(path)
-    wanted = {"sampling_rate_hz", "vector_pitch_mm", "centre_frequency_hz", "bandwidth_hz", "frame_rate_hz"}
-    assert {*caught.value.settings} == wanted
-    sweep = read_metaimage(
-        write_mha(tmp_path / "b.mha", grey(), frames=[]), given_over(BMODE, frame_rate_hz=20.0)
-    )
-    np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
 
 
 NRRD = "NRRD0004\ntype: uint8\nencoding: {}\nendian: little\n{}\n\n"
@@ -336,21 +291,3 @@ def test_tracker_recordings_without_images(realdata, tmp_path):
         tmp_path / "a.mha", np.zeros((3, 0, 0), np.uint8), {"ElementType": "MET_OTHER"}, path_of(3)[1]
     )
     assert len(read_poses(empty).readings) == 3
-
-
-def test_stamps_that_are_all_the_same_are_none(tmp_path):
-    _, frames = path_of(4)
-    with pytest.raises(MissingSettingsError) as caught:
-        _ = opened(tmp_path, [frame | {"Timestamp": "0"} for frame in frames]).sweep
-    assert caught.value.settings == ("frame_rate_hz",)
-
-
-def test_frames_may_be_numbered_with_more_digits(tmp_path):
-    """As Ibis numbers them."""
-    true, frames = path_of(4)
-    opened(tmp_path, frames)
-    path = tmp_path / "a.mha"
-    path.write_bytes(path.read_bytes().replace(b"Seq_Frame", b"Seq_Frame000000"))
-    np.testing.assert_allclose(
-        read_poses(path).readings.world_from_sensor.as_matrix(), true.as_matrix(), atol=1e-9
-    )

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
 WIRES = ("G1", "7:L1", "2")
@@ -30,36 +29,6 @@ def test_a_wire_goes_by_its_name_before_its_number_or_there_are_none(tmp_path):
     assert (plain.wire, len(plain)) == (None, 2)
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("frame,column_px\n0,1\n", 1),
-        ("0,1,2,G1\n", 1),
-        ("", 1),
-        (HEAD + "0,1,2\n", 2),
-        (HEAD + "# one\n0,1,2,G1\n0,x,2,G1\n", 4),
-        (HEAD + "0,1,inf,G1\n", 2),
-        (HEAD + "0.5,1,2,G1\n", 2),
-        (HEAD + "-1,1,2,G1\n", 2),
-        (HEAD + "1e30,1,2,G1\n", 2),
-        (HEAD + "0,1,2,H9\n", 2),
-        (HEAD + "0,1,2,3\n", 2),
-        (HEAD + "0,1,2,G1\n\n0,5,5,0\n", 4),
-    ],
-)
-def test_what_is_wrong_is_named_with_its_line(tmp_path, text, line):
-    with pytest.raises(InvalidInputError, match=rf"points\.csv: line {line}: ") as caught:
-        read_points(file_of(tmp_path, text), WIRES)
-    assert "\n" not in str(caught.value)
-
-
-def test_files_that_cannot_be_read_are_told(tmp_path):
-    with pytest.raises(FileError, match="cannot be read"):
-        read_points(tmp_path / "none.csv")
-    with pytest.raises(InvalidInputError, match="points below the heading"):
-        read_points(file_of(tmp_path, HEAD), WIRES)
-
-
 @pytest.mark.parametrize("names", [WIRES, ()])
 @pytest.mark.parametrize("wire", [np.tile([2, 0, 1], 4), None])
 def test_what_is_written_is_read_again(tmp_path, names, wire):
@@ -71,23 +40,3 @@ def test_what_is_written_is_read_again(tmp_path, names, wire):
     np.testing.assert_array_equal(again.frame, points.frame)
     np.testing.assert_allclose(again.pixels, points.pixels, atol=0.51e-3)  # three digits are written
     np.testing.assert_array_equal(again.wire, wire)
-
-
-@pytest.mark.parametrize("names", [("a,b", "c"), ("#1", "c"), ("a ", "c"), ("a",)])
-def test_what_could_not_be_read_again_is_not_written(tmp_path, names):
-    points = PickedPoints(np.array([0]), np.ones((1, 2)), np.array([1]))
-    with pytest.raises(InvalidInputError):
-        write_points(tmp_path / "points.csv", points, names)
-    assert not (tmp_path / "points.csv").exists()
-
-
-def test_arrays_and_images_that_do_not_match_are_refused():
-    with pytest.raises(MismatchError):
-        PickedPoints(np.array([0, 1]), np.ones((1, 2)))
-    with pytest.raises(InvalidInputError):
-        PickedPoints(np.array([-1]), np.ones((1, 2)))
-    inside = PickedPoints(np.array([0]), np.array([(-0.5, 19.5)]))
-    inside.require_inside((5, 10, 20))
-    for frame, pixels in ((5, (1.0, 2.0)), (4, (9.6, 2.0)), (4, (1.0, -0.6))):
-        with pytest.raises(MismatchError, match=f"frame {frame}"):
-            PickedPoints(np.array([frame]), np.array([pixels])).require_inside((5, 10, 20))

@@ -1,14 +1,12 @@
 """One door: what a recording lacks comes from options or from a file beside it, and is asked for at once."""
 
-import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from image_examples import grey, tracked, write_mha
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.io import readers
 from speckle3d.io.describe import describe
@@ -42,12 +40,6 @@ def test_a_recordings_own_file_comes_before_the_folders_and_options_before_both(
     given = ImportSettings(dynamic_range_db=80.0)
     assert load_sweep(images, given).signal == BModeSettings(80.0)
     assert settings_for(images, given).column_pitch_mm == 0.1
-
-
-def test_a_wrong_file_beside_a_recording_is_named(images):
-    images.with_name("a.mha.toml").write_text("column_pitch = 0.1")
-    with pytest.raises(InvalidInputError, match=r"a\.mha\.toml: column_pitch: .*expected column_pitch_mm"):
-        load_sweep(images)
 
 
 def test_the_hash_of_a_recording_covers_what_stands_beside_it(images):
@@ -101,11 +93,6 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path, mo
     assert load_sweep(".").grid.vector_pitch_mm == 0.3
 
 
-def test_a_folder_that_no_reader_claims_is_refused(tmp_path):
-    with pytest.raises(FileError, match=r"expected a recording.*got a folder that none"):
-        load_sweep(tmp_path)
-
-
 class Entry:
     """An entry point whose object is loaded, or fails."""
 
@@ -126,25 +113,6 @@ def test_an_entry_point_that_is_of_no_use_is_told_of_and_left_out(monkeypatch, l
     monkeypatch.setattr(readers, "entry_points", lambda group: [Entry(load)])
     with pytest.warns(UserWarning, match=rf"entry point lab of speckle3d\.readers: left out: .*{said}"):
         assert readers._others() == ()
-
-
-def test_a_reader_that_fails_to_tell_does_not_claim(folders, monkeypatch, shipped):
-    broken = replace(folders, claims=failing)
-    monkeypatch.setattr(readers, "_others", lambda: (broken,))
-    readers.readers.cache_clear()
-    with pytest.warns(UserWarning, match="reader of folder of a lab: left out"):
-        assert find_reader(shipped / "phantom.h5").format == "speckle3d.sweep"
-
-
-def test_a_sweep_files_own_numbers_are_not_replaced_unseen(shipped, tmp_path):
-    shutil.copy(shipped / "phantom.h5", tmp_path / "a.h5")
-    alone = recording_sha256(tmp_path / "a.h5")
-    (tmp_path / "import.toml").write_text("speed_of_sound_m_s = 1482\n")
-    assert recording_sha256(tmp_path / "a.h5") == alone
-    assert load_sweep(tmp_path / "a.h5").signal.speed_of_sound_m_s == 1540.0
-    (tmp_path / "a.h5.toml").write_text("speed_of_sound_m_s = 1482\n")
-    with pytest.raises(InvalidInputError, match=r"a\.h5\.toml: expected none beside a speckle3d\.sweep"):
-        load_sweep(tmp_path / "a.h5")
 
 
 @pytest.mark.parametrize(

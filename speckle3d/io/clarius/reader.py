@@ -209,7 +209,7 @@ class Package:
             if element_mm is not None:
                 words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
                 return Value(element_mm * per_line, words, _OWN)
-        return Value()
+        return Value(self.settings.vector_pitch_mm, "--vector-pitch-mm")
 
     @cached_property
     def file(self) -> ClariusFile:

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 from speckle3d.core.errors import FileError
 from speckle3d.io.igtl.messages import HEADER, MessageError, Received, body_bytes, decode
@@ -165,7 +165,8 @@ class End:
             reading = [] if is_full else self._peers
             writing = [peer for peer in self._peers if peer.outbox or peer.left]
             wait_s = _FULL_S if is_full else _LOOK_S
-            readable, writable, _ = select.select([self._woken, *more, *reading], writing, [], wait_s)
+            looked_at: list[Any] = [self._woken, *more, *reading]
+            readable, writable, _ = select.select(looked_at, writing, [], wait_s)
             if self._woken in readable:
                 self._woken.recv(_PIECE_BYTES)
             for peer in list(self._peers):

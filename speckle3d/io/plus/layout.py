@@ -34,10 +34,13 @@ class Layout:
         (a line of I, a line of Q).
     orientation : str
         As MF: columns to the marked side, rows away from the probe.
+    conjugated : bool
+        Whether Q has the other sign in the file.
     """
 
     kind: str
     orientation: str
+    conjugated: bool = False
 
     @classmethod
     def of(cls, header: SequenceHeader, machine: str | None = None) -> Layout:
@@ -95,7 +98,7 @@ class Layout:
         if self.is_complex:
             pairs = np.moveaxis(pixels, self._pair_axis, 0)
             joined = pairs[0::2].astype(np.complex64)
-            joined.imag = pairs[1::2]
+            joined.imag = -pairs[1::2].astype(np.float32) if self.conjugated else pairs[1::2]
             pixels = np.moveaxis(joined, 0, self._pair_axis)
         return self._flipped(pixels if self.has_lines_in_rows else pixels.T)
 

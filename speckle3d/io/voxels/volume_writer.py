@@ -11,14 +11,17 @@ References
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.files import PathLike
-from speckle3d.core.labels import LabelMap
+from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.deflate import GZIP, ZLIB, packer
@@ -85,6 +88,86 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
             file.write(pack.flush())
             if suffix == ".mha":
                 put_packed_size(file, header, file.tell() - len(header))
+
+
+class VolumeWriter:
+    """Takes the planes of a volume in a block and writes it as `write_volume` does when the block ends.
+
+    Parameters
+    ----------
+    path : path
+        With a suffix of `SUFFIXES`.
+    shape : tuple of int
+        Number of voxels along i, j and k.
+    spacing_mm : tuple of float
+        Distance between neighbouring voxel centres along i, j and k.
+    world_from_grid : RigidTransform
+        Pose of the grid; its origin is the centre of voxel ``[0, 0, 0]``; mm.
+    dtype : dtype
+        uint8, int16, uint16 or float32.
+    fields : mapping of str to str, optional
+        What the file says of the voxels; `read_volume` gives it back.
+    compress : bool
+        Whether voxels are packed with deflate; of .nii.gz, they always are, of .nii never.
+    segments : sequence of Segment, optional
+        What labels mean; voxels are labels if this is given, even if it is empty.
+
+    Raises
+    ------
+    InvalidInputError
+        If an argument is not what it must be.
+    FileError
+        If the file cannot be written; `NoSpaceError` if the disk is full.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from speckle3d.io.voxels.volumes import read_volume
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = f"{folder}/v.nrrd"
+    ...     with VolumeWriter(file, (4, 3, 2), (1, 1, 1), RigidTransform.identity(), "uint8") as writer:
+    ...         for k in range(2):
+    ...             writer.append(np.full((1, 3, 4), k, np.uint8))
+    ...     read_volume(file).voxels[0, 0].tolist()
+    [0, 1]
+    """
+
+    def __init__(
+        self,
+        path: PathLike,
+        shape: tuple[int, int, int],
+        spacing_mm: tuple[float, float, float],
+        world_from_grid: RigidTransform,
+        dtype: npt.DTypeLike,
+        fields: Mapping[str, str] | None = None,
+        compress: bool = True,
+        segments: Sequence[Segment] | None = None,
+    ) -> None:
+        self._path, self._compress, self._planes = path, compress, 0
+        place = np.zeros(shape, dtype, order="F"), spacing_mm, world_from_grid, dict(fields or {})
+        self._volume = Volume(*place) if segments is None else LabelMap(*place, tuple(segments))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            write_volume(self._path, self._volume, self._compress)
+
+    def append(self, planes: npt.NDArray[Any]) -> None:
+        """Take the next planes along k, shape (k, j, i), of the volume's type.
+
+        Raises
+        ------
+        MismatchError
+            If they are of another shape or type, or more than are left.
+        """
+        target = self._volume.voxels.T[self._planes :][: len(planes)]
+        if planes.shape != target.shape or planes.dtype != target.dtype:
+            expected = f"planes of shape {target.shape}, {target.dtype}"
+            raise MismatchError(f"{self._path}: expected {expected}, got {planes.shape}, {planes.dtype}")
+        target[:] = planes
+        self._planes += len(planes)
 
 
 def _header(suffix: str, volume: Volume, is_packed: bool) -> bytes:

@@ -4,11 +4,11 @@ import pytest
 from format_examples import FRAMES, SAMPLES, VECTORS, grey, iq, matlab_order, rf, write_mat
 from scipy.io import savemat
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
 from speckle3d.io.describe import describe
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import load_sweep, open_recording
+from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.load import load_sweep
 
 TIMES = 0.1 * np.arange(FRAMES)
 AXES = "sample, vector, frame"
@@ -84,28 +84,6 @@ def test_grey_levels_saved_as_double_with_positions(tmp_path, new):
 
 
 @VERSIONS
-def test_one_frame_needs_no_axis_and_no_rate(tmp_path, new):
-    path = saved(tmp_path, new, one=matlab_order(rf())[..., 0])
-    for axes in ("sample, vector", AXES):
-        sweep = load_sweep(path, mapped(rf="one", axes=axes, time_s=None))
-        np.testing.assert_array_equal(read(sweep), rf()[:1])
-
-
-@VERSIONS
-@pytest.mark.parametrize("bad", [np.nan, TIMES[1]])
-def test_a_frame_without_a_time_of_its_own_is_left_out(tmp_path, new, bad):
-    path = saved(tmp_path, new, t=np.where(np.arange(FRAMES) == 2, bad, TIMES))
-    recording = open_recording(path, mapped(rf="RData"))
-    np.testing.assert_array_equal(read(recording.sweep), np.delete(rf(), 2, axis=0))
-    assert any("images: 1 of 4 left out" in note for note in recording.notes)
-
-
-def test_times_that_are_all_the_same_are_none(tmp_path):
-    with pytest.raises(MissingSettingsError, match="--frame-rate-hz"):
-        load_sweep(saved(tmp_path, t=0 * TIMES), mapped(rf="RData"))
-
-
-@VERSIONS
 def test_an_element_of_an_array_of_structs(tmp_path, new):
     path = saved(tmp_path, new)
     if new:  # each field is a list of references, as MATLAB writes them
@@ -138,40 +116,6 @@ def test_without_a_mapping_the_arrays_are_listed_in_one_line(tmp_path, new):
     assert ("array RData", "40 x 6 x 4", "int16") in describe(path)
 
 
-def test_what_is_missing_is_asked_for_at_once(tmp_path):
-    with pytest.raises(MissingSettingsError) as caught:
-        load_sweep(saved(tmp_path), ImportSettings(arrays={"rf": "RData", "axes": AXES}))
-    missing = ("vector_pitch_mm", "sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz", "frame_rate_hz")
-    assert caught.value.settings == missing
-
-
-@pytest.mark.parametrize("new", [pytest.param(False, marks=pytest.mark.slow), True], ids=["5", "7.3"])
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"axes": None},
-        {"axes": "sample, vector"},
-        {"axes": "sample, sample, vector"},
-        {"axes": "sample, vector, -"},
-        {"axes": "vector, frame, sample"},  # contradicts the length of t
-        {"rf": "Data"},
-        {"rf": "Trans"},
-        {"rf": "Trans.kind"},
-        {"rf": "Cells{3}"},
-        {"rf": None, "iq": "RData"},
-        {"colour": "RData"},
-        {"vector_pitch_mm": "t"},
-        {"vector_pitch_mm": "Trans.spacingMm * x"},
-    ],
-    ids=str,
-)
-def test_a_wrong_mapping_is_refused_in_one_line(tmp_path, new, changes):
-    with pytest.raises(InvalidInputError) as caught:
-        read(load_sweep(saved(tmp_path, new), mapped(**{"rf": "RData"} | changes)))
-    assert "\n" not in str(caught.value)
-    assert not isinstance(caught.value, MissingSettingsError)
-
-
 @VERSIONS
 @pytest.mark.parametrize("left", [0.3, 0.95])
 def test_a_truncated_file_is_an_error_of_one_line(tmp_path, new, left):
@@ -181,33 +125,3 @@ def test_a_truncated_file_is_an_error_of_one_line(tmp_path, new, left):
     with pytest.raises(Speckle3DError) as caught:
         read(load_sweep(path, mapped(rf="RData")))
     assert "\n" not in str(caught.value)
-
-
-@VERSIONS
-def test_echoes_that_are_no_numbers_are_refused(tmp_path, new):
-    data = matlab_order(rf()).astype(float)
-    data[3, 2, 1] = np.nan
-    with pytest.raises(InvalidInputError, match=r"expected a finite value, got nan"):
-        read(load_sweep(saved(tmp_path, new, data=data), mapped(rf="data")))
-
-
-@pytest.mark.parametrize("inside", [False, True])
-def test_a_flag_that_claims_an_imaginary_part_does_not_crash(tmp_path, inside):
-    """SciPy reads on into the next matrix, and ends the interpreter."""
-    variables = {"A": rf()[0], "B": np.arange(5.0)}
-    path = write_mat(tmp_path / "a.mat", packed=False, **({"S": variables} if inside else variables))
-    content = bytearray(path.read_bytes())
-    last = [i for i in range(128, len(content), 8) if content[i : i + 4] == b"\6\0\0\0"][1 if inside else 0]
-    content[last + 9] |= 8
-    path.write_bytes(content)
-    with pytest.raises(FileError, match="imaginary"):
-        load_sweep(path)
-
-
-def test_elsewhere_is_not_gone_to(tmp_path):
-    path = saved(tmp_path, True)
-    with h5py.File(path, "r+") as file:
-        del file["RData"]
-        file["RData"] = h5py.ExternalLink("other.mat", "/RData")
-    with pytest.raises(InvalidInputError, match="another file"):
-        load_sweep(path, mapped(rf="RData"))

@@ -36,18 +36,6 @@ def test_arrays_make_a_sweep(tmp_path):
     np.testing.assert_array_equal(sweep.frame_time_s, times)
 
 
-@pytest.mark.parametrize(("frames", "given", "missing"), [
-    (GREY, {}, ["pitch_mm", "frame_rate_hz", "dynamic_range_db", "pictures.md"]),
-    (GREY.astype(np.int16), {"pitch_mm": 0.1, "frame_rate_hz": 20.0}, ["signal"]),
-    (GREY.astype(float), {}, ["float64", "astype"]),
-    (GREY[0], {}, ["(n, row, column)"]),
-])  # fmt: skip
-def test_what_is_missing_is_asked_for_by_name(frames, given, missing):
-    with pytest.raises(InvalidInputError) as error:
-        speckle3d.Sweep.from_arrays(frames, **given)
-    assert all(word in str(error.value) for word in missing)
-
-
 def test_an_array_file_is_read(tmp_path):
     np.save(tmp_path / "grey.npy", GREY)
     with pytest.raises(MissingSettingsError) as error:

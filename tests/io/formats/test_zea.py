@@ -70,17 +70,6 @@ def test_iq_of_the_other_sign_are_refused_and_noise_is_asked_about(tmp_path):
     np.testing.assert_array_equal(read(load_sweep(path, given)), iq())
 
 
-def test_files_without_coordinates_ask_for_where_lines_are(tmp_path):
-    path = write_zea(tmp_path / "a.hdf5", rf(), placed=False)
-    with pytest.raises(MissingSettingsError) as caught:
-        load_sweep(path)
-    missing = ("vector_pitch_mm", "sampling_rate_hz", "bandwidth_hz", "frame_rate_hz")
-    assert caught.value.settings == missing
-    sweep = load_sweep(path, GIVEN.model_copy(update={"vector_pitch_mm": 0.2, "sampling_rate_hz": 20e6}))
-    np.testing.assert_array_equal(read(sweep), rf())
-    assert sweep.grid == ImageGrid(VECTORS, SAMPLES, 0.2, 0.037, 0.0)
-
-
 def test_grey_levels_of_a_track_beside_channel_data(tmp_path):
     path = write_zea(tmp_path / "a.hdf5", rf(), "raw_data", home="tracks/track_0/")
     with pytest.raises(InvalidInputError, match="channel data need beamforming"):
@@ -118,68 +107,6 @@ def test_the_earliest_product_of_the_only_track_is_read_unless_another_is_named(
         load_sweep(path, GIVEN)
     given = GIVEN.model_copy(update={"arrays": {"data": "tracks/b/data/beamformed_data"}})
     np.testing.assert_array_equal(read(load_sweep(path, given)), rf(3))
-
-
-def test_axes_are_told_by_the_coordinates_and_not_by_their_order(tmp_path):
-    """An image written lateral axis first, as one version of the format has it."""
-    path = write_zea(tmp_path / "a.hdf5", rf())
-    with h5py.File(path, "r+") as file:
-        for name in (VALUES, PLACES):
-            changed(name, lambda values: values.transpose(0, 2, 1, 3))(file)
-    sweep = load_sweep(path, GIVEN)
-    np.testing.assert_array_equal(read(sweep), rf())
-    require_grid(sweep.grid)
-
-
-def changed(name, change):
-    def put(file):
-        values = change(file[name][()])
-        del file[name]
-        file[name] = values
-
-    return put
-
-
-def polar():
-    r, angle = np.linspace(0.01, 0.03, SAMPLES)[:, None], np.linspace(-0.5, 0.5, VECTORS)
-    return np.stack([r * np.sin(angle), 0 * r * angle, r * np.cos(angle)], axis=-1)
-
-
-def elsewhere(file):
-    del file[VALUES]
-    file[VALUES] = h5py.ExternalLink("other.h5", "/v")
-
-
-def never_written(file):
-    del file[VALUES]
-    shape = (FRAMES, SAMPLES, VECTORS, 1)
-    file.create_dataset(VALUES, shape=shape, dtype="f4", chunks=(1, *shape[1:]))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        changed(VALUES, lambda v: np.repeat(v, 3, axis=3)),
-        changed(VALUES, lambda v: v[:, :-1]),
-        changed(VALUES, lambda v: v[:0]),
-        changed(VALUES, lambda v: np.where(v == v.max(), np.nan, v)),
-        changed(PLACES, lambda v: np.where(v == v.max(), np.nan, v)),
-        changed(PLACES, lambda v: v + 1e-3 * np.arange(4)[:, None, None, None]),
-        changed(PLACES, lambda v: np.broadcast_to(polar(), v.shape)),
-        changed(PLACES, lambda v: v[:, :, ::-1]),
-        changed("scan/center_frequency", lambda v: [6e6, 7e6]),
-        elsewhere,
-        never_written,
-    ],
-)
-def test_what_cannot_be_is_refused_in_one_line(tmp_path, change):
-    path = write_zea(tmp_path / "a.hdf5", rf())
-    with h5py.File(path, "r+") as file:
-        change(file)
-    with pytest.raises(InvalidInputError) as caught:
-        read(load_sweep(path, GIVEN))
-    assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize("bad", [0.0, np.nan])

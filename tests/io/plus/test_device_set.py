@@ -10,7 +10,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.io.load import load_sweep, recording_files
+from speckle3d.io.load import load_sweep
 from speckle3d.io.plus.device_set import read_device_set
 
 TURN = Rotation.from_euler("xyz", [0.1, -0.2, 0.3]).as_matrix()
@@ -107,18 +107,6 @@ def test_names_of_frames_are_those_of_the_set(tmp_path):
     np.testing.assert_allclose(sweep.tracker.sensor_from_image.translation, [10, 20, 30])
 
 
-def test_options_and_the_header_are_above_the_set(tmp_path):
-    frames = tracked(3)[2]
-    for frame in frames:
-        frame["ImageToProbeTransform"] = text(matrix((0.5, 0.6, 0.5), (1, 2, 3)))
-    path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
-    config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()))
-    sweep = load_sweep(path, given(config, column_pitch_mm=0.7))
-    assert sweep.grid.vector_pitch_mm == 0.7
-    assert sweep.grid.sample_spacing_mm == pytest.approx(0.6)
-    np.testing.assert_allclose(sweep.tracker.sensor_from_image.translation, [1, 2, 3])
-
-
 def test_the_machine_orientation_counts_where_the_header_has_none(tmp_path):
     config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()),
                      more='<DataSource PortUsImageOrientation="UN"/>')  # fmt: skip
@@ -157,47 +145,3 @@ def test_the_clip_of_volumes_is_that_of_plus(tmp_path):
         assert (mask != expected).mean() < (0.0003 if angles else 1e-9)
     whole = '<VolumeReconstruction ClipRectangleOrigin="0 0" ClipRectangleSize="820 616"/>'
     assert read_device_set(written(tmp_path / "set.xml", scan=whole)).clip.region_text(grid) is None
-
-
-def test_a_settings_file_names_a_set_of_its_folder(tmp_path, sequence):
-    folder = tmp_path / "sub"
-    folder.mkdir()
-    moved = sequence.rename(folder / "a.mha")
-    written(folder / "set.xml", ("Image", "Probe", matrix()))
-    (folder / "import.toml").write_text('plus_config = "set.xml"\ndynamic_range_db = 60.0\n')
-    assert load_sweep(moved).tracker.sensor_from_image is not None
-    assert {path.name for path in recording_files(moved)} == {"a.mha", "import.toml", "set.xml"}
-    written(tmp_path / "set.xml", ("Image", "Probe", matrix()))
-    (folder / "link.xml").symlink_to(tmp_path / "set.xml")
-    for name in ("../set.xml", str(folder / "set.xml"), "link.xml"):
-        (folder / "import.toml").write_text(f'plus_config = "{name}"\n')
-        with pytest.raises(InvalidInputError, match=r"import\.toml: plus_config"):
-            load_sweep(moved)
-
-
-@pytest.mark.parametrize(
-    ("content", "named"),
-    [
-        ("<PlusConfiguration", "XML"),
-        ('<!DOCTYPE a [<!ENTITY b "c">]><PlusConfiguration/>', "declaration"),
-        ("<Other/>", "Other"),
-        ('<PlusConfiguration><ScanConversion TransducerWidthMm="-1"/></PlusConfiguration>', "above zero"),
-        (SINGLE.format("Image", "Probe", "1 2"), "Transform Image: Matrix"),
-        (SINGLE.format("Probe", "Image", "0 " * 16), "Probe to Image.*singular"),
-        (SINGLE.format("Image", "Probe", "0 " * 16), "axes of some length"),
-    ],
-)
-def test_what_is_wrong_is_named(tmp_path, sequence, content, named):
-    (tmp_path / "set.xml").write_text(content)
-    with pytest.raises(InvalidInputError, match=rf"set\.xml.*{named}") as caught:
-        load_sweep(sequence, given(str(tmp_path / "set.xml")))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_transform_said_twice_is_said_alike(tmp_path):
-    image, back = ("Image", "Probe", matrix()), ("Probe", "Image", np.linalg.inv(matrix()))
-    assert len(read_device_set(written(tmp_path / "set.xml", image, image, back)).transforms) == 2
-    other = ("Image", "Probe", matrix(place=(10.0, 20.0, 31.0)))
-    for first in (image, back):
-        with pytest.raises(InvalidInputError, match=r"set\.xml: Transform From=Image To=Probe.* 31 "):
-            read_device_set(written(tmp_path / "set.xml", first, other))

@@ -45,12 +45,3 @@ def test_documents_are_told_apart(tmp_path, content, expected, option):
     with pytest.raises(InvalidInputError, match=rf"a\.xml: expected a recording, got .*{option}") as caught:
         load_sweep(path)
     assert rows["sweep"] == f"none: {caught.value}"
-
-
-@pytest.mark.parametrize("content", ["<Other/>", "<a><PlusConfiguration/></a>", "<PlusConfiguration"])
-def test_other_xml_is_one_line(tmp_path, content):
-    path = tmp_path / "a.xml"
-    path.write_text(content)
-    with pytest.raises(InvalidInputError, match=r"a\.xml: expected") as caught:
-        load_sweep(path)
-    assert len(str(caught.value).splitlines()) == 1

@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sweep_examples
-from format_examples import SPACING_MM, carrying
 from image_examples import grey, write_mha
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.describe import describe
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import load_sweep, open_recording
+from speckle3d.io.load import load_sweep
 from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.sweep_writer import write_sweep
 
@@ -63,7 +61,7 @@ def test_echoes_survive_a_sequence_and_a_sweep_file(tmp_path, kind, dtype):
     again = load_sweep(tmp_path / "out.mha")
     np.testing.assert_array_equal(again.frames[1], sweep.frames[1])
     assert (again.grid, again.signal) == (sweep.grid, sweep.signal)
-    assert read_header(tmp_path / "out.mha").pixels.dtype == dtype
+    assert read_header(tmp_path / "out.mha").dtype == dtype
 
 
 def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
@@ -131,23 +129,3 @@ def test_itk_reads_the_same_pixels(tmp_path, compressed):
         write_sequence(tmp_path / name, sweep, compressed=compressed)
         image = SimpleITK.ReadImage(str(tmp_path / name))
         np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
-
-
-def test_names_of_other_files_are_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"\.mha, \.mhd, \.nrrd, got '\.nii'"):
-        write_sequence(tmp_path / "a.nii", sweep_examples.bmode_sweep())
-
-
-def test_analytic_lines_whose_q_has_the_other_sign_are_turned_and_survive_a_sweep_file(tmp_path):
-    frames = np.conj(carrying(6e6, 1540.0))
-    pairs = np.rint(4000 * np.stack([frames.real, frames.imag], axis=-1)).astype(np.int16)
-    pairs[0, 0, 0] = 5, -32768  # whose opposite int16 does not hold
-    values = pairs.reshape(*frames.shape[:2], -1)
-    path = write_mha(tmp_path / "a.mha", values, {"UltrasoundImageType": "RF_IQ_LINE"})
-    given = RF.model_copy(update={"sampling_rate_hz": 1540e3 / (2 * SPACING_MM)})
-    sweep = load_sweep(path, given)
-    np.testing.assert_array_equal(sweep.frames[0], pairs[0, ..., 0] - 1j * pairs[0, ..., 1].astype(float))
-    rows = open_recording(path, given).rows
-    assert ("sign of Q", "turned, as told by the phase", "") in rows
-    write_sweep(tmp_path / "a.h5", sweep)
-    np.testing.assert_array_equal(load_sweep(tmp_path / "a.h5").frames[0], sweep.frames[0])

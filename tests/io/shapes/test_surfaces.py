@@ -43,14 +43,3 @@ def test_damaged_files_are_one_clear_error(path):
         path.write_bytes(whole[:cut])
         with pytest.raises((FileError, InvalidInputError), match=path.name):
             read_surface(path)
-
-
-def test_what_cannot_be_written_leaves_nothing(tmp_path):
-    surface = Surface(CORNERS, FACES)
-    with pytest.raises(InvalidInputError, match=r"\.stl, \.ply, \.vtk"):
-        write_surface(tmp_path / "t.obj", surface)
-    with pytest.raises(InvalidInputError, match="at least one triangle"):
-        write_surface(tmp_path / "t.stl", Surface(CORNERS, FACES[:0]))
-    with pytest.raises(FileError):
-        write_surface(tmp_path / "none" / "t.stl", surface)
-    assert list(tmp_path.iterdir()) == []

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import SimpleITK
-from disks import FULL, limited
 from sweep_examples import poses
 
-from speckle3d.core.errors import InvalidInputError, NoSpaceError
 from speckle3d.io.shapes.transforms import SUFFIXES, transform_paths, write_transform, write_transforms
 
 POINTS = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [3.0, -20.0, 7.0]])
@@ -35,21 +33,3 @@ def test_a_file_for_each_frame(tmp_path, suffix):
     for path, pose in zip(paths, every, strict=True):
         found = SimpleITK.ReadTransform(str(path)).TransformPoint([1.0, 2.0, 3.0])
         np.testing.assert_allclose(found, pose.inv().apply([1.0, 2.0, 3.0]), atol=1e-12)
-
-
-def test_what_slicer_would_not_read_is_refused(tmp_path):
-    with pytest.raises(InvalidInputError, match=r"\.tfm or \.h5, got '\.txt'"):
-        write_transform(tmp_path / "t.txt", poses(1)[0])
-    with pytest.raises(InvalidInputError, match="a row of 2"):
-        write_transform(tmp_path / "t.tfm", poses(2))
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_on_a_full_disk_the_old_files_stay(tmp_path, suffix):
-    path = tmp_path / f"t{suffix}"
-    write_transforms(path, poses(3))
-    before = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
-    with limited(len(before[f"t-0000{suffix}"]) // 2), pytest.raises(NoSpaceError, match=FULL):
-        write_transforms(path, poses(3, seed=1))
-    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before
