@@ -16,6 +16,7 @@ import speckle3d as s3
 from speckle3d.cli.stream.live import _trouble
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.igtl.link import LinkState
+from speckle3d.io.load import import_notes
 from speckle3d.io.reconstructions import read_reconstruction
 
 RF = (

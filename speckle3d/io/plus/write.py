@@ -135,11 +135,12 @@ def write_sequence(
         return size + (0 if pack is None else file.write(pack.flush()))
 
     if suffix == ".mhd":
-        beside = f"{target.stem}.{'zraw' if compressed else 'raw'}"
-        data = target.with_name(beside)
-        if data.exists() and not (target.exists() and read_header(target).data == data.resolve()):
+        beside, other = (f"{target.stem}.{end}" for end in ("zraw", "raw")[:: 1 if compressed else -1])
+        data, old = target.with_name(beside), read_header(target).data if target.exists() else None
+        if data.exists() and data.resolve() != old:
             raise InvalidInputError(f"{data}: is there and no part of {target.name}: give another name")
-        with FileSet(target.name, (beside,)).replaced(target.parent) as part:
+        stale = () if old is None or old.name != other else (other,)
+        with FileSet(target.name, (beside,), stale).replaced(target.parent) as part:
             with (part / beside).open("wb") as file:
                 size = write_images(file, ZLIB)
             packed = size if compressed else None
