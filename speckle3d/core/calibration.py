@@ -132,21 +132,14 @@ class Calibration:
     def facts(self) -> list[tuple[str, object]]:
         """What the calibration shows of itself."""
         place = self.rotation if self.translation_mm is None else self.sensor_from_image
-        kept, given = len(self.frames.used), self.frames.given
-        offset = "not estimated" if self.time_offset_s is None else f"{self.time_offset_s:+.4f} s"
         return [
             ("of", f"the {self.sensor}, by {self.method}"),
             ("sensor_from_image", place),
-            (
-                "pixels",
-                None
-                if self.pixel_mm is None
-                else " x ".join(f"{each:.4g}" for each in self.pixel_mm) + " mm",
-            ),
+            ("pixels, mm", self.pixel_mm),
             ("residual", f"{self.rms:.3g} {self.rms_unit} RMS"),
-            ("condition number", f"{self.condition_number:.3g}"),
-            ("clock offset", offset),
-            ("frames", f"{kept} of {given} used"),
+            ("condition number", self.condition_number),
+            ("clock offset, s", self.time_offset_s),
+            ("frames", f"{len(self.frames.used)} of {self.frames.given} used"),
             ("verdict", self.verdict),
         ]
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.geometry import require_increasing
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import BModeSettings, RFSettings
 
@@ -132,16 +133,12 @@ class EchoSpectra:
 
     def __post_init__(self) -> None:
         for name in ("depth_mm", "frequency_hz"):
-            values = getattr(self, name)
-            if not values.size or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
-                raise InvalidInputError(f"spectrum, {name}: expected values that increase, got others")
-        if self.power.shape != (self.depth_mm.size, self.frequency_hz.size):
-            raise InvalidInputError(
-                f"spectrum, power: expected shape ({self.depth_mm.size}, {self.frequency_hz.size}), "
-                f"got {self.power.shape}"
-            )
-        if not (np.isfinite(self.power) & (self.power >= 0)).all():
-            raise InvalidInputError("spectrum, power: expected finite values of zero or above, got others")
+            if not getattr(self, name).size:
+                raise InvalidInputError(f"spectrum, {name}: expected values, got none")
+            require_increasing(getattr(self, name), f"spectrum, {name}")
+        shape = self.depth_mm.size, self.frequency_hz.size
+        if self.power.shape != shape or not (np.isfinite(self.power) & (self.power >= 0)).all():
+            raise InvalidInputError(f"spectrum, power: expected values of zero or above, shape {shape}")
 
     def at(self, depth_mm: FloatArray, frequency_hz: FloatArray) -> FloatArray:
         """Power at depths of any shape and at other frequencies, shape (..., f)."""

@@ -26,7 +26,5 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
         If it is something else.
     """
     if not isinstance(value, kind):
-        got = (
-            f"{type(value).__name__} {str(value)[:60]!r}" if isinstance(value, str) else type(value).__name__
-        )
+        got = type(value).__name__
         raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")

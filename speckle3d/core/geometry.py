@@ -79,14 +79,6 @@ def skew(vectors: FloatArray) -> FloatArray:
     return np.asarray(matrices - np.swapaxes(matrices, -1, -2))
 
 
-def components(poses: RigidTransform | Rotation) -> tuple[FloatArray, FloatArray]:
-    """Quaternions, scalar last, and translations, zero for rotations alone: shapes (..., 4) and (..., 3)."""
-    if isinstance(poses, RigidTransform):
-        return np.ascontiguousarray(poses.rotation.as_quat()), np.ascontiguousarray(poses.translation)
-    xyzw = np.ascontiguousarray(poses.as_quat())
-    return xyzw, np.zeros((*xyzw.shape[:-1], 3))
-
-
 def nearest_rotation(matrices: npt.ArrayLike) -> FloatArray:
     """Rotation matrices nearest to given ones in the sum of squared differences.
 

@@ -38,11 +38,9 @@ class Segment:
     colour: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        if not 0 < self.value < 2**16:
-            raise InvalidInputError(f"segment: expected a label from 1 to 65535, got {self.value}")
-        if not self.name.strip():
-            raise InvalidInputError(f"segment {self.value}: expected a name, got {self.name!r}")
         colour = tuple(float(part) for part in self.colour)
+        if not (0 < self.value < 2**16 and self.name.strip()):
+            raise InvalidInputError(f"segment: expected a label from 1 to 65535 and a name, got {self}")
         if len(colour) != 3 or not all(0 <= part <= 1 for part in colour):
             raise InvalidInputError(f"segment {self.value}: expected a colour of three parts, got {colour}")
         object.__setattr__(self, "colour", colour)
@@ -58,7 +56,6 @@ STATE_SEGMENTS = (
 """Of voxels by how they came to their value."""
 
 
-@shown
 @shown
 @dataclass(frozen=True)
 class LabelMap(Volume):
@@ -91,16 +88,9 @@ class LabelMap(Volume):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_segments(self.voxels.dtype, self.segments)
-
-
-def require_segments(dtype: np.dtype[np.generic], segments: tuple[Segment, ...]) -> None:
-    """Raise `InvalidInputError` unless labels of a type can have these segments."""
-    if dtype.name not in LABEL_TYPES:
-        raise InvalidInputError(f"labels: expected {' or '.join(LABEL_TYPES)}, got {dtype}")
-    values = [segment.value for segment in segments]
-    if len({*values}) != len(values):
-        raise InvalidInputError(f"segments: expected one for each label, got labels {values}")
-    most = np.iinfo(dtype.name).max
-    if values and max(values) > most:
-        raise InvalidInputError(f"segments: expected labels up to {most} of {dtype}, got {max(values)}")
+        labels, kind = [segment.value for segment in self.segments], self.voxels.dtype
+        if kind.name not in LABEL_TYPES:
+            raise InvalidInputError(f"labels: expected {' or '.join(LABEL_TYPES)}, got {kind}")
+        most = np.iinfo(kind.name).max
+        if len({*labels}) != len(labels) or max(labels, default=0) > most:
+            raise InvalidInputError(f"segments: expected one for each label up to {most}, got {labels}")

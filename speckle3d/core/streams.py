@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation, Slerp
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import components, require_increasing
+from speckle3d.core.geometry import require_increasing
 from speckle3d.core.shown import shown
 
 DEFAULT_MAX_GAP_S = 0.2
@@ -94,11 +94,6 @@ class TimedSamples(Generic[Samples]):
                 f"gaps over {self.max_gap_s:g} s are not bridged"
             )
         return t
-
-    @cached_property
-    def components(self) -> tuple[FloatArray, FloatArray]:
-        """Quaternions, scalar last, and translations, zero for rotations alone: shapes (m, 4) and (m, 3)."""
-        return components(self.world_from_sensor)
 
     @cached_property
     def _slerp(self) -> Slerp:

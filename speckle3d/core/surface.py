@@ -120,9 +120,7 @@ class Surface:
 
     def _spread(self, of_corners: FloatArray) -> FloatArray:
         """Sum of what each triangle gives to its corners, shape (m, 3, 3) to (n, 3)."""
-        total = np.zeros_like(self.vertices_mm, dtype=float)
-        for axis in range(3):
-            total[:, axis] = np.bincount(
-                self.triangles.ravel(), of_corners[..., axis].ravel(), len(self.vertices_mm)
-            )
-        return total
+        corners = self.triangles.ravel()
+        shape = len(self.vertices_mm), corners.size
+        belonging = coo_array((np.ones(corners.size), (corners, np.arange(corners.size))), shape=shape)
+        return np.asarray(belonging @ of_corners.reshape(-1, 3))

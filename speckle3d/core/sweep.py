@@ -25,8 +25,6 @@ INERTIAL = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 LARGEST_SKEW_RAD = 0.2
 """Of an image's axes: those of published calibrations lean by 0.05."""
 
-_UNCALIBRATED = "the sensor is not calibrated to the image: {} lacks the attribute {}"
-
 
 class Frames(Protocol):
     """Frames on disk or in memory; indexing reads one."""
@@ -188,7 +186,10 @@ class ImageGrid:
             raise InvalidInputError(
                 f"first_sample_depth_mm: expected a finite value, got {self.first_sample_depth_mm}"
             )
-        require_skew(self.skew_rad, "skew_rad")
+        if not abs(self.skew_rad) <= LARGEST_SKEW_RAD:
+            raise InvalidInputError(
+                f"skew_rad: expected at most {LARGEST_SKEW_RAD:g} either way, got {self.skew_rad}"
+            )
 
     @property
     def width_mm(self) -> float:
@@ -237,8 +238,11 @@ class _Sensor(Generic[Samples]):
 
     label: ClassVar[str]
     """What messages call the sensor."""
-    uncalibrated: ClassVar[str]
-    """Message that the sensor's mounting is missing, which names the attribute of a sweep file."""
+
+    @property
+    def uncalibrated(self) -> str:
+        """Message that the sensor's mounting is missing."""
+        return f"the {self.label} is not calibrated to the image (its attribute sensor_from_image)"
 
     def covers(self, frame_time_s: npt.ArrayLike) -> BoolArray:
         """Which frames have a reading."""
@@ -264,7 +268,6 @@ class OrientationSensor(_Sensor[Rotation]):
     """An orientation sensor's stream. A reading taken at t belongs to image time t + `time_offset_s`."""
 
     label: ClassVar[str] = "orientation sensor"
-    uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/orientation", "sensor_from_image_wxyz")
 
     readings: TimedRotations
     accelerometer_m_s2: FloatArray | None = None
@@ -286,13 +289,9 @@ class Tracker(_Sensor[RigidTransform]):
     """
 
     label: ClassVar[str] = "tracker"
-    uncalibrated: ClassVar[str] = _UNCALIBRATED.format("/tracker", "sensor_from_image")
 
     readings: TimedPoses
     image_skew_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_skew(self.image_skew_rad, "image_skew_rad")
 
 
 @shown
@@ -495,22 +494,14 @@ def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.Arr
     return measured.rotation if isinstance(measured, RigidTransform) else measured
 
 
-def require_skew(skew_rad: float, name: str) -> None:
-    """Raise `InvalidInputError` unless an image's axes are about square."""
-    if not abs(skew_rad) <= LARGEST_SKEW_RAD:
-        raise InvalidInputError(f"{name}: expected at most {LARGEST_SKEW_RAD:g} either way, got {skew_rad}")
-
-
 def _require_kind(sweep: Sweep) -> None:
     """Raise unless samples are complex where the settings say so, and real where they do not."""
     are_complex = np.dtype(sweep.frames.dtype).kind == "c"
     if are_complex != (isinstance(sweep.signal, RFSettings) and sweep.signal.are_complex):
-        expected = (
-            "real samples, or a demodulation_frequency_hz with them (0 for the analytic signal)"
-            if are_complex
-            else "complex samples (I/Q) with a demodulation_frequency_hz"
+        raise InvalidInputError(
+            f"{sweep.name}: expected complex samples (I/Q) with a demodulation_frequency_hz (0: analytic "
+            f"signal), real ones without, got {sweep.frames.dtype}"
         )
-        raise InvalidInputError(f"{sweep.name}: expected {expected}, got {sweep.frames.dtype}")
 
 
 def _require_positive(settings: object, names: tuple[str, ...]) -> None:

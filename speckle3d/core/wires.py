@@ -12,7 +12,6 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import require_finite
 
-_UNIT_TOLERANCE = 1e-6
 _PARALLEL_SINE = 0.02
 """Sine of about one degree, within which the outer wires of an N are parallel. Holes are drilled to 0.1 mm
 over tens of millimetres, a quarter of that."""
@@ -43,8 +42,7 @@ class WirePhantom:
     Raises
     ------
     InvalidInputError
-        If there are no wires, values are not finite, directions are not of unit length, names repeat, or a
-        pattern has a number that is no wire's.
+        If there are no wires, values are not finite, names repeat, or a pattern is not of wires.
     MismatchError
         If names, points, directions and ends differ in number.
     """
@@ -67,11 +65,6 @@ class WirePhantom:
         repeated = [name for i, name in enumerate(self.names) if name in self.names[:i]]
         if repeated:
             raise InvalidInputError(f"names: expected different ones, got {repeated[0]!r} twice")
-        lengths = np.linalg.norm(self.directions, axis=1)
-        bad = np.flatnonzero(np.abs(lengths - 1.0) > _UNIT_TOLERANCE)
-        if bad.size:
-            length = lengths[bad[0]]
-            raise InvalidInputError(f"directions[{bad[0]}]: expected unit length, got {length:.6g}")
         for number, pattern in enumerate(self.patterns):
             if not pattern or len(set(pattern)) < len(pattern) or not set(pattern) <= set(range(k)):
                 raise InvalidInputError(
@@ -115,12 +108,7 @@ class WirePhantom:
 
         ``normals @ (position - points_mm)`` are the two components of a position's distance from the wire.
         """
-        steep = np.argsort(np.abs(self.directions), axis=1)[:, :2]
-        # Of the two axes least along the wire, the first in order: a wire along an axis gets the other two.
-        first = np.eye(3)[np.sort(steep, axis=1)[:, 0]]
-        first = first - np.sum(first * self.directions, axis=1, keepdims=True) * self.directions
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        return np.stack([first, np.cross(self.directions, first)], axis=1)
+        return np.linalg.svd(self.directions[:, None])[2][:, 1:]
 
     def equations(self, wire: IntArray) -> tuple[FloatArray, FloatArray]:
         """Equations of positions in C on the wires with these numbers, shape (...).

@@ -73,7 +73,6 @@ def test_patterns_of_other_numbers_are_no_n():
     [
         {"names": ("a", "b", "a")},
         {"patterns": ((0, 1, 3),)},
-        {"directions": 2.0 * np.eye(3)},
         {"points_mm": np.full((3, 3), np.nan)},
         {"points_mm": np.zeros((2, 3))},
     ],
