@@ -18,9 +18,6 @@ from calibration.plane import Problem, Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 
-_ROUNDING = 1e-20
-"""Variance of equal cosines, from rounding; tilts of a tenth of a degree make 1e-13."""
-
 
 @dataclass(frozen=True)
 class BeamBias:
@@ -30,8 +27,6 @@ class BeamBias:
     ----------
     width_mm : float
         Thickness of the beam.
-    closed_form_mm : float
-        Displacement of the image along its y axis, from the heights alone; negative: towards the probe.
     simulated_mm : ndarray, shape (3,)
         Displacement of the middle of the lines' points along the image's axes when all parameters are
         estimated.
@@ -40,7 +35,6 @@ class BeamBias:
     """
 
     width_mm: float
-    closed_form_mm: float
     simulated_mm: FloatArray
     rms_mm: float
 
@@ -48,19 +42,6 @@ class BeamBias:
 def depth_error_mm(normal_in_image: FloatArray, width_mm: float) -> FloatArray:
     """How much too shallow lines appear, (w / 2) |n_z / n_y|, for normals of the wall in images, (m, 3)."""
     return np.asarray(width_mm / 2.0 * np.abs(normal_in_image[:, 2] / normal_in_image[:, 1]))
-
-
-def bias_along_beam_mm(normal_in_image: FloatArray, width_mm: float) -> float:
-    """Closed form of the bias along y if only the heights of the image and the wall were unknown.
-
-    Least squares explain the height error (w / 2)|n_z| by moving the wall, and the image along its y axis by
-    (w / 2) cov(|n_z|, |n_y|) / var(|n_y|). NaN where the wall was met at one angle only.
-    """
-    oblique, along = np.abs(normal_in_image[:, 2]), np.abs(normal_in_image[:, 1])
-    spread = float(np.var(along))
-    if spread < _ROUNDING:
-        return float("nan")
-    return width_mm / 2.0 * float(np.mean((oblique - oblique.mean()) * (along - along.mean()))) / spread
 
 
 def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
@@ -89,4 +70,4 @@ def predict_bias(solution: Solution, width_mm: float) -> BeamBias:
         one.sensor_from_image.apply(np.append(middle * one.pixel_mm, 0.0)) for one in (chain, seen.chain)
     )
     moved = chain.sensor_from_image.rotation.inv().apply(after - before)
-    return BeamBias(width_mm, bias_along_beam_mm(normal, width_mm), moved, seen.rms)
+    return BeamBias(width_mm, moved, seen.rms)

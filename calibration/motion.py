@@ -53,7 +53,7 @@ either side."""
 _ABSENT = 0.25
 """Standard deviation, over such a step, below which a motion is absent: a hand that means to hold still
 wobbles by 0.7 to 1.4 degrees, one that moves on purpose by five."""
-_OBLONG = 3.0
+OBLONG = 3.0
 """Pixels found to be so oblong are taken for square: their shape was not determined."""
 
 TILT = "tilt the probe to and fro (rotate about the image's lateral axis)"
@@ -196,7 +196,7 @@ def extents(solution: Solution) -> dict[str, float]:
     swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
     if solution.prior is not None:
         size = solution.prior.pixel_mm
-    elif "s_x" in solution.free and not 1.0 / _OBLONG < size[0] / size[1] < _OBLONG:
+    elif "s_x" in solution.free and not 1.0 / OBLONG < size[0] / size[1] < OBLONG:
         size = np.full(2, size[1])
     ends = (points.pixels * size).reshape(-1, 1 if solution.angular else 2, 2)
     along = ends[:, 0] if solution.angular else ends[:, 1] - ends[:, 0]

@@ -1,4 +1,4 @@
-"""N-wire phantoms: points of the image in the phantom from three dots each, and a start for the calibration.
+"""N-wire phantoms: points of the image in the phantom from three dots each, PLUS's error, and labels of dots.
 
 The outer wires of an N are parallel, so that the middle dot divides the distance between the outer two as the
 place where the image cuts the middle wire divides the distance between its crossings with the outer wires.
@@ -12,34 +12,20 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
-
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.dots import Dots
 from calibration.detection.labelling import label_by_calibration, label_dots
-from calibration.plane import Chain
-from calibration.points import ImagePoints, Seen, affine_equations
-from calibration.robust import cauchy_weights, robust_linear
-from calibration.wires import wire_start
+from calibration.points import ImagePoints, Seen
+from calibration.wires import Wires, solve_wires
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
 _PLUS_SHARE = 0.95
 """Share of the errors of which PLUS reports mean and standard deviation, the least ones."""
-_REWEIGHTINGS = 10
-_FEWEST_POINTS = 9
-"""Three equations each, for nine unknowns, and twice as many again to tell a wrong one."""
-_LEAST_SINGULAR = 1e-4
-"""Least ratio of singular values at which the linear problem is determined: at a smaller one, noise of 0.01
-mm moves the answer by the image's own size."""
-_FAR = 2.698
-"""Distance, in robust standard deviations (four medians), at which a point has half its weight."""
 
 
 def trimmed_mean_mm(errors_mm: FloatArray, share: float = _PLUS_SHARE) -> tuple[float, float]:
@@ -102,7 +88,7 @@ def nwire_errors_mm(
     points : ImagePoints
         With the wire of each; all N whose three dots are there count.
     sensor_from_pixels : ndarray, shape (4, 4)
-        Affine: PLUS's ``ImageToProbe``, `Calibration.pixel_matrix`, or `pixel_matrix` of a chain.
+        Affine: PLUS's ``ImageToProbe``, or `Calibration.pixel_matrix`.
 
     Returns
     -------
@@ -120,70 +106,9 @@ def nwire_errors_mm(
     return np.asarray(np.linalg.norm(seen - expected, axis=1))
 
 
-def pixel_matrix(chain: Chain) -> FloatArray:
-    """Affine matrix from pixels (column, row, 0, 1) to the sensor's frame in mm, shape (4, 4)."""
-    scale = np.diag([*chain.pixel_mm, float(chain.pixel_mm.mean()), 1.0])
-    return np.asarray(chain.sensor_from_image.as_matrix() @ scale)
-
-
-def start_from_nwires(points: ImagePoints, phantom: WirePhantom) -> Chain:
-    """Calibrate in closed form: least squares of the errors of `nwire_errors_mm`, [1]_ (see `wire_start`).
-
-    Parameters
-    ----------
-    points : ImagePoints
-        With the wire of each.
-    phantom : WirePhantom
-        Where its own place is not known, that is found first.
-
-    Raises
-    ------
-    InsufficientDataError
-        If the points are too few, or do not determine the answer.
-    InvalidInputError
-        If the points have no wires.
-
-    References
-    ----------
-    .. [1] R. M. Comeau et al., 1998, see this module.
-    """
-    middle, phantom_mm = middle_wires(points, phantom)
-    if len(middle) < _FEWEST_POINTS:
-        raise InsufficientDataError(
-            f"expected at least {_FEWEST_POINTS} middle dots of N to start from, got {len(middle)}"
-        )
-    weights = partial(cauchy_weights, limit=_FAR)
-    place = phantom.world_from_phantom
-    if place is None:
-        place = _place(middle, phantom_mm)
-    equations = np.broadcast_to(np.eye(3), (len(middle), 3, 3)), phantom_mm
-    return wire_start(middle, equations, place.inv(), weights, _REWEIGHTINGS, _LEAST_SINGULAR)[0]
-
-
-def _place(middle: ImagePoints, phantom_mm: FloatArray) -> RigidTransform:
-    """Find ``world_from_phantom``: linear equations of its matrix and the image's origin and axes."""
-    spread, centre = middle.pixels.std() or 1.0, middle.pixels.mean(axis=0)
-    image = affine_equations((middle.pixels - centre) / spread, middle.turns)
-    near = phantom_mm - phantom_mm.mean(axis=0)
-    phantom = affine_equations(near[:, :2], np.broadcast_to(np.eye(3), (len(near), 3, 3)))
-    third = near[:, 2, None, None] * np.eye(3)
-    matrix = np.concatenate([image, -phantom, -third], axis=2)
-    fit = robust_linear(
-        matrix, -middle.shifts_mm, partial(cauchy_weights, limit=_FAR), _REWEIGHTINGS, _LEAST_SINGULAR
-    )
-    if fit.rank < fit.parameters.size:
-        raise InsufficientDataError("the sensor turned too little to find where the phantom is")
-    axes = fit.parameters[12:].reshape(3, 3).T
-    turn = Rotation.from_matrix(nearest_rotation(axes))
-    return RigidTransform.from_components(fit.parameters[9:12] - turn.apply(phantom_mm.mean(axis=0)), turn)
-
-
-def label_and_start(
-    dots: Dots,
-    phantom: WirePhantom,
-    world_from_sensor: RigidTransform,
-    pixel_mm: npt.ArrayLike,
-) -> tuple[Seen, Chain]:
+def label_by_wires(
+    dots: Dots, phantom: WirePhantom, world_from_sensor: RigidTransform, pixel_mm: npt.ArrayLike
+) -> Seen:
     """Assign dots to wires, first by themselves, then by the calibration that follows from most frames.
 
     Parameters
@@ -196,7 +121,7 @@ def label_and_start(
     Raises
     ------
     InsufficientDataError, InvalidInputError
-        See `label_dots` and `start_from_nwires`.
+        See `label_dots` and `solve_wires`.
     """
     if len(dots.frame) and dots.frame[-1] >= len(world_from_sensor):
         raise MismatchError(f"expected a pose for frame {dots.frame[-1]}, got {len(world_from_sensor)} poses")
@@ -204,10 +129,9 @@ def label_and_start(
     if len(alone) == 0:
         reasons = sorted(set(alone.dropped.values())) or ["no frames"]
         raise InsufficientDataError(f"expected frames that show all wires, got none: {reasons[0]}")
-    start = start_from_nwires(alone.points(world_from_sensor[alone.frame]), phantom)
-    found = label_by_calibration(dots, phantom, start, world_from_sensor)
-    registered = replace(phantom, world_from_phantom=start.target_from_world.inv())
-    return found, start_from_nwires(found.points(world_from_sensor[found.frame]), registered)
+    solution = solve_wires(alone.points(world_from_sensor[alone.frame]), phantom)
+    assert isinstance(solution.phantom, Wires)
+    return label_by_calibration(dots, solution.phantom.geometry, solution.chain, world_from_sensor)
 
 
 def _wires(points: ImagePoints, phantom: WirePhantom) -> IntArray:

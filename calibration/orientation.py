@@ -14,10 +14,16 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from calibration.motion import require_adequate
-from calibration.plane import LineDirections, Problem, Solution, angle_starts
+from calibration.plane import (
+    LineDirections,
+    Problem,
+    Solution,
+    angle_starts,
+    hemisphere,
+    in_plane_mirror,
+)
 from calibration.points import ANGLES, SOME_FRAMES, ImagePoints, as_directions
 from calibration.settings import OrientationFit
-from calibration.starts import hemisphere, in_plane_mirror
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 

@@ -18,13 +18,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.motion import Adequacy, judge, require_adequate
+from calibration.motion import OBLONG, Adequacy, judge, require_adequate
 from calibration.noise import fit_noise
 from calibration.points import (
     ANGLES,
@@ -40,28 +40,26 @@ from calibration.points import (
 )
 from calibration.robust import autocorrelation_time, robust_linear
 from calibration.settings import OUTLIER_SIGMA, PlaneFit
-from calibration.starts import hemisphere, in_plane_mirror, rotation_to_z, rotations_all_over
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.geometry import roll_yaw_tilt, skew
-from speckle3d.core.leastsquares import condition_number, huber_weights, robust_sigma
+from speckle3d.core.geometry import nearest_rotation, roll_yaw_tilt, skew
+from speckle3d.core.leastsquares import condition_number, robust_sigma
 from speckle3d.core.shown import shown
 
 _FEWEST_LINES = 6
 """Two equations each: the fewest for eleven unknowns."""
-_PIXEL_MM = 0.15
-"""Pixel size to start from where none is given and free ones fail: some hundred rows over some
-centimetres."""
+_NORMALS = 30
+"""About 26 degrees apart: refinement converges from further away."""
 _MOST_STEPS = 100
 _TOLERANCE = 1e-12
 """Relative decrease of the sum of squares that a last step promises."""
-_REFINED, _KEPT, _ANGLE_FRAMES = 12, 3, 30
-"""Mountings whose angles are refined, from so many frames, and those that go on to the next stage."""
+_REFINED, _KEPT, _ANGLE_FRAMES, _ROUNDS = 6, 3, 30, 4
+"""Normals whose angles are refined, from so many frames with so many reweightings, and those that go on."""
 _HOPELESS, _TINY = 3.0, 1e-12
 """Ends whose mean absolute residual is as many times the least are not looked at again."""
 _ROUGHLY = 1e-3
-_NEARLY_ABSOLUTE = 0.06745
-"""Limit of Huber's weights, a tenth of the median: nearly all residuals count by their absolute value."""
+_NEARLY = 0.1
+"""Residuals above this share of the median count by their absolute value."""
 _REWEIGHTINGS = 8
 _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
@@ -95,9 +93,14 @@ class Chain:
     sensor_from_image: RigidTransform
     target_from_world: RigidTransform
 
+    @cached_property
+    def matrices(self) -> tuple[FloatArray, FloatArray]:
+        """Sensor from image and target from world, shape (4, 4) each."""
+        return self.sensor_from_image.as_matrix(), self.target_from_world.as_matrix()
+
     def target_from_image(self, points: ImagePoints) -> RigidTransform:
         """Pose of the image of each point in the phantom's frame."""
-        probe, target = self.sensor_from_image.as_matrix(), self.target_from_world.as_matrix()
+        probe, target = self.matrices
         return RigidTransform(target @ points.world_from_sensor.as_matrix() @ probe, normalize=False)
 
     def parameters(self) -> FloatArray:
@@ -119,7 +122,7 @@ class Chain:
         moved[:3, :3] = Rotation.from_rotvec(step[7:4:-1]).as_matrix() * [*sign, sign.prod()]
         moved[:3, 3] = step[2:5]
         shifted[:3, :3], shifted[:3, 3] = Rotation.from_rotvec(step[13:10:-1]).as_matrix(), step[8:11]
-        probe, target = self.sensor_from_image.as_matrix(), self.target_from_world.as_matrix()
+        probe, target = self.matrices
         return Chain(
             np.abs(size),
             RigidTransform(probe @ moved, normalize=False),
@@ -215,9 +218,7 @@ class Equations:
 
     def at(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Residuals, (n, r), and derivatives by the small displacements of `Chain.displaced`, (n, r, 14)."""
-        probe, target = (
-            pose.rotation.as_matrix() for pose in (chain.sensor_from_image, chain.target_from_world)
-        )
+        probe, target = (matrix[:3, :3] for matrix in chain.matrices)
         place, (u, v) = self._places(chain), self.points.pixels.T[..., None]
         x, y = u * chain.pixel_mm[0], v * chain.pixel_mm[1]
         in_world = (self.rows.reshape(-1, 3) @ target).reshape(self.rows.shape)
@@ -242,7 +243,7 @@ class Equations:
 
     def _places(self, chain: Chain) -> FloatArray:
         """Where the points are in the phantom's frame, mm, shape (n, 3)."""
-        probe, target = chain.sensor_from_image.as_matrix(), chain.target_from_world.as_matrix()
+        probe, target = chain.matrices
         in_sensor = (self.points.pixels * chain.pixel_mm) @ probe[:3, :2].T + probe[:3, 3]
         in_world = np.einsum("nij,nj->ni", self.points.turns, in_sensor) + self.points.shifts_mm
         return np.asarray(in_world @ target[:3, :3].T + target[:3, 3])
@@ -276,8 +277,7 @@ def least_squares(
     Parameters
     ----------
     prior : PixelPrior, optional
-        Counts as two further residuals of standard deviation `sigma`. Lines then err by rows: in millimetres,
-        an image that shrinks to nothing would leave no residual.
+        Counts as two further residuals of standard deviation `sigma`.
     tolerance : float
         Relative decrease of the sum of squares below which a step is the last.
 
@@ -286,17 +286,12 @@ def least_squares(
     InvalidInputError
         If there are fewer residuals than parameters, or some are not finite.
     """
-    columns, row_mm = columns_of(free), float(start.pixel_mm[1])
-    by_rows = prior is not None and equations.rows.shape[1] == 1
+    columns = columns_of(free)
 
     def at(chain: Chain) -> tuple[FloatArray, FloatArray, float]:
         values, slopes = equations.at(chain)
         r, j = values.ravel(), slopes.reshape(values.size, -1)[:, columns]
         if prior is not None:
-            if by_rows:
-                larger = chain.pixel_mm[1] / row_mm
-                r, j = r / larger, j / larger
-                j[:, columns.index(1)] -= r / chain.pixel_mm[1]
             slope = sigma / (prior.error * prior.pixel_mm[:, None])
             more = (np.array(columns) == np.arange(2)[:, None]) * slope
             r, j = np.append(r, sigma * prior.deviation(chain.pixel_mm)), np.vstack([j, more])
@@ -327,6 +322,11 @@ def least_squares(
     return chain
 
 
+def absolute_weights(sizes: FloatArray, axis: int | None = None) -> FloatArray:
+    """Weights by which most residuals count by their absolute value: Huber's, with a tenth of the median."""
+    return np.asarray(1.0 / np.maximum(sizes, _NEARLY * np.median(sizes, axis, keepdims=True) + _TINY))
+
+
 def nearly_absolute(
     equations: Equations, start: Chain, free: Sequence[str], rounds: int = _REWEIGHTINGS
 ) -> Chain:
@@ -337,7 +337,7 @@ def nearly_absolute(
         if size.mean() > 0.99 * before:
             break
         before = size.mean()
-        weights = np.sqrt(huber_weights(size / sigma_of(size), _NEARLY_ABSOLUTE))
+        weights = np.sqrt(absolute_weights(size))
         chain = least_squares(replace(equations, weights=weights), chain, free, tolerance=_ROUGHLY)
     return chain
 
@@ -654,23 +654,34 @@ def calibrate_plane(
         prior = PixelPrior(np.asarray(pixel_mm, dtype=float), s.pixel_error)
     solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma, prior), fixed_mm)
     if prior is not None and np.abs(prior.deviation(solution.chain.pixel_mm)).max() > _CONTRADICTS:
-        solution = _without_prior(lines, solution, s)
+        # Lines that contradict the pixel size given are believed if they determine it by themselves.
+        solution = _from_stages(lines, Problem(Plane(), probe, s.outlier_sigma), None)
     return _facing_up(require_adequate(solution))
 
 
+def hemisphere() -> FloatArray:
+    """Unit vectors spread evenly over the hemisphere z >= 0, the pole first, shape (30, 3)."""
+    k = np.arange(_NORMALS)
+    z, around = 1.0 - k / _NORMALS, k * np.pi * (3.0 - np.sqrt(5.0))
+    flat = np.sqrt(1.0 - z**2)
+    return np.column_stack([flat * np.cos(around), flat * np.sin(around), z])
+
+
 def angle_starts(
-    directions: ImagePoints, size: FloatArray, normals: FloatArray, level: bool = False
+    directions: ImagePoints, pixel_mm: FloatArray | None, normals: FloatArray, level: bool = False
 ) -> list[Chain]:
     """First stage: angles with which line directions lie in a plane, whatever the mounting; the best first.
 
-    A line of the plane lies in it, wherever the plane is. Mountings are tried all over, and the best refined.
+    A line of the plane is square to its normal, wherever the plane is. For one of some normals that is linear
+    in the image's two axes, whose common length is not told: the eigenvector of the least eigenvalue, with
+    weights for nearly least absolute residuals. The best are refined with the normal.
 
     Parameters
     ----------
     directions : ImagePoints
         See `as_directions`.
-    size : ndarray, shape (2,)
-        Of pixels, in any unit.
+    pixel_mm : ndarray, shape (2,), optional
+        In any unit; without it, the lengths of the axes tell the pixels' shape.
     normals : ndarray, shape (k, 3)
         Of the plane, in the world.
     level : bool
@@ -681,26 +692,37 @@ def angle_starts(
     list of Chain
         Without distances.
     """
-    phantom = LineDirections(size, level)
-    tried = rotations_all_over()
-    # Half a turn about z leaves the directions of lines as they are.
-    tried = tried[tried.as_matrix()[:, 0, 0] >= 0]
-    along = directions.pixels * size
+    sizes = np.tile(np.ones(2) if pixel_mm is None else pixel_mm, (len(normals), 1))
+    along = directions.pixels * sizes[0]
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     up = np.einsum("ki,nij->knj", normals, directions.turns)
-    sines = np.einsum("kni,jia,na->jkn", up, tried.as_matrix()[:, :, :2], along, optimize=True)
-    costs = np.abs(sines).mean(axis=2)
-    few = Equations.of(directions.of_some_frames(_ANGLE_FRAMES), phantom)
+    rows = (up[..., None] * along[:, None]).reshape(len(normals), -1, 6)
+    sines = np.ones(rows.shape[:2])
+    for _ in range(_ROUNDS):
+        weighted = rows * absolute_weights(sines, axis=1)[..., None]
+        axes = np.linalg.eigh(np.swapaxes(weighted, 1, 2) @ rows)[1][..., :1]
+        sines = np.abs(rows @ axes)[..., 0]
+    across = axes.reshape(-1, 3, 2)
+    lengths = np.linalg.norm(across, axis=1)
+    turns = nearest_rotation(across / lengths[:, None])
+    if pixel_mm is None:
+        sizes[:, 0] = np.clip(lengths[:, 0] / lengths[:, 1], 1.0 / OBLONG, OBLONG)
+    seen = directions.pixels * sizes[:, None]
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    costs = np.abs(np.einsum("knb,kbc,knc->kn", up, turns[..., :2], seen)).mean(axis=1)
+    few = directions.of_some_frames(_ANGLE_FRAMES)
     ends = list[tuple[float, Chain]]()
-    for best in np.argsort(costs, axis=None)[:_REFINED]:
-        mounting, plane = np.unravel_index(best, costs.shape)
-        turns = tried[int(mounting)], rotation_to_z(normals[plane])
-        start = Chain(size, *map(RigidTransform.from_rotation, turns))
-        end = nearly_absolute(few, start, (*ANGLES, *phantom.determined), 4)
+    for number in np.argsort(costs)[:_REFINED]:
+        pose = Rotation.from_matrix(turns[number]), rotation_to_z(normals[number])
+        phantom = LineDirections(sizes[number], level)
+        equations = Equations.of(few, phantom)
+        free = [*(["s_x"] if pixel_mm is None else []), *ANGLES, *phantom.determined]
+        start = Chain(sizes[number], *map(RigidTransform.from_rotation, pose))
+        end = nearly_absolute(equations, start, free, _ROUNDS)
         # The world is turned as little as puts the plane's normal upright.
         upright = rotation_to_z(end.target_from_world.rotation.as_matrix()[2])
         end = replace(end, target_from_world=RigidTransform.from_rotation(upright))
-        ends.append((float(np.abs(few.residuals(end)).mean()), end))
+        ends.append((float(np.abs(equations.residuals(end)).mean()), end))
     ends.sort(key=lambda one: one[0])
     kept = list[Chain]()
     for cost, end in ends:
@@ -710,21 +732,22 @@ def angle_starts(
     return kept[:_KEPT]
 
 
+def in_plane_mirror(rotation: Rotation) -> Rotation:
+    """The other rotation that explains the same line directions: half a turn in the image plane."""
+    return rotation * Rotation.from_euler("z", np.pi)
+
+
+def rotation_to_z(normal: FloatArray) -> Rotation:
+    """A rotation that turns a plane's normal into the z axis."""
+    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [normal])[0]
+
+
 def _from_stages(lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | None) -> Solution:
     """Angles from line directions, then distances, then all."""
     few = lines.of_some_frames(SOME_FRAMES)
     pixel_mm = fixed_mm if problem.prior is None else problem.prior.pixel_mm
-
-    def starts(size: FloatArray | None) -> list[Chain]:
-        # Where nothing is known of pixels, they are taken for square until all is solved for.
-        angles = angle_starts(as_directions(few), np.ones(2) if size is None else size, hemisphere())
-        return [_with_distances(few, one, size) for one in angles]
-
-    solution = problem.best(lines, starts(pixel_mm))
-    if pixel_mm is not None or not solution.adequacy.refused:
-        return solution
-    # Free pixels may shrink to nothing on the way where the motion is poor.
-    return problem.best(lines, [solution.chain, *starts(np.full(2, _PIXEL_MM))])
+    angles = angle_starts(as_directions(few), pixel_mm, hemisphere())
+    return problem.best(lines, [_with_distances(few, one, pixel_mm) for one in angles])
 
 
 def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | None) -> Chain:
@@ -740,36 +763,15 @@ def _with_distances(lines: ImagePoints, angles: Chain, pixel_mm: FloatArray | No
             unknown.append(height[:, None])
         else:
             target_mm = target_mm - height
-        fit = robust_linear(np.hstack(unknown), target_mm, partial(huber_weights, limit=0.6745), rounds=4)
-        size = square * (fit.parameters[4] if pixel_mm is None else 1.0)
+        found, left = robust_linear(np.hstack(unknown), target_mm)
+        size = square * (found[4] if pixel_mm is None else 1.0)
         if size[1] < 0:
             turn, size = in_plane_mirror(turn), -size
-        probe = RigidTransform.from_components(fit.parameters[:3], turn)
-        shift = RigidTransform.from_translation([0.0, 0.0, fit.parameters[3]])
-        median = float(np.median(np.abs(fit.residuals)))
+        probe = RigidTransform.from_components(found[:3], turn)
+        shift = RigidTransform.from_translation([0.0, 0.0, found[3]])
+        median = float(np.median(np.abs(left)))
         ends.append((median, Chain(size, probe, shift * angles.target_from_world)))
     return min(ends, key=lambda one: one[0])[1]
-
-
-def _without_prior(lines: ImagePoints, solution: Solution, s: PlaneFit) -> Solution:
-    """Believe lines that contradict the pixel size given if they determine it by themselves.
-
-    Raises
-    ------
-    InsufficientDataError
-        If they do not.
-    """
-    alone = _from_stages(lines, Problem(Plane(), PROBE, s.outlier_sigma), None)
-    if not alone.adequacy.refused:
-        return alone
-    if solution.adequacy.refused or solution.prior is None:
-        return solution
-    stated, fitted = solution.prior.pixel_mm, solution.chain.pixel_mm
-    raise InsufficientDataError(
-        f"expected lines that agree with pixels of {stated[0]:.4g} x {stated[1]:.4g} mm to "
-        f"{100 * solution.prior.error:g} %, got {fitted[0]:.4g} x {fitted[1]:.4g} mm with them, and without "
-        f"them {alone.adequacy.verdict}"
-    )
 
 
 def _facing_up(solution: Solution) -> Solution:

@@ -149,7 +149,7 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
         lines += ["", "On a bare wall, lines at the first echo put the image too near to the probe, by"]
         lines += [
             f"  {abs(one.simulated_mm[1]):.2f} mm if the beam is {one.width_mm:g} mm thick "
-            f"(closed form {abs(one.closed_form_mm):.2f} mm; it leaves an RMS of {one.rms_mm:.3f} mm)"
+            f"(it leaves an RMS of {one.rms_mm:.3f} mm)"
             for one in beam
         ]
         lines += [

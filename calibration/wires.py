@@ -9,9 +9,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.linalg import toeplitz
@@ -19,20 +17,16 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
 from calibration.motion import require_adequate
-from calibration.plane import Chain, Equations, Problem, Solution, probe_parameters
+from calibration.plane import Chain, Equations, Phantom, Problem, Solution, probe_parameters
 from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
-from calibration.robust import RobustFit, robust_linear
+from calibration.robust import robust_linear
 from calibration.settings import Registration, WireFit
-from calibration.starts import rotations_all_over
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
-from speckle3d.core.leastsquares import huber_weights
 from speckle3d.core.wires import WirePhantom
 
 _ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "free": TARGET}
-NEARLY_ABSOLUTE = partial(huber_weights, limit=0.6745)
-"""Least absolute values for residuals above the median, 0.6745 standard deviations."""
 
 _FEWEST_FRAMES = 6
 _STARTS = 6
@@ -100,7 +94,7 @@ def calibrate_cross_wire(
     found = find_consensus(points, pixel_mm)
     if not found.believed and len(points) == len(points.frames):
         # Poor motion, too, can leave no consensus; then that is said.
-        start, _ = wire_start(points, CrossWire().vanishing(points), Rotation.identity())
+        start, _ = wire_start(points, CrossWire(), Rotation.identity())
         require_adequate(problem.best(points, [_sized(start, held)]))
     found.require()
     agreeing = points[found.nearest[found.agreed]]
@@ -172,6 +166,17 @@ def calibrate_wires(
     InsufficientDataError
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
+    return require_adequate(solve_wires(points, geometry, pixel_mm, settings, registration))
+
+
+def solve_wires(
+    points: ImagePoints,
+    geometry: WirePhantom,
+    pixel_mm: FloatArray | None = None,
+    settings: WireFit | None = None,
+    registration: Registration = "turned",
+) -> Solution:
+    """As `calibrate_wires`, whether or not the motion determines the answer."""
     s = settings or WireFit()
     if registration not in _ESTIMATED:
         raise InvalidInputError(
@@ -183,15 +188,15 @@ def calibrate_wires(
     place = centred.world_from_phantom
     if place is not None:
         phantom = Wires(centred, _ESTIMATED[registration])
-        starts = [wire_start(points, phantom.vanishing(points), place.inv())[0]]
+        starts = [wire_start(points, phantom, place.inv())[0]]
     else:
         phantom = Wires(centred)
         few = points.of_some_frames(SOME_FRAMES)
-        tried = [wire_start(few, phantom.vanishing(few), turn) for turn in rotations_all_over()]
-        tried.sort(key=lambda one: float(np.median(np.abs(one[1].residuals))))
+        # Rotations of an icosahedron, 36 degrees apart.
+        tried = [wire_start(few, phantom, turn) for turn in Rotation.create_group("I")]
+        tried.sort(key=lambda one: one[1])
         starts = [chain for chain, _ in tried[:_STARTS]]
-    sized = [_sized(start, held) for start in starts]
-    return require_adequate(Problem(phantom, probe, s.outlier_sigma).best(points, sized))
+    return Problem(phantom, probe, s.outlier_sigma).best(points, [_sized(start, held) for start in starts])
 
 
 def _about_middle(geometry: WirePhantom) -> WirePhantom:
@@ -216,42 +221,24 @@ def _require_frames(points: ImagePoints) -> None:
 
 
 def wire_start(
-    points: ImagePoints,
-    equations: tuple[FloatArray, FloatArray],
-    target_from_world: RigidTransform | Rotation,
-    weights: Callable[[FloatArray], FloatArray] = NEARLY_ABSOLUTE,
-    rounds: int = 4,
-    least_singular: float | None = None,
-) -> tuple[Chain, RobustFit]:
+    points: ImagePoints, phantom: Phantom, target_from_world: RigidTransform | Rotation
+) -> tuple[Chain, float]:
     """Find the image among wires from all frames of a recording, by robust linear least squares.
 
     The axes come out free of the constraint that they be square; the chain has the nearest that are.
 
     Parameters
     ----------
-    equations : (rows, offsets), shapes (n, r, 3) and (n, r)
-        ``rows @ position = offsets`` in the phantom's frame, as from `Phantom.vanishing`; those of one point
-        get one weight.
     target_from_world : RigidTransform or Rotation
         If a rotation, the translation is found too.
-    weights, rounds
-        See `robust_linear`.
-    least_singular : float, optional
-        Ratio of singular values below which the answer counts as not determined.
 
     Returns
     -------
     chain : Chain
-    fit : RobustFit
-        Residuals of shape (n, r), mm, before the axes are squared.
-
-    Raises
-    ------
-    InsufficientDataError
-        If the points do not determine the answer, judged by `least_singular`; without it, the smallest
-        parameters that explain the points are returned.
+    median_mm : float
+        Of the residuals' magnitudes, before the axes are squared.
     """
-    rows, offsets = equations
+    rows, offsets = phantom.vanishing(points)
     shifted = isinstance(target_from_world, Rotation)
     known = (
         RigidTransform.from_rotation(target_from_world)
@@ -266,12 +253,9 @@ def wire_start(
     if shifted:
         matrix = np.concatenate([matrix, rows], axis=2)
     wanted = offsets - np.einsum("nri,ni->nr", rows, known.apply(points.shifts_mm))
-    fit = robust_linear(matrix, wanted, weights, rounds, least_singular)
-    if least_singular is not None and fit.rank < fit.parameters.size:
-        raise InsufficientDataError("the dots do not determine where the image is: too few wires or poses")
-    axes = fit.parameters[3:9].reshape(2, 3) / spread
-    size = np.linalg.norm(axes, axis=1)
-    turn = Rotation.from_matrix(nearest_rotation((axes / size[:, None]).T))
-    probe = RigidTransform.from_components(fit.parameters[:3] - centre @ axes, turn)
-    shift = RigidTransform.from_translation(fit.parameters[9:] if shifted else np.zeros(3))
-    return Chain(size, probe, shift * known), fit
+    found, left = robust_linear(matrix, wanted)
+    axes = found[3:9].reshape(2, 3) / spread
+    image = np.vstack([found[:3] - centre @ axes, axes])
+    shift = RigidTransform.from_translation(found[9:] if shifted else np.zeros(3))
+    chain = squared(image, np.zeros(3))
+    return replace(chain, target_from_world=shift * known), float(np.median(np.abs(left)))

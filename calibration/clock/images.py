@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform
 
-from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, least_between, peak_of
+from calibration.clock.offset import SEARCH_S, ClockOffset, covered, delays_around, peak_of
 from calibration.clock.smoothing import SmoothReadings
 from calibration.images.similarity import LEAST_OVERLAP, Comparison, Estimate, whole_images
 from calibration.images.stacks import TrackedImages, read_stack
@@ -130,16 +130,14 @@ def delay_from_images(
     misfit = 1.0 - np.nanmean(curves, axis=1)
     best = _clear_peak(tried, curves, misfit, search_s, doubts)
     width = _half_width(tried, misfit, best)
-    near, least, _ = least_between(
-        lambda delay: 1.0 - float(np.nanmean(correlations(queries, delay))), tried, best
-    )
-    low, high = max(near - width, tried[0]), min(near + width, tried[-1])
+    low, high = max(tried[best] - width, tried[0]), min(tried[best] + width, tried[-1])
     places = np.linspace(low, high, _PLACES)
-    seconds, scatter = _placed(places, np.array([correlations(queries, float(one)) for one in places]))
+    fine = np.array([correlations(queries, float(one)) for one in places])
+    seconds, scatter = _placed(places, fine)
     # A peak must be located to well within its own width.
-    if not (least < 1.0 and SIGMAS * scatter < width and low <= seconds <= high):
+    if not (SIGMAS * scatter < width and low <= seconds <= high):
         raise InsufficientDataError(
-            f"expected correlations with a top, got none near the best delay, {near:+.3f} s: {doubts}"
+            f"expected correlations with a top, got none near the best delay, {tried[best]:+.3f} s: {doubts}"
         )
     error = float(np.hypot(scatter, _from_jitter(tracked, steady, times - seconds, sensor_from_image)))
     if not error < search_s:
@@ -147,7 +145,7 @@ def delay_from_images(
             f"expected readings that tell the delay, got {seconds:+.3f} s +- {error:.3g} s from their jitter "
             f"alone, no better than the {search_s:g} s searched: move the probe faster"
         )
-    return ClockOffset(seconds, error, 1.0 - least)
+    return ClockOffset(seconds, error, float(np.nanmean(fine, axis=1).max()))
 
 
 def _there_and_back(poses: RigidTransform, grid: ImageGrid) -> tuple[int, FloatArray]:

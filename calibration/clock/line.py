@@ -9,6 +9,7 @@ References
 .. [1] G. M. Treece, A. H. Gee, R. W. Prager, C. J. C. Cash and L. H. Berman, "High-definition freehand 3-D
    ultrasound", Ultrasound in Medicine and Biology 29, 2003 (from onsets of abrupt motion; here all motion is
    used).
+.. [2] M. Ezekiel, "Methods of correlation analysis", 1930 (the adjusted coefficient of determination).
 """
 
 from __future__ import annotations
@@ -35,10 +36,6 @@ _STILL = 1e-9
 
 _TREND = 0.95
 """Share of the variance that constant speed may explain; more, and the motion fits at any delay."""
-
-_TOLD = 2.0
-"""Independent values of a line over the numbers fitted to it: below, tissue in which edges were taken for a
-line was followed by 92 %, 0.2 s off."""
 
 _ONE_WAY = "the motion goes one way and does not return: move the probe up and down"
 _IRREGULARLY = "move the probe up and down, irregularly"
@@ -119,9 +116,10 @@ def delay_from_lines(
     best = peak_of(tried, misfits, _ONE_WAY if one_way else "the motion repeats itself; move irregularly")
     seconds, least, curvature = least_between(misfit, tried, best)
     left, rank = fit(seconds)
-    # Of so few independent values any slow motion would explain a line at some delay, which is fitted too.
+    # Of few independent values any slow motion explains a line at some delay, which is fitted too: the share
+    # explained is adjusted for the numbers fitted [2]_.
     told, fitted = len(wanted) / autocorrelation_time(wanted), rank + 1
-    if told < _TOLD * fitted or least * (told - 1.0) > (1.0 - LEAST_FOLLOWED) * (told - fitted):
+    if least * (told - 1.0) > (1.0 - LEAST_FOLLOWED) * (told - fitted):
         raise InsufficientDataError(
             f"expected a line whose motion tells much more than the {fitted} numbers fitted to it, got one "
             f"that turns so seldom that it tells {told:.1f}: record for longer, and {_IRREGULARLY}"

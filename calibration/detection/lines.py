@@ -20,7 +20,6 @@ from scipy.ndimage import gaussian_filter1d
 
 from calibration.detection.region import DENSELY, Columns, checked_pixel, lay_columns, without_standing
 from calibration.points import Seen
-from calibration.robust import autocorrelation_time
 from calibration.settings import LineSettings, Place
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -45,8 +44,6 @@ and side lobes are fainter. The floor's reverberations lie beneath it and are no
 _LEAST_SHARE = 0.25
 """Share of all sampled columns that must agree, however few the line could meet: with a line that cuts a
 corner of the region, two or three noisy edges always agree."""
-_FINEST_ROWS = 0.1
-"""Least scatter of an edge's place: the precision of interpolation between rows."""
 
 
 class NoLineError(InsufficientDataError):
@@ -62,10 +59,6 @@ class EchoLine:
     points_px : ndarray, shape (2, 2)
         Column and row, fractional, of two points on the line: at the mean of the agreeing columns minus and
         plus their root mean square spread, where the errors of a fitted line are uncorrelated and equal.
-    point_sd_mm : float
-        Standard error of each point's depth; residuals of neighbouring columns may be correlated.
-    direction_sd_rad : float
-        Standard error of the line's direction in the image plane.
     consensus, possible : int
         Columns that agree, and sampled columns in which the line is inside the region.
     inlier_px : ndarray, shape (k, 2)
@@ -73,8 +66,6 @@ class EchoLine:
     """
 
     points_px: FloatArray
-    point_sd_mm: float
-    direction_sd_rad: float
     consensus: int
     possible: int
     inlier_px: FloatArray
@@ -246,7 +237,7 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
     strong = [line for line in accepted if line.strength >= least]
     depths = [line.start + line.slope * middle for line in strong]
     upper = [line for line, depth in zip(strong, depths, strict=True) if depth <= min(depths) + tolerance]
-    return _measured(max(upper, key=lambda line: line.agreed), columns, pixel_mm)
+    return _measured(max(upper, key=lambda line: line.agreed), columns)
 
 
 def _typical(score: Float32Array) -> float:
@@ -303,30 +294,10 @@ def _between(values: Float32Array, column: IntArray, row: IntArray) -> FloatArra
     return np.where(bend < 0.0, 0.5 * (before - after) / np.where(bend < 0.0, bend, -1.0), 0.0)
 
 
-def _measured(line: _Candidate, columns: Columns, pixel_mm: FloatArray) -> EchoLine:
+def _measured(line: _Candidate, columns: Columns) -> EchoLine:
     # Errors of a fit's level at the mean column and of its slope are uncorrelated. At one standard deviation
     # of the columns to either side both contribute equally, so that the two points' errors are uncorrelated.
-    x, y = columns.column[line.agree].astype(float), line.row[line.agree]
-    spread = float(x.std())
-    ends = x.mean() + spread * np.array([-1.0, 1.0])
-    residual = line.row - line.start - line.slope * columns.column
-    level_sd_mm = _level_sd(np.where(line.agree, residual, np.nan)) * float(pixel_mm[1])
-    steepness = line.slope * pixel_mm[1] / pixel_mm[0]
-    return EchoLine(
-        points_px=np.stack([ends, line.start + line.slope * ends], axis=1),
-        point_sd_mm=float(np.sqrt(2.0) * level_sd_mm),
-        direction_sd_rad=float(level_sd_mm / (spread * pixel_mm[0]) / (1 + steepness**2)),
-        consensus=line.agreed,
-        possible=line.possible,
-        inlier_px=np.stack([x, y], axis=1),
-    )
-
-
-def _level_sd(residual: FloatArray) -> float:
-    """Standard error of the mean of residuals (NaN where missing) that may be correlated with neighbours."""
-    there = np.isfinite(residual)
-    count = float(there.sum())
-    energy = float(np.maximum(np.nansum(residual**2), count * _FINEST_ROWS**2))
-    likeness = float(np.minimum(autocorrelation_time(residual, energy), count / 4))
-    # The line itself took two of as many free residuals as there are independent ones.
-    return float(np.sqrt(energy / (count - 2.0 * likeness) * likeness / count))
+    x = columns.column[line.agree].astype(float)
+    ends = x.mean() + x.std() * np.array([-1.0, 1.0])
+    points_px = np.stack([ends, line.start + line.slope * ends], axis=1)
+    return EchoLine(points_px, line.agreed, line.possible, np.stack([x, line.row[line.agree]], axis=1))

@@ -93,7 +93,7 @@ def notes_of(result: ImageCalibration) -> list[str]:
 
 
 def figure_of(result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImages]) -> Figure:
-    """One page: images beside reslices before and after, similarity about the answer, effect of errors."""
+    """One page: images beside reslices before and after, similarity about the answer."""
     figure = Figure(figsize=(12.0, 10.8), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(3, 3, height_ratios=[1.3, 1.3, 1.0])
@@ -110,14 +110,8 @@ def figure_of(result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImag
             axes.plot(offset, similarities(comparison, about, name, offset), color=colour, label=name)
         axes.set(xlabel=f"off the answer / {unit}", ylabel="mean correlation")
         axes.legend(fontsize=8)
-    bars, place = panels[2, 2], np.arange(len(PARAMETERS))
-    bars.bar(place - 0.2, result.angulation.alone, 0.4, color=_COLOURS[0], label="by itself")
-    bars.bar(place + 0.2, result.angulation.recoverable, 0.4, color=_COLOURS[1], label="others free")
-    bars.set_xticks(place, [f"{name}\n{'1°' if k < 3 else '1 mm'}" for k, name in enumerate(PARAMETERS)])
-    bars.set(xlabel="error of the calibration", ylabel="disagreement of the sweeps / mm")
-    bars.legend(fontsize=8)
-    for axes in panels[2:].flat:
         axes.grid(alpha=0.3)
+    panels[2, 2].set_axis_off()
     figure.suptitle(f"verdict: {_verdict(result)}", fontsize=10)
     return figure
 

@@ -14,7 +14,7 @@ from calibration.detection.crossings import crossings_in_frames
 from calibration.detection.dots import dots_in_frames
 from calibration.detection.labelling import label_dots
 from calibration.detection.lines import detect_lines
-from calibration.nwires import label_and_start, nwire_errors_mm, pixel_matrix, trimmed_mean_mm
+from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.orientation import calibrate_orientation
 from calibration.plane import Solution, calibrate_plane
 from calibration.points import ImagePoints, Seen
@@ -278,7 +278,7 @@ def _seen_wires(
     times, offset_s = recording.frame_time_s, recording.time_offset_s
     if isinstance(recording.readings, TimedPoses) and covered(recording.readings, times, offset_s).all():
         # A calibration from the frames that show all wires finds those of the other frames.
-        return label_and_start(dots, wired.phantom, recording.readings.at(times - offset_s), size)[0]
+        return label_by_wires(dots, wired.phantom, recording.readings.at(times - offset_s), size)
     return label_dots(dots, wired.phantom, size)
 
 
@@ -288,5 +288,6 @@ def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
     if not isinstance(phantom, Wires) or not phantom.geometry.n_shapes:
         return []
     place = chain.target_from_world.inv()
-    mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, pixel_matrix(chain), place))
+    matrix = outcome.calibration.pixel_matrix()
+    mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, matrix, place))
     return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]

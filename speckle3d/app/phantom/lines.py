@@ -69,8 +69,5 @@ class LinesViewer(PhantomViewer):
         rows = v + (x - v) / (w - u) * (across - u)
         self._line.data = {"column": across, "row": rows}
         self._inliers.data = dict(zip(("column", "row"), line.inlier_px.T, strict=True))
-        known_mm, known_deg = 1.96 * line.point_sd_mm, 1.96 * np.rad2deg(line.direction_sd_rad)
-        return (
-            f"line: {line.consensus} of {line.possible} columns agree; row {rows[1]:.2f} in the middle, "
-            f"known to {known_mm:.3f} mm and {known_deg:.3f}° (95 %)"
-        )
+        agreed = f"{line.consensus} of {line.possible} columns agree"
+        return f"line: {agreed}; row {rows[1]:.2f} in the middle"
