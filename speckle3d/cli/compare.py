@@ -74,7 +74,7 @@ def compare(
     """
     require_extra("report", "compare", "plotly")
     from speckle3d.report.page import write_report
-    from speckle3d.study.compare import StudyProgress, compare_sweeps
+    from speckle3d.study.compare import compare_sweeps
     from speckle3d.study.paper import paper_study
     from speckle3d.study.schedulers import scheduler_for
 
@@ -83,17 +83,13 @@ def compare(
         raise InvalidInputError("expected sweeps to compare, or --paper, one of them")
     table = ""
     with scheduler_for(scheduler, workers) as where, progress_bar("comparing") as bar:
-
-        def progress(at: StudyProgress) -> None:
-            bar(round(at.done_frames), at.frames)
-
         if paper:
             study, table = paper_study(
-                out, curves_file, where, progress, lambda n, total: note(f"{n} of {total} sweeps simulated")
+                out, curves_file, where, bar, lambda n, total: note(f"{n} of {total} sweeps simulated")
             )
         else:
             study = compare_sweeps(
-                paths, out, drift, reference, curves_file, settings, calibration or (), where, progress
+                paths, out, drift, reference, curves_file, settings, calibration or (), where, bar
             )
     write_report(out)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)

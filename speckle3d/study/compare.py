@@ -10,17 +10,17 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
 from speckle3d.config import Config, config_from_toml
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Speckle3DError
 from speckle3d.core.printable import printable
+from speckle3d.core.progress import Progress
 from speckle3d.correction.modes import DRIFT_MODES
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
@@ -36,62 +36,87 @@ KNOWN_MODES = ("image", SUBSET, *DRIFT_MODES)
 
 
 @dataclass(frozen=True)
-class SweepJob:
-    """One sweep to reconstruct, with everything that determines the result.
+class StudyRequest:
+    """What is done with each sweep; with the input's bytes it determines the result.
 
     Attributes
     ----------
-    planned : SweepOutcome
-        With the name, the input and the key: SHA-256 of the input's bytes, configuration, version, modes,
-        reference, curves and calibrations.
+    curves : path, optional
+        By default curves.h5 beside each sweep.
     modes : tuple of str, or None
-        Beside `image`; None for all that the sweep has sensors for.
-    crossing : path, optional
-        The crossing sweep, if mode `crossed` is asked for.
+        Beside `image`; None for all that a sweep has sensors for.
     """
 
-    planned: SweepOutcome
-    folder: Path
-    curves: Path
+    directory: Path
+    curves: Path | None
     settings_toml: str
     modes: tuple[str, ...] | None
     reference: str | None
     calibrations: tuple[Path, ...]
-    crossing: Path | None = None
 
-    def failed(self, reason: str) -> SweepOutcome:
-        """What became of it if it failed."""
-        return replace(self.planned, status="failed", reason=reason)
+    def plan(self, name: str, path: Path) -> SweepOutcome:
+        """Plan a sweep: its folder is named after all that determines its content; failed if it cannot be."""
+        crossing = self._crossing(path)
+        try:
+            if crossing is not None and not crossing.exists():
+                raise InvalidInputError(f"mode crossed: expected a crossing sweep {crossing.name} beside it")
+            frames, sha256 = len(load_sweep(path)), recording_sha256(path)
+            used = [sha256_of(each) for each in (self._curves(path), *self.calibrations)]
+            used += [] if crossing is None else [recording_sha256(crossing)]
+        except Exception as error:  # noqa: BLE001 - one row that says why
+            return SweepOutcome(name, path, "failed", _reason(error))
+        parts = [sha256, self.settings_toml, version("speckle3d"), self.modes, self.reference, used]
+        key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+        return SweepOutcome(name, path, "planned", "", sha256, key, f"sweeps/{name}-{key[:8]}", 0.0, frames)
 
-    def done(self, skipped: bool = False) -> SweepOutcome:
-        """What became of it if its folder is there, which is whole then."""
-        (summary,) = json.loads((self.folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-        seconds, folder = float(summary["details"]["seconds"]), f"sweeps/{self.folder.name}"
-        return replace(self.planned, status="done", folder=folder, seconds=seconds, skipped=skipped)
+    def run(self, planned: SweepOutcome) -> SweepOutcome:
+        """Do a sweep unless it is done; whatever is wrong with it becomes the outcome's reason."""
+        folder = self.directory / planned.folder
+        skipped = (folder / RESULTS.primary).is_file()
+        try:
+            if not skipped:
+                self._reconstruct(planned, folder)
+        except Exception as error:  # noqa: BLE001 - one broken sweep, or one bug that it reveals, stops no other
+            return failed(planned, _reason(error))
+        (summary,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
+        return replace(planned, status="done", seconds=summary["details"]["seconds"], skipped=skipped)
+
+    def _reconstruct(self, planned: SweepOutcome, folder: Path) -> None:
+        path = planned.path
+        if recording_sha256(path) != planned.sha256:
+            raise InvalidInputError(f"{path}: expected the file that the study began with, got another")
+        settings, sweep, crossing = (
+            config_from_toml(self.settings_toml),
+            load_sweep(path),
+            self._crossing(path),
+        )
+        mounted, _ = apply_calibrations(sweep, self.calibrations)
+        modes = available_modes(mounted, settings) if self.modes is None else self.modes
+        run_job(
+            sweep,
+            path,
+            read_curves(self._curves(path)),
+            folder,
+            [mode for mode in modes if mode != "image"],
+            self.reference,
+            settings,
+            calibrations=self.calibrations,
+            crossing=None if crossing is None else (load_sweep(crossing), crossing),
+        )
+
+    def _curves(self, path: Path) -> Path:
+        return self.curves or path.parent / "curves.h5"
+
+    def _crossing(self, path: Path) -> Path | None:
+        """``SWEEP-crossing.h5`` of ``SWEEP.h5``, and the other way round, if mode `crossed` is asked for."""
+        stem = path.stem.removesuffix("-crossing")
+        name = stem if stem != path.stem else f"{stem}-crossing"
+        return path.with_name(f"{name}{path.suffix}") if "crossed" in (self.modes or ()) else None
 
 
-@dataclass
-class StudyProgress:
-    """How far a study is, and how long the rest will take by the pace so far; skipped sweeps set no pace."""
-
-    sweeps: int
-    frames: int
-    done: int = 0
-    failed: int = 0
-    done_frames: int = 0
-    remaining_s: float | None = None
-    _run_frames: int = 0
-    _began_s: float = field(default_factory=time.monotonic)
-
-    def add(self, outcome: SweepOutcome) -> None:
-        """Count a finished sweep."""
-        self.done += 1
-        self.failed += outcome.status == "failed"
-        self.done_frames += outcome.frames
-        self._run_frames += outcome.frames * (outcome.status == "done" and not outcome.skipped)
-        if self._run_frames:
-            pace_s = (time.monotonic() - self._began_s) / self._run_frames
-            self.remaining_s = pace_s * (self.frames - self.done_frames)
+def failed(planned: SweepOutcome, reason: str) -> SweepOutcome:
+    """What became of a sweep that failed."""
+    return replace(planned, status="failed", reason=reason, folder="")
 
 
 def compare_sweeps(
@@ -103,7 +128,7 @@ def compare_sweeps(
     config: Config | None = None,
     calibrations: Sequence[Path] = (),
     scheduler: Scheduler | None = None,
-    progress: Callable[[StudyProgress], None] | None = None,
+    progress: Progress | None = None,
 ) -> Study:
     """Reconstruct sweeps in every mode, compare the modes, and write it all into `directory`.
 
@@ -119,7 +144,7 @@ def compare_sweeps(
     curves : path, optional
         Decorrelation curves; by default curves.h5 beside each sweep.
     progress : callable, optional
-        Called at the beginning and after each sweep.
+        Called at the beginning and after each sweep with the number of frames done and of all.
 
     Raises
     ------
@@ -140,32 +165,30 @@ def compare_sweeps(
     if curves is not None:
         read_curves(curves)
     settings = (config or Config()).to_toml()
-    jobs: list[SweepJob] = []
+    mounted, curves = tuple(each.resolve() for each in calibrations), curves and curves.resolve()
+    request = StudyRequest(directory.resolve(), curves, settings, chosen, reference, mounted)
     outcomes: dict[str, SweepOutcome] = {}
     first: dict[str, str] = {}
     for name, path in named(paths):
-        plan = plan_sweep(name, path, directory, curves, settings, chosen, reference, tuple(calibrations))
-        if isinstance(plan, SweepJob) and (same := first.setdefault(plan.planned.sha256, name)) != name:
-            plan = plan.failed(f"the same recording as {same}, which counts once")
-        if isinstance(plan, SweepJob):
-            jobs.append(plan)
-        outcomes[name] = plan.planned if isinstance(plan, SweepJob) else plan
-    if not jobs:
+        plan = request.plan(name, path.resolve())
+        if plan.sha256 and (same := first.setdefault(plan.sha256, name)) != name:
+            plan = failed(plan, f"the same recording as {same}, which counts once")
+        outcomes[name] = plan
+    # The longest first, so that no worker is left with it while the others have nothing to do.
+    todo = sorted((each for each in outcomes.values() if each.folder), key=lambda each: -each.frames)
+    if not todo:
         one = next(iter(outcomes.values()))
         raise InsufficientDataError(
             f"expected a sweep that can be compared, got none of {len(outcomes)}; {one.name}: {one.reason}"
         )
-    # The longest first, so that no worker is left with it while the others have nothing to do.
-    jobs.sort(key=lambda job: -job.planned.frames)
     make_folder(directory / "sweeps")
-    so_far = StudyProgress(len(jobs), sum(job.planned.frames for job in jobs))
-    tell = progress or (lambda at: None)
-    tell(so_far)
+    done, total, tell = 0, sum(each.frames for each in todo), progress or (lambda done, total: None)
+    tell(done, total)
     try:
-        for outcome in (scheduler or Scheduler()).run(run_sweep, jobs, SweepJob.failed):
+        for outcome in (scheduler or Scheduler()).run(request.run, todo, failed):
             outcomes[outcome.name] = outcome
-            so_far.add(outcome)
-            tell(so_far)
+            done += outcome.frames
+            tell(done, total)
     finally:
         for folder in (directory / "sweeps", directory):
             with suppress(OSError):  # it holds finished sweeps
@@ -189,69 +212,6 @@ def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
             name if counts[name] == 1 else f"{word}-{name}" for word, name in zip(more, names, strict=True)
         ]
     return list(zip(names, files, strict=True))
-
-
-def plan_sweep(
-    name: str,
-    path: Path,
-    directory: Path,
-    curves: Path | None,
-    settings_toml: str,
-    modes: tuple[str, ...] | None,
-    reference: str | None,
-    calibrations: tuple[Path, ...],
-) -> SweepJob | SweepOutcome:
-    """Find out what determines a sweep's results; an outcome at once if it cannot be opened."""
-    path = path.resolve()
-    curves_file = (curves or path.parent / "curves.h5").resolve()
-    mounted = tuple(each.resolve() for each in calibrations)
-    crossing = crossing_of(path) if "crossed" in (modes or ()) else None
-    try:
-        if crossing is not None and not crossing.exists():
-            raise InvalidInputError(f"mode crossed: expected a crossing sweep {crossing.name} beside it")
-        frames, sha256 = len(load_sweep(path)), recording_sha256(path)
-        used = [sha256_of(each) for each in (curves_file, *mounted)]
-        used += [] if crossing is None else [recording_sha256(crossing)]
-    except Exception as error:  # noqa: BLE001 - one row that says why
-        return SweepOutcome(name, path, "failed", _reason(error))
-    parts = [sha256, settings_toml, version("speckle3d"), modes, reference, used]
-    key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-    folder = (directory / "sweeps" / f"{name}-{key[:8]}").resolve()
-    planned = SweepOutcome(name, path, "planned", sha256=sha256, key=key, frames=frames)
-    return SweepJob(planned, folder, curves_file, settings_toml, modes, reference, mounted, crossing)
-
-
-def crossing_of(path: Path) -> Path:
-    """The crossing sweep of ``SWEEP.h5``: ``SWEEP-crossing.h5`` beside it, and the other way round."""
-    stem = path.stem.removesuffix("-crossing")
-    return path.with_name(f"{stem}{path.suffix}" if stem != path.stem else f"{stem}-crossing{path.suffix}")
-
-
-def run_sweep(job: SweepJob) -> SweepOutcome:
-    """Do a job unless it is done; whatever is wrong with the sweep becomes the outcome's reason."""
-    if (job.folder / RESULTS.primary).is_file():
-        return job.done(skipped=True)
-    path = job.planned.path
-    try:
-        if recording_sha256(path) != job.planned.sha256:
-            raise InvalidInputError(f"{path}: expected the file that the study began with, got another")
-        settings, sweep = config_from_toml(job.settings_toml), load_sweep(path)
-        mounted, _ = apply_calibrations(sweep, job.calibrations)
-        modes = available_modes(mounted, settings) if job.modes is None else job.modes
-        run_job(
-            sweep,
-            path,
-            read_curves(job.curves),
-            job.folder,
-            [mode for mode in modes if mode != "image"],
-            job.reference,
-            settings,
-            calibrations=job.calibrations,
-            crossing=None if job.crossing is None else (load_sweep(job.crossing), job.crossing),
-        )
-        return job.done()
-    except Exception as error:  # noqa: BLE001 - one broken sweep, or one bug that it reveals, stops no other
-        return job.failed(_reason(error))
 
 
 def _reason(error: Exception) -> str:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from importlib.resources import files
@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.core.tables import text_table
@@ -38,7 +39,7 @@ from speckle3d.scoring.lengths import TRACKER, ModeError
 from speckle3d.scoring.references import error_rows, find_reference, tracker_alone
 from speckle3d.scoring.statistics import MeanInterval, mean_interval
 from speckle3d.simulation.presets import SimulationSettings, simulate
-from speckle3d.study.compare import StudyProgress, compare_sweeps
+from speckle3d.study.compare import compare_sweeps
 from speckle3d.study.results import Study, json_text, write_texts
 from speckle3d.study.schedulers import Scheduler
 
@@ -90,8 +91,8 @@ def paper_study(
     directory: Path,
     curves: Path | None = None,
     scheduler: Scheduler | None = None,
-    progress: Callable[[StudyProgress], None] | None = None,
-    simulated: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+    simulated: Progress | None = None,
 ) -> tuple[Study, str]:
     """Simulate the eleven sweeps, compare the modes, and write it all into `directory`.
 

@@ -17,9 +17,8 @@ from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.scoring.displacements import point_errors
-from speckle3d.study.compare import StudyProgress, compare_sweeps, named
+from speckle3d.study.compare import compare_sweeps, named
 from speckle3d.study.reslices.cut_geometry import read_plane
-from speckle3d.study.results import SweepOutcome
 from speckle3d.study.schedulers import Scheduler
 
 MODES = ["image", "consistent-subset", "orientation", "pose", "fused", "tracker"]
@@ -168,16 +167,3 @@ def test_landmarks_that_come_with_a_sweep_are_scored(sweeps, tmp_path, monkeypat
     (row,) = [row for row in study.drift if row["mode"] == "pose"]
     expected = point_errors(poses, load_sweep(sweeps[0]).truth, None, marks)
     assert (row["GLE_mm"], row["LLE_mm"]) == pytest.approx((expected["GLE_mm"], expected["LLE_mm"]))
-
-
-def test_progress_knows_the_time_left_from_the_first_finished_sweep_on(tmp_path):
-    done = SweepOutcome("a", tmp_path, "done", frames=100)
-    at = StudyProgress(sweeps=3, frames=300)
-    at.add(replace(done, skipped=True))
-    assert at.remaining_s is None
-    at._began_s -= 20.0
-    at.add(done)
-    # One sweep of 100 frames is left, at 0.2 s a frame.
-    assert at.remaining_s == pytest.approx(20.0, rel=0.01)
-    at.add(replace(done, status="failed"))
-    assert (at.remaining_s, at.failed, at.done) == (0.0, 1, 3)
