@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
-from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
 from speckle3d.imaging.measures.belonging import require_inside
 from speckle3d.imaging.measures.measure import Measurement, measured
-from speckle3d.motion.joint_errors import joint_errors, turn_factors
+from speckle3d.motion.joint_errors import joint_errors
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.trajectories import poses_of
 
@@ -68,7 +66,7 @@ def caution(reconstruction: Reconstruction, mode: str) -> str | None:
     The images' errors are taken then: too large along the sweep of a good tracker, too small across it.
     """
     trust = reconstruction.trust
-    if mode in ("image", "orientation") or (trust is not None and mode in trust.modes):
+    if mode == "image" or (trust is not None and mode in trust.modes):
         return None
     return f"mode {mode} claims no errors of its own: those of the images are taken"
 
@@ -110,28 +108,4 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
         own = trust.modes[mode]
         stretched = SharedErrors(0.0, own.length_sigma, np.zeros(2))
         return joint_errors(own.covariance, poses, centre, stretched)
-    image = joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
-    config = stored_config(reconstruction.config_toml) if reconstruction.config_toml else Config()
-    if mode == "orientation":
-        return _sensed(image, poses, centre, reconstruction.frame_time_s, config)
-    return _tracked(image, poses, centre, config) if mode == "pose" else image
-
-
-def _tracked(image: PoseErrors, poses: RigidTransform, centre_mm: FloatArray, config: Config) -> PoseErrors:
-    """Errors of the images, and a path that goes off at an angle as the image may sit on the tracker."""
-    path = (poses[0].inv() * poses).apply(centre_mm) - centre_mm
-    factors = np.zeros((3, len(poses), 6))
-    factors[:, :, :3] = np.cross(config.fused.mounting_sigma_rad * np.eye(3)[:, None], path)
-    return PoseErrors(np.concatenate([image.factors, factors]))
-
-
-def _sensed(
-    image: PoseErrors, poses: RigidTransform, centre_mm: FloatArray, time_s: FloatArray, config: Config
-) -> PoseErrors:
-    """Errors of the images' steps, turned by an orientation sensor with errors of its own."""
-    own = config.fused
-    places = image.factors.copy()
-    places[:, :, 3:] = 0.0
-    sigma = np.array([own.inclination_sigma_rad, own.inclination_sigma_rad, own.heading_sigma_rad])
-    turned = turn_factors(sigma, own.wander_s, time_s, poses, centre_mm)
-    return PoseErrors(np.concatenate([places, turned]))
+    return joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)

@@ -23,7 +23,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.tables import text_table
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path, make_folder
-from speckle3d.scoring.lengths import TRACKER, ModeError
+from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.overall import FITTED_TO_TRACKER, number, over_sweeps, overall_text
 
 FORMAT = "speckle3d.study"
@@ -87,9 +87,9 @@ class Summary:
 
     @property
     def lines(self) -> list[str]:
-        """What stands below the table: doubts, remarks on rows, and where a tracker made a length worse."""
+        """What stands below the table: doubts, and remarks on rows."""
         remarks = {f"{row.mode}: {self.remark(row)}": None for row in self.rows if self.remark(row)}
-        return [*self.doubt_lines, *(f"{self.sweep}: {each}" for each in [*remarks, *self._made_worse()])]
+        return [*self.doubt_lines, *(f"{self.sweep}: {each}" for each in remarks)]
 
     def remark(self, row: ModeError) -> str:
         """What a reader of a row must know beside its numbers; empty for nothing."""
@@ -101,19 +101,6 @@ class Summary:
         if row.mode in self.doubted:
             words.append(f"in doubt: {self.doubted[row.mode]}")
         return "; ".join(words)
-
-    def _made_worse(self) -> list[str]:
-        if self.reference != "truth":
-            return []
-        errors = {(row.part, row.mode): row.length_error_percent for row in self.rows}
-        jitter = {row.part: 196 * row.sigma_mm / row.estimate_mm for row in self.rows if row.mode == TRACKER}
-        return [
-            f"part {part}: {mode} is farther from the truth ({error:+.1f} %) than image "
-            f"({errors[part, 'image']:+.1f} %); the tracker's jitter is +- {jitter[part]:.1f} % of its "
-            "length (95 %)"
-            for (part, mode), error in errors.items()
-            if mode in FITTED_TO_TRACKER and part in jitter and abs(error) > abs(errors[part, "image"])
-        ]
 
     def records(self) -> list[dict[str, Any]]:
         """Rows with what is known beside their errors: ``sweep``, ``reference`` and ``remark``."""
