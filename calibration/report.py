@@ -111,13 +111,13 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
 
 
 def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """What was found as description, value and unit, angles in degrees."""
+    """What was found as description, value with its 95 % interval, and unit, angles in degrees."""
     rows = [("method", calibration.method, ""), ("sensor", calibration.sensor, "")]
     rows += [one.row() for one in calibration.parameters if one.name not in ANGLES]
     angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
     errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
     rows += [
-        (name, f"{angle:.3f} +- {error:.3f}", "deg")
+        (name, f"{angle:.3f} +- {1.96 * error:.3f} (95 %)", "deg")
         for name, angle, error in zip(ANGLES_IN_WORDS, angles, errors, strict=True)
     ]
     used = f"{len(calibration.frames.used)} of {calibration.frames.given}"

@@ -206,7 +206,7 @@ def remarks(outcome: Outcome) -> list[str]:
     notes = [] if outcome.choice is None else [str(outcome.choice)]
     notes += _nwire_notes(outcome, outcome.solution.points)
     if (offset := outcome.offset) is not None:
-        notes.insert(0, f"clock offset {offset.seconds:+.4f} +- {offset.standard_error_s:.4f} s, estimated")
+        notes.insert(0, f"clock offset {offset.seconds:+.4f} +- {1.96 * offset.standard_error_s:.4f} s (95 %), estimated")
     return notes
 
 
@@ -290,4 +290,4 @@ def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
     place = chain.target_from_world.inv()
     matrix = outcome.calibration.pixel_matrix()
     mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, matrix, place))
-    return [f"3-D error of the middle wires {mean:.3f} +- {sd:.3f} mm (the least 95 %, as PLUS has it)"]
+    return [f"3-D error of the middle wires {mean:.3f} mm, SD {sd:.3f} mm (of the least 95 %, as PLUS has it)"]

@@ -34,9 +34,9 @@ class Parameter:
     unit: str
 
     def row(self) -> tuple[str, str, str]:
-        """Name, value with its standard error, and unit, for people."""
+        """Name, value with its 95 % interval, and unit, for people."""
         value, unit = readable(self.value, self.unit)
-        return self.name, f"{value} +- {readable(self.standard_error, self.unit)[0]}", unit
+        return self.name, f"{value} +- {readable(1.96 * self.standard_error, self.unit)[0]} (95 %)", unit
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,8 @@ def test_values_are_those_of_the_pose_and_in_the_units_that_they_name():
     # One quantity, one error: roll, yaw and tilt stand once in the table.
     told = [row for row in rows_of(found) if row[0].startswith(("roll", "yaw", "tilt", "alpha"))]
     errors = np.rad2deg(np.sqrt(np.diag(found.covariance)[2::-1]))
-    assert [float(row[1].split("+- ")[1]) for row in told] == pytest.approx(errors, abs=6e-4)
+    halves = [float(row[1].split("+- ")[1].removesuffix(" (95 %)")) for row in told]
+    assert halves == pytest.approx(1.96 * errors, abs=6e-4)
 
 
 def test_every_frame_is_used_or_has_a_reason():
