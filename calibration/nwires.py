@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from calibration.detection.dots import Dots
 from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.points import ImagePoints, Seen
 from calibration.wires import Wires, solve_wires
@@ -107,7 +106,7 @@ def nwire_errors_mm(
 
 
 def label_by_wires(
-    dots: Dots, phantom: WirePhantom, world_from_sensor: RigidTransform, pixel_mm: npt.ArrayLike
+    dots: Seen, phantom: WirePhantom, world_from_sensor: RigidTransform, pixel_mm: npt.ArrayLike
 ) -> Seen:
     """Assign dots to wires, first by themselves, then by the calibration that follows from most frames.
 

@@ -138,19 +138,23 @@ class Seen:
         Number of the wire that each dot shows.
     dropped : dict of int to str
         Why other frames show nothing.
+    score : ndarray, shape (m,), optional
+        Contrast of dots that are not yet assigned to wires, grey levels; the strongest of a frame first.
     """
 
     frame: IntArray
     pixels: FloatArray
     wire: IntArray | None = None
     dropped: dict[int, str] = field(default_factory=dict)
+    score: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def __getitem__(self, chosen: BoolArray | IntArray) -> Seen:
         wire = None if self.wire is None else self.wire[chosen]
-        return Seen(self.frame[chosen], self.pixels[chosen], wire, self.dropped)
+        score = None if self.score is None else self.score[chosen]
+        return Seen(self.frame[chosen], self.pixels[chosen], wire, self.dropped, score)
 
     def without(self, frames: Collection[int], reason: str) -> Seen:
         """Leave out frames, for the same reason each, whether anything was found in them or not."""

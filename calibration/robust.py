@@ -42,7 +42,7 @@ def robust_linear(matrix: FloatArray, wanted: FloatArray) -> tuple[FloatArray, F
         size = np.linalg.norm(residuals.reshape(-1, group), axis=1)
         weights = huber_weights(size / robust_sigma(size, _ROUNDING), _ABSOLUTE)
         root = np.repeat(np.sqrt(weights), group)
-    return parameters, residuals.reshape(wanted.shape)
+    return np.asarray(parameters), np.asarray(residuals).reshape(wanted.shape)
 
 
 def autocorrelation_time(residuals: FloatArray) -> float:

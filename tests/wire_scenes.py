@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from calibration.points import Seen
 from speckle3d.core.wires import WirePhantom
 
 PIXEL_MM = np.array([0.16, 0.15])
@@ -113,7 +114,7 @@ def plus_results(folder, kind):
 def candidates(shown, seed, noise_mm=0.1, wrong=6, missing=()):
     """Dots as found, strongest first: most wires and, weaker, wrong dots and ringing under some wires.
 
-    Returns frame, pixels, score; `missing` holds (frame, wire) pairs without a dot.
+    `missing` holds (frame, wire) pairs without a dot.
     """
     rng = np.random.default_rng(seed)
     found = []
@@ -128,4 +129,5 @@ def candidates(shown, seed, noise_mm=0.1, wrong=6, missing=()):
         )
         order = np.argsort(-score)
         found.append((np.full(len(score), i), pixels[order], score[order]))
-    return tuple(np.concatenate(column) for column in zip(*found, strict=True))
+    frame, pixels, score = (np.concatenate(column) for column in zip(*found, strict=True))
+    return Seen(frame, pixels, score=score)

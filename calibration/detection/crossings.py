@@ -23,6 +23,7 @@ import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 
+from calibration.detection.dots import centred
 from calibration.detection.region import checked_pixel, in_every_frame, region_mask
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -48,8 +49,6 @@ _FEWEST_GLANCES = 8
 """With fewer frames, wires may seem to stand still, too."""
 _STANDING = 0.3
 """Part of the frames that are darker than what stands still; wires are in one place less often."""
-_SHIFTS = 5
-"""Steps of the mean shift that centres a candidate; a bead is then placed to 0.02 mm."""
 _PEAKS = 40
 """Maxima looked at for each width."""
 
@@ -138,7 +137,7 @@ def _crossings(
         away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
         if score[one] > 0 and (away >= _APART_MM).all() and len(kept) < _MOST_CANDIDATES:
             kept.append(int(one))
-    return np.reshape([_centred(grey, one, pixel_mm) for one in pixels[kept]], (-1, 2))
+    return np.reshape([centred(grey, one, pixel_mm) for one in pixels[kept]], (-1, 2))
 
 
 def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tuple[Float32Array, FloatArray]:
@@ -190,23 +189,3 @@ def _between(response: Float32Array, peaks: IntArray) -> FloatArray:
     before, here, after = np.stack([window[:, :, 1], window[:, 1]]).transpose(2, 1, 0)
     bend = np.maximum(2.0 * here - before - after, np.finfo(np.float32).tiny)
     return np.asarray(np.clip(0.5 * (after - before) / bend, -0.5, 0.5))
-
-
-def _centred(grey: Float32Array, pixel: FloatArray, pixel_mm: FloatArray) -> FloatArray:
-    """Move a place to the centre of what is bright around it, by mean shift.
-
-    Filters see the tail of ringing under a wire as part of it: 0.4 mm, where the centre is 0.15 mm too deep.
-    """
-    reach = np.ceil(2.0 * _WIDTH_MM / pixel_mm).astype(int)
-    start = np.maximum(np.rint(pixel).astype(int) - reach, 0)
-    stop = np.rint(pixel).astype(int) + reach + 1
-    window = grey[start[0] : stop[0], start[1] : stop[1]]
-    weight = np.maximum(window - np.median(window), 0.0) ** 2
-    places = np.stack(np.meshgrid(*(np.arange(n) for n in window.shape), indexing="ij"), axis=-1) + start
-    centre = pixel
-    for _ in range(_SHIFTS):
-        near = weight * np.exp(-0.5 * np.sum(((places - centre) * pixel_mm / _WIDTH_MM) ** 2, axis=2))
-        if not near.sum() > 0:
-            return pixel
-        centre = np.asarray(np.sum(places * near[..., None], axis=(0, 1)) / near.sum())
-    return centre

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import RigidTransform
 
-from calibration.detection.dots import Dots
 from calibration.plane import Chain
 from calibration.points import Seen, affine_equations
 from speckle3d.core.arrays import FloatArray, IntArray
@@ -31,8 +30,6 @@ _STEEPEST = 2.0
 """Largest ratio of a distance in the image to that in the phantom: of an image 60 degrees from square."""
 _PARALLEL_COSINE = 0.99
 _MOST_HYPOTHESES = 4000
-_REFINED = 128
-"""Hypotheses refined; ringing under four wires of a phantom with a fourfold symmetry makes half as many."""
 _LIKE_MM = 0.1
 """Of hypotheses whose misfit is within this of the best, the one with the strongest dots counts."""
 _LEAST_MM = 0.5
@@ -45,21 +42,15 @@ _COLLINEAR_MM = 0.8
 """How far a dot may be off the line of the outer two."""
 _RESIDUAL_MM = 0.5
 """Largest root mean square misfit of a frame's dots."""
-_PIXEL_TOLERANCE = 0.05
-"""Relative standard deviation of the pixel size that is given."""
-_DOT_MM, _SQUARE = 0.3, 0.01
-"""How far a dot is from its wire, typically, and the cosine between an image's axes from computing: what the
-pixel size's uncertainty is weighed against."""
 _RIDGE_MM2 = 1e-3
 """Holds axes that the wires leave open near zero; a dot 10 mm off the centre weighs 100 mm^2."""
-_STEPS = 10
 _GATE_MM = 1.5
 """How far from where a calibration says it is a wire's dot may be."""
 _WIDTHS, _GAPS = (0.9, 1.1 * _STEEPEST), (0.85, 1.1 * _STEEPEST)
 """Distances in the image over the phantom's: of a layer's outer wires, and between layers."""
 
 
-def label_dots(dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> Seen:
+def label_dots(dots: Seen, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> Seen:
     """Assign dots to the wires of an N-wire phantom, each frame by itself.
 
     Parameters
@@ -78,14 +69,14 @@ def label_dots(dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> See
     InvalidInputError
         If the phantom has fewer than two N, or they are not parallel.
     """
-    layers, size = _layers(phantom), np.asarray(pixel_mm, dtype=float)
+    layers, size, score = _layers(phantom), np.asarray(pixel_mm, dtype=float), _scores(dots)
     wires = np.concatenate([layer.wires for layer in layers])
     found: dict[int, FloatArray] = {}
     dropped = dict(dots.dropped)
     for frame in np.unique(dots.frame):
         here = dots.frame == frame
         try:
-            chosen = _label(dots.pixels[here] * size, dots.score[here], layers, phantom)
+            chosen = _label(dots.pixels[here] * size, score[here], layers, phantom)
             found[int(frame)] = dots.pixels[here][chosen]
         except InsufficientDataError as error:
             few = here.sum() < wires.size
@@ -99,7 +90,7 @@ def label_dots(dots: Dots, phantom: WirePhantom, pixel_mm: npt.ArrayLike) -> See
 
 
 def label_by_calibration(
-    dots: Dots,
+    dots: Seen,
     phantom: WirePhantom,
     chain: Chain,
     world_from_sensor: RigidTransform,
@@ -120,16 +111,20 @@ def label_by_calibration(
     """
     image_from_phantom = (chain.target_from_world * world_from_sensor * chain.sensor_from_image).inv()
     kept: list[tuple[int, int, int]] = []
-    dropped = dict(dots.dropped)
+    dropped, score = dict(dots.dropped), _scores(dots)
     for frame in np.unique(dots.frame):
         here = np.flatnonzero(dots.frame == frame)
         expected_mm = _seen_at(phantom, image_from_phantom[int(frame)])
-        pairs = _nearest(dots.pixels[here] * chain.pixel_mm, dots.score[here], expected_mm)
+        pairs = _nearest(dots.pixels[here] * chain.pixel_mm, score[here], expected_mm)
         kept += [(int(frame), int(here[dot]), wire) for dot, wire in pairs]
         if not pairs:
             dropped[int(frame)] = "no dot where the calibration expects a wire"
     frames, index, wires = np.array(kept, dtype=np.int64).reshape(-1, 3).T
     return Seen(frames, dots.pixels[index], wires, dropped)
+
+
+def _scores(dots: Seen) -> FloatArray:
+    return np.ones(len(dots)) if dots.score is None else dots.score
 
 
 @dataclass(frozen=True)
@@ -176,7 +171,6 @@ def _label(dots_mm: FloatArray, score: FloatArray, layers: list[_Layer], phantom
     wires = np.concatenate([layer.wires for layer in layers])
     triples = [_triples(dots_mm, layer, phantom) for layer in layers]
     chosen = _combined(triples, dots_mm, score, layers)
-    chosen = chosen[np.argsort(misfits_mm(dots_mm[chosen], wires, phantom, 0))[:_REFINED]]
     rms_mm = misfits_mm(dots_mm[chosen], wires, phantom)
     best = float(rms_mm.min())
     if best > _RESIDUAL_MM:
@@ -267,19 +261,16 @@ def _combined(
     return chosen
 
 
-def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom, steps: int = _STEPS) -> FloatArray:
-    """Root mean square components of dots' distances from wires, for the pose of the image that fits best.
+def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom) -> FloatArray:
+    """Root mean square components of dots' distances from wires, for the image that fits best.
 
-    Equations are linear in the image's origin and its two axes, which steps of Newton's method make square
-    and, within `_PIXEL_TOLERANCE`, of length one.
+    Equations are linear in the image's origin and its two axes, which may be of any lengths and at any angle.
 
     Parameters
     ----------
     dots_mm : ndarray, shape (b, m, 2)
         Of many hypotheses.
     wires : ndarray of int, shape (m,)
-    steps : int
-        With none, axes are of any lengths and at any angle.
 
     Returns
     -------
@@ -290,21 +281,8 @@ def misfits_mm(dots_mm: FloatArray, wires: IntArray, phantom: WirePhantom, steps
     matrix = affine_equations(seen, np.broadcast_to(rows, (len(seen), *rows.shape)))
     matrix, wanted = matrix.reshape(len(seen), -1, 9), offsets.ravel()
     normal = np.swapaxes(matrix, 1, 2) @ matrix + _RIDGE_MM2 * np.eye(9)
-    pull = wanted @ matrix
-    image = np.linalg.solve(normal, pull[..., None])[..., 0]
-    weight = (_DOT_MM / np.array([_PIXEL_TOLERANCE, _PIXEL_TOLERANCE, _SQUARE]))[:, None] ** 2
-    for _ in range(steps):
-        axes = image[:, 3:].reshape(-1, 2, 3)
-        axes = axes / np.linalg.norm(axes, axis=2, keepdims=True)
-        held = np.zeros((len(seen), 3, 9))
-        held[:, 0, 3:6], held[:, 1, 6:] = held[:, 2, 6:], held[:, 2, 3:6] = axes[:, 0], axes[:, 1]
-        target = np.ones((len(seen), 3, 1))
-        target[:, 2, 0] = np.sum(axes[:, 0] * axes[:, 1], axis=1)
-        turned = np.swapaxes(held, 1, 2)
-        wanted_too = pull[..., None] + turned @ (weight * target)
-        image = np.linalg.solve(normal + turned @ (weight * held), wanted_too)[..., 0]
-    misfit = (matrix @ image[..., None])[..., 0] - wanted
-    return np.asarray(np.sqrt(np.mean(misfit**2, axis=1)))
+    image = np.linalg.solve(normal, (wanted @ matrix)[..., None])
+    return np.asarray(np.sqrt(np.mean(((matrix @ image)[..., 0] - wanted) ** 2, axis=1)))
 
 
 def _seen_at(phantom: WirePhantom, image_from_phantom: RigidTransform) -> FloatArray:

@@ -16,28 +16,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from scipy.spatial.transform import RigidTransform
 
-from calibration.images.angulation import PARAMETERS
-from calibration.images.similarity import Comparison, Estimate, Level
 from calibration.images.solver import SPECKLED_SIMILARITY, ImageCalibration
 from calibration.images.stacks import TrackedImages
-from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.core.arrays import Float32Array
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
-from speckle3d.core.threads import ahead
 from speckle3d.imaging.cuts.planes import image_plane
 from speckle3d.imaging.cuts.reslice import resample_image, reslice_frames
 from speckle3d.imaging.images import ChosenImages
 
 PIXEL_MM = 0.15
-_COLOURS = ("#0072B2", "#D55E00", "#009E73")
 _UNSEEN = "#33415c"
 """Where the other sweep has no frame: blue-grey, as in cuts."""
 _REACH_MM = 1.5
-
-CURVES = Level(1.0, images=10)
-"""What is compared for the similarity curves."""
-
-CURVES_TO, CURVE_POINTS = 6.0, 25
-"""Reach of the similarity curves in mm and degrees, and how finely they are drawn."""
 
 WEAK_SCALE = 0.01
 """Relative standard error of an estimated pixel size above which the scanner's own value is better."""
@@ -93,48 +83,15 @@ def notes_of(result: ImageCalibration) -> list[str]:
 
 
 def figure_of(result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImages]) -> Figure:
-    """One page: images beside reslices before and after, similarity about the answer."""
-    figure = Figure(figsize=(12.0, 10.8), layout="constrained")
+    """One page: an image of each sweep beside what the other shows in its place, before and after."""
+    figure = Figure(figsize=(12.0, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(3, 3, height_ratios=[1.3, 1.3, 1.0])
+    panels = figure.subplots(2, 3)
     for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
         held = result.sweeps.frames_held_out[k]
         _draw_images(panels[k], result, one, other, int(held[len(held) // 2]))
-    comparison = result.sweeps.level(CURVES, result.sensor_from_image)
-    about = Estimate(result.sensor_from_image, result.scales)
-    offset = np.linspace(-CURVES_TO, CURVES_TO, CURVE_POINTS)
-    for axes, names, unit in zip(
-        panels[2], (PARAMETERS[3:], PARAMETERS[:3]), ("mm", "degrees"), strict=False
-    ):
-        for name, colour in zip(names, _COLOURS, strict=True):
-            axes.plot(offset, similarities(comparison, about, name, offset), color=colour, label=name)
-        axes.set(xlabel=f"off the answer / {unit}", ylabel="mean correlation")
-        axes.legend(fontsize=8)
-        axes.grid(alpha=0.3)
-    panels[2, 2].set_axis_off()
     figure.suptitle(f"verdict: {_verdict(result)}", fontsize=10)
     return figure
-
-
-def similarities(comparison: Comparison, about: Estimate, name: str, offset: FloatArray) -> FloatArray:
-    """Mean correlation of images with cuts of the other sweep, with one of `PARAMETERS` moved, shape (k,).
-
-    Parameters
-    ----------
-    offset : ndarray, shape (k,)
-        Degrees about, or mm along, an axis of the image through its origin.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        NaN where no image overlaps the other sweep by three tenths.
-    """
-    unit = np.eye(8)[PARAMETERS.index(name)] * (np.deg2rad(1.0) if name in PARAMETERS[:3] else 1.0)
-
-    def at(step: float) -> float:
-        return comparison.at(about.stepped(step * unit, np.zeros(3))).mean
-
-    return np.array(list(ahead(at, offset.tolist())))
 
 
 def cut_of(

@@ -206,7 +206,8 @@ def remarks(outcome: Outcome) -> list[str]:
     notes = [] if outcome.choice is None else [str(outcome.choice)]
     notes += _nwire_notes(outcome, outcome.solution.points)
     if (offset := outcome.offset) is not None:
-        notes.insert(0, f"clock offset {offset.seconds:+.4f} +- {1.96 * offset.standard_error_s:.4f} s (95 %), estimated")
+        half_s = 1.96 * offset.standard_error_s
+        notes.insert(0, f"clock offset {offset.seconds:+.4f} +- {half_s:.4f} s (95 %), estimated")
     return notes
 
 
@@ -274,7 +275,7 @@ def _seen_wires(
     if wired.phantom is None:
         return crossings_in_frames(recording.images, size, region, progress)
     clip: npt.ArrayLike | None = wired.clip_px if region is None else region
-    dots = dots_in_frames(recording.images, size, clip, progress).without(settings.leave_out)
+    dots = dots_in_frames(recording.images, size, clip, progress).without(settings.leave_out, BY_HAND)
     times, offset_s = recording.frame_time_s, recording.time_offset_s
     if isinstance(recording.readings, TimedPoses) and covered(recording.readings, times, offset_s).all():
         # A calibration from the frames that show all wires finds those of the other frames.
@@ -290,4 +291,4 @@ def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
     place = chain.target_from_world.inv()
     matrix = outcome.calibration.pixel_matrix()
     mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, matrix, place))
-    return [f"3-D error of the middle wires {mean:.3f} mm, SD {sd:.3f} mm (of the least 95 %, as PLUS has it)"]
+    return [f"3-D error of the middle wires {mean:.3f} mm, SD {sd:.3f} mm (the least 95 %, as PLUS has it)"]

@@ -7,7 +7,6 @@ from scipy.spatial.transform import RigidTransform
 from wire_scenes import PIXEL_MM as DOT_MM
 from wire_scenes import candidates, scene
 
-from calibration.detection.dots import Dots
 from calibration.nwires import label_by_wires
 from calibration.plane import calibrate_plane
 from speckle3d.core.sweep import ImageGrid
@@ -46,7 +45,7 @@ def test_a_bright_pixel_is_in_the_voxel_at_its_place():
 
 def test_dots_get_the_labels_of_their_wires():
     shown = scene(9, frames=10)
-    dots = Dots(*candidates(shown, 1))
+    dots = candidates(shown, 1)
     labelled = label_by_wires(dots, shown.phantom, shown.world_from_sensor, DOT_MM)
     off_mm = (labelled.pixels - shown.pixels[labelled.frame, labelled.wire]) * DOT_MM
     # Dots are placed to 0.1 mm, wires are 5 mm apart or more.

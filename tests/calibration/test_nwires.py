@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from wire_scenes import PIXEL_MM, candidates, plus_results, scene
 
-from calibration.detection.dots import Dots
 from calibration.nwires import label_by_wires, middle_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.points import Seen
 from calibration.wires import solve_wires
@@ -59,7 +58,7 @@ def test_a_phantom_nobody_registered_is_found_by_turning_the_probe():
 def test_frames_that_lack_wires_are_labelled_by_what_the_others_say():
     shown = scene(9, frames=20)
     missing = {(3, 4), (5, 0), (11, 7)}
-    dots = Dots(*candidates(shown, 1, missing=missing))
+    dots = candidates(shown, 1, missing=missing)
     labelled = label_by_wires(dots, shown.phantom, shown.world_from_sensor, PIXEL_MM * 1.03)
     away = np.abs((labelled.pixels - shown.pixels[labelled.frame, labelled.wire]) * PIXEL_MM).max(axis=1)
     assert (away < 0.5).sum() == 20 * 9 - 3  # five deviations of the noise

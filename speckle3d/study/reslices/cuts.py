@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
@@ -26,7 +26,6 @@ from speckle3d.study.reslices.cut_geometry import Anchors, anchors_of
 from speckle3d.study.reslices.places import (
     AnyCut,
     Place,
-    frame_centres,
     frame_lines,
     sweep_extent,
     view_of,
@@ -46,14 +45,11 @@ class DrawnCut:
     frames : ndarray, shape (n, m, 2)
         Line in which each frame crosses the cut, by the picture's axes, mm; NaN where it does not. Empty for
         cuts of voxels.
-    centres : ndarray, shape (n,)
-        Where along x the frames' centres are, from the first one's, mm.
     """
 
     image: Float32Array
     cut: AnyCut
     frames: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
-    centres: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -74,8 +70,6 @@ class CutPicture:
         Black and white.
     name : str
         Of the sweep or the volume.
-    numbers : ndarray of int, shape (n,), optional
-        Of the frames; by default from 0.
     anchors : mapping of str to mapping
         Poses of some frames of each mode; see `cut_geometry.anchors_of`.
     lengths : mapping of str to str
@@ -88,7 +82,6 @@ class CutPicture:
     unit: str = "dB, 0: maximum"
     levels: tuple[float, float] | None = None
     name: str = ""
-    numbers: IntArray | None = None
     anchors: Mapping[str, Anchors] = field(default_factory=dict)
     lengths: Mapping[str, str] = field(default_factory=dict)
 
@@ -198,7 +191,6 @@ def cut_posed(
         unit if voxels is None else _unit_of(voxels[0]),
         limits if voxels is None else None,
         opened.posed.sweep.name,
-        numbers,
         {mode: anchors_of(each, numbers) for mode, each in poses.items()},
         length_words(lengths, opened.reference),
     )
@@ -216,7 +208,6 @@ def drawn_cuts(
             image,
             cuts[mode],
             frame_lines(cuts[mode], grid, poses[mode]),
-            frame_centres(cuts[mode], grid, poses[mode]),
         )
         for mode, image in images.items()
     }

@@ -235,14 +235,6 @@ def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) 
     return np.asarray(lines + np.array(cut.first_mm))
 
 
-def frame_centres(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
-    """Where the frames' centres are along a plane's x, from the first's, shape (n,), mm; not on a sheet."""
-    if isinstance(cut, CurvedSheet):
-        return np.empty(0)
-    x = cut.world_from_plane.inv().apply(world_from_image.apply(grid.centre_mm))[:, 0]
-    return np.asarray(x - x[0])
-
-
 def sweep_extent(world_from_image: RigidTransform, grid: ImageGrid) -> str:
     """Where a sweep lies, in words."""
     outlines = frame_outlines(grid, world_from_image)

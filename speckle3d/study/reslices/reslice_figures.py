@@ -1,7 +1,6 @@
 """Pictures of reslices: cuts at the poses of several modes under one grey scale, and how long each mode is.
 
-Below cuts along the sweep stands where every mode has the frames: a mode that is too long has a longer row.
-The lengths beside the rows are those of the tables (`speckle3d.scoring.lengths`).
+The lengths over the cuts are those of the tables (`speckle3d.scoring.lengths`).
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import RigidTransform
 
@@ -51,8 +50,8 @@ _DEEP_MM, _LONG_MM = 12.0, 16.0
 _LARGEST_MM = (400.0, 200.0)
 """Of the cut along a sweep that goes with every reconstruction, however far a mode runs away."""
 
-_ACROSS_IN, _DOWN_IN, _ROW_IN = 11.0, 6.0, 0.28
-"""Width and height that the cuts share, and height of a mode's row."""
+_ACROSS_IN, _DOWN_IN = 11.0, 6.0
+"""Width and height that the cuts share."""
 
 
 def draw_strip(
@@ -154,25 +153,20 @@ def draw_cuts(picture: CutPicture, across_in: float = _ACROSS_IN) -> tuple[Figur
     cuts = picture.cuts
     levels = picture.levels or _levels(cuts)
     size = np.max([(drawn.cut.width_mm, drawn.cut.height_mm) for drawn in cuts.values()], axis=0)
-    along = picture.axes[0] == "along the sweep" and all(len(drawn.centres) for drawn in cuts.values())
     # Cuts in a row or in a column, whichever shows them larger.
     grids = [(1, len(cuts)), (len(cuts), 1)]
     scales = [min(across_in / (c * size[0]), _DOWN_IN / (r * size[1])) for r, c in grids]
     scale, (down, across) = max(zip(scales, grids, strict=True))
     wide = max(across * (scale * size[0] + 0.6) + 1.6, 5.0)
-    tall, below = down * (scale * size[1] + 0.7) + 0.7, (0.9 + _ROW_IN * len(cuts)) if along else 0.0
-    figure = new_figure(wide, tall + below)
-    above: FigureBase = figure
-    if along:
-        above, under = figure.subfigures(2, 1, height_ratios=(tall, below), squeeze=False).ravel()
-        _draw_rows(under.subplots(), picture)
-    places = above.subplots(down, across, squeeze=False).ravel()
+    figure = new_figure(wide, down * (scale * size[1] + 0.7) + 0.7)
+    places = figure.subplots(down, across, squeeze=False).ravel()
     panels = dict(zip(cuts, places, strict=True))
     for mode, drawn in cuts.items():
         # A volume has none of the colours of modes.
         colour = "#404040" if mode == "volume" else colour_of(mode, list(cuts))
         image = show_grey(panels[mode], drawn.image, drawn.cut.extent_mm, levels)
-        panels[mode].set_title(label_of(mode), fontsize="medium", color=colour, parse_math=False)
+        title = "\n".join(filter(None, [label_of(mode), picture.lengths.get(mode, "")]))
+        panels[mode].set_title(title, fontsize="small", color=colour, parse_math=False)
         lines = list(drawn.frames[spread_frames(len(drawn.frames), 8)])
         panels[mode].add_collection(
             LineCollection(lines, colors="#FFD700", linewidths=0.6, alpha=0.6), autolim=False
@@ -180,7 +174,7 @@ def draw_cuts(picture: CutPicture, across_in: float = _ACROSS_IN) -> tuple[Figur
         panels[mode].tick_params(labelsize="small")
     places[0].set_ylabel(f"{picture.axes[1]} / mm")
     places[-1 if down > 1 else 0].set_xlabel(f"{picture.axes[0]} / mm")
-    above.colorbar(image, ax=list(places), label=picture.unit, shrink=0.8)
+    figure.colorbar(image, ax=list(places), label=picture.unit, shrink=0.8)
     name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
     return figure, panels
 
@@ -226,29 +220,6 @@ def busiest_rows(image: Float32Array, count: int) -> int:
     # Near the face the probe's own echo would win.
     first = min(count // 3, len(sums) - 1)
     return first + int(np.argmax(sums[first:]))
-
-
-def _draw_rows(axes: Axes, picture: CutPicture) -> None:
-    """Draw some of every mode's frames on a line of its own, with the mode's length beside it."""
-    rows = {mode: drawn.centres for mode, drawn in picture.cuts.items()}
-    first = next(iter(rows.values()))
-    shown = spread_frames(len(first), 12)
-    for y, (mode, x) in enumerate(rows.items()):
-        colour = colour_of(mode, list(rows))
-        axes.plot([x.min(), x.max()], [y, y], color=colour)
-        axes.plot(x[shown], np.full(len(shown), y), "|", color=colour, markersize=9)
-        axes.text(1.01, y, picture.lengths.get(mode, ""), transform=axes.get_yaxis_transform(), color=colour,
-                  fontsize="small", va="center")  # fmt: skip
-    for index in shown:
-        text = str(index if picture.numbers is None else picture.numbers[index])
-        axes.annotate(text, (first[index], -0.4), ha="center", fontsize="xx-small", color="0.4")
-    axes.set_yticks(range(len(rows)), [label_of(mode) for mode in rows])
-    axes.set_ylim(len(rows) - 0.5, -0.8)
-    axes.spines[["left", "right", "top"]].set_visible(False)
-    axes.tick_params(labelsize="small", left=False)
-    axes.set_xlabel(
-        "frames' centres along the sweep, mm from the first; above: their numbers", fontsize="small"
-    )
 
 
 def _levels(cuts: Mapping[str, DrawnCut]) -> tuple[float, float]:

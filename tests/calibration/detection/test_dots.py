@@ -4,12 +4,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from wire_scenes import PIXEL_MM, picture, plus_results, scene
 
-from calibration.detection.dots import dots_in_image
+from calibration.detection.dots import dots_in_frames
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.metaimage import read_metaimage
 from speckle3d.io.plus_config import read_wire_phantom
 
-NOTHING = np.zeros((0, 2))
+
+def dots_in(image, *options):
+    seen = dots_in_frames(image[None], *options)
+    return seen.pixels, seen.score
 
 
 def gaussian_dot(place, sds_mm=(0.4, 0.3), pixel_mm=PIXEL_MM, shape=(120, 100)):
@@ -20,7 +23,7 @@ def gaussian_dot(place, sds_mm=(0.4, 0.3), pixel_mm=PIXEL_MM, shape=(120, 100)):
 @given(u=st.floats(20, 100), v=st.floats(20, 80), gain=st.floats(0.1, 1000), floor=st.floats(-50, 50))
 @settings(deadline=None, max_examples=25)
 def test_a_dot_is_placed_between_pixels_whatever_the_gain(u, v, gain, floor):
-    pixels, score = dots_in_image(gain * (gaussian_dot((u, v)) + floor), PIXEL_MM)
+    pixels, score = dots_in(gain * (gaussian_dot((u, v)) + floor), PIXEL_MM)
     # A tenth of a pixel: the edge of the part that counts is cut at whole pixels, five to six of them across.
     np.testing.assert_allclose(pixels, [[u, v]], atol=0.1)
     # What the two Gaussians leave of one of these widths: the ratio of the areas before and after.
@@ -34,7 +37,7 @@ def test_wires_are_found_in_speckle_through_side_lobes_and_ringing():
     away, ranks = [], []
     for i, true in enumerate(shown.pixels):
         image = picture(true, seed=i, strength=rng.uniform(0.2, 1.5, len(true)))
-        pixels, score = dots_in_image(image, PIXEL_MM)
+        pixels, score = dots_in(image, PIXEL_MM)
         assert (np.diff(score) <= 0).all()
         apart = np.linalg.norm((pixels[None] - true[:, None]) * PIXEL_MM, axis=2)
         away.append(apart.min(axis=1))
@@ -56,7 +59,7 @@ def test_real_wires_are_found_where_others_found_them(realdata):
     frames, points, _, _ = plus_results(folder, "Validation")
     away = []
     for frame, point in list(zip(frames, points, strict=True))[::4]:
-        pixels, _ = dots_in_image(sweep.frames[frame], [config.pixel_mm] * 2, config.clip_px)
+        pixels, _ = dots_in(sweep.frames[frame], [config.pixel_mm] * 2, config.clip_px)
         away.append(np.linalg.norm(pixels[None] - point[:, None], axis=2).min(axis=1))
     # Measured 0.79 px in the middle and 3.9 px at most; a dot's echo is 40 px wide and 13 px high.
     assert np.median(away) < 1.0
