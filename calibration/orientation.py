@@ -15,12 +15,12 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.motion import require_adequate
 from calibration.plane import (
-    LineDirections,
     Problem,
     Solution,
     angle_starts,
     hemisphere,
     in_plane_mirror,
+    line_directions,
 )
 from calibration.points import ANGLES, SOME_FRAMES, ImagePoints, as_directions
 from calibration.settings import OrientationFit
@@ -62,15 +62,16 @@ def calibrate_orientation(
         mirror; or the motion does not determine the answer, and then the missing motion is named.
     """
     s = settings or OrientationFit()
-    directions = as_directions(lines) if len(lines) == 2 * len(lines.frames) else lines
+    size = np.array([pixel_mm[0] / pixel_mm[1], 1.0])
+    directions = as_directions(lines, size) if len(lines) == 2 * len(lines.frames) else lines
     if len(directions) < FEWEST_LINES:
         raise InsufficientDataError(
             f"expected lines in at least {FEWEST_LINES} frames, got {len(directions)}"
         )
-    normals, size = hemisphere(), np.array([pixel_mm[0] / pixel_mm[1], 1.0])
+    normals = hemisphere()
     normals = normals[:1] if s.level else normals[normals[:, 2] > np.cos(STEEPEST_PLANE)]
     starts = angle_starts(directions.of_some_frames(SOME_FRAMES), size, normals, s.level)
-    problem = Problem(LineDirections(size, s.level), ANGLES, s.outlier_sigma)
+    problem = Problem(line_directions(s.level), ANGLES, s.outlier_sigma)
     side = "down (plane seen from above)" if s.viewed_from == "above" else "up (plane seen from below)"
     assumed = f"assumed, as no image tells it: the beam points {side}"
     solution = require_adequate(replace(problem.best(directions, starts), assumed=assumed))

@@ -158,34 +158,13 @@ class Plane:
         return np.broadcast_to(np.array([[0.0, 0.0, 1.0]]), (n, 1, 3)), np.zeros((n, 1))
 
 
-@dataclass(frozen=True)
-class LineDirections:
+def line_directions(level: bool = False) -> Plane:
     """A plane of which line directions alone are used, wherever it is (TR 303, appendix A; Housden 2008).
 
-    `ImagePoints.pixels` then holds directions, and the poses have no translation.
-
-    Parameters
-    ----------
-    pixel_mm : ndarray, shape (2,)
-        For the length of a direction, which is brought to one.
-    level : bool
-        The plane's normal is the world's z axis.
+    `ImagePoints.pixels` then holds directions (`as_directions`), and the poses have no translation: what
+    vanishes is the sine of the angle between line and plane. A level one's normal is the world's z axis.
     """
-
-    pixel_mm: FloatArray
-    level: bool = False
-    seen_as: SeenAs = "direction"
-
-    @property
-    def determined(self) -> tuple[str, ...]:
-        """The two angles of the plane, unless it is level."""
-        return () if self.level else ("beta_c", "gamma_c")
-
-    def vanishing(self, points: ImagePoints) -> tuple[FloatArray, FloatArray]:
-        """Sine of the angle between line and plane."""
-        rows = np.zeros((len(points), 1, 3))
-        rows[:, 0, 2] = 1.0 / np.linalg.norm(points.pixels * self.pixel_mm, axis=1)
-        return rows, np.zeros((len(points), 1))
+    return Plane(() if level else ("beta_c", "gamma_c"), "direction")
 
 
 # 2. Residuals and their derivatives
@@ -710,15 +689,13 @@ def angle_starts(
     seen = directions.pixels * sizes[:, None]
     seen /= np.linalg.norm(seen, axis=2, keepdims=True)
     costs = np.abs(np.einsum("knb,kbc,knc->kn", up, turns[..., :2], seen)).mean(axis=1)
-    few = directions.of_some_frames(_ANGLE_FRAMES)
+    phantom = line_directions(level)
+    equations = Equations.of(directions.of_some_frames(_ANGLE_FRAMES), phantom)
     ends = list[tuple[float, Chain]]()
     for number in np.argsort(costs)[:_REFINED]:
         pose = Rotation.from_matrix(turns[number]), rotation_to_z(normals[number])
-        phantom = LineDirections(sizes[number], level)
-        equations = Equations.of(few, phantom)
-        free = [*(["s_x"] if pixel_mm is None else []), *ANGLES, *phantom.determined]
         start = Chain(sizes[number], *map(RigidTransform.from_rotation, pose))
-        end = nearly_absolute(equations, start, free, _ROUNDS)
+        end = nearly_absolute(equations, start, (*ANGLES, *phantom.determined), _ROUNDS)
         # The world is turned as little as puts the plane's normal upright.
         upright = rotation_to_z(end.target_from_world.rotation.as_matrix()[2])
         end = replace(end, target_from_world=RigidTransform.from_rotation(upright))
@@ -746,7 +723,8 @@ def _from_stages(lines: ImagePoints, problem: Problem, fixed_mm: FloatArray | No
     """Angles from line directions, then distances, then all."""
     few = lines.of_some_frames(SOME_FRAMES)
     pixel_mm = fixed_mm if problem.prior is None else problem.prior.pixel_mm
-    angles = angle_starts(as_directions(few), pixel_mm, hemisphere())
+    directions = as_directions(few, np.ones(2) if pixel_mm is None else pixel_mm)
+    angles = angle_starts(directions, pixel_mm, hemisphere())
     return problem.best(lines, [_with_distances(few, one, pixel_mm) for one in angles])
 
 

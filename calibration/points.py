@@ -175,10 +175,12 @@ class Seen:
         return ImagePoints(self.pixels, self.frame, world_from_sensor, self.wire, time_s)
 
 
-def as_directions(lines: ImagePoints) -> ImagePoints:
-    """Directions of lines given by two points each; their poses keep the rotation alone."""
+def as_directions(lines: ImagePoints, pixel_mm: FloatArray) -> ImagePoints:
+    """Directions of lines given by two points each, of length one; their poses keep the rotation alone."""
     turns = RigidTransform.from_rotation(lines.world_from_sensor[::2].rotation)
-    return replace(lines[::2], pixels=lines.pixels[1::2] - lines.pixels[::2], world_from_sensor=turns)
+    along = lines.pixels[1::2] - lines.pixels[::2]
+    along = along / np.linalg.norm(along * pixel_mm, axis=1, keepdims=True)
+    return replace(lines[::2], pixels=along, world_from_sensor=turns)
 
 
 def affine_equations(places: FloatArray, rows: FloatArray) -> FloatArray:

@@ -114,7 +114,7 @@ def validate(solution: Solution, points: ImagePoints) -> FloatArray:
         If the recording is too short to find the plane in.
     """
     chain, phantom = solution.chain, solution.phantom
-    points = as_directions(points) if solution.angular else points
+    points = as_directions(points, chain.pixel_mm) if solution.angular else points
     if phantom.seen_as != "dot" and phantom.determined:
         return Problem(phantom, (), np.inf).solve(points, chain).residuals
     return Equations.of(points, phantom).residuals(chain)

@@ -26,7 +26,7 @@ STEP_S = 0.02
 """Steps of the offsets tried first: half a frame at 25 frames/s, in which no hand reverses."""
 
 _ANEW = 15
-"""Of so many offsets tried, one gets a calibration from nothing; others begin from the one beside them."""
+"""Of so many offsets tried, one gets a calibration from nothing; others begin from the nearest of these."""
 _MOST_STEPS = 10
 _CLOSE = 0.1
 """Steps end when one is below this share of the standard error."""
@@ -135,7 +135,7 @@ def _as_seen(solution: Solution, points: ImagePoints) -> ImagePoints:
     if points.pixels.shape == solution.points.pixels.shape:
         turns = RigidTransform.from_rotation(points.world_from_sensor.rotation)
         return replace(points, world_from_sensor=turns)
-    return as_directions(points)
+    return as_directions(points, solution.chain.pixel_mm)
 
 
 def _sigmas(
@@ -144,20 +144,14 @@ def _sigmas(
     """Robust standard deviation of the residuals of some frames at every offset."""
     some = [points_at(float(offset)).of_some_frames(SOME_FRAMES) for offset in tried_s]
     found = _anew(calibrate, some)
-    sigmas = np.empty(len(tried_s))
-    begins = np.array(sorted(found))
-    begin_of = begins[np.abs(np.arange(len(some))[:, None] - begins).argmin(axis=1)]
-    for begin, solution in found.items():
-        mine = np.flatnonzero(begin_of == begin)
-        # To both sides, each from the solution of the one beside it.
-        for side in (mine[mine >= begin], mine[mine < begin][::-1]):
-            chain = solution.chain
-            for number in side:
-                equations = Equations.of(_as_seen(solution, some[number]), solution.phantom)
-                free = [name for name in solution.free if solution.prior is None or name not in SCALES]
-                chain = nearly_absolute(equations, chain, free)
-                sigmas[number] = sigma_of(equations.residuals(chain))
-    return sigmas
+    sigmas = []
+    for number, points in enumerate(some):
+        solution = found[min(found, key=lambda begin: abs(begin - number))]
+        equations = Equations.of(_as_seen(solution, points), solution.phantom)
+        free = [name for name in solution.free if solution.prior is None or name not in SCALES]
+        chain = nearly_absolute(equations, solution.chain, free)
+        sigmas.append(sigma_of(equations.residuals(chain)))
+    return np.array(sigmas)
 
 
 def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, Solution]:

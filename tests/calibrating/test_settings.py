@@ -17,32 +17,16 @@ from speckle3d.calibrating.settings import (
     frames_of,
     frames_text,
     offset_of,
-    region_of,
-    region_text,
     with_values,
 )
 from speckle3d.cli.calibrate import phantoms as calibrate_phantoms
 from speckle3d.core.errors import InvalidInputError
-
-number = st.floats(-1e4, 1e4, allow_nan=False)
 
 
 @given(st.sets(st.integers(0, 10**9)))
 @settings(deadline=None)
 def test_frames_are_read_as_they_are_written(frames):
     assert frames_of(frames_text(frames)) == tuple(sorted(frames))
-
-
-@given(st.lists(st.tuples(number, number), min_size=3, max_size=8))
-@settings(deadline=None)
-def test_a_region_is_read_as_it_is_written(corners):
-    assert region_of(region_text(tuple(corners))) == tuple(corners)
-
-
-def test_frames_are_numbers_and_ranges():
-    assert frames_of("17-20, 3,18") == (3, 17, 18, 19, 20)
-    assert frames_text((3, 17, 18, 19, 20, 22)) == "3,17-20,22"
-    assert frames_of("") == ()
 
 
 @pytest.mark.parametrize("text", ["3;4", "-3", "5-3", "1.5", "0-9999999", "9999999999", "a", "3-4-5", "٣"])

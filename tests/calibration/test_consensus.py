@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 from calibration_examples import PIXEL_MM, scan_wires
-from crossing_images import crossing_world
 
 from calibration.consensus import find_consensus
-from calibration.detection.crossings import crossings_in_frames
 from calibration.points import ImagePoints
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
@@ -57,23 +55,3 @@ def test_chance_candidates_are_refused_and_the_statistic_told(frames, each):
     if each > 1:
         assert f"of {frames} frames" in str(refused.value)
         assert "chance gives" in str(refused.value)
-
-
-@pytest.mark.slow
-def test_images_of_crossing_wires_calibrate():
-    found = []
-    for seed in (603, 621):
-        world = crossing_world(seed, 40)
-        seen = crossings_in_frames(world.images, world.pixel_mm)
-        readings = world.world_from_sensor[seen.frame]
-        solution = calibrate_cross_wire(seen.points(readings), world.pixel_mm)
-        picked = solution.points_used
-        away = np.hypot(*((picked.pixels - world.crossing_px[picked.frame]) * world.pixel_mm).T)
-        shown = np.flatnonzero(world.shown)
-        found.append(np.isin(shown, picked.frame[away < 2.0]).mean())
-        # The tracker's 0.25 and 0.3 mm and 0.15 degrees, and half the beam's thickness.
-        assert solution.rms < 1.0
-        other = np.random.default_rng(seed).permutation(40)
-        with pytest.raises(InsufficientDataError, match="chance"):
-            calibrate_cross_wire(seen.points(world.world_from_sensor[other[seen.frame]]), world.pixel_mm)
-    assert min(found) >= 0.8

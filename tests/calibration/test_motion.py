@@ -7,7 +7,7 @@ import pytest
 from calibration_examples import BEAM_DOWN, COLUMNS, PIXEL_MM, TRIAL_1, about, centre_of, scan_wires
 from scipy.spatial.transform import RigidTransform
 
-from calibration.motion import MOTIONS, REFUSED_MM, TILT, WEAK_MM, require_adequate, weakest_of
+from calibration.motion import MOTIONS, require_adequate
 from calibration.orientation import calibrate_orientation
 from calibration.plane import Plane, Problem, calibrate_plane
 from calibration.points import ImagePoints
@@ -80,26 +80,6 @@ def test_doing_as_told_cures_a_calibration(calibrate, done):
     else:
         away = centre_of(chain.sensor_from_image, chain.pixel_mm) - centre_of(TRIAL_1, PIXEL_MM)
         assert np.linalg.norm(away) < 4 * error
-
-
-def test_three_words_for_three_states():
-    moves = {"roll": 15.0, "move": 11.0}
-    sufficient = calibrate_plane(lines_of(moves | {"tilt": 25.0})).adequacy
-    assert (sufficient.refused, sufficient.missing) == (False, ())
-    assert sufficient.standard_error < WEAK_MM
-    assert f"{sufficient.standard_error:.2g} mm" in sufficient.verdict
-    weakly = calibrate_plane(lines_of(moves | {"tilt": 8.0}, noise_mm=0.4)).adequacy
-    assert not weakly.refused
-    assert WEAK_MM < weakly.standard_error < REFUSED_MM
-    assert TILT in weakly.verdict
-    assert weakly.weakest in weakly.verdict
-
-
-def test_the_weakest_direction_is_named_in_words():
-    rng = np.random.default_rng(0)
-    x, y, other = rng.standard_normal((3, 50))
-    alike = np.column_stack([x, x + 1e-3 * y, other])
-    assert weakest_of(alike, ("y", "z_c", "gamma")) == "a shift along the beam (with the phantom's z)"
 
 
 def test_a_phantom_that_does_not_explain_the_images_is_not_blamed_on_the_motion():

@@ -43,26 +43,6 @@ def test_one_size_and_time_give_what_dense_algebra_gives():
     assert noise.white == pytest.approx(np.sqrt(variance))
 
 
-def test_what_is_known_before_counts_as_one_more_measurement():
-    problem = drawn(np.random.default_rng(2), 0.0)
-    grid = grid_of(problem)
-    prior, excess = np.diag([0.0, 50.0, 0.0]), np.array([0.0, 0.3, 0.0])
-    still = grid[(grid[:, :2] == 0).all(axis=1)]
-    noise, _ = fit_wandering(*problem, still, prior, excess)
-    rows = np.vstack([problem[0] / noise.white, [0.0, np.sqrt(50.0), 0.0]])
-    wanted = -np.append(problem[1] / noise.white, np.sqrt(50.0) * 0.3)
-    np.testing.assert_allclose(noise.step, np.linalg.lstsq(rows, wanted, rcond=None)[0], rtol=1e-6)
-    np.testing.assert_allclose(noise.covariance, np.linalg.inv(rows.T @ rows), rtol=1e-6)
-
-
-def test_exact_data_are_no_accident():
-    jacobian, residuals, *rest = drawn(np.random.default_rng(4), 0.0)
-    problem = (jacobian, 0.0 * residuals, *rest)
-    noise, _ = fit_wandering(*problem, grid_of(problem))
-    assert np.isfinite(noise.covariance).all()
-    assert not noise.step.any()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 0.5, 2.0])
 def test_errors_lie_within_those_claimed(size):

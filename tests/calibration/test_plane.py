@@ -65,13 +65,6 @@ def test_a_thick_beam_biases_a_bare_wall_as_published(seed, beam_mm, shift_mm):
     assert 80 < published_kappa(solution) < 95
 
 
-def test_the_noise_column_is_as_published():
-    # Table 6: RMS 0.354; its single centre shift of 0.366 lies within the spread of seeds, 0.16 to 0.9.
-    solution = calibrate_plane(scan_plane(np.random.default_rng(0), noisy=True).lines, settings=ALL_FRAMES)
-    assert solution.rms == pytest.approx(0.354, rel=0.10)
-    assert np.linalg.norm(moved_mm(solution)) < 1.0
-
-
 @pytest.mark.parametrize("fixed", [True, False])
 def test_exact_lines_give_the_exact_calibration(fixed):
     floor = RigidTransform.from_components([30.0, -200.0, 150.0], Rotation.from_euler("xyz", [0.1, -0.3, 1]))
@@ -111,19 +104,6 @@ def test_derivatives_are_those_of_finite_differences(at):
         np.testing.assert_allclose(slopes[..., column], (above - below) / 2e-6, atol=2e-3)
 
 
-def test_pixel_sizes_that_become_negative_are_turned_into_the_same_calibration():
-    chain = Chain(PIXEL_MM, TRIAL_1, RigidTransform.identity())
-    corners = np.array([[0.0, 0.0], [290.0, 0.0], [0.0, 290.0]])
-    for size in ([-2 * PIXEL_MM[0], 0.0], [0.0, -2 * PIXEL_MM[1]], -2 * PIXEL_MM):
-        flipped = chain.displaced(np.append(size, np.zeros(12)))
-        assert (flipped.pixel_mm > 0).all()
-        places = [
-            one.sensor_from_image.apply(np.column_stack([corners * pixel, np.zeros(3)]))
-            for one, pixel in ((flipped, flipped.pixel_mm), (chain, PIXEL_MM + size))
-        ]
-        np.testing.assert_allclose(*places, atol=1e-12)
-
-
 def test_wrong_lines_in_a_tenth_of_the_frames_hardly_move_the_answer():
     rng = np.random.default_rng(0)
     right = scan_plane(rng, 300, line_noise_mm=0.2).lines
@@ -151,11 +131,6 @@ def test_the_missing_motion_is_named_and_nothing_returned(options, named, settin
         calibrate_plane(lines(**options), PIXEL_MM, settings)
     others = {TILT, ROLL, UP_AND_DOWN} - {named}
     assert not any(other in str(refused.value) for other in others)
-
-
-def test_turning_about_the_planes_normal_is_not_needed():
-    # The plane looks the same from every side. The standard error of the corners is 0.25 mm; four times that.
-    assert np.linalg.norm(moved_mm(calibrate_plane(lines(count=200, yaw_deg=0.0)))) < 1.0
 
 
 def test_what_cannot_be_calibrated_is_refused():

@@ -7,18 +7,13 @@ import re
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from speckle3d.config import Config
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.scoring.displacements import point_errors
-from speckle3d.study.compare import compare_sweeps, named
-from speckle3d.study.reslices.cut_geometry import read_plane
+from speckle3d.study.compare import compare_sweeps
 from speckle3d.study.schedulers import Scheduler
 
 MODES = ["image", "consistent-subset", "orientation", "pose", "fused", "tracker"]
@@ -79,14 +74,6 @@ def test_one_number_for_a_length_in_every_output(study):
         assert line.split()[4] == f"{1.96 * row['sigma_mm']:.2f}"
 
 
-def test_the_enlarged_part_lies_where_it_does_in_the_whole_cut(study):
-    folder = study.directory / stored(study.directory)["sweeps"][0]["folder"]
-    whole, part = (read_plane(folder / name, "pose").cut for name in ("reslice.png", "enlarged.png"))
-    x, y = part.first_mm
-    pixels_mm = whole.world_from_mm([x, x + 1.0], [y, y + 2.0])
-    np.testing.assert_allclose(part.world_from_mm([x, x + 1.0], [y, y + 2.0]), pixels_mm, atol=1e-9)
-
-
 def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tmp_path):
     shutil.copytree(study.directory, tmp_path / "again")
     before = numbers(study.directory)
@@ -119,26 +106,6 @@ def test_a_mode_that_a_sweep_has_no_sensor_for_is_its_reason(sweeps, tmp_path):
     assert stored(compare_sweeps([bare], tmp_path / "all").directory)["modes"] == ["image"]
 
 
-def test_a_bug_in_one_sweep_is_its_reason_and_leaves_nothing(sweeps, tmp_path, monkeypatch):
-    def broken(*_, **__):
-        raise ZeroDivisionError("in the middle")
-
-    monkeypatch.setattr("speckle3d.study.job.draw_strip", broken)
-    outcome = compare_sweeps(sweeps[:1], tmp_path / "out").outcomes[0]
-    assert outcome.reason == "ZeroDivisionError: in the middle"
-    assert not (tmp_path / "out" / "sweeps").exists()
-
-
-def test_files_of_one_name_are_told_apart_and_one_given_twice_is_one(tmp_path):
-    a, b, c = (tmp_path / name for name in ("a/s.h5", "b/s.h5", "a/t.h5"))
-    assert named([a, b, a, c]) == [("a-s", a), ("b-s", b), ("t", c)]
-    assert dict(named([b, a])) == {"a-s": a, "b-s": b}
-    twins = [tmp_path / name for name in ("x/a/s.h5", "y/a/s.h5")]
-    names = [name for name, _ in named(twins)]
-    assert len(set(names)) == 2
-    assert named([tmp_path / "s\x1b[31m.h5"])[0][0] == "s%x1b[31m"
-
-
 def test_copies_of_a_recording_count_once(study, sweeps, tmp_path):
     shutil.copytree(study.directory, tmp_path / "again")
     shutil.copy(sweeps[0], tmp_path / "a.h5")
@@ -148,22 +115,3 @@ def test_copies_of_a_recording_count_once(study, sweeps, tmp_path):
     assert "s5" in again.outcomes[3].reason
     # Three files, of which two are one sweep: no statistics.
     assert stored(again.directory)["intervals"] == []
-
-
-def test_broken_sweeps_alone_are_refused_and_nothing_is_written(sweeps, tmp_path):
-    with pytest.raises(InsufficientDataError):
-        compare_sweeps([sweeps[1]], tmp_path / "study")
-    with pytest.raises(InvalidInputError):
-        compare_sweeps([], tmp_path / "study")
-    assert not (tmp_path / "study").exists()
-
-
-def test_landmarks_that_come_with_a_sweep_are_scored(sweeps, tmp_path, monkeypatch):
-    marks = Landmarks(np.array([3, 20]), np.array([[1.0, 2.0, 0.0], [4.0, 8.0, 0.0]]))
-    monkeypatch.setattr("speckle3d.study.job.load_landmarks", lambda path: marks)
-    study = compare_sweeps(sweeps[:1], tmp_path, ["pose"])
-    (entry,) = stored(tmp_path)["sweeps"]
-    poses = read_reconstruction(tmp_path / entry["folder"] / "reconstruction.h5").poses["pose"]
-    (row,) = [row for row in study.drift if row["mode"] == "pose"]
-    expected = point_errors(poses, load_sweep(sweeps[0]).truth, None, marks)
-    assert (row["GLE_mm"], row["LLE_mm"]) == pytest.approx((expected["GLE_mm"], expected["LLE_mm"]))

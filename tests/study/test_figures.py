@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 
-from speckle3d.core.errors import FileError, MismatchError
-from speckle3d.core.reconstruction import MODES as RECONSTRUCTED
+from speckle3d.core.errors import MismatchError
 from speckle3d.scoring.lengths import accumulated
 from speckle3d.scoring.references import Reference, sweep_curves
-from speckle3d.study.figures import colour_of, figure_drift, label_of, save_figure
+from speckle3d.study.figures import figure_drift
 
 FRAMES = 60
 
@@ -54,26 +53,3 @@ def test_the_reference_has_gaps_and_is_its_own_whatever_it_is_compared_with(swee
     np.testing.assert_array_equal(drawn, again)
     with pytest.raises(MismatchError):
         sweep_curves({"image": image}, CENTRE_MM, Reference("truth", tracker[1:], covered))
-
-
-def test_a_png_of_150_dots_per_inch_appears_whole(sweep, tmp_path):
-    figure = figure_drift(sweep_curves({"image": sweep[0]}, CENTRE_MM))
-    path = save_figure(figure, tmp_path / "new" / "drift.png")
-    header = path.read_bytes()[:24]
-    assert header[:8] == b"\x89PNG\r\n\x1a\n"
-    assert int.from_bytes(header[16:20], "big") == 1500
-    assert [p.name for p in path.parent.iterdir()] == ["drift.png"]
-    (tmp_path / "file").write_text("")
-    with pytest.raises(FileError):
-        save_figure(figure, tmp_path / "file" / "drift.png")
-
-
-def test_neither_pyplot_nor_a_window_system_is_touched(python):
-    code = "import sys, speckle3d.study.figures; print('matplotlib.pyplot' in sys.modules)"
-    assert python(code) == "False\n"
-
-
-def test_modes_go_by_their_names_and_have_colours_of_their_own():
-    modes = [*RECONSTRUCTED, "tracker", "truth", "bent"]
-    assert len({colour_of(mode, modes) for mode in modes}) == len(modes)
-    assert (label_of("pose"), label_of("tracker")) == ("pose", "tracker alone")

@@ -1,12 +1,10 @@
 """Means over sweeps, and which modes the sweeps tell apart."""
 
-import re
-
 import numpy as np
 import pytest
 
 from speckle3d.scoring.statistics import mean_interval
-from speckle3d.study.overall import over_sweeps, overall_text, reference_words
+from speckle3d.study.overall import over_sweeps
 
 
 def study(sweeps, gain=3.0, seed=3):
@@ -64,25 +62,3 @@ def test_modes_that_differ_in_every_sweep_are_told_apart_and_like_ones_not():
     assert pair["wilcoxon_p"] == pytest.approx(2 / 2**11)
     assert pair["holm_p"] >= 2 * pair["wilcoxon_p"]
     assert of(paired, "length_error_percent", "image", "twin")["better"] is None
-
-
-def test_few_sweeps_tell_nothing_apart_and_two_are_no_statistics():
-    for sweeps in (4, 5):
-        _, paired = over_sweeps(*study(sweeps))
-        assert {row["better"] for row in paired} == {None}
-    assert over_sweeps(*study(2)) == ([], [])
-
-
-def test_the_text_says_who_is_better_and_what_its_metrics_are():
-    intervals, paired = over_sweeps(*study(11))
-    lines = overall_text(intervals, paired, {"s0": "truth"}).splitlines()
-    assert lines[0].split() == ["mean", "of", "11", "sweeps", "image", "twin", "pose"]
-    (fdr,) = [line for line in lines if line.startswith("FDR / %")]
-    mean = of(intervals, "FDR_percent", "pose")
-    assert f"{mean['mean']:.1f} [{mean['low']:.1f}, {mean['high']:.1f}]" in fdr
-    assert {f"less length error, FDR: pose than {other}" for other in ("image", "twin")} <= set(lines)
-    assert [line.partition(":")[0] for line in lines if re.match("[A-Z]+:", line)] == ["FDR", "GPE"]
-    assert lines[-1] == "reference: truth"
-    mixed = reference_words(["pose"], {"s0": "truth", "s1": "tracker"})
-    assert re.search("truth of s0.*tracker of s1.*pose was fitted", mixed)
-    assert overall_text([], []) == ""

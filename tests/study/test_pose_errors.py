@@ -49,25 +49,6 @@ def test_a_mode_with_claims_of_its_own_has_these():
     assert along(errors, 0, N - 1) == pytest.approx(np.sqrt((0.004 * 20) ** 2 + 1e-4 * 20), rel=1e-3)
 
 
-def test_orientation_keeps_the_images_length_and_has_the_sensors_angles():
-    errors, image = errors_of(made(), "orientation"), errors_of(made())
-    assert along(errors, 0, N - 1) == pytest.approx(along(image, 0, N - 1), rel=1e-3)
-    settings, seconds = Config().fused, (N - 1) / 20.0
-    wander = np.sqrt(2 * (1 - np.exp(-seconds / settings.wander_s)))
-    turned = np.sqrt(errors.covariance()[-1].diagonal()[3:])
-    # The world's z, the heading, is up: in the image here a mix of depth and elevation.
-    size = np.sqrt(2 * settings.inclination_sigma_rad**2 + settings.heading_sigma_rad**2)
-    assert np.linalg.norm(turned) == pytest.approx(wander * size, rel=1e-3)
-    assert turned[0] == pytest.approx(wander * settings.inclination_sigma_rad, rel=1e-3)
-
-
-def test_the_trackers_mounting_makes_a_path_go_off_at_an_angle():
-    errors, image = errors_of(made(), "pose"), errors_of(made())
-    more = errors.covariance()[-1] - image.covariance()[-1]
-    sideways = (Config().fused.mounting_sigma_rad * 20.0) ** 2
-    np.testing.assert_allclose(more.diagonal(), [sideways, sideways, 0, 0, 0, 0], rtol=1e-3, atol=1e-9)
-
-
 def test_points_of_the_world_are_measured_at_once():
     (row,) = measure(made(), (WORLD * IMAGE[10]).apply([[5.0, 9.0, 0.0], [15.0, 9.0, 0.0]]), "fused")
     assert row.value == pytest.approx(10.0)

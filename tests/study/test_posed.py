@@ -1,7 +1,5 @@
 """Recordings opened with the poses of their frames, and the grey levels their images are given in."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import sweep_examples
@@ -9,15 +7,14 @@ from image_examples import grey, text_of, tracked, write_mha
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import CalibrationFile, Provenance, Reconstruction
-from speckle3d.core.volume import Volume
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import recording_sha256
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import sweep_of
-from speckle3d.study.posed import MARK, open_posed, pose_mark, posed_at, require_made_at
+from speckle3d.study.posed import open_posed
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
 LEANING = PIXELS.copy()
@@ -46,16 +43,6 @@ def test_bmode_as_it_is_stored_needs_no_dynamic_range(tmp_path):
             posed.source(levels)
 
 
-def test_a_dynamic_range_that_is_given_serves_the_other_levels(tmp_path):
-    posed = open_posed(sequence(tmp_path), dynamic_range_db=40.0)
-    amplitude, meaning = posed.source("linear")
-    assert meaning == "echo amplitude, linear, of B-mode over 40 dB; 1 is full scale"
-    expected = 10 ** ((grey(4)[1].T / 255 - 1) * 40 / 20)
-    np.testing.assert_allclose(amplitude.images[1], expected, rtol=1e-5)
-    _, meaning = posed.source("log", 50.0)
-    assert meaning == "log-compressed, 0 to 255 over 50 dB"
-
-
 def test_frames_without_a_valid_pose_are_left_out_and_counted(tmp_path):
     posed = open_posed(sequence(tmp_path, invalid=(0, 3)))
     np.testing.assert_array_equal(posed.frames, [1, 2])
@@ -64,19 +51,6 @@ def test_frames_without_a_valid_pose_are_left_out_and_counted(tmp_path):
     np.testing.assert_array_equal(source.images[0], grey(4)[1].T)
     assert posed.notes() == ["a: 2 of 4 frames have no valid pose and are left out"]
     assert open_posed(sequence(tmp_path)).notes() == []
-
-
-def test_a_tracker_s_images_lie_where_the_whole_calibration_puts_them(tmp_path):
-    posed = open_posed(sequence(tmp_path, LEANING))
-    source, _ = posed.source()
-    tracker = posed.sweep.tracker
-    mounting = tracker.readings.at(posed.sweep.frame_time_s).inv() * source.world_from_image
-    placed = mounting.as_matrix() @ source.grid.image_from_sample
-    np.testing.assert_allclose(placed, np.tile(LEANING[:, [0, 1, 3]], (4, 1, 1)), atol=1e-9)
-    assert posed.sweep.grid.skew_rad == 0  # of the sweep itself, which others measure on
-    with_truth = replace(posed.sweep, truth=RigidTransform.identity(4))
-    assert posed_at(with_truth).source()[0].grid.skew_rad == 0
-    assert posed_at(with_truth, "tracker").source()[0].grid.skew_rad == tracker.image_skew_rad
 
 
 def test_a_calibration_of_ours_takes_the_place_of_all_of_it(tmp_path):
@@ -109,14 +83,3 @@ def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_p
         Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, made), tmp_path / "s.h5"
     )
     np.testing.assert_allclose(opened.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())
-
-
-def test_a_volume_made_at_other_poses_is_told_apart():
-    poses = RigidTransform.from_translation(np.arange(9.0).reshape(3, 3))
-    place = (0.5, 0.5, 0.5), RigidTransform.identity()
-    made = Volume(np.zeros((2, 2, 2), np.uint8), *place, {MARK: pose_mark(poses)})
-    require_made_at(made, poses, "v.nrrd")
-    require_made_at(Volume(np.zeros((2, 2, 2), np.uint8), *place), poses, "of an older file")
-    moved = RigidTransform.from_translation([0.0, 0.0, 0.01]) * poses
-    with pytest.raises(MismatchError):
-        require_made_at(made, moved, "v.nrrd")

@@ -4,14 +4,13 @@ import csv
 import io
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import sweep_examples
 
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import Provenance
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.details import doubted_modes, recorded_doubts
@@ -55,17 +54,6 @@ def test_json_and_csv_hold_every_number_and_nothing_where_there_is_none():
     assert (line["sweep"], line["mode"], float(line["tilt_error_deg"])) == ("beef, 1", "image", -1.254)
 
 
-def test_what_numbers_do_not_say_stands_below_the_table():
-    for reference, mode, doubted, words in (
-        ("tracker", "pose", {"pose": "clock"}, "fitted to this tracker; in doubt: clock"),
-        ("truth", "pose", {}, ""),
-        ("tracker", "tracker", {}, "the reference itself"),
-    ):
-        of = summary(reference, [row(), row(mode)], doubted=doubted)
-        assert of.remark(of.rows[1]) == of.records()[1]["remark"] == words
-        assert (f"beef, 1: {mode}: {words}" in summary_text([of])) is bool(words)
-
-
 def test_the_table_is_aligned_narrow_and_says_of_what_its_intervals_are():
     rows = [row(sigma_mm=1.84), row("orientation", tilt_error_deg=float("nan"))]
     text = summary_text([summary("truth", rows)])
@@ -75,13 +63,6 @@ def test_the_table_is_aligned_narrow_and_says_of_what_its_intervals_are():
     assert lines[3].split()[-7:] == ["23.00", "-", "20.00", "+15.0", "-", "+0.10", "+0.00"]
     assert "95 %" in lines[4]
     assert "reference: truth" in lines[5]
-
-
-def test_a_length_that_the_tracker_made_worse_is_told_with_the_jitters_share():
-    rows = [row(length_error_percent=0.6), row("pose", length_error_percent=-2.6)]
-    text = summary_text([summary("truth", [*rows, row("tracker", sigma_mm=0.23)])])
-    assert "pose is farther from the truth (-2.6 %) than image (+0.6 %)" in text
-    assert "jitter is +- 2.0 % of its length (95 %)" in text
 
 
 def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
@@ -110,24 +91,3 @@ def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(t
     doubts = json.loads((tmp_path / "study.json").read_text())["doubts"]
     assert [(each["sweep"], each["suspect"]) for each in doubts] == [("s", "units"), ("s", "spikes")]
     assert "mode pose is left out" in study.table
-
-
-def test_a_study_takes_the_place_of_the_one_before_with_all_that_was_made_from_it(tmp_path, monkeypatch):
-    failed = [SweepOutcome("a", tmp_path / "a.h5", "failed", "first")]
-    write_study(tmp_path, failed, "first")
-    made = [tmp_path / name for name in ("report.html", "overview.png", "paper.txt")]
-    for path in made:
-        path.write_text("of the first")
-    kept = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_text", full_disk)
-        with pytest.raises(FileError, match=r"study\.json: .*No space"):
-            write_study(tmp_path, failed, "second")
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == kept
-    write_study(tmp_path, failed, "second")
-    assert not any(path.exists() for path in made)
-    assert json.loads((tmp_path / "study.json").read_text())["settings_toml"] == "second"
-
-
-def full_disk(*_, **__):
-    raise OSError(28, "No space left on device")

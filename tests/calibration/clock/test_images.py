@@ -56,13 +56,6 @@ def test_the_standard_error_knows_the_trackers_jitter(recording):
         assert abs(found.seconds - 0.02) < 3.0 * found.standard_error_s
 
 
-def test_a_rough_mounting_is_enough(recording):
-    turned = RigidTransform.from_translation([3.0, -5.0, 8.0])
-    found = delay_from_images(tracked(recording, 0.03), turned, 0.1)
-    # A centimetre off turns 0.6 degrees of wander into 0.1 mm, at 10 mm/s either way 5 ms; here within 4.
-    assert found.seconds == pytest.approx(0.03, abs=0.004)
-
-
 def noise(images):
     return np.random.default_rng(0).standard_normal(images.shape)
 
@@ -85,14 +78,3 @@ def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, ch
         delay_from_images(
             replace(whole, images=change(whole.images)), RigidTransform.identity(), search_s, 20
         )
-
-
-def test_images_of_one_plane_are_refused_at_once(recording):
-    whole = tracked(recording, 0.0)
-    times = whole.frame_time_s
-    along = 10.0 * np.sin(np.linspace(0.0, np.pi, times.size))
-    # Tremor of a millimetre across is less than a beam's width.
-    path = np.column_stack([along, 0.5 * along, 0.5 * np.sin(20.0 * times)])
-    readings = TimedPoses(times, RigidTransform.from_translation(path))
-    with pytest.raises(InsufficientDataError):
-        delay_from_images(replace(whole, readings=readings, images=None), RigidTransform.identity(), 0.05)

@@ -1,12 +1,10 @@
 """Readings between samples: noise alike at all times, motion followed, gaps kept apart."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.clock.smoothing import SmoothReadings
-from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.streams import TimedPoses, TimedRotations
+from speckle3d.core.streams import TimedPoses
 
 PERIOD_S = 0.02
 TIMES = np.arange(0.0, 8.0, PERIOD_S)
@@ -43,22 +41,3 @@ def test_noise_is_reduced_alike_at_all_times_and_motion_is_followed():
     assert (scatter(smooth, between) < [0.14, 0.1]).all()
     # A width of one period misses a fourth derivative: 22 mm (0.02 s pi)^4 / 8 = 0.00004 mm.
     assert (scatter(SmoothReadings(TimedPoses(TIMES, exact)), between) < 2e-4).all()
-
-
-def test_samples_beyond_a_gap_do_not_count_and_gaps_are_refused():
-    there = (TIMES < 4.0) | (TIMES > 4.3)
-    place = np.outer(np.where(TIMES < 4.0, 0.0, 100.0), [1.0, 0.0, 0.0])[there]
-    readings = SmoothReadings(TimedPoses(TIMES[there], RigidTransform.from_translation(place)))
-    np.testing.assert_allclose(
-        readings.at([3.9, 4.33, 4.4]).translation[:, 0], [0.0, 100.0, 100.0], atol=1e-9
-    )
-    with pytest.raises(InsufficientDataError):
-        readings.at([4.1])
-
-
-@pytest.mark.parametrize("count", [1, 3, 60])
-def test_turns_alone_and_few_samples_are_read_too(count):
-    turns = moving(TIMES[:count]).rotation
-    found = SmoothReadings(TimedRotations(TIMES[:count], turns)).at(TIMES[:count])
-    inside = slice(5, -5) if count > 10 else slice(None)
-    assert (turns.inv() * found.rotation).magnitude()[inside].max() < 1e-5

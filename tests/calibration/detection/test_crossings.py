@@ -2,7 +2,6 @@
 
 import numpy as np
 from crossing_images import Look, Probe, crossing_world
-from scipy.ndimage import gaussian_filter
 from wire_scenes import PIXEL_MM, picture
 
 from calibration.detection.crossings import crossings_in_frames
@@ -62,17 +61,3 @@ def test_a_bead_is_the_first_candidate_and_placed_to_a_tenth_of_a_millimetre():
     # Measured 0.02 mm; ringing under the bead draws it down by 0.1 mm, alike everywhere.
     assert (np.abs(across) < 0.1).all()
     assert (np.abs(down - 0.1) < 0.05).all()
-
-
-def test_long_wires_a_third_of_a_right_angle_apart_are_found_in_speckle():
-    apart_deg = 30.0
-    rng = np.random.default_rng(3)
-    u, v = np.meshgrid(np.arange(240.0), np.arange(240.0), indexing="ij")
-    for turn in np.linspace(0.1, 2.9, 4):
-        true = rng.uniform(90, 150, 2)
-        image = 40.0 + 12.0 * gaussian_filter(rng.standard_normal(u.shape), 2.0) / 0.14
-        for angle, level in ((turn, 110.0), (turn + np.deg2rad(apart_deg), 70.0)):
-            off = (v - true[1]) * np.cos(angle) - (u - true[0]) * np.sin(angle)
-            image = np.maximum(image, 40.0 + level * np.exp(-0.5 * (off / 4.0) ** 2))
-        pixels = crossings_in_frames(np.clip(image, 0, 255).astype(np.uint8)[None], (0.25, 0.25)).pixels
-        assert np.min(np.hypot(*((pixels - true) * 0.25).T)) < 2.0

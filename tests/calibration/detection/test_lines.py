@@ -116,21 +116,6 @@ def test_a_floor_is_found_where_it_is(conditions, degrees):
     assert 0.7 * line.possible <= line.consensus <= line.possible <= 61
 
 
-@pytest.mark.slow
-def test_standard_errors_are_those_of_speckle_and_the_two_points_err_independently():
-    lines = [detect_line(floor_image(seed, 8.0, 5.0, (128, 220), lobes=0.0)) for seed in range(120)]
-    off = np.array([too_deep_mm(line, 8.0, 5.0, 128) for line in lines])
-    angle = np.radians([error_degrees(line, 5.0) for line in lines])
-    claimed, turned = (
-        np.sqrt(np.mean([getattr(line, name) ** 2 for line in lines]))
-        for name in ("point_sd_mm", "direction_sd_rad")
-    )
-    # A standard deviation of 240 (120) draws is itself known to 5 % (7 %).
-    assert 1 / 1.3 < off.std() / claimed < 1.3
-    assert 1 / 1.3 < angle.std() / turned < 1.3
-    assert abs(np.corrcoef(off.T)[0, 1]) < 0.3  # three standard errors
-
-
 def test_where_on_the_echo_the_line_is_put():
     image = floor_image(4, 10.0, 3.0, rough_mm=0.1)
     depths = [

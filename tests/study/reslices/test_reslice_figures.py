@@ -1,15 +1,12 @@
 """Pictures of cuts: one scale, true axes, how long each mode is, and where the picture's points lie."""
 
 import numpy as np
-import pytest
-from PIL import Image
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.cuts.curved import curved_sheet
 from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane
+from speckle3d.study.reslices.cut_geometry import read_plane
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, length_words
 from speckle3d.study.reslices.reslice_figures import busiest_rows, draw_cuts, save_reslices
 
@@ -39,18 +36,6 @@ def test_cuts_share_one_scale_true_axes_and_the_lengths_of_the_table():
     }
 
 
-@pytest.mark.parametrize("size_mm", [(300.0, 20.0), (12.0, 45.0)])
-def test_panels_do_not_overlap(size_mm):
-    plane = ReslicePlane(PLACED, *size_mm, size_mm[0] / 20)
-    image = -np.arange(np.prod(plane.shape), dtype=np.float32).reshape(plane.shape)
-    figure, panels = draw_cuts(CutPicture({name: DrawnCut(image, plane) for name in "abcdefg"}))
-    figure.draw_without_rendering()
-    boxes = [axes.get_tightbbox() for axes in panels.values()]
-    for i, one in enumerate(boxes):
-        for other in boxes[:i]:
-            assert one.x0 >= other.x1 or other.x0 >= one.x1 or one.y0 >= other.y1 or other.y0 >= one.y1
-
-
 def test_where_planes_and_sheets_lie_comes_back_from_the_file(tmp_path):
     sheet = curved_sheet([[0, 0, 0], [5, 0, 0], [5, 7, 0]], [0, 0, 2.0], (-1.0, 4.0), 0.5, smooth=False)
     cuts = {"pose": PLANE, "truth": sheet}
@@ -62,16 +47,6 @@ def test_where_planes_and_sheets_lie_comes_back_from_the_file(tmp_path):
         np.testing.assert_allclose(shown.world_from_mm(x, y), cut.world_from_mm(x, y), atol=1e-9)
         assert shown.shape == cut.shape
     np.testing.assert_allclose(read_plane(path).cut.world_from_mm(-1.0, 2.5), PLACED.translation)
-
-
-def test_a_picture_without_a_finite_value_or_of_another_kind_is_refused(tmp_path):
-    with pytest.raises(InvalidInputError):
-        draw_cuts(CutPicture({"pose": DrawnCut(np.full(PLANE.shape, np.nan, np.float32), PLANE)}))
-    Image.new("L", (3, 3)).save(tmp_path / "other.png")
-    (tmp_path / "text.png").write_text("no picture")
-    for name in ("other.png", "text.png"):
-        with pytest.raises(InvalidInputError):
-            read_cuts(tmp_path / name)
 
 
 def test_the_enlarged_part_is_where_structures_run_along_the_sweep():

@@ -4,24 +4,20 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from urllib.parse import unquote
 
-import nrrd
 import numpy as np
 import pytest
 import SimpleITK
 import slicerio
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.imaging.voxels.settings import CompoundingSettings
-from speckle3d.io.headers import read_header
 from speckle3d.study.posed import PosedSweep
-from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
+from speckle3d.study.scenes.scene import SceneRequest, write_scene
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
 BUILT_IN = {"vtkMRMLColorTableNodeGrey", "vtkMRMLColorTableNodeFileViridis.txt"}
-LPS_FROM_RAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 def posed_sweep(mode="image", frames=8):
@@ -88,22 +84,6 @@ def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
     np.testing.assert_allclose(inside, [1.0, 2.0, 0.0], atol=1e-9)
 
 
-def test_images_move_through_the_volume(folder):
-    """Image and pose of a frame as Slicer finds them: by the same index value; pixels to RAS."""
-    voxels, header = nrrd.read(str(folder / "images-image.seq.nrrd"))
-    posed = posed_sweep()
-    np.testing.assert_array_equal(voxels[:, :, 0, 5], posed.sweep.frames[5])
-    poses = read_header(folder / "poses-image.seq.mha")
-    times = [f"{float(frame['Timestamp']):.3f}" for frame in poses.frames]
-    assert header["axis 3 index values"].split() == times
-    matrix = np.reshape([float(x) for x in poses.frames[5]["ImageToWorldTransform"].split()], (4, 4))
-    place = LPS_FROM_RAS @ matrix @ [4, 9, 0, 1]
-    np.testing.assert_allclose(
-        place[:3], posed.world_from_image[5].apply([2.0, 1.0 + 9 * 0.25, 0.0]), atol=1e-9
-    )
-    assert poses.frames[5]["ImageToWorldTransform"] == header["Seq_Frame0005_ImageToWorldTransform"]
-
-
 def test_a_scene_replaces_a_scene_with_all_its_files(tmp_path):
     target = tmp_path / "s"
     write_scene(target, [posed_sweep("image"), posed_sweep("pose")], REQUEST)
@@ -112,13 +92,3 @@ def test_a_scene_replaces_a_scene_with_all_its_files(tmp_path):
     (target / "volume-crop.nrrd").unlink()
     stems = ("first-frame", "outlines", "scene", "state", "volume")
     assert sorted(path.name.split(".")[0].removesuffix("-image") for path in target.iterdir()) == [*stems]
-
-
-def test_a_folder_of_something_else_is_left_alone(tmp_path):
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InvalidInputError):
-        require_scene_place(tmp_path)
-    (tmp_path / "scene.mrml").write_text("<MRML/>")
-    require_scene_place(tmp_path)
-    with pytest.raises(InvalidInputError):
-        require_scene_place(tmp_path, tmp_path / "notes.txt")

@@ -1,10 +1,7 @@
 """Grids of volumes as they are asked for, from the request to the file that other programs read."""
 
-from pathlib import Path
-
 import pytest
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.region import Region
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.study.posed import open_posed
@@ -47,18 +44,3 @@ def test_a_region_bounds_the_grid_and_what_is_in_it(posed, tmp_path, settings):
     points = [image.TransformIndexToPhysicalPoint((4, y, 5)) for y in range(2, 9)]
     inside = [posed.world_from_image[len(posed.frames) // 2].inv().apply(point)[:2] for point in points]
     assert all(3 < x < 9 and 10 < y < 20 for x, y in inside)
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        GridRequest(like=Path("v.nrrd"), shape=(1, 1, 1)),
-        GridRequest(within_gb=1.0, spacing_mm=SPACING),
-        GridRequest(shape=SHAPE, size_mm=(1.0, 1.0, 1.0)),
-        GridRequest(origin_mm=(1e4, 0.0, 0.0), axes="world"),
-    ],
-)
-def test_what_cannot_be_had_is_refused_before_a_file_is_made(posed, tmp_path, asked):
-    with pytest.raises(InvalidInputError):
-        write_voxels(posed, VolumeRequest(tmp_path / "v.nrrd", COARSE, asked))
-    assert not list(tmp_path.iterdir())
