@@ -14,9 +14,6 @@ PathLike: TypeAlias = str | os.PathLike[str]
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 """A pipe is opened without waiting for its writer; where there is no such flag, there are no such pipes."""
 
-_SMALL_BYTES = 2**26
-"""An hour of a sensor at 1 kHz, or a frame of 8,000 x 4,000 samples; every machine has room for so much."""
-
 
 def open_regular(path: PathLike) -> BufferedReader:
     """Open an ordinary file for reading bytes; a link is followed.
@@ -34,11 +31,3 @@ def open_regular(path: PathLike) -> BufferedReader:
         file.close()
         raise FileError(f"{path}: expected a file, got a folder, pipe or device")
     return file
-
-
-def plausible_bytes(stored_bytes: int, ratio: int) -> int:
-    """Bytes that so many on disk may become in memory: little, or `ratio` times as many.
-
-    A compressed stream can claim a thousand times its size.
-    """
-    return max(_SMALL_BYTES, ratio * stored_bytes)

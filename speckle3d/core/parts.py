@@ -1,11 +1,11 @@
-"""Temporary files, told from those that killed processes left."""
+"""Files that appear whole or not at all, by way of temporary ones that killed processes leave behind."""
 
 from __future__ import annotations
 
 import errno
+import glob
 import importlib
 import os
-import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,46 +25,38 @@ def cannot_write(path: str | os.PathLike[str], error: OSError, words: str = "can
     return kind(f"{path}: {words}: {reason}")
 
 
-def part_beside(target: Path) -> Path:
-    """Make up the name of a temporary sibling, with the target's suffix."""
-    return target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
-
-
 @contextmanager
-def marked(part: Path) -> Iterator[None]:
-    """Make a file that `clear_parts` leaves alone during the block.
+def whole_file(target: Path) -> Iterator[Path]:
+    """Yield a temporary sibling, with the target's suffix, that takes its place if the block succeeds.
 
-    The mark is a lock of the operating system, which ends with the process, however it ends.
+    A lock of the operating system marks it, which ends with the process, however it ends; siblings without,
+    which killed processes left, are removed.
+
+    Raises
+    ------
+    FileError
+        If the system refuses to write.
     """
     fcntl = locks()
-    file = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-    try:
-        if fcntl is not None:
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(file)
-
-
-def clear_parts(target: Path) -> None:
-    """Remove temporary siblings of a file that are marked by no process; without locks, none."""
-    fcntl = locks()
-    own = re.compile(rf"\.part-[0-9a-f]{{8}}-{re.escape(target.name)}")
-    try:
-        left = [
-            each.path for each in os.scandir(target.parent) if own.fullmatch(each.name) and each.is_file()
-        ]
-    except OSError:  # a folder that may be written, but not listed
-        return
+    left = target.parent.glob(f".part-{'[0-9a-f]' * 8}-{glob.escape(target.name)}")
     for path in left if fcntl is not None else ():
-        with suppress(OSError):  # gone by now, of another user, or marked
-            file = os.open(path, os.O_RDONLY)
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                os.unlink(path)
-            finally:
-                os.close(file)
+        with suppress(OSError), path.open("rb") as file:  # gone by now, of another user, or at work
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
+    part = target.with_name(f".part-{secrets.token_hex(4)}-{target.name}")
+    try:
+        with part.open("xb") as file:
+            if fcntl is not None:
+                with suppress(OSError):  # a file system without locks
+                    fcntl.flock(file, fcntl.LOCK_EX)
+            yield part
+            os.replace(part, target)
+    except FileError:
+        raise
+    except OSError as error:
+        raise cannot_write(target, error) from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def locks() -> Any:

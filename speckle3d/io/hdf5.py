@@ -20,7 +20,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
 from speckle3d.core.files import PathLike as PathLike
 from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import transforms_from_matrices
-from speckle3d.core.parts import cannot_write, clear_parts, marked, part_beside
+from speckle3d.core.parts import cannot_write, whole_file
 
 Node: TypeAlias = h5py.Group | h5py.Dataset
 
@@ -52,19 +52,8 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     FileError
         If the folder does not exist, `path` is not an ordinary file, or the system refuses to write.
     """
-    target = require_target(path)
-    clear_parts(target)
-    part = part_beside(target)
-    try:
-        with marked(part):
-            yield part
-            os.replace(part, target)
-    except Speckle3DError:
-        raise
-    except OSError as error:
-        raise cannot_write(path, error) from error
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(require_target(path)) as part:
+        yield part
 
 
 def require_target(path: PathLike) -> Path:

@@ -77,8 +77,6 @@ class LivePose:
         Median correlation with the frame before; NaN for the first.
     best : float
         The largest median correlation with any earlier frame.
-    revision : int
-        How often what is known of the sweep had been revised.
     """
 
     frame: int
@@ -87,7 +85,6 @@ class LivePose:
     flags: int
     median: float
     best: float
-    revision: int
 
 
 class LiveTracker:
@@ -141,7 +138,6 @@ class LiveTracker:
         self._flags = np.zeros(0, dtype=np.int64)
         self._poses = RigidTransform.identity(0)
         self._motion: Motion | None = None
-        self._revision = 0
         self._lock, self._grown = threading.Lock(), threading.Condition()
         self._ended = False
         self._failure: Exception | None = None
@@ -216,7 +212,6 @@ class LiveTracker:
                 int(self._flags[number]),
                 float(before[0]) if before.size else float("nan"),
                 best,
-                self._revision,
             )
 
     def revise(self) -> None:
@@ -299,7 +294,6 @@ class LiveTracker:
             if count < len(self._poses):
                 parts.append(revised[-1] * last.inv() * self._poses[count:])
             self._poses, self._motion = RigidTransform.concatenate(parts), motion
-            self._revision += 1
 
     def _keep_revising(self) -> None:
         """Revise as often as there are new frames, on this thread alone: matching needs the others."""

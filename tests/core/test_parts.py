@@ -5,19 +5,31 @@ import os
 import pytest
 
 from speckle3d.core.errors import FileError, NoSpaceError
-from speckle3d.core.parts import cannot_write, clear_parts, marked, part_beside
+from speckle3d.core.parts import cannot_write, whole_file
+
+
+def fail_to_write(target):
+    with whole_file(target) as part:
+        part.write_text("half")
+        raise ZeroDivisionError
 
 
 def test_what_a_killed_process_left_is_removed_and_what_is_at_work_is_not(tmp_path):
-    target = tmp_path / "a[1].h5"
-    left, other = part_beside(target), part_beside(tmp_path / "b.h5")
-    left.touch()
+    target, other = tmp_path / "a[1].h5", tmp_path / ".part-0123abcd-b.h5"
+    (tmp_path / ".part-0123abcd-a[1].h5").touch()
     other.touch()
-    with marked(live := part_beside(target)):
-        clear_parts(target)
-        assert sorted(tmp_path.iterdir()) == sorted([live, other])
-    clear_parts(target)
-    assert list(tmp_path.iterdir()) == [other]
+    with whole_file(target) as one:
+        one.write_text("one")
+        with whole_file(target) as two:
+            two.write_text("two")
+            assert sorted(tmp_path.iterdir()) == sorted([one, two, other])
+            assert two.suffix == target.suffix
+        assert target.read_text() == "two"
+    assert sorted(tmp_path.iterdir()) == sorted([target, other])
+    assert target.read_text() == "one"
+    with pytest.raises(ZeroDivisionError):
+        fail_to_write(target)
+    assert sorted(tmp_path.iterdir()) == sorted([target, other])
 
 
 @pytest.mark.parametrize("code", ["ENOSPC", "EFBIG", "EDQUOT", "EACCES"])

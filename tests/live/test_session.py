@@ -210,7 +210,7 @@ def test_a_gap_that_frames_left_for_later_make_is_not_called_too_fast(monkeypatc
     said = []
     monkeypatch.setattr("speckle3d.live.session.Words.take", lambda _, words, __: said.append(words))
     unlike, lost, like = (
-        LivePose(1, 0.0, RigidTransform.identity(), flags, median, median, 0)
+        LivePose(1, 0.0, RigidTransform.identity(), flags, median, median)
         for flags, median in ((0, 0.05), (int(FrameFlag.UNMATCHED), 0.01), (0, 0.9))
     )
     for pose in (unlike, lost, like):

@@ -63,9 +63,8 @@ def test_learning_from_the_latest_frames_alone_keeps_the_place(shipped, monkeypa
     sweep, curves = shipped_part(shipped, 64)
     monkeypatch.setattr(tracking, "LATEST", 24)
     monkeypatch.setattr(tracking, "EVERY", 4)
-    tracker, told = live(sweep, curves)
+    tracker, _ = live(sweep, curves)
     assert apart_mm(sweep, tracker.poses, track(sweep, curves).image).max() < 0.1
-    assert told[-1].revision > 10
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.parts import cannot_write, clear_parts, marked, part_beside
+from speckle3d.core.parts import whole_file
 from xsens.logs.clocks import Stamps
 from xsens.logs.columns import column_of
 from xsens.logs.parts import Hints, Parts, assembled
@@ -223,17 +223,8 @@ def write_csv(path: str | os.PathLike[str], log: ImuLog) -> None:
     names, columns = zip(*_csv_columns(log), strict=True)
     cells = [["" if number != number else repr(number) for number in values.tolist()] for values in columns]
     lines = (*_comments(log), ",".join(names), *map(",".join, zip(*cells, strict=True)), "")
-    target = Path(path)
-    part = part_beside(target)
-    try:
-        clear_parts(target)
-        with marked(part):
-            part.write_text("\n".join(lines), encoding="utf-8", newline="\n")
-            os.replace(part, target)
-    except OSError as error:
-        raise cannot_write(target, error) from error
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(Path(path)) as part:
+        part.write_text("\n".join(lines), encoding="utf-8", newline="\n")
 
 
 def _csv_columns(log: ImuLog) -> Iterator[tuple[str, FloatArray | IntArray]]:
