@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,28 +14,7 @@ from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.io.growing_sweep import GrowingSweep
 from speckle3d.io.igtl.messages import TransformReceived
 from speckle3d.live.frames import ImageLayout
-
-
-@dataclass
-class Counts:
-    """What was written, and what could not be.
-
-    Attributes
-    ----------
-    frames, readings : int
-    refused : int
-        Messages that could not be written; `last_refused` says why the last one could not.
-    restarts : int
-        How often the sender's clock began anew.
-    last_refused : str
-    """
-
-    frames: int = 0
-    readings: int = 0
-    refused: int = 0
-    restarts: int = 0
-    last_refused: str = ""
-
+from speckle3d.live.progress import Progress
 
 RESTARTED_S = 1.0
 """A frame so long before the last one shows that the sender was started anew."""
@@ -55,13 +33,17 @@ class Recording:
     layout : ImageLayout
     first_s : float
         The first frame's time on the sender's clock.
+    progress : Progress
+        Told how many frames are written, what is refused, and how often the sender's clock begins anew.
     packed : bool
         Whether frames are compressed.
     """
 
-    def __init__(self, path: Path, layout: ImageLayout, first_s: float, packed: bool = False) -> None:
+    def __init__(
+        self, path: Path, layout: ImageLayout, first_s: float, progress: Progress, packed: bool = False
+    ) -> None:
         example = layout.example
-        self.counts, self._first_s, self._last_s = Counts(), first_s, float("-inf")
+        self._progress, self._first_s, self._last_s = progress, first_s, float("-inf")
         self._began_s = self._came_s = time.monotonic()
         self._timeless = False
         self._sweep = GrowingSweep(
@@ -85,11 +67,11 @@ class Recording:
     def keep_frame(self, frame: npt.NDArray[Any], sent_s: float) -> float | None:
         """Write a frame; its time in the sweep, or None if it is not later than the last frame's."""
         now_s = time.monotonic()
-        if self.counts.frames and sent_s == 0.0:
+        if self._progress.recorded and sent_s == 0.0:
             self._timeless = True
         elif sent_s - self._first_s < self._last_s - RESTARTED_S:
             self._first_s = sent_s - (self._last_s + now_s - self._came_s)
-            self.counts.restarts += 1
+            self._progress.restarts += 1
         time_s = self._time_of(sent_s, now_s)
         try:
             if time_s <= self._last_s:
@@ -101,7 +83,8 @@ class Recording:
         except InvalidInputError as error:
             self.refuse(error)
             return None
-        self.counts.frames, self._last_s, self._came_s = self.counts.frames + 1, time_s, now_s
+        self._progress.recorded += 1
+        self._last_s, self._came_s = time_s, now_s
         return time_s
 
     def keep_reading(self, transform: TransformReceived, with_position: bool) -> None:
@@ -117,13 +100,11 @@ class Recording:
                 self._sweep.append_orientation(time_s, rigid.rotation.as_quat(scalar_first=True)[0])
         except InvalidInputError as error:
             self.refuse(error)
-            return
-        self.counts.readings += 1
 
     def _time_of(self, sent_s: float, now_s: float) -> float:
         return now_s - self._began_s if self._timeless else sent_s - self._first_s
 
     def refuse(self, error: InvalidInputError) -> None:
         """Count a message that cannot be written."""
-        self.counts.refused += 1
-        self.counts.last_refused = str(error)
+        self._progress.refused += 1
+        self._progress.last_refused = str(error)

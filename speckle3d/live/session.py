@@ -40,7 +40,6 @@ MOST_WAITING = 12
 """Frames that wait to be matched, half a second of them: more would be late, not better."""
 _LOOK_S = 0.1
 VOLUME_EVERY_S = 1.0
-_DONE_BY = {"_match": "placing", "_send_volumes": "volumes", "_look_for_crossing": "crossing check"}
 
 
 class Source(Protocol):
@@ -165,7 +164,9 @@ class Session:
             return
         with (
             self._tracking(layout),
-            Recording(self._settings.recording, layout, first.time_s, self._settings.packed) as recording,
+            Recording(
+                self._settings.recording, layout, first.time_s, self.progress, self._settings.packed
+            ) as recording,
         ):
             self._take_all(waiting, recording, layout)
             while not self._is_over(until_s):
@@ -197,11 +198,6 @@ class Session:
                     recording.keep_reading(message, with_position=True)
                 elif message.device == self._settings.orientation:
                     recording.keep_reading(message, with_position=False)
-        counts = recording.counts
-        self.progress.recorded = counts.frames
-        self.progress.restarts = counts.restarts
-        if counts.refused:
-            self.progress.refused, self.progress.last_refused = counts.refused, counts.last_refused
 
     def _take_image(self, image: ImageReceived, recording: Recording, layout: ImageLayout) -> None:
         came_s = time.monotonic()
@@ -214,7 +210,7 @@ class Session:
         if time_s is None:
             return
         with self._changed:
-            self._queue.append(_Waiting(recording.counts.frames, frame, time_s, image.time_s, came_s))
+            self._queue.append(_Waiting(self.progress.recorded, frame, time_s, image.time_s, came_s))
             if len(self._queue) > MOST_WAITING:
                 # Every other one, so that those that are left out leave no gap that speckle does not cross.
                 thinned = list(self._queue)[::-2][::-1]
@@ -228,13 +224,15 @@ class Session:
         """Match frames and make volumes in threads that end with the block."""
         self._layout = layout
         settings = self._settings
-        work = [self._match]
+        work = {"placing": self._match}
         with LiveTracker(layout.example, self._curves, settings.config, images=self._keep) as self.tracker:
             if settings.volume or self._crossing is not None:
                 self._volume = GrowingVolume(self.tracker.image_grid)
-            work += [self._send_volumes] if settings.volume else []
-            work += [self._look_for_crossing] if self._crossing is not None else []
-            threads = [threading.Thread(target=self._guarded, args=(each,), daemon=True) for each in work]
+            work |= {"volumes": self._send_volumes} if settings.volume else {}
+            work |= {"crossing check": self._look_for_crossing} if self._crossing is not None else {}
+            threads = [
+                threading.Thread(target=self._guarded, args=each, daemon=True) for each in work.items()
+            ]
             for thread in threads:
                 thread.start()
             try:
@@ -246,14 +244,14 @@ class Session:
                 for thread in threads:
                     thread.join()
 
-    def _guarded(self, work: Callable[[], None]) -> None:
+    def _guarded(self, name: str, work: Callable[[], None]) -> None:
         """Do work of a thread; an error ends this work alone, since what is received must be recorded."""
         try:
             work()
         except Exception as error:  # noqa: BLE001 (told in the line, and kept for who runs the session)
             self.failure = error
             said = str(error) if isinstance(error, Speckle3DError) else repr(error)
-            self.progress.failed = f"{_DONE_BY[work.__name__]} ended, recording goes on: {said}"
+            self.progress.failed = f"{name} ended, recording goes on: {said}"
 
     def _keep(self, frame: int, intensity: Float32Array) -> None:
         if self._volume is not None:

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal as filters
 
-from speckle3d.core.arrays import Complex64Array
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, Frames, RFSettings, Sweep, read_frame
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
@@ -30,76 +29,23 @@ _GREY_DECIMATION = 4
 
 
 @dataclass(frozen=True)
-class Demodulator:
-    """The analytic signal shifted down and decimated without delay.
-
-    Parameters
-    ----------
-    rf : RFSettings
-        Of the real samples that go in.
-    frequency_hz : float
-        What they are shifted down by.
-    decimation : int, optional
-        By default the largest that leaves a quarter more than the band needs.
-    """
-
-    rf: RFSettings
-    frequency_hz: float
-    decimation: int | None = None
-
-    def __post_init__(self) -> None:
-        most = int(self.rf.sampling_rate_hz / (_LEAST_ROOM * 2 * self.reach_hz))
-        if not 1 <= self.every <= most:
-            raise InvalidInputError(
-                f"decimation: expected 1 to {most} for the band about {self.frequency_hz:g} Hz, "
-                f"got {self.every}"
-            )
-
-    @property
-    def reach_hz(self) -> float:
-        """Highest frequency after mixing that is kept."""
-        low, high = self.rf.bandwidth_hz
-        return max(high - self.frequency_hz, self.frequency_hz - low) + _GUARD * (high - low)
-
-    @property
-    def every(self) -> int:
-        """The decimation."""
-        if self.decimation is not None:
-            return self.decimation
-        return max(1, int(self.rf.sampling_rate_hz / (_ROOM * 2 * self.reach_hz)))
-
-    @property
-    def signal(self) -> RFSettings:
-        """Of the complex samples that come out."""
-        rate_hz = self.rf.sampling_rate_hz / self.every
-        return replace(self.rf, sampling_rate_hz=rate_hz, demodulation_frequency_hz=self.frequency_hz)
-
-    def samples(self, count: int) -> int:
-        """How many come out of so many."""
-        return -(-count // self.every)
-
-    def __call__(self, frame: npt.NDArray[Any]) -> Complex64Array:
-        """I + iQ of a frame, shape (vector, sample); the echoes' envelope is their magnitude."""
-        turns = self.frequency_hz / self.rf.sampling_rate_hz * np.arange(frame.shape[1])
-        mixed = filters.hilbert(frame, axis=1) * np.exp(-2j * np.pi * turns)
-        kept = filters.resample_poly(mixed, 1, self.every, axis=1, window=_WINDOW)
-        return np.asarray(kept, dtype=np.complex64)
-
-
-@dataclass(frozen=True)
 class ReceivedFrames:
     """What is stored of RF frames: I/Q in whole counts of 16 bits, or the log-compressed envelope in 8 bits.
 
     Parameters
     ----------
     frames : Frames
-    demodulate : Demodulator
+        Real echoes, whose analytic signal is shifted down and decimated without delay.
+    cycles_per_sample : float
+        What they are shifted down by.
+    decimation : int
     dynamic_range_db : float, optional
         From black to white, of an envelope; I/Q without it.
     """
 
     frames: Frames
-    demodulate: Demodulator
+    cycles_per_sample: float
+    decimation: int
     dynamic_range_db: float | None = None
     any_thread: ClassVar[bool] = True
     computed: ClassVar[bool] = True
@@ -114,18 +60,20 @@ class ReceivedFrames:
     def shape(self) -> tuple[int, int, int]:
         """Frames, vectors, samples."""
         n, vectors, samples = self.frames.shape
-        return n, vectors, self.demodulate.samples(samples)
+        return n, vectors, -(-samples // self.decimation)
 
     def __len__(self) -> int:
         return self.frames.shape[0]
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         """One frame, shape (vector, sample)."""
-        counts = self.demodulate(read_frame(self.frames, index))
+        echoes = filters.hilbert(read_frame(self.frames, index), axis=1)
+        mixed = echoes * np.exp(-2j * np.pi * self.cycles_per_sample * np.arange(echoes.shape[1]))
+        counts = filters.resample_poly(mixed, 1, self.decimation, axis=1, window=_WINDOW)
         if self.dynamic_range_db is None:
             limits = np.iinfo(np.int16)
-            parts = np.clip(np.rint(counts.view(np.float32)), limits.min, limits.max)
-            return parts.view(np.complex64)
+            parts = np.clip(np.rint(counts.view(np.float64)), limits.min, limits.max)
+            return parts.view(np.complex128).astype(np.complex64)
         # The envelope's square is twice the RF's.
         over_speckle = np.maximum(np.abs(counts) ** 2 / (2.0 * SPECKLE_RMS_COUNTS**2), 1e-12)
         level = 1.0 + (10.0 * np.log10(over_speckle) - _WHITE_DB) / self.dynamic_range_db
@@ -140,7 +88,7 @@ def received_as_iq(sweep: Sweep, frequency_hz: float | None = None, decimation: 
     frequency_hz : float, optional
         What the echoes are shifted down by, by default their centre frequency.
     decimation : int, optional
-        See `Demodulator`.
+        By default the largest that leaves a quarter more than the band needs.
 
     Raises
     ------
@@ -165,14 +113,23 @@ def received_as_bmode(sweep: Sweep, dynamic_range_db: float, decimation: int | N
 def _received(
     sweep: Sweep, frequency_hz: float | None, decimation: int | None, dynamic_range_db: float | None
 ) -> Sweep:
-    rf, grid = sweep.signal, sweep.grid
+    rf = sweep.signal
     if not isinstance(rf, RFSettings) or rf.are_complex:
         raise InvalidInputError(f"{sweep.name}: expected RF, got samples of another kind")
-    made = Demodulator(rf, rf.centre_frequency_hz if frequency_hz is None else frequency_hz, decimation)
-    spacing_mm = made.signal.sample_spacing_mm
+    (low, high), rate_hz = rf.bandwidth_hz, rf.sampling_rate_hz
+    frequency_hz = rf.centre_frequency_hz if frequency_hz is None else frequency_hz
+    width_hz = 2 * (max(high - frequency_hz, frequency_hz - low) + _GUARD * (high - low))
+    most = int(rate_hz / (_LEAST_ROOM * width_hz))
+    every = max(1, int(rate_hz / (_ROOM * width_hz))) if decimation is None else decimation
+    if not 1 <= every <= most:
+        raise InvalidInputError(
+            f"decimation: expected 1 to {most} for the band about {frequency_hz:g} Hz, got {every}"
+        )
+    signal = replace(rf, sampling_rate_hz=rate_hz / every, demodulation_frequency_hz=frequency_hz)
+    frames = ReceivedFrames(sweep.frames, frequency_hz / rate_hz, every, dynamic_range_db)
     return replace(
         sweep,
-        frames=ReceivedFrames(sweep.frames, made, dynamic_range_db),
-        grid=replace(grid, samples=made.samples(grid.samples), sample_spacing_mm=spacing_mm),
-        signal=made.signal if dynamic_range_db is None else BModeSettings(dynamic_range_db),
+        frames=frames,
+        grid=replace(sweep.grid, samples=frames.shape[2], sample_spacing_mm=signal.sample_spacing_mm),
+        signal=signal if dynamic_range_db is None else BModeSettings(dynamic_range_db),
     )

@@ -10,6 +10,7 @@ import speckle3d as s3
 from speckle3d.core.sweep import ImageGrid, Sweep
 from speckle3d.live import recording
 from speckle3d.live.frames import ImageLayout
+from speckle3d.live.progress import Progress
 from speckle3d.live.recording import Recording
 
 
@@ -21,12 +22,13 @@ def kept(tmp_path, monkeypatch):
         frame = np.ones((4, 8), dtype=np.int16)
         grid = ImageGrid(4, 8, 0.3, RF.sample_spacing_mm)
         example = Sweep(frame[None], grid, RF, np.zeros(1))
+        layout, progress = ImageLayout("Image", example, True), Progress()
         clock = iter([here_s[0], *here_s])
         monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: next(clock)))
-        with Recording(tmp_path / "sweep.h5", ImageLayout("Image", example, True), sent_s[0]) as made:
+        with Recording(tmp_path / "sweep.h5", layout, sent_s[0], progress) as made:
             for sent in sent_s:
                 made.keep_frame(frame, sent)
-        return s3.load_sweep(tmp_path / "sweep.h5").frame_time_s, made.counts
+        return s3.load_sweep(tmp_path / "sweep.h5").frame_time_s, progress
 
     return keep
 
