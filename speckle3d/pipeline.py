@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,20 +32,20 @@ from speckle3d.examine.images import examine_images
 from speckle3d.examine.recording import examine_recording
 from speckle3d.examine.sensors import examined_sensors
 from speckle3d.io.curves import curves_beside, read_curves, trust_words
-from speckle3d.matching.frames import ImageSink, MatchedSweep, match_chosen, match_sweep
+from speckle3d.matching.frames import ImageSink, MatchedSweep, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.attenuation import Attenuation
 from speckle3d.motion.coherence import Coherence, RowScales
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import MotionProblem
-from speckle3d.motion.image_motion import (
+from speckle3d.motion.estimate import (
     ImageMotion,
     consistent_poses,
     estimate_image_motion,
     frame_pairs,
 )
+from speckle3d.motion.planes import MotionProblem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -227,13 +226,9 @@ def track(
     require_placed(flags, sweep.name)
 
     problem = motion_problem(curves, matcher, len(sweep), settings)
-    spectra, match = (
-        matches.texture.spectra(flags == 0),
-        partial(match_chosen, sweep, matcher, usable=matches.usable),
-    )
-    same_probe = settings.curves.same_probe
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
-    motion = estimate_image_motion(problem, matches.table, spectra, bad, same_probe, match)
+    spectra = matches.texture.spectra(flags == 0)
+    motion = estimate_image_motion(problem, matches.table, spectra, bad, settings.curves.same_probe)
     flags[motion.unplaced & (flags == 0)] = int(FrameFlag.UNMATCHED)
     require_placed(flags, sweep.name)
     doubts += motion.attenuation.doubts
@@ -315,7 +310,7 @@ def _tracked(
     source: str,
 ) -> Tracked:
     """Seen from the side on which the elevational motion has its sign."""
-    motion, taken = solution.motion, solution.motion.pairs.planes.used
+    motion, taken = solution.motion, solution.motion.pairs.used
     image, covariance, edges = solution.poses, solution.covariance, solution.edges
     if direction < 0:
         image, covariance, edges = mirrored(image), MIRROR @ covariance @ MIRROR, edges.mirrored()

@@ -58,8 +58,8 @@ def examine_curves(sweep: Sweep, texture: Texture, motion: Motion, usable: BoolA
     """
     problem, pairs = motion.problem, motion.pairs
     size = texture.speckle_size(usable)
-    least = FLAT * float(problem.fitter.estimator.typical_distance(np.sqrt(0.5)))
-    ratios = sum_ratios(pairs.first, pairs.second, pairs.sign * pairs.planes.offset_mm, least)
+    least = FLAT * float(problem.typical_distance(np.sqrt(0.5)))
+    ratios = sum_ratios(pairs.first, pairs.second, pairs.offset_mm, least)
     doubts = doubt_curves(size, rows_without_tilt(motion), ratios, problem.curves, problem.patches)
     return unrefuted([*doubt_speed(motion.path, sweep.frame_time_s), *doubts], sweep.name, MismatchError)
 
@@ -71,7 +71,7 @@ def rows_without_tilt(motion: Motion) -> RowScales | None:
         return None
     steps = np.diff(motion.path, axis=0)
     tilt_per_mm = float(steps[:, 2] @ steps[:, 0]) / max(float(steps[:, 0] @ steps[:, 0]), 1e-12)
-    lever = np.median(problem.patches.rows_of(problem.fitter.levers.lever_mm), axis=-1)
+    lever = np.median(problem.patches.rows_of(problem.levers.lever_mm), axis=-1)
     explained = np.log(np.maximum(np.abs(1.0 + tilt_per_mm * lever), 1e-3))
     return replace(rows, logarithm=rows.logarithm + explained - np.median(explained))
 

@@ -21,8 +21,8 @@ from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.distances import LEAST_CORRELATION
-from speckle3d.motion.image_motion import ImageMotion
+from speckle3d.motion.estimate import ImageMotion
+from speckle3d.motion.planes import LEAST_CORRELATION
 from speckle3d.motion.trajectory import HELD_MM
 
 IMAGES = "images"

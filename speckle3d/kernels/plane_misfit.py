@@ -18,25 +18,23 @@ flags."""
 
 _LEAST_MM = 0.05
 """Distance below which correlation is flat: sensitivities are not taken to be less than here."""
-_LEAST_SENSITIVITY = 1e-6
-_RHO, LATERAL, _LEVER, _SPREAD, _SHARE, _GAIN, _SHARE_SD, _CELLS = range(8)
+_RHO, LATERAL, _LEVER, _SPREAD, _SHARE, _GAIN, _CELLS = range(7)
 """Rows of the table of a pair's patches that take part."""
 
 
 class EchoModels(NamedTuple):
-    """How patches depart from fully developed speckle, as kernels take it; see `speckle3d.motion.distances`.
+    """How patches' correlations depart from fully developed speckle's, rho_F, in each pair.
+
+    rho(d) = gain (share + (1 - share) sqrt(rho_F(d)))^2; see `speckle3d.motion.coherence`.
 
     Attributes
     ----------
     share, gain : float64, shape (e, p) or (1, p)
         With one row, it is that of all pairs.
-    share_error : float
-        Relative standard deviation.
     """
 
     share: FloatArray
     gain: FloatArray
-    share_error: float
 
 
 class Levers(NamedTuple):
@@ -80,11 +78,9 @@ class PairPatches(NamedTuple):
 
     Attributes
     ----------
-    table : float64, shape (8, p)
+    table : float64, shape (7, p)
     start : int64, shape (p,)
         Of each patch's curve in `amplitude`.
-    patch : int64, shape (p,)
-        Which of the image's patches each is.
     amplitude : float64
         The curves one after the other.
     last : float
@@ -95,7 +91,6 @@ class PairPatches(NamedTuple):
 
     table: FloatArray
     start: IntArray
-    patch: IntArray
     amplitude: FloatArray
     last: float
     step_mm: float
@@ -111,7 +106,6 @@ def predict_correlation(
     step_mm: float,
     share: float,
     gain: float,
-    share_sd: float,
     cells: float,
     of_echo: bool,
 ) -> tuple[float, float, float]:
@@ -123,8 +117,8 @@ def predict_correlation(
         sqrt(rho_F) on a grid, from `first` on; read up to the position `last` in it.
     step_mm : float
         Of the grid.
-    share, share_sd, gain : float
-        Share of the amplitude that stays, its standard deviation, and gain.
+    share, gain : float
+        Share of the amplitude that stays, and gain.
     """
     at = distance_mm / step_mm
     at = at if at < last else last
@@ -136,9 +130,7 @@ def predict_correlation(
     model = gain * field * field
     derivative = 2.0 * gain * field * (1.0 - share) * (rise / step_mm)
     limited = model if model < 0.999 else 0.999
-    share_error = share_sd * (1.0 - g) * 2.0 * field * gain
-    variance = _variance(limited, cells, of_echo) + INTERPOLATION**2
-    return model, derivative, variance + share_error * share_error
+    return model, derivative, _variance(limited, cells, of_echo) + INTERPOLATION**2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -162,7 +154,6 @@ def _predict(d: float, i: int, patches: PairPatches) -> tuple[float, float, floa
         patches.step_mm,
         t[_SHARE, i],
         t[_GAIN, i],
-        t[_SHARE_SD, i],
         t[_CELLS, i],
         patches.of_echo,
     )
@@ -268,41 +259,24 @@ def descend(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def conclude(
-    plane: FloatArray,
-    size: int,
-    patches: PairPatches,
-    rules: FitRules,
-    excess_mm: FloatArray,
-    sigma_mm: FloatArray,
-    information: FloatArray,
+def add_information(
+    plane: FloatArray, size: int, patches: PairPatches, rules: FitRules, information: FloatArray
 ) -> None:
-    """Fill excess distances and their deviations, and add the patches' information on the plane."""
-    table = patches.table
+    """Add the patches' information on the plane."""
+    arm = np.ones(3)
     for i in range(size):
         z, _, d = _distance(plane, i, patches)
         model, _, certainty = _predict(d, i, patches)
         # Near no distance the correlation is flat; its curvature still tells one that is not small.
         off = d if d > _LEAST_MM else _LEAST_MM
         _, steep, _ = _predict(off, i, patches)
-        sensitivity = -steep * certainty
-        left = (table[_RHO, i] - model) * certainty
-        sigma = 1.0 / max(sensitivity, _LEAST_SENSITIVITY)
-        excess_mm[patches.patch[i]], sigma_mm[patches.patch[i]] = -left * sigma, sigma
-        misfit = abs(left)
+        misfit = abs((patches.table[_RHO, i] - model) * certainty)
         weight = 1.0 if misfit <= rules.huber else rules.huber / misfit
-        told = sensitivity * max(abs(z), _LEAST_MM) / off
-        told *= weight * told
-        x, y = table[LATERAL, i], table[_LEVER, i]
-        information[0, 0] += told
-        information[0, 1] += told * x
-        information[0, 2] += told * y
-        information[1, 1] += told * x * x
-        information[1, 2] += told * x * y
-        information[2, 2] += told * y * y
-    information[1, 0] = information[0, 1]
-    information[2, 0] = information[0, 2]
-    information[2, 1] = information[1, 2]
+        told = steep * certainty * max(abs(z), _LEAST_MM) / off
+        arm[1], arm[2] = patches.table[LATERAL, i], patches.table[_LEVER, i]
+        for k in range(3):
+            for j in range(3):
+                information[k, j] += weight * told * told * arm[k] * arm[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -323,7 +297,6 @@ def gather(
     for p in range(used.shape[1]):
         if not used[e, p]:
             continue
-        patches.patch[size] = p
         patches.start[size] = p * curves.amplitude.shape[1]
         table[_RHO, size] = rho[e, p]
         table[LATERAL, size] = levers.lateral_mm[p] - moved_mm[e, 0]
@@ -331,7 +304,6 @@ def gather(
         table[_SPREAD, size] = levers.spread_mm[p]
         table[_SHARE, size] = models.share[row, p]
         table[_GAIN, size] = models.gain[row, p]
-        table[_SHARE_SD, size] = models.share_error * models.share[row, p]
         table[_CELLS, size] = curves.cells[p]
         size += 1
     return size

@@ -1,4 +1,4 @@
-"""Fitting the planes of frame pairs to the correlations of their patches, and which patches agree on one."""
+"""Fitting the planes of frame pairs to the correlations of their patches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from speckle3d.kernels.plane_misfit import (
     FitRules,
     Levers,
     PairPatches,
-    conclude,
+    add_information,
     descend,
     gather,
 )
@@ -35,16 +35,11 @@ class FittedPlanes(NamedTuple):
         Inverse of their covariance.
     cost : float64, shape (e,)
         The robust cost.
-    excess_mm, sigma_mm : float64, shape (e, p)
-        How much farther each patch is than the plane has it, and the standard deviation of that; NaN where it
-        takes no part.
     """
 
     coefficients: FloatArray
     information: FloatArray
     cost: FloatArray
-    excess_mm: FloatArray
-    sigma_mm: FloatArray
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -112,8 +107,7 @@ def fit_planes(
     """
     most = rho.shape[1]
     patches = PairPatches(
-        np.empty((8, most)),
-        np.empty(most, np.int64),
+        np.empty((7, most)),
         np.empty(most, np.int64),
         curves.amplitude.reshape(curves.amplitude.size),
         curves.amplitude.shape[1] - 1.001,
@@ -149,53 +143,4 @@ def fit_planes(
             for j in range(3):
                 information[k, j] = precision[k] if j == k else 0.0
         best = fitted.coefficients[e]
-        conclude(best, size, patches, rules, fitted.excess_mm[e], fitted.sigma_mm[e], information)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def agreeing_patches(
-    distance_mm: FloatArray,
-    sigma_mm: FloatArray,
-    raised_mm: FloatArray,
-    either_side: BoolArray,
-    support_sigma: float,
-    support: BoolArray,
-) -> None:
-    """Patches that agree on one plane of known slopes; see `speckle3d.motion.planes.consistent_subset`.
-
-    Parameters
-    ----------
-    distance_mm, sigma_mm, raised_mm : float64, shape (e, p)
-    either_side : bool, shape (e,)
-    support_sigma : float
-    support : bool, shape (e, p)
-        Receives the result.
-    """
-    pairs, patches = distance_mm.shape
-    d, raised, sharp = np.empty(patches), np.empty(patches), np.empty(patches)
-    for e in range(pairs):
-        size = 0
-        for p in range(patches):
-            support[e, p] = False
-            if np.isfinite(distance_mm[e, p]):
-                d[size], raised[size] = distance_mm[e, p], raised_mm[e, p]
-                sharp[size] = 1.0 / sigma_mm[e, p]
-                size += 1
-        highest, at = -np.inf, 0.0
-        for n in range(2 * size if either_side[e] else size):
-            k = n if n < size else n - size
-            offset = (d[k] if n < size else -d[k]) - raised[k]
-            agreed, misfit = 0.0, 0.0
-            for i in range(size):
-                error = abs(abs(offset + raised[i]) - d[i]) * sharp[i]
-                agree = error <= support_sigma
-                agreed += 1.0 if agree else 0.0
-                misfit += error if agree else 0.0
-            # Among placements of equal support, the one whose supporters lie closest.
-            score = agreed - misfit / (size * support_sigma + 1.0)
-            if score > highest:
-                highest, at = score, offset
-        for p in range(patches):
-            if np.isfinite(distance_mm[e, p]):
-                error = abs(abs(at + raised_mm[e, p]) - distance_mm[e, p]) * (1.0 / sigma_mm[e, p])
-                support[e, p] = error <= support_sigma
+        add_information(best, size, patches, rules, information)

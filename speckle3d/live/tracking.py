@@ -31,18 +31,10 @@ from speckle3d.matching.frames import FrameByFrame, FrameMaker, ImageSink
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.estimate import (
-    Motion,
-    alike_pairs,
-    edges_of,
-    elevation_of,
-    estimate_motion,
-    planes_of,
-    signed_path,
-)
-from speckle3d.motion.signs import pair_signs
-from speckle3d.motion.trajectory import fixed, joined, solve_trajectory
+from speckle3d.motion.estimate import Motion, alike_pairs, elevation_of, estimate_motion, strangers
+from speckle3d.motion.planes import pair_planes
+from speckle3d.motion.signs import ADAPTED_ERROR, likeliest_path, on_path
+from speckle3d.motion.trajectory import edges_of, fixed, joined, solve_trajectory
 from speckle3d.pipeline import matcher_for, motion_problem
 
 ANEW = 4
@@ -56,6 +48,8 @@ EVERY = 8
 """Frames after which motion is estimated anew, if nothing is done in the background."""
 LONGEST_HURRY_S = 1.0
 """For which nothing is revised, however many frames wait."""
+LAST = 10**9
+"""Later than any frame."""
 COMPARED = 400
 """Earlier frames against whose levels a frame's are judged."""
 
@@ -242,16 +236,18 @@ class LiveTracker:
             second=np.full(len(self._tables[number]), frames.size - 1),
         )
         problem, known = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
-        pairs = planes_of(problem, table, alike_pairs(problem, table), latest_of(motion.coherence))
+        rows = alike_pairs(problem, table)
+        models = motion.coherence and motion.coherence.models(np.full(rows.size, LAST))
+        pairs, determined = pair_planes(problem, table, rows, models)
+        pairs = pairs[determined].scaled(motion.scale)
         if not len(pairs):
             return
-        pairs = replace(pairs, planes=pairs.planes.scaled(motion.scale))
         earlier = elevation_of(known, problem.centre_mm)[:, :2]
-        path = signed_path(problem, table, np.ones(len(table), dtype=bool), pairs, known=earlier)
-        pairs = pairs.with_signs(pair_signs(path, *pairs.signless))
-        edges = edges_of(table, pairs, motion.slopes.applied(pairs.planes))
+        apart = strangers(problem, table)
+        pairs = on_path(pairs, likeliest_path(pairs, frames.size, ADAPTED_ERROR, apart, earlier))
+        edges = edges_of(table, motion.slopes.applied(pairs))
         held = joined(fixed(known, problem.centre_mm), edges) if len(known) > 1 else edges
-        placed = solve_trajectory(held, frames.size, problem.centre_mm, problem.trajectory).poses
+        placed = solve_trajectory(held, frames.size, problem.centre_mm, problem.trajectory.huber).poses
         self._poses = RigidTransform.concatenate([self._poses[:-1], known[0] * placed[-1:]])
 
     def _revise_now(self) -> None:
@@ -277,8 +273,8 @@ class LiveTracker:
         problem = replace(self._problem, frames=count - begin)
         try:
             motion = estimate_motion(problem, table, sound)
-            edges = edges_of(table, motion.pairs, motion.slopes.applied(motion.pairs.planes))
-            poses = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory).poses
+            edges = edges_of(table, motion.slopes.applied(motion.pairs))
+            poses = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory.huber).poses
         except (InsufficientDataError, np.linalg.LinAlgError):
             # Frames that come later may tell.
             return
@@ -312,15 +308,6 @@ class LiveTracker:
             self._grown.wait_for(lambda: self._ended or len(self) > max(frames, ANEW))
             self._grown.wait_for(lambda: self._ended or not self.hurried, LONGEST_HURRY_S)
             return not self._ended
-
-
-def latest_of(coherence: Coherence | None) -> Coherence | None:
-    """Coherence at the latest frames alone, for whatever frame is asked."""
-    if coherence is None:
-        return None
-    return replace(
-        coherence, frame=coherence.frame[-1:], share=coherence.share[-1:], gain=coherence.gain[-1:]
-    )
 
 
 def _against(poses: RigidTransform, others: RigidTransform, centre_mm: FloatArray) -> bool:

@@ -31,8 +31,8 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves, EchoSpectra
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.sweep import RFSettings
-from speckle3d.motion.diffraction import NEPER_PER_DB, STEP_MM, Lens, half_distance, speckle_correlation
-from speckle3d.motion.lens import nominal_probe, stretched
+from speckle3d.motion.diffraction import NEPER_PER_DB
+from speckle3d.motion.lens import stretched
 
 UNKNOWN_SIGMA = 0.3 / np.sqrt(3.0)
 """Standard deviation of the difference where no spectrum tells it: soft tissues and phantoms lie within 0.3
@@ -53,8 +53,9 @@ LARGEST = 1.5
 """Largest difference that is looked for, dB/cm/MHz."""
 LEAST_FREQUENCIES = 6
 """In the band, that a row's three numbers are fitted to: patches of 3 mm have 20 in 5 MHz."""
-LEAST_STEP = 0.05
-"""Difference, dB/cm/MHz, for which widening is calculated at least; it is straight below."""
+WIDENING = 1.3
+"""Power of the echo's wavelength with which curves widen, mean over depth: 1.22 to 1.32 by diffraction for the
+probes of two simulators, 1 in front of the focus and 1.5 far behind it."""
 OTHER_BAND = 6.0
 """Gain in the log-likelihood by one exponent in all rows, from skin to bottom, from which another transmit
 band or filter is told. Twenty-one sweeps of two simulators gain 0.3 to 4.3; with the band 0.3 MHz off they
@@ -129,12 +130,12 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     shift, gain = _common_exponent(exponent, sigma, per_unit)
     if gain > OTHER_BAND:
         return replace(unknown, doubts=(_other_band(shift, middle),))
-    lens = nominal_probe(curves).lens
-    step = float(np.copysign(max(abs(beta), LEAST_STEP), beta))
-    before, after = (_log_width(lens, spectra.depth_mm, frequency_mhz, phantom, each) for each in (0.0, step))
-    by_unit = (after - before) / step
     error = float(np.hypot(error, MODEL_SIGMA))
-    return Attenuation(beta, error, spectra.depth_mm, beta * by_unit, abs(float(by_unit.mean())) * error)
+    attenuated = _attenuated(phantom, spectra.depth_mm, frequency_mhz, beta)
+    square = [(each @ frequency_mhz**2) / each.sum(axis=1) for each in (phantom, attenuated)]
+    stretch = WIDENING / 2.0 * np.log(square[0] / square[1])
+    by_unit = abs(float(stretch.mean())) / abs(beta) if abs(beta) > 0.01 else LENGTH_PER_UNIT
+    return Attenuation(beta, error, spectra.depth_mm, stretch, by_unit * error)
 
 
 def _loss(depth_mm: FloatArray) -> FloatArray:
@@ -242,16 +243,6 @@ def _log_likelihood(left: FloatArray, sigma: FloatArray) -> FloatArray:
         for share in np.linspace(0.05, 0.95, 10)
     ]
     return np.asarray(logsumexp(by_share, axis=0))
-
-
-def _log_width(
-    lens: Lens, depth_mm: FloatArray, frequency_mhz: FloatArray, power: FloatArray, difference: float
-) -> FloatArray:
-    """Logarithm of the distance that halves the correlation, for attenuation that differs."""
-    attenuated = _attenuated(power, depth_mm, frequency_mhz, difference)
-    distance = STEP_MM / 2.0 * np.arange(int(2.4 * lens.aperture_mm / STEP_MM), dtype=float)
-    rho = speckle_correlation(lens, depth_mm[:, None], 1e6 * frequency_mhz, attenuated[:, None], distance)
-    return np.log([half_distance(distance, row) for row in rho])
 
 
 def _other_band(exponent: float, middle_mhz: float) -> Doubt:

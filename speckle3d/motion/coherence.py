@@ -16,20 +16,19 @@ where r < 0.5 alone: over tissue some 2 % of the scale stay open.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.stats import theilslopes
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.shown import shown
-from speckle3d.kernels.plane_misfit import Levers
+from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
-from speckle3d.matching.patches import PatchGrid
-from speckle3d.motion.distances import WELL_FALLEN, EchoModel
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.motion.planes import WELL_FALLEN, MotionProblem
 
 CURVES_SIGMA = 0.002
 """Relative error of all distances that curves from some twenty independent blocks of phantom have."""
@@ -56,6 +55,8 @@ LEAST_BINS = 4
 and the structure's power are."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
+ROUNDS, SETTLED = 30, 1e-3
+"""Most rounds of a fit, and the step of its numbers that ends them."""
 MOST_SHARE, MOST_POWER = {"echo": 0.5, "intensity": 0.95}, 0.9
 """Bounds of c, by what is correlated, and of a. An echo that is structure for the most part is r^a alone, a
 curve of another width, and tells no scale; of intensity, structure's share is larger, because its phase does
@@ -73,12 +74,12 @@ class CoherenceSettings(BaseModel):
 @shown
 @dataclass(frozen=True)
 class Coherence:
-    """Share of structure and gain of every patch, by frame, and the error of the scale of all distances.
+    """Share of structure and gain of every patch, by piece of the sweep, and the error of the scale.
 
     Attributes
     ----------
     frame : ndarray, shape (b,)
-        Frames at which they are given; linear between them.
+        Middles of the pieces.
     share, gain : ndarray, shape (b, p)
     scale_sigma : float
         Standard deviation of the logarithm of the scale of all distances.
@@ -89,17 +90,10 @@ class Coherence:
     gain: FloatArray
     scale_sigma: float
 
-    def models(self, frame: FloatArray | IntArray) -> EchoModel:
-        """Echo models of pairs about frames of shape (e,)."""
-        at = np.clip(np.asarray(frame, dtype=float), self.frame[0], self.frame[-1])
-        before = np.clip(np.searchsorted(self.frame, at, side="right") - 1, 0, max(self.frame.size - 2, 0))
-        after = np.minimum(before + 1, self.frame.size - 1)
-        width = np.maximum(self.frame[after] - self.frame[before], 1.0)
-        part = ((at - self.frame[before]) / width)[:, None]
-        share, gain = (
-            np.asarray((1 - part) * v[before] + part * v[after], dtype=float) for v in (self.share, self.gain)
-        )
-        return EchoModel(share, gain)
+    def models(self, frame: IntArray) -> EchoModels:
+        """Echo models of pairs about frames of shape (e,): those of the nearest piece."""
+        piece = np.abs(frame[:, None] - self.frame).argmin(axis=1)
+        return EchoModels(self.share[piece], self.gain[piece])
 
 
 @dataclass(frozen=True)
@@ -118,132 +112,137 @@ class RowScales:
     share: FloatArray
 
 
-class PatchCorrelations:
-    """Correlations of each patch, averaged over pairs of like distance, and the curves they are read with.
+@dataclass(frozen=True)
+class _Binned:
+    """Correlations of each patch of each piece, averaged over pairs of like distance, and their curves.
 
-    Parameters
+    Attributes
     ----------
-    first, second : ndarray, shape (e,)
-        Frames of each pair.
-    correlation : ndarray, shape (e, p)
-        NaN where a patch has none.
-    path : ndarray, shape (n, 2) or (n, 3)
-        Elevational position of each frame's centre, and its slopes along x and, if known, y.
-    levers : Levers
-        What slopes are multiplied by at each patch.
+    distance, mean, weight : ndarray, shape (q, bins)
+        Of fully developed speckle that would fall to zero.
+    amplitude : ndarray, shape (q, m)
+        Of fully developed speckle, on a grid of `step_mm`.
+    determined : ndarray of bool, shape (q,)
+        Patches seen at enough distances.
     """
 
-    def __init__(
-        self,
-        first: IntArray,
-        second: IntArray,
-        correlation: Float32Array,
-        path: FloatArray,
-        curves: DecorrelationCurves,
-        patches: PatchGrid,
-        levers: Levers,
-    ) -> None:
-        self._first, self._second, self._correlation = first, second, correlation
-        self._levers, self._patches = levers, patches
-        at = curves.at(patches.centre_mm[:, 1])
-        end = at.correlation[:, -1]
-        self._floor = np.where(end > WELL_FALLEN, 0.0, end)
-        self._amplitude = np.sqrt(np.clip((at.correlation.T - self._floor) / (1 - self._floor), 0.0, 1.0)).T
-        self._step_mm = float(curves.distance_mm[1])
-        self._cells, self.of_echo = at.cells, curves.key.correlation_of == "echo"
-        self._reach_mm = float(curves.distance_mm[-1]) if end.max() > WELL_FALLEN else np.inf
-        travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path[:, 0])))])
-        count = max(1, int(travel[-1] / PIECE_MM))
-        edges = np.searchsorted(travel, np.linspace(0, travel[-1], count + 1)[1:-1])
-        self._piece = np.searchsorted(edges, (first + second) / 2, side="right")
-        self.centres = (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
-        self._patch = np.tile(np.arange(len(patches)), count)
-        self._bin(path)
+    distance: FloatArray
+    mean: FloatArray
+    weight: FloatArray
+    amplitude: FloatArray
+    step_mm: float
+    determined: BoolArray
 
-    def _bin(self, path: FloatArray) -> None:
-        """Average correlations over pairs of like distance, for every piece of the sweep and patch."""
-        moved = np.zeros((self._first.size, 3))
-        moved[:, : path.shape[1]] = path[self._second] - path[self._first]
-        z, yaw, tilt = moved.T[:, :, None]
-        distance = np.hypot(
-            z + yaw * self._levers.lateral_mm + tilt * self._levers.lever_mm, tilt * self._levers.spread_mm
-        )
-        usable = np.isfinite(self._correlation) & (distance <= self._reach_mm)
-        bins = _BIN_EDGES_MM.size - 1
-        at = np.minimum(np.searchsorted(_BIN_EDGES_MM, distance, side="right") - 1, bins - 1)
-        at += bins * (np.arange(len(self._patches)) + len(self._patches) * self._piece[:, None])
-        at, shape = at[usable], (self._patch.size, bins)
-        sums = [
-            np.bincount(at, weights, minlength=self._patch.size * bins).reshape(shape)
-            for weights in (None, distance[usable], self._correlation[usable])
-        ]
-        count = np.maximum(sums[0], 1)
-        self._distance, mean = sums[1] / count, sums[2] / count
-        floor, cells = self._floor[self._patch, None], self._cells[self._patch, None]
-        variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, self.of_echo) + INTERPOLATION**2
-        self._mean = (mean - floor) / (1 - floor)
-        self._weight = (1 - floor) * np.sqrt(sums[0] / variance)
-        enough = (sums[0] > 0).sum(axis=1) >= LEAST_BINS
-        self.determined = enough if enough.any() else np.ones_like(enough)
-
-    def _speckle(self, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def speckle(self, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Amplitude of speckle at scaled distances, and its derivative by ln scale."""
-        position = self._distance * scale / self._step_mm
-        cell = np.minimum(position, self._amplitude.shape[1] - 2).astype(int)
-        at = cell + self._amplitude.shape[1] * self._patch[:, None]
-        low, high = self._amplitude.take(at), self._amplitude.take(at + 1)
-        inside = position <= self._amplitude.shape[1] - 1
-        value = np.where(inside, low + (position - cell) * (high - low), high)
-        return np.maximum(value, 1e-6), np.where(inside, (high - low) * position, 0.0)
+        last = self.amplitude.shape[1] - 1
+        position = np.minimum(self.distance * scale / self.step_mm, last)
+        cell = np.minimum(position, last - 1).astype(int)
+        low, high = (np.take_along_axis(self.amplitude, cell + k, axis=1) for k in (0, 1))
+        slope = np.where(position < last, (high - low) * position, 0.0)
+        return np.maximum(low + (position - cell) * (high - low), 1e-6), slope
 
     def fit(
         self,
-        log_scale: float | None = None,
-        most_share: float | None = None,
+        most_share: float,
         most_power: float = 0.0,
-        share_sigma: float = np.inf,
+        log_scale: float | None = None,
+        sigma: float = np.inf,
     ) -> FloatArray:
-        """Fit ln s, gain, c and a of every patch of every piece, shape (q, 4).
+        """Fit ln s, gain, c and a of every patch by bounded Levenberg-Marquardt, shape (q, 4).
 
         Parameters
         ----------
+        most_share, most_power : float
+            Upper bounds of c and a.
         log_scale : float, optional
             To which ln s is held; by default each patch tells its own.
-        most_share, most_power : float
-            Upper bounds of c (`MOST_SHARE` by default) and a.
-        share_sigma : float
+        sigma : float
             Standard deviation of a normal prior of c about zero.
         """
-        most_share = MOST_SHARE["echo" if self.of_echo else "intensity"] if most_share is None else most_share
-        lowest = np.array([-1.0 if log_scale is None else log_scale, 0.05, 0.0, 0.0])
-        highest = np.array([1.0 if log_scale is None else log_scale, 1.2, most_share, most_power])
+        low, high = (-1.0, 1.0) if log_scale is None else (log_scale, log_scale)
+        lowest, highest = np.array([low, 0.05, 0.0, 0.0]), np.array([high, 1.2, most_share, most_power])
+        x = np.tile(np.clip([0.0, 0.95, 0.05, 0.1], lowest, highest), (len(self.mean), 1))
+        left, jacobian = self._misfit(x, sigma)
+        damping = np.full((len(x), 1), 1e-2)
+        for _ in range(ROUNDS):
+            gradient = np.einsum("kmn,km->kn", jacobian, left)
+            free = ~(((x <= lowest) & (gradient > 0)) | ((x >= highest) & (gradient < 0)))
+            normal = np.einsum("kmn,kmo->kno", jacobian, jacobian) * (free[:, :, None] & free[:, None, :])
+            diagonal = np.einsum("knn->kn", normal)
+            diagonal += damping * diagonal + np.where(free, 1e-12, 1.0)
+            step = np.linalg.solve(normal, np.where(free, gradient, 0.0)[:, :, None])[:, :, 0]
+            trial = np.clip(x - step, lowest, highest)
+            trial_left, trial_jacobian = self._misfit(trial, sigma)
+            better = (trial_left**2).sum(axis=1) <= (left**2).sum(axis=1)
+            moved = np.abs(trial - x).max()
+            x[better], left[better], jacobian[better] = (
+                trial[better],
+                trial_left[better],
+                trial_jacobian[better],
+            )
+            damping *= np.where(better, 0.2, 4.0)[:, None]
+            if moved < SETTLED:
+                break
+        return x
 
-        def misfit(v: FloatArray) -> tuple[FloatArray, FloatArray]:
-            r, slope = self._speckle(np.exp(v[:, :1]))
-            gain, share, power = v[:, 1:2], v[:, 2:3], v[:, 3:4]
-            long = r**power
-            echo = (1 - share) * r + share * long
-            by_echo = 2 * gain * echo
-            by_scale = by_echo * (1 - share + share * power * long / r) * slope
-            by_share, by_power = by_echo * (long - r), by_echo * share * long * np.log(r)
-            jacobian = np.stack([by_scale, echo**2, by_share, by_power], axis=-1) * self._weight[..., None]
-            left = self._weight * (gain * echo**2 - self._mean)
-            prior = np.broadcast_to(np.array([0.0, 0.0, 1 / share_sigma, 0.0]), (len(v), 1, 4))
-            return np.append(left, share / share_sigma, axis=1), np.concatenate([jacobian, prior], axis=1)
+    def _misfit(self, x: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
+        """Weighted misfits, shape (q, bins + 1), and their derivatives by ln s, gain, c and a."""
+        r, slope = self.speckle(np.exp(x[:, :1]))
+        gain, share, power = x[:, 1:2], x[:, 2:3], x[:, 3:4]
+        long = r**power
+        echo = (1 - share) * r + share * long
+        by_echo = 2 * gain * echo
+        by_scale = by_echo * (1 - share + share * power * long / r) * slope
+        by = by_scale, echo**2, by_echo * (long - r), by_echo * share * long * np.log(r)
+        jacobian = np.stack(by, axis=-1) * self.weight[..., None]
+        prior = np.broadcast_to([0.0, 0.0, 1 / sigma, 0.0], (len(x), 1, 4))
+        left = self.weight * (gain * echo**2 - self.mean)
+        return np.append(left, share / sigma, axis=1), np.concatenate([jacobian, prior], axis=1)
 
-        start = np.clip([0.0, 0.95, 0.05, 0.1], lowest, highest)
-        return bounded_least_squares(misfit, np.tile(start, (self._patch.size, 1)), lowest, highest)
 
-    @property
-    def row_depth_mm(self) -> FloatArray:
-        """Depth of each row of patches, shape (r,)."""
-        return self._patches.row_depth_mm
-
-    def row_medians(self, values: FloatArray) -> FloatArray:
-        """Medians of patches' values of shape (q,) over the row and the pieces, shape (r,); NaN of none."""
-        by_piece = np.where(self.determined, values, np.nan).reshape(-1, len(self._patches))
-        by_row = np.moveaxis(self._patches.rows_of(by_piece), 1, 0)
-        return np.array([_median(row) for row in by_row])
+def _binned(
+    problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray
+) -> tuple[_Binned, FloatArray]:
+    """Average correlations over pairs of like distance; returns the middles of the sweep's pieces, too."""
+    first, second, correlation = table.first[sound], table.second[sound], table.correlation[sound]
+    curves, levers, grid = problem.at_patches, problem.levers, problem.curves.distance_mm
+    travel = np.append(0.0, np.cumsum(np.abs(np.diff(path[:, 0]))))
+    pieces = max(1, int(travel[-1] / PIECE_MM))
+    edges = np.searchsorted(travel, np.linspace(0, travel[-1], pieces + 1)[1:-1])
+    moved = np.zeros((first.size, 3))
+    moved[:, : path.shape[1]] = path[second] - path[first]
+    z, yaw, tilt = moved.T[:, :, None]
+    along = z + yaw * levers.lateral_mm + tilt * levers.lever_mm
+    distance = np.hypot(along, tilt * levers.spread_mm)
+    usable = np.isfinite(correlation)
+    if problem.end_amplitude.any():
+        usable &= distance <= grid[-1]
+    patches, bins = correlation.shape[1], _BIN_EDGES_MM.size - 1
+    at = np.minimum(np.searchsorted(_BIN_EDGES_MM, distance, side="right") - 1, bins - 1)
+    piece = np.searchsorted(edges, (first + second) / 2, side="right")
+    at = (at + bins * (np.arange(patches) + patches * piece[:, None]))[usable]
+    count, by_distance, by_correlation = (
+        np.bincount(at, weights, pieces * patches * bins).reshape(-1, bins)
+        for weights in (None, distance[usable], correlation[usable])
+    )
+    some = np.maximum(count, 1)
+    mean = by_correlation / some
+    end = curves.amplitude[:, -1] ** 2
+    floor = np.where(end > WELL_FALLEN, 0.0, end)[:, None]
+    amplitude = np.sqrt(np.clip((curves.amplitude**2 - floor) / (1 - floor), 0.0, 1.0))
+    floor, cells = np.tile(floor, (pieces, 1)), np.tile(curves.cells, pieces)[:, None]
+    variance = correlation_variance(np.clip(mean, 0.0, 0.995), cells, curves.of_echo) + INTERPOLATION**2
+    determined = (count > 0).sum(axis=1) >= LEAST_BINS
+    binned = _Binned(
+        by_distance / some,
+        (mean - floor) / (1 - floor),
+        (1 - floor) * np.sqrt(count / variance),
+        np.tile(amplitude, (pieces, 1)),
+        curves.step_mm,
+        determined if determined.any() else np.ones_like(determined),
+    )
+    return binned, (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
 
 
 def _median(values: FloatArray) -> float:
@@ -252,65 +251,21 @@ def _median(values: FloatArray) -> float:
     return float(np.median(finite)) if finite.size else float("nan")
 
 
-def bounded_least_squares(
-    misfit: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    start: FloatArray,
-    lowest: FloatArray,
-    highest: FloatArray,
-    rounds: int = 30,
-    settled: float = 1e-3,
-) -> FloatArray:
-    """Solve many small bounded least-squares problems at once by Levenberg-Marquardt.
-
-    Parameters
-    ----------
-    misfit : callable
-        From parameters, shape (k, n), to residuals, shape (k, m), and their derivatives, shape (k, m, n).
-    start : ndarray, shape (k, n)
-    lowest, highest : ndarray, shape (n,)
-        Bounds; parameters that press against one stay there.
-    rounds, settled : int, float
-        Most rounds, and the step that ends them.
-
-    Returns
-    -------
-    ndarray, shape (k, n)
-    """
-    x, damping = start.copy(), np.full(len(start), 1e-2)
-    left, jacobian = misfit(x)
-    cost = (left**2).sum(axis=1)
-    diagonal = np.arange(start.shape[1])
-    for _ in range(rounds):
-        gradient = np.einsum("kmn,km->kn", jacobian, left)
-        free = ~(((x <= lowest) & (gradient > 0)) | ((x >= highest) & (gradient < 0)))
-        normal = np.einsum("kmn,kmo->kno", jacobian, jacobian) * (free[:, :, None] & free[:, None, :])
-        normal[:, diagonal, diagonal] *= 1 + damping[:, None]
-        normal[:, diagonal, diagonal] += np.where(free, 1e-12, 1.0)
-        step = -np.linalg.solve(normal, np.where(free, gradient, 0.0)[:, :, None])[:, :, 0]
-        trial = np.clip(x + step, lowest, highest)
-        trial_left, trial_jacobian = misfit(trial)
-        trial_cost = (trial_left**2).sum(axis=1)
-        better = trial_cost <= cost
-        moved = np.abs(trial - x).max(axis=1)
-        x[better], cost[better] = trial[better], trial_cost[better]
-        left[better], jacobian[better] = trial_left[better], trial_jacobian[better]
-        damping = np.where(better, damping / 5, damping * 4)
-        if (moved < settled).all():
-            break
-    return x
-
-
-def scale_sigma(coherence: Coherence | None) -> float:
-    """Relative standard deviation of the scale of all distances; the curves' own without adaptation."""
-    return CURVES_SIGMA if coherence is None else coherence.scale_sigma
-
-
-def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, float, RowScales]:
+def estimate_coherence(
+    problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray
+) -> tuple[Coherence, float, RowScales]:
     """Estimate shares of structure, gains, and the factor that distances along the path are still to get.
 
     Structure of an echo turns its phase, so that it decays with some power of speckle's coherence; of
     intensity, which has no phase, shapes with and without decay fit alike: the mean of both scales is taken,
     and what lies between them is claimed.
+
+    Parameters
+    ----------
+    sound : ndarray of bool, shape (e,)
+        Pairs of the table that count.
+    path : ndarray, shape (n, 2) or (n, 3)
+        Elevational position of each frame's centre, and its slopes along x and, if known, y.
 
     Returns
     -------
@@ -319,44 +274,42 @@ def estimate_coherence(correlations: PatchCorrelations) -> tuple[Coherence, floa
         True distances over those of the path, median over the patches.
     RowScales
     """
-    frozen = correlations.fit()
-    typical = float(np.nanmean(correlations.row_medians(frozen[:, 2])))
+    binned, centres = _binned(problem, table, sound, path)
+    determined, of_echo = binned.determined, problem.at_patches.of_echo
+    most_share = MOST_SHARE["echo" if of_echo else "intensity"]
+
+    def row_medians(values: FloatArray) -> FloatArray:
+        by_piece = np.where(determined, values, np.nan).reshape(centres.size, -1)
+        return np.array([_median(row) for row in np.moveaxis(problem.patches.rows_of(by_piece), 1, 0)])
+
+    frozen = binned.fit(most_share)
+    typical = float(np.nanmean(row_medians(frozen[:, 2])))
     if typical < NO_STRUCTURE:
-        fits = [correlations.fit(most_share=0.0)]
-    elif correlations.of_echo:
-        fits = [correlations.fit(most_power=MOST_POWER)]
+        fits = [binned.fit(0.0)]
     else:
-        fits = [frozen, correlations.fit(most_power=MOST_POWER)]
+        fits = [*([] if of_echo else [frozen]), binned.fit(most_share, MOST_POWER)]
     # Where noise is most of the correlation, its course tells nothing of the scale.
-    clear = correlations.determined & (frozen[:, 1] >= LEAST_GAIN)
-    medians = [_median(fit[clear if clear.any() else correlations.determined, 0]) for fit in fits]
-    log_scale, pieces = float(np.mean(medians)), correlations.centres.size
-    share_gain = correlations.fit(log_scale, share_sigma=max(typical, LEAST_SHARE))[:, [2, 1]]
+    clear = determined & (frozen[:, 1] >= LEAST_GAIN)
+    medians = [_median(fit[clear if clear.any() else determined, 0]) for fit in fits]
+    log_scale = float(np.mean(medians))
+    gain, share = binned.fit(most_share, 0.0, log_scale, max(typical, LEAST_SHARE))[:, 1:3].T
     # Patches that tell nothing are taken for the sweep's typical ones.
-    share_gain[~correlations.determined] = [
-        _median(column) for column in share_gain[correlations.determined].T
-    ]
-    share, gain = share_gain.T
-    rows = RowScales(
-        correlations.row_depth_mm,
-        correlations.row_medians(np.mean(fits, axis=0)[:, 0]) - log_scale,
-        correlations.row_medians(gain),
-        correlations.row_medians(share),
-    )
+    gain, share = (np.where(determined, v, _median(v[determined])) for v in (gain, share))
+    logarithm = row_medians(np.mean(fits, axis=0)[:, 0]) - log_scale
+    rows = RowScales(problem.patches.row_depth_mm, logarithm, row_medians(gain), row_medians(share))
     # Standard error of a median of rows, by their median absolute deviation from a line: tilt makes one.
-    finite = np.isfinite(rows.logarithm)
-    logarithm, depth = rows.logarithm[finite], rows.depth_mm[finite]
-    spread = ROW_SIGMA
-    if logarithm.size > 2:
-        line = theilslopes(logarithm, depth)
-        spread = 1.4826 * float(np.median(np.abs(logarithm - line.intercept - line.slope * depth)))
+    finite = np.isfinite(logarithm)
+    count, spread = int(finite.sum()), ROW_SIGMA
+    if count > 2:
+        line = theilslopes(logarithm[finite], rows.depth_mm[finite])
+        spread = robust_sigma(logarithm[finite] - line.intercept - line.slope * rows.depth_mm[finite])
     if typical >= NO_STRUCTURE:
-        count = logarithm.size
         spread = np.sqrt((count * spread**2 + PRIOR_ROWS * ROW_SIGMA**2) / (count + PRIOR_ROWS))
-    errors = 1.2533 * spread / np.sqrt(logarithm.size), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
+    errors = 1.2533 * spread / np.sqrt(count), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
+    shape = centres.size, -1
     return (
-        Coherence(correlations.centres, share.reshape(pieces, -1), gain.reshape(pieces, -1), sigma),
+        Coherence(centres, share.reshape(shape), gain.reshape(shape), sigma),
         float(np.exp(log_scale)),
         rows,
     )

@@ -11,9 +11,9 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import RFSettings
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.motion.diffraction import (
+    BACKSCATTER_EXPONENT,
+    SPEED_M_S,
     SUB_DEPTHS,
-    Lens,
-    Nominal,
     band_nodes,
     sensitivity,
     sheet_spectrum,
@@ -45,7 +45,10 @@ class ProbeSheet(BaseModel):
     )
     attenuation_db_cm_mhz: float = Field(0.5, ge=0, le=3, description="Of the tissue, one way.")
     backscatter_exponent: float = Field(
-        1.1, ge=-1, le=4, description="Of scattered power over frequency: soft tissue 0.6 to 1.6."
+        BACKSCATTER_EXPONENT,
+        ge=-1,
+        le=4,
+        description="Of scattered power over frequency: soft tissue 0.6 to 1.6.",
     )
     transmit_aperture_mm: float | None = Field(
         None,
@@ -67,7 +70,7 @@ class ProbeSheet(BaseModel):
     depth_mm: float = Field(40.0, gt=5, le=300, description="Depth of the images.")
     sampling_rate_mhz: float | None = Field(None, gt=0, le=1000, description="Of the RF.")
     vector_pitch_mm: float | None = Field(None, gt=0, le=5, description="Distance of vectors.")
-    speed_of_sound_m_s: float = Field(1540.0, gt=300, le=4000)
+    speed_of_sound_m_s: float = Field(SPEED_M_S, gt=300, le=4000)
     probe: str = Field("", description="Name of probe and preset as recordings have it.")
 
     @field_validator("band_mhz")
@@ -78,12 +81,16 @@ class ProbeSheet(BaseModel):
         return value
 
     @property
-    def lens(self) -> Lens:
-        """What shapes the elevational field."""
+    def nominal(self) -> NominalProbe:
+        """Probe and tissue that the elevational field is calculated for."""
         transmit = self.transmit_aperture_mm
-        if transmit is None:
-            transmit = self.elevation_focus_mm / self.f_number
-        return Lens(self.elevation_aperture_mm, self.elevation_focus_mm, transmit, self.speed_of_sound_m_s)
+        return NominalProbe(
+            self.elevation_aperture_mm,
+            self.elevation_focus_mm,
+            self.elevation_focus_mm / self.f_number if transmit is None else transmit,
+            *(1e6 * f for f in self.band_mhz),
+            self.attenuation_db_cm_mhz,
+        )
 
     @property
     def signal(self) -> RFSettings:
@@ -98,7 +105,7 @@ class ProbeSheet(BaseModel):
             raise InvalidInputError(
                 "sampling_rate_mhz: expected in the probe's settings, or a sweep, got none"
             )
-        low, high = (1e6 * f for f in self.band_mhz)
+        low, high = self.nominal.low_hz, self.nominal.high_hz
         return RFSettings(
             1e6 * self.sampling_rate_mhz, self.speed_of_sound_m_s, (low + high) / 2.0, (low, high)
         )
@@ -124,9 +131,9 @@ def sheet_curves(
     speckle_mm2 : ndarray, shape (r,), optional
         Area of one independent cell of speckle at each depth; by default from band and f-number.
     """
-    rows = np.asarray(depth_mm, dtype=float)
+    rows, probe, speed = np.asarray(depth_mm, dtype=float), sheet.nominal, sheet.speed_of_sound_m_s
     grid: FloatArray = GRID_MM * np.arange(round(largest_mm / GRID_MM) + 1, dtype=float)
-    band = key.signal.bandwidth_hz if isinstance(key.signal, RFSettings) else _band(sheet)
+    band = key.signal.bandwidth_hz if isinstance(key.signal, RFSettings) else (probe.low_hz, probe.high_hz)
     frequency = band_nodes(band, key.edge_fraction)
     passed = _passed(frequency, band, key.edge_fraction)
     inside = key.patch_height_mm * ((np.arange(SUB_DEPTHS) + 0.5) / SUB_DEPTHS - 0.5)
@@ -136,9 +143,9 @@ def sheet_curves(
         sent = seen.at(depths, frequency)
     else:
         exponents = sheet.attenuation_db_cm_mhz, sheet.backscatter_exponent
-        sent = sheet_spectrum(frequency, _band(sheet), *exponents, depths)
+        sent = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, depths)
     weight = sent * passed**2
-    rho = speckle_correlation(sheet.lens, depths, frequency, weight, grid)
+    rho = speckle_correlation(probe, depths, frequency, weight, grid, speed)
     cells = (
         key.patch_width_mm
         * key.patch_height_mm
@@ -150,7 +157,7 @@ def sheet_curves(
     tilt = None
     if isinstance(key.signal, RFSettings):
         width = np.array([np.interp(0.5, -np.log(row), grid) for row in correlation])
-        pivot = tilt_pivot(sheet.lens, rows, frequency, weight.mean(axis=1))
+        pivot = tilt_pivot(probe, rows, frequency, weight.mean(axis=1), speed)
         tilt = TiltResponse(pivot, two_way_wavenumber(key.signal) * width**2)
     return DecorrelationCurves(
         key,
@@ -161,13 +168,7 @@ def sheet_curves(
         tilt=tilt,
         scale_sigma=sheet_sigma(sheet, rows, seen is not None),
         origin="data sheet",
-        nominal=NominalProbe(
-            sheet.elevation_aperture_mm,
-            sheet.elevation_focus_mm,
-            sheet.lens.transmit_mm,
-            *_band(sheet),
-            sheet.attenuation_db_cm_mhz,
-        ),
+        nominal=probe,
     )
 
 
@@ -177,7 +178,6 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -
     Tissue is within the attenuation's tolerance. With the echo's spectrum known, neither attenuation nor
     frequency matters any more.
     """
-    nominal = Nominal(sheet.lens, _band(sheet), sheet.attenuation_db_cm_mhz, sheet.backscatter_exponent)
     known = 0.0 if spectrum_known else 1.0
     sigma = UNIFORM * np.array(
         [
@@ -187,12 +187,8 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -
             known * sheet.frequency_tolerance,
         ]
     )
-    common = sensitivity(nominal, depth_mm).mean(axis=0)
+    common = sensitivity(sheet.nominal, depth_mm, sheet.backscatter_exponent).mean(axis=0)
     return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2))
-
-
-def _band(sheet: ProbeSheet) -> tuple[float, float]:
-    return 1e6 * sheet.band_mhz[0], 1e6 * sheet.band_mhz[1]
 
 
 def _passed(frequency_hz: FloatArray, band_hz: tuple[float, float], edge_fraction: float) -> FloatArray:

@@ -21,13 +21,14 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from speckle3d.core.arrays import ComplexArray, FloatArray
+from speckle3d.core.curves import NominalProbe
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.diffraction import lens_fields
 
@@ -41,25 +42,10 @@ _OFF_AXIS = 0.2
 """Mean square distance of an aperture's elements from its middle over half its width squared: 1/3 for equal
 weights, 0.13 for a raised cosine."""
 NEPER_PER_DB = float(np.log(10.0) / 20.0)
-
-
-@dataclass(frozen=True)
-class Lens:
-    """What shapes the elevational field.
-
-    Attributes
-    ----------
-    aperture_mm, focus_mm : float
-        Height of the elements, and where the lens focuses.
-    transmit_mm : float
-        Width of the transmit aperture, whose outer elements are farther away; 0 to leave that out.
-    speed_of_sound_m_s : float
-    """
-
-    aperture_mm: float
-    focus_mm: float
-    transmit_mm: float = 0.0
-    speed_of_sound_m_s: float = 1540.0
+SPEED_M_S = 1540.0
+"""Of sound in soft tissue, where no sheet says otherwise."""
+BACKSCATTER_EXPONENT = 1.1
+"""Of scattered power over frequency in soft tissue, which has 0.6 to 1.6."""
 
 
 def band_nodes(band_hz: tuple[float, float], edge_fraction: float) -> FloatArray:
@@ -95,7 +81,12 @@ def sheet_spectrum(
 
 
 def speckle_correlation(
-    lens: Lens, depth_mm: FloatArray, frequency_hz: FloatArray, power: FloatArray, distance_mm: FloatArray
+    probe: NominalProbe,
+    depth_mm: FloatArray,
+    frequency_hz: FloatArray,
+    power: FloatArray,
+    distance_mm: FloatArray,
+    speed_m_s: float = SPEED_M_S,
 ) -> FloatArray:
     """Correlation of fully developed speckle, the squared magnitude of the echo's, shape (r, k).
 
@@ -108,7 +99,7 @@ def speckle_correlation(
     distance_mm : ndarray, shape (k,)
     """
     weight = power / power.sum(axis=-1, keepdims=True)
-    fields, z = _two_way_fields(lens, depth_mm.ravel(), frequency_hz)
+    fields, z = _two_way_fields(probe, depth_mm.ravel(), frequency_hz, speed_m_s)
     size = 2 * z.size
     spectra = np.abs(fft.fft(fields, size, axis=-1)) ** 2
     energy = spectra.mean(axis=-1)
@@ -120,7 +111,12 @@ def speckle_correlation(
 
 
 def tilt_pivot(
-    lens: Lens, depth_mm: FloatArray, frequency_hz: FloatArray, power: FloatArray, tilt_rad: float = 0.004
+    probe: NominalProbe,
+    depth_mm: FloatArray,
+    frequency_hz: FloatArray,
+    power: FloatArray,
+    speed_m_s: float = SPEED_M_S,
+    tilt_rad: float = 0.004,
 ) -> FloatArray:
     """Where speckle of each depth seems to turn about when the probe tilts, mm from the patch, shape (y,).
 
@@ -131,8 +127,8 @@ def tilt_pivot(
     depth_mm : ndarray, shape (y,)
     power : ndarray, shape (y, f)
     """
-    fields, z = _two_way_fields(lens, depth_mm, frequency_hz)
-    two_way = 4e-3 * np.pi * frequency_hz / lens.speed_of_sound_m_s
+    fields, z = _two_way_fields(probe, depth_mm, frequency_hz, speed_m_s)
+    two_way = 4e-3 * np.pi * frequency_hz / speed_m_s
     turned = fields * np.exp(1j * two_way[:, None] * tilt_rad * z)
     size = 2 * z.size
     cross = fft.ifft(fft.fft(turned, size, axis=-1) * fft.fft(fields, size, axis=-1).conj(), axis=-1)
@@ -146,18 +142,18 @@ def tilt_pivot(
 
 
 def _two_way_fields(
-    lens: Lens, depth_mm: FloatArray, frequency_hz: FloatArray
+    probe: NominalProbe, depth_mm: FloatArray, frequency_hz: FloatArray, speed_m_s: float
 ) -> tuple[ComplexArray, FloatArray]:
     """Two-way field at each depth and frequency over elevation, shape (y, f, z), and the elevations."""
-    wavenumber = 2e-3 * np.pi * frequency_hz / lens.speed_of_sound_m_s
+    wavenumber = 2e-3 * np.pi * frequency_hz / speed_m_s
     shortest = 2.0 * np.pi / wavenumber[-1]
-    count = int(np.ceil(_STRIPS_PER_WAVELENGTH * lens.aperture_mm / shortest))
-    strip = lens.aperture_mm * ((np.arange(count) + 0.5) / count - 0.5)
-    reach = 0.8 * lens.aperture_mm + 1.5
+    count = int(np.ceil(_STRIPS_PER_WAVELENGTH * probe.aperture_mm / shortest))
+    strip = probe.aperture_mm * ((np.arange(count) + 0.5) / count - 0.5)
+    reach = 0.8 * probe.aperture_mm + 1.5
     steps = int(np.ceil(reach / STEP_MM))
     z: FloatArray = STEP_MM * np.arange(steps + 1, dtype=float)
-    delay = lens.focus_mm - np.hypot(lens.focus_mm, strip)
-    off_mm = np.sqrt(_OFF_AXIS) * lens.transmit_mm / 2.0
+    delay = probe.focus_mm - np.hypot(probe.focus_mm, strip)
+    off_mm = np.sqrt(_OFF_AXIS) * probe.transmit_mm / 2.0
     distance = np.append(depth_mm, np.hypot(depth_mm, off_mm)) if off_mm else depth_mm
     parts = np.empty((distance.size, frequency_hz.size, z.size, 2))
     spread = z, strip, delay, wavenumber, np.ones(distance.size), 1
@@ -165,35 +161,6 @@ def _two_way_fields(
     one_way = parts.view(complex)[..., 0]
     half = one_way[: depth_mm.size] * one_way[-depth_mm.size :]
     return np.concatenate([half[..., :0:-1], half], axis=-1), np.concatenate([-z[:0:-1], z])
-
-
-@dataclass(frozen=True)
-class Nominal:
-    """A probe and tissue about which distances are varied.
-
-    Attributes
-    ----------
-    lens : Lens
-    band_hz : tuple of float
-        Of the pulse, at -6 dB.
-    attenuation_db_cm_mhz, backscatter_exponent : float
-    """
-
-    lens: Lens
-    band_hz: tuple[float, float]
-    attenuation_db_cm_mhz: float = 0.5
-    backscatter_exponent: float = 1.1
-
-    def log_width(self, depth_mm: FloatArray) -> FloatArray:
-        """Logarithm of the distance in mm that halves the correlation at each depth, shape (r,)."""
-        frequency = band_nodes(self.band_hz, 0.1)[::2]
-        power = sheet_spectrum(
-            frequency, self.band_hz, self.attenuation_db_cm_mhz, self.backscatter_exponent, depth_mm[:, None]
-        )
-        steps = int(_WIDEST * self.lens.aperture_mm / STEP_MM)
-        distance: FloatArray = STEP_MM / 2.0 * np.arange(steps, dtype=float)
-        rho = speckle_correlation(self.lens, depth_mm[:, None], frequency, power, distance)
-        return np.log([half_distance(distance, row) for row in rho])
 
 
 _WIDEST = 1.2
@@ -209,26 +176,36 @@ def half_distance(distance_mm: FloatArray, correlation: FloatArray) -> float:
     return float(distance_mm[after - 1] + part * (distance_mm[after] - distance_mm[after - 1]))
 
 
-def sensitivity(nominal: Nominal, depth_mm: FloatArray) -> FloatArray:
-    """Derivatives of `Nominal.log_width`, shape (r, 4).
+def log_width(
+    probe: NominalProbe, depth_mm: FloatArray, backscatter_exponent: float = BACKSCATTER_EXPONENT
+) -> FloatArray:
+    """Logarithm of the distance in mm that halves the correlation at each depth, shape (r,)."""
+    band = probe.low_hz, probe.high_hz
+    frequency = band_nodes(band, 0.1)[::2]
+    power = sheet_spectrum(
+        frequency, band, probe.attenuation_db_cm_mhz, backscatter_exponent, depth_mm[:, None]
+    )
+    distance: FloatArray = STEP_MM / 2 * np.arange(int(_WIDEST * probe.aperture_mm / STEP_MM), dtype=float)
+    rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance)
+    return np.log([half_distance(distance, row) for row in rho])
+
+
+def sensitivity(
+    probe: NominalProbe, depth_mm: FloatArray, backscatter_exponent: float = BACKSCATTER_EXPONENT
+) -> FloatArray:
+    """Derivatives of `log_width`, shape (r, 4).
 
     By the logarithm of focus, of aperture, by attenuation in dB/cm/MHz, and by the logarithm of frequency.
     """
-    n, up = nominal, np.exp(SMALL)
 
-    def varied(
-        focus: float = 1.0, aperture: float = 1.0, more: float = 0.0, pitch: float = 1.0
-    ) -> FloatArray:
-        lens = replace(n.lens, focus_mm=n.lens.focus_mm * focus, aperture_mm=n.lens.aperture_mm * aperture)
-        band = n.band_hz[0] * pitch, n.band_hz[1] * pitch
-        return replace(
-            n, lens=lens, band_hz=band, attenuation_db_cm_mhz=n.attenuation_db_cm_mhz + more
-        ).log_width(depth_mm)
+    def widths(step: float) -> FloatArray:
+        factor = float(np.exp(step))
+        varied = (
+            replace(probe, focus_mm=factor * probe.focus_mm),
+            replace(probe, aperture_mm=factor * probe.aperture_mm),
+            replace(probe, attenuation_db_cm_mhz=max(probe.attenuation_db_cm_mhz + step, 0.0)),
+            replace(probe, low_hz=factor * probe.low_hz, high_hz=factor * probe.high_hz),
+        )
+        return np.stack([log_width(one, depth_mm, backscatter_exponent) for one in varied], axis=1)
 
-    pairs = [
-        (varied(focus=up), varied(focus=1 / up)),
-        (varied(aperture=up), varied(aperture=1 / up)),
-        (varied(more=SMALL), varied(more=-SMALL)),
-        (varied(pitch=up), varied(pitch=1 / up)),
-    ]
-    return np.stack([(high - low) / (2.0 * SMALL) for high, low in pairs], axis=1)
+    return (widths(SMALL) - widths(-SMALL)) / (2.0 * SMALL)

@@ -1,40 +1,33 @@
-"""From correlations of frame pairs to signed planes and the path of the sweep."""
+"""From a sweep's correlations to the poses of its frames and what these claim: all that images tell."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import EchoSpectra
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.relative import RelativePoses
-from speckle3d.matching.patches import PatchGrid
-from speckle3d.matching.schedule import TrajectorySettings
+from speckle3d.core.reconstruction import FramePairs, SharedErrors
+from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import (
-    Coherence,
-    PatchCorrelations,
-    RowScales,
-    estimate_coherence,
-    scale_sigma,
-)
-from speckle3d.motion.distances import LEAST_CORRELATION, DistanceEstimator
+from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
+from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, RowScales, estimate_coherence
 from speckle3d.motion.lens import with_fitted_lens
-from speckle3d.motion.planes import PairPlanes, PlaneFitter, PlaneSettings
-from speckle3d.motion.signs import (
-    ADAPTED_ERROR,
-    PLAIN_ERROR,
-    SignedPairs,
-    Strangers,
-    pair_signs,
-    settled_path,
+from speckle3d.motion.planes import (
+    LEAST_CORRELATION,
+    MotionProblem,
+    PairPlanes,
+    pair_planes,
+    patch_distances,
 )
-from speckle3d.motion.trajectory import relative_poses_of, solve_trajectory
-from speckle3d.motion.uncertainty import SlopeEvidence, weigh_slopes
+from speckle3d.motion.signs import ADAPTED_ERROR, PLAIN_ERROR, Strangers, likeliest_path, on_path
+from speckle3d.motion.subset import consistent_planes
+from speckle3d.motion.trajectory import edges_of, solve_trajectory, unjoined
+from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh_slopes
 
 ROUNDS = 2
 """Rounds in which shares and scale, and the path that they are read from, are estimated in turn; a third
@@ -43,43 +36,8 @@ LENS_ROUNDS = 4
 """Fits of a data sheet's lens: a path read with a wrong lens bends the rows otherwise than the right one."""
 ENOUGH_PAIRS = 3
 """Pairs to earlier frames from which a frame needs none that tells less."""
-
-
-@dataclass(frozen=True)
-class MotionProblem:
-    """What the correlations of one sweep are read with.
-
-    Attributes
-    ----------
-    curves : DecorrelationCurves
-    patches : PatchGrid
-    centre_mm : ndarray, shape (3,)
-        The image's centre.
-    frames : int
-        Of the sweep.
-    planes : PlaneSettings
-    trajectory : TrajectorySettings
-    adapt : bool
-        Whether structure and noise are adapted to.
-    """
-
-    curves: DecorrelationCurves
-    patches: PatchGrid
-    centre_mm: FloatArray
-    frames: int
-    planes: PlaneSettings
-    trajectory: TrajectorySettings
-    adapt: bool = True
-
-    def with_curves(self, curves: DecorrelationCurves) -> MotionProblem:
-        """Return the same problem with other curves."""
-        return replace(self, curves=curves)
-
-    @cached_property
-    def fitter(self) -> PlaneFitter:
-        """Fitter of planes to the patches of a pair."""
-        estimator = DistanceEstimator(self.curves, self.patches)
-        return PlaneFitter(estimator, self.patches.centre_mm - self.centre_mm[:2], self.planes)
+PAIRS_AT_ONCE = 1024
+"""Pairs whose distances are held at once."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +48,14 @@ class Motion:
     ----------
     problem : MotionProblem
         With the curves as they were read in the end.
-    pairs : SignedPairs
+    pairs : PairPlanes
+        On their sides of the first frames.
     coherence : Coherence or None
         Share of structure and gain of every patch; None if not adapted to.
     rows : RowScales or None
         Scales that rows of patches ask for; None if not adapted to.
+    slopes : SlopeWeights
+        Weight of the slopes that the planes have.
     path : ndarray, shape (n, 3)
         Elevational position of the image's centre and slopes along x and y of every frame.
     scale : float
@@ -102,29 +63,103 @@ class Motion:
     """
 
     problem: MotionProblem
-    pairs: SignedPairs
+    pairs: PairPlanes
     coherence: Coherence | None
     rows: RowScales | None
+    slopes: SlopeWeights
     path: FloatArray
     scale: float = 1.0
 
     @property
-    def structure(self) -> float:
-        """Mean share of structure."""
-        return 0.0 if self.coherence is None else float(self.coherence.share.mean())
+    def scale_sigma(self) -> float:
+        """Relative standard deviation of the scale of all distances; the curves' own without adaptation."""
+        return CURVES_SIGMA if self.coherence is None else self.coherence.scale_sigma
+
+
+@dataclass(frozen=True)
+class ImageMotion:
+    """Poses of all frames by the images, of either sign of the elevational motion.
+
+    Attributes
+    ----------
+    motion : Motion
+    table : CorrelationTable
+        Of its pairs.
+    attenuation : Attenuation
+        Of the tissue over the curves' phantom, by the echoes' spectrum.
+    edges : RelativePoses
+        From which the poses were solved.
+    poses : RigidTransform, length n
+    covariance : ndarray, shape (n, 6, 6)
+        See `speckle3d.motion.uncertainty`; what the curves' mismatch does is in it.
+    shared : SharedErrors
+        What of it all frames have in common.
+    unplaced : ndarray of bool, shape (n,)
+        Frames that no pair joins to earlier ones.
+    """
+
+    motion: Motion
+    table: CorrelationTable
+    attenuation: Attenuation
+    edges: RelativePoses
+    poses: RigidTransform
+    covariance: FloatArray
+    shared: SharedErrors
+    unplaced: BoolArray
 
     @property
-    def slopes(self) -> SlopeEvidence:
-        """Weight of the slopes that the planes have."""
-        return slope_evidence(self.problem, self.pairs, self.coherence)
+    def length_sigma(self) -> float:
+        """Relative standard deviation of the scale of distances, which all pairs share."""
+        return float(np.hypot(self.shared.scale_sigma, self.shared.curves_sigma))
+
+
+def estimate_image_motion(
+    problem: MotionProblem,
+    table: CorrelationTable,
+    spectra: EchoSpectra | None,
+    bad: BoolArray,
+    same_probe: bool,
+) -> ImageMotion:
+    """Estimate attenuation, distances, scale and path; solve the poses; say what they claim.
+
+    Parameters
+    ----------
+    problem : MotionProblem
+        With the curves as measured.
+    table : CorrelationTable
+        Of the sweep's frames.
+    spectra : EchoSpectra or None
+        Of its echoes.
+    bad : ndarray of bool, shape (n,)
+        Frames whose pairs are not to be trusted.
+    same_probe : bool
+        Whether the curves were measured with the very probe of the sweep.
+
+    Raises
+    ------
+    InsufficientDataError
+        If no pair determines a plane.
+    """
+    attenuation = estimate_attenuation(problem.curves, spectra)
+    curves = attenuation.applied(problem.curves)
+    sound = ~bad[table.first] & ~bad[table.second]
+    motion = estimate_motion(replace(problem, curves=curves), table, sound)
+    edges = edges_of(table, motion.slopes.applied(motion.pairs))
+    solved = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory.huber, True)
+    curves_sigma = motion.problem.curves.mismatch(same_probe, attenuation.log_length_sigma)
+    shared = SharedErrors(motion.scale_sigma, curves_sigma, motion.slopes.deviation_per_mm)
+    structure = 0.0 if motion.coherence is None else float(motion.coherence.share.mean())
+    covariance = claimed_covariance(solved.poses, solved.covariance, problem.centre_mm, shared, structure)
+    unplaced = unjoined(motion.pairs.second, problem.frames)
+    return ImageMotion(motion, table, attenuation, edges, solved.poses, covariance, shared, unplaced)
 
 
 def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: BoolArray) -> Motion:
     """Estimate shares of structure, the scale of distances and the path, each from the others, in turn.
 
-    Distances and their scale need the path, the path needs distances: both are repeated `ROUNDS` times. For
-    curves from a data sheet the lens is fitted to what depths then disagree on, and all is read again with
-    it.
+    All that iterates does so here. Distances and their scale need the path, the path needs distances: both
+    are repeated `ROUNDS` times. For curves from a data sheet the lens is fitted to what depths then disagree
+    on, and all is read again with it.
 
     Parameters
     ----------
@@ -137,163 +172,30 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
     InsufficientDataError
         If no pair determines a plane.
     """
-    path = rough_path(problem, table)
-    if problem.curves.origin == "data sheet" and problem.adapt:
-        # Tilt bends rows as a lens does: it is left out until the lens is known.
-        tilt, problem = problem.curves.tilt, problem.with_curves(replace(problem.curves, tilt=None))
-        assert problem.curves.nominal is not None
-        focus_mm = problem.curves.nominal.focus_mm
-        for _ in range(LENS_ROUNDS):
-            motion = _in_turn(problem, table, sound, path)
-            assert motion.rows is not None
-            curves = with_fitted_lens(problem.curves, motion.rows, focus_mm)
-            problem, path = problem.with_curves(curves), motion.path
-        problem = problem.with_curves(replace(problem.curves, tilt=tilt))
-    return _in_turn(problem, table, sound, path)
-
-
-def _in_turn(problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray) -> Motion:
-    """Shares and scale from the path, the path from distances, in turn; at last the scale of all patches."""
+    alike, determined = pair_planes(problem, table, alike_pairs(problem, table))
+    path = likeliest_path(alike[determined], problem.frames, PLAIN_ERROR, strangers(problem, table))
     if not problem.adapt:
-        pairs = _signed(
-            problem, table, sound, unsigned_planes(problem, table, path, sound, None), PLAIN_ERROR
-        )
-        return Motion(problem, pairs, None, None, path_of(problem, table, pairs, None))
-    coherence, scale, rows = coherence_of(problem, table, path, sound)
-    for _ in range(ROUNDS):
-        planes = unsigned_planes(problem, table, path * scale, sound, coherence)
-        pairs = _signed(problem, table, sound, planes, ADAPTED_ERROR)
-        path = path_of(problem, table, pairs, coherence)
-        coherence, scale, rows = coherence_of(problem, table, path, sound)
-    pairs = replace(pairs, planes=pairs.planes.scaled(scale))
-    return Motion(problem, pairs, coherence, rows, path_of(problem, table, pairs, coherence), scale)
-
-
-def rough_path(problem: MotionProblem, table: CorrelationTable) -> FloatArray:
-    """Place frames one after the other by the earlier ones that they resemble, by a phantom's curves.
-
-    Returns
-    -------
-    ndarray, shape (n, 2)
-        Elevational position of each frame's centre, mm, and its slope along x.
-    """
-    rows = alike_pairs(problem, table)
-    planes = problem.fitter.fit(table.correlation[rows], table.inplane[rows, :2])
-    rows, planes = rows[planes.determined], planes[planes.determined]
-    return settled_path(
-        problem.frames,
-        table.first[rows],
-        table.second[rows],
-        planes.coefficients[:, :2],
-        planes.covariance[:, :2, :2],
-        strangers=strangers(problem, table, np.ones(len(table), dtype=bool)),
-        hold=True,
-    )
-
-
-def unsigned_planes(
-    problem: MotionProblem,
-    table: CorrelationTable,
-    path: FloatArray,
-    sound: BoolArray,
-    coherence: Coherence | None,
-) -> SignedPairs:
-    """Planes of the pairs near enough on a path to tell a distance; all signs are +1."""
-    rows = _near_pairs(problem, table, path[:, 0], sound)
-    start = np.abs(path[table.second[rows], 0] - path[table.first[rows], 0])
-    return planes_of(problem, table, rows, coherence, start)
-
-
-def planes_of(
-    problem: MotionProblem,
-    table: CorrelationTable,
-    rows: IntArray,
-    coherence: Coherence | None,
-    start_mm: FloatArray | None = None,
-) -> SignedPairs:
-    """Planes of some rows of the table, as far as they are determined; all signs are +1."""
-    first, second = table.first[rows], table.second[rows]
-    planes = problem.fitter.fit(
-        table.correlation[rows], table.inplane[rows, :2], coherence, first, start_mm=start_mm
-    )
-    return SignedPairs(rows, first, second, planes, np.ones(rows.size))[planes.determined]
-
-
-def _signed(
-    problem: MotionProblem, table: CorrelationTable, sound: BoolArray, pairs: SignedPairs, error: float
-) -> SignedPairs:
-    """Pairs with the signs that belong together on the likeliest path."""
-    if not len(pairs):
-        raise InsufficientDataError(
-            f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
-            f"{table.correlation.shape[1]} patches: is the image wide enough, and do the curves fit it?"
-        )
-    path = signed_path(problem, table, sound, pairs, error)
-    return pairs.with_signs(pair_signs(path, *pairs.signless))
-
-
-def signed_path(
-    problem: MotionProblem,
-    table: CorrelationTable,
-    sound: BoolArray,
-    pairs: SignedPairs,
-    error: float = ADAPTED_ERROR,
-    known: FloatArray | None = None,
-) -> FloatArray:
-    """Likeliest path through unsigned planes, shape (n, 2).
-
-    Parameters
-    ----------
-    error : float
-        Relative, of distances, as for `settled_path`.
-    known : ndarray, shape (m, 2), optional
-        Path of the first m frames, which stays.
-    """
-    return settled_path(
-        problem.frames,
-        *pairs.signless,
-        error,
-        strangers(problem, table, sound),
-        hold=known is not None and len(known) > 0,
-        known=known,
-    )
-
-
-def coherence_of(
-    problem: MotionProblem, table: CorrelationTable, path: FloatArray, sound: BoolArray
-) -> tuple[Coherence, float, RowScales]:
-    """Fit what stays of the patches' echoes, and the scale of the path; see `estimate_coherence`."""
-    pairs = table.first[sound], table.second[sound], table.correlation[sound]
-    return estimate_coherence(
-        PatchCorrelations(*pairs, path, problem.curves, problem.patches, problem.fitter.levers)
-    )
-
-
-def slope_evidence(problem: MotionProblem, pairs: SignedPairs, coherence: Coherence | None) -> SlopeEvidence:
-    """Weight of the images' own yaw and tilt."""
-    expected = float(np.deg2rad(problem.planes.turn_deg_per_mm))
-    return weigh_slopes(problem.fitter.design(), pairs.planes, scale_sigma(coherence), expected)
-
-
-def edges_of(table: CorrelationTable, pairs: SignedPairs, planes: PairPlanes) -> RelativePoses:
-    """Relative poses of pairs, from `planes` in place of their own."""
-    inplane = table.inplane[pairs.row], table.inplane_covariance[pairs.row]
-    return relative_poses_of(pairs.first, pairs.second, *inplane, planes, pairs.sign)
-
-
-def path_of(
-    problem: MotionProblem, table: CorrelationTable, pairs: SignedPairs, coherence: Coherence | None
-) -> FloatArray:
-    """Position and slopes of every frame on the trajectory of some pairs, shape (n, 3)."""
-    slopes = slope_evidence(problem, pairs, coherence)
-    edges = edges_of(table, pairs, slopes.applied(pairs.planes))
-    poses = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory).poses
-    return elevation_of(poses, problem.centre_mm)
-
-
-def elevation_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    """Elevational position of the image's centre, mm, and slopes along x and y, shape (n, 3)."""
-    return np.column_stack([poses.apply(centre_mm)[:, 2], poses.rotation.as_matrix()[:, 2, :2]])
+        pairs = _signed_planes(problem, table, sound, path, None)
+        slopes = weigh_slopes(pairs, CURVES_SIGMA, problem.planes)
+        return Motion(problem, pairs, None, None, slopes, _path_of(problem, table, pairs, slopes))
+    nominal, tilt = problem.curves.nominal, problem.curves.tilt
+    fitted = problem.curves.origin == "data sheet" and nominal is not None
+    if fitted:
+        # Tilt bends rows as a lens does: it is left out until the lens is known.
+        problem = replace(problem, curves=replace(problem.curves, tilt=None))
+    for lens_round in range(LENS_ROUNDS + 1 if fitted else 1):
+        coherence, scale, rows = estimate_coherence(problem, table, sound, path)
+        for _ in range(ROUNDS):
+            pairs = _signed_planes(problem, table, sound, path * scale, coherence)
+            slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
+            path = _path_of(problem, table, pairs, slopes)
+            coherence, scale, rows = estimate_coherence(problem, table, sound, path)
+        if nominal is not None and lens_round < LENS_ROUNDS and fitted:
+            curves, path = with_fitted_lens(problem.curves, rows, nominal), path * scale
+            tilt_known = tilt if lens_round == LENS_ROUNDS - 1 else None
+            problem = replace(problem, curves=replace(curves, tilt=tilt_known))
+    slopes, path = weigh_slopes(pairs, coherence.scale_sigma, problem.planes), path * [scale, 1.0, 1.0]
+    return Motion(problem, pairs.scaled(scale), coherence, rows, slopes, path, scale)
 
 
 def alike_pairs(problem: MotionProblem, table: CorrelationTable) -> IntArray:
@@ -305,13 +207,46 @@ def alike_pairs(problem: MotionProblem, table: CorrelationTable) -> IntArray:
     return np.flatnonzero(alike)
 
 
+def _signed_planes(
+    problem: MotionProblem,
+    table: CorrelationTable,
+    sound: BoolArray,
+    path: FloatArray,
+    coherence: Coherence | None,
+) -> PairPlanes:
+    """Planes of the pairs near enough on a path, with the signs of the likeliest path through them."""
+    rows = _near_pairs(problem, table, path[:, 0], sound)
+    first, second = table.first[rows], table.second[rows]
+    models = None if coherence is None else coherence.models(first)
+    planes, determined = pair_planes(problem, table, rows, models, np.abs(path[second, 0] - path[first, 0]))
+    planes = planes[determined]
+    if not len(planes):
+        raise InsufficientDataError(
+            f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
+            f"{table.correlation.shape[1]} patches: is the image wide enough, and do the curves fit it?"
+        )
+    error = PLAIN_ERROR if coherence is None else ADAPTED_ERROR
+    apart = strangers(problem, table.where(sound))
+    return on_path(planes, likeliest_path(planes, problem.frames, error, apart))
+
+
+def strangers(problem: MotionProblem, table: CorrelationTable) -> Strangers:
+    """Frames that were compared and do not resemble each other, and how far apart they are.
+
+    Speckle at half the distance at which it keeps `least_correlation` would keep two thirds of it: no
+    error of curves makes the one look like the other, and what stays of echoes only adds to it.
+    """
+    least = problem.trajectory.least_correlation
+    far = table.median < least
+    return Strangers(table.first[far], table.second[far], float(problem.typical_distance(np.sqrt(least))) / 2)
+
+
 def _near_pairs(
     problem: MotionProblem, table: CorrelationTable, position_mm: FloatArray, sound: BoolArray
 ) -> IntArray:
     """Rows of pairs so near that fully developed speckle would keep enough correlation."""
     settings = problem.trajectory
-    distance = np.abs(position_mm[table.second] - position_mm[table.first])
-    left = problem.fitter.estimator.typical_correlation(distance)
+    left = problem.typical_correlation(np.abs(position_mm[table.second] - position_mm[table.first]))
     near = (left >= settings.clear_correlation) & sound
     # Frames without enough of them take those that tell less, and if need be one that tells little.
     pairs = np.bincount(table.second[near], minlength=problem.frames)
@@ -323,13 +258,62 @@ def _near_pairs(
     return np.flatnonzero(near)
 
 
-def strangers(problem: MotionProblem, table: CorrelationTable, sound: BoolArray) -> Strangers:
-    """Frames that were compared and do not resemble each other, and how far apart they are.
+def _path_of(
+    problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes, slopes: SlopeWeights
+) -> FloatArray:
+    """Position and slopes of every frame on the trajectory of some pairs, shape (n, 3)."""
+    edges = edges_of(table, slopes.applied(pairs))
+    solved = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory.huber)
+    return elevation_of(solved.poses, problem.centre_mm)
 
-    Speckle at half the distance at which it keeps `least_correlation` would keep two thirds of it: no
-    error of curves makes the one look like the other, and what stays of echoes only adds to it.
+
+def elevation_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+    """Elevational position of the image's centre, mm, and slopes along x and y, shape (n, 3)."""
+    return np.column_stack([poses.apply(centre_mm)[:, 2], poses.rotation.as_matrix()[:, 2, :2]])
+
+
+def consistent_poses(
+    solution: ImageMotion, sensed: Rotation | None, direction: int
+) -> tuple[RigidTransform | None, BoolArray]:
+    """Poses from the orientation-consistent patches (None without a sensor), and each pair's patches used.
+
+    Parameters
+    ----------
+    sensed : Rotation, length n, or None
+        Orientation of every frame.
+    direction : int
+        Sign of the elevational motion.
     """
-    least = problem.trajectory.least_correlation
-    far = (table.median < least) & sound
-    half = 0.5 * float(problem.fitter.estimator.typical_distance(np.sqrt(least)))
-    return Strangers(table.first[far], table.second[far], half)
+    motion = solution.motion
+    if sensed is None:
+        return None, motion.pairs.used
+    models = None if motion.coherence is None else motion.coherence.models(motion.pairs.first)
+    planes = consistent_planes(
+        motion.problem, motion.pairs, solution.table, models, motion.scale, sensed, direction
+    )
+    problem, edges = motion.problem, edges_of(solution.table, planes)
+    solved = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory.huber)
+    return solved.poses, planes.used
+
+
+def frame_pairs(solution: ImageMotion, used: BoolArray, direction: int) -> Iterator[FramePairs]:
+    """Yield the pairs for the reconstruction file, some at a time; deviations include that of the scale."""
+    motion, edges = solution.motion, solution.edges
+    pairs, problem = motion.pairs, motion.problem
+    centre = RigidTransform.from_translation(problem.centre_mm)
+    flip, turn = np.diag([1.0, 1.0, direction, 1.0]), MIRROR if direction < 0 else np.eye(6)
+    for start in range(0, max(len(pairs), 1), PAIRS_AT_ONCE):
+        some = slice(start, start + PAIRS_AT_ONCE)
+        models = None if motion.coherence is None else motion.coherence.models(pairs.first[some])
+        correlation = solution.table.correlation[pairs.row[some]]
+        distance, sigma = (motion.scale * v for v in patch_distances(problem, correlation, models))
+        yield FramePairs(
+            first=edges.first[some],
+            second=edges.second[some],
+            first_from_second=flip @ (centre * edges.poses[some] * centre.inv()).as_matrix() @ flip,
+            covariance=turn @ edges.covariance[some] @ turn,
+            distance_mm=distance.astype(np.float32),
+            sigma_mm=np.hypot(sigma, solution.length_sigma * distance).astype(np.float32),
+            used=used[some],
+            patch_centre_mm=problem.patches.centre_mm,
+        )

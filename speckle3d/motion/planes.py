@@ -3,7 +3,7 @@
 z(x, y) = a + b (x - xc) + c (y - yc) for points of the second frame, about the image's centre, where
 b = R31 and c = R32 of the relative rotation. The plane is fitted to the correlations themselves, whose errors
 are nearly Gaussian, and not to distances, which are skewed where speckle has all but gone and missing
-where it has. Correlations know no sign; the plane returned has a >= 0, and the trajectory settles its sign.
+where it has. Correlations know no sign; planes as fitted have a >= 0, and the path settles their signs.
 
 Tilt is nearly invisible to decorrelation: a focused beam's wavefront is curved about the focus, so that
 turning moves the speckle of all depths alike, and patches see a + c (y - yc - pivot) with a pivot that grows
@@ -12,21 +12,26 @@ with depth as y does. The fit keeps what is seen; `speckle3d.motion.uncertainty`
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from functools import cached_property
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.threads import in_parallel
-from speckle3d.kernels.plane_misfit import FitRules, Levers
+from speckle3d.kernels.plane_misfit import EchoModels, FitRules, Levers
 from speckle3d.kernels.planes import FittedPlanes, fit_planes
-from speckle3d.kernels.statistics import PatchCurves
-from speckle3d.motion.coherence import Coherence
-from speckle3d.motion.distances import DistanceEstimator, EchoModel, PatchDistances
+from speckle3d.kernels.statistics import INTERPOLATION, PatchCurves, correlation_variance
+from speckle3d.matching.patches import PatchGrid
+from speckle3d.matching.schedule import TrajectorySettings
+from speckle3d.matching.table import CorrelationTable
 
+LEAST_CORRELATION = 0.03
+"""A patch that correlates less than this holds no distance at all."""
+WELL_FALLEN = 0.1
+"""Correlation above which a curve's end is where it was no longer measured, not where it has levelled out."""
 CROSSING_EVIDENCE = 6.0
 """Gain in twice the log-likelihood (a BIC) for which frames are taken to cross inside the image."""
 OUTLYING = 9.0
@@ -43,8 +48,6 @@ LEAST_PATCHES = 6
 NEAR_MM = 0.15
 """Least distance at which fits start: correlation is flat at zero, and a fit from there takes distance for
 tilt."""
-PAIRS_AT_ONCE = 2048
-"""Pairs that are fitted at once: what a fit needs of a long sweep's pairs is larger than its results."""
 GRAIN = 32
 """Pairs that are worth another thread's while."""
 
@@ -73,54 +76,100 @@ class PlaneSettings(BaseModel):
 
 
 @dataclass(frozen=True)
-class PairPlanes:
-    """Planes of frame pairs.
+class MotionProblem:
+    """What the correlations of one sweep are read with.
 
     Attributes
     ----------
+    curves : DecorrelationCurves
+    patches : PatchGrid
+    centre_mm : ndarray, shape (3,)
+        The image's centre.
+    frames : int
+        Of the sweep.
+    planes : PlaneSettings
+    trajectory : TrajectorySettings
+    adapt : bool
+        Whether structure and noise are adapted to.
+    """
+
+    curves: DecorrelationCurves
+    patches: PatchGrid
+    centre_mm: FloatArray
+    frames: int
+    planes: PlaneSettings
+    trajectory: TrajectorySettings
+    adapt: bool = True
+
+    @cached_property
+    def at_patches(self) -> PatchCurves:
+        """Fully developed curves at the patches."""
+        at = self.curves.at(self.patches.centre_mm[:, 1])
+        amplitude = np.ascontiguousarray(np.sqrt(at.correlation))
+        of_echo = self.curves.key.correlation_of == "echo"
+        return PatchCurves(amplitude, float(self.curves.distance_mm[1]), at.cells, of_echo)
+
+    @cached_property
+    def levers(self) -> Levers:
+        """What slopes are multiplied by at each patch."""
+        tilt, (x, y) = self.curves.tilt, (self.patches.centre_mm - self.centre_mm[:2]).T
+        if tilt is None:
+            # Unknown, it is taken to turn about the focus, and the focus to be at the image's centre: all
+            # depths then see the centre's distance.
+            return Levers(np.ascontiguousarray(x), np.zeros(x.size), np.zeros(x.size))
+        at = tilt.at(self.patches.centre_mm[:, 1], self.curves.depth_mm)
+        return Levers(np.ascontiguousarray(x), y - at.pivot_mm, np.ascontiguousarray(at.spread_mm))
+
+    @cached_property
+    def end_amplitude(self) -> FloatArray:
+        """Amplitude at each patch's last distance, beyond which nothing is read; 0 if it has levelled out."""
+        end = self.at_patches.amplitude[:, -1]
+        return np.where(end**2 > WELL_FALLEN, end, 0.0)
+
+    def typical_distance(self, amplitude: FloatArray | float) -> FloatArray:
+        """Distance at which the median patch's fully developed speckle keeps an amplitude, mm."""
+        typical = np.median(self.at_patches.amplitude, axis=0)
+        return np.asarray(np.interp(-np.asarray(amplitude), -typical, self.curves.distance_mm))
+
+    def typical_correlation(self, distance_mm: FloatArray) -> FloatArray:
+        """Median over the patches of fully developed speckle's correlation; 0 where it was not measured."""
+        rho = self.at_patches.amplitude**2
+        beyond = float(np.median(np.where(self.end_amplitude > 0, 0.0, rho[:, -1])))
+        grid = self.curves.distance_mm
+        return np.asarray(np.interp(distance_mm, grid, np.median(rho, axis=0), right=beyond))
+
+
+@dataclass(frozen=True)
+class PairPlanes:
+    """Frame pairs, and the plane of each one's second frame seen from the first.
+
+    Attributes
+    ----------
+    row : ndarray of int, shape (e,)
+        Of each pair in its `CorrelationTable`.
+    first, second : ndarray of int, shape (e,)
+        Its frames.
     coefficients : ndarray, shape (e, 3)
         a, b and c.
     covariance : ndarray, shape (e, 3, 3)
         Of (a, b, c).
     used : ndarray of bool, shape (e, p)
         Patches that took part.
-    excess_mm, sigma_mm : ndarray of float32, shape (e, p)
-        How much farther each patch is than the plane has it, and the standard deviation of that, both to
-        first order in the correlation; NaN for patches that took no part.
-    determined : ndarray of bool, shape (e,)
-        Pairs whose patches determine a plane; the others' mean nothing.
     """
 
+    row: IntArray
+    first: IntArray
+    second: IntArray
     coefficients: FloatArray
     covariance: FloatArray
     used: BoolArray
-    excess_mm: Float32Array
-    sigma_mm: Float32Array
-    determined: BoolArray
 
     def __len__(self) -> int:
-        return len(self.coefficients)
+        return int(self.row.size)
 
-    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> PairPlanes:
-        """Planes of some of the pairs."""
-        return PairPlanes(*(getattr(self, each.name)[pairs] for each in fields(self)))
-
-    @classmethod
-    def none(cls, patches: int) -> PairPlanes:
-        """Planes of no pair."""
-        empty = np.zeros((0, patches), dtype=np.float32)
-        return cls(
-            np.zeros((0, 3)), np.zeros((0, 3, 3)), empty.astype(bool), empty, empty, np.zeros(0, dtype=bool)
-        )
-
-    @classmethod
-    def concatenate(cls, planes: Sequence[PairPlanes]) -> PairPlanes:
-        """Return the planes of several sets of pairs, one after the other."""
-        return cls(*(np.concatenate([getattr(p, each.name) for p in planes]) for each in fields(cls)))
-
-    def followed_by(self, others: PairPlanes) -> PairPlanes:
-        """Return these planes and others."""
-        return PairPlanes.concatenate([self, others])
+    def __getitem__(self, pairs: IntArray | BoolArray) -> PairPlanes:
+        """Some of the pairs."""
+        return PairPlanes(*(getattr(self, field.name)[pairs] for field in fields(self)))
 
     @property
     def offset_mm(self) -> FloatArray:
@@ -129,219 +178,149 @@ class PairPlanes:
 
     def scaled(self, factor: float) -> PairPlanes:
         """Return the same planes with all distances multiplied by a factor."""
-        return replace(
-            self,
-            coefficients=self.coefficients * factor,
-            covariance=self.covariance * factor**2,
-            excess_mm=self.excess_mm * np.float32(factor),
-            sigma_mm=self.sigma_mm * np.float32(factor),
+        return replace(self, coefficients=self.coefficients * factor, covariance=self.covariance * factor**2)
+
+    def signed(self, sign: FloatArray) -> PairPlanes:
+        """Return the planes on the sides of their first frames that signs of shape (e,) say."""
+        return replace(self, coefficients=self.coefficients * sign[:, None])
+
+
+def fully_developed(patches: int) -> EchoModels:
+    """Model of a phantom's speckle, for all pairs."""
+    return EchoModels(np.zeros((1, patches)), np.ones((1, patches)))
+
+
+def pair_planes(
+    problem: MotionProblem,
+    table: CorrelationTable,
+    rows: IntArray,
+    models: EchoModels | None = None,
+    start_mm: FloatArray | None = None,
+    subset: BoolArray | None = None,
+    slopes: FloatArray | None = None,
+    either_side: BoolArray | None = None,
+) -> tuple[PairPlanes, BoolArray]:
+    """Fit planes to the correlations of frame pairs by robust maximum likelihood, pair by pair.
+
+    Parameters
+    ----------
+    rows : ndarray of int, shape (e,)
+        Of the table.
+    models : EchoModels, optional
+        How echoes depart from fully developed speckle; a phantom's, if not given.
+    start_mm : ndarray, shape (e,), optional
+        About how far apart the frames are; by default by the pair's median correlation.
+    subset : ndarray of bool, shape (e, p), optional
+        Patches allowed to take part.
+    slopes : ndarray, shape (e, 2), optional
+        b and c as a sensor has them. The planes' signs are then theirs, and a may be negative.
+    either_side : ndarray of bool, shape (e,), optional
+        Whether a plane of known slopes may have a < 0; all may, if not given.
+
+    Returns
+    -------
+    PairPlanes
+    ndarray of bool, shape (e,)
+        Pairs whose patches determine a plane: not if fewer than six can take part, or if the image's centre
+        comes to lie farther away than the curves were measured, or might.
+    """
+    correlation = table.correlation[rows]
+    echo = models or fully_developed(correlation.shape[1])
+    used = _measured(problem, correlation, echo)
+    used = used if subset is None else used & subset
+    used &= (used.sum(axis=1) >= LEAST_PATCHES)[:, None]
+    if start_mm is None:
+        share = echo.share.mean(axis=1)
+        left = (np.sqrt(np.maximum(table.median[rows], 0.0)) - share) / np.maximum(1.0 - share, 0.1)
+        start_mm = problem.typical_distance(left)
+    sensed = slopes is not None
+    told = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
+    side = np.ones(rows.size, dtype=bool) if either_side is None else either_side
+    settings, start = problem.planes, np.maximum(start_mm, NEAR_MM)
+    slope_sd = SENSED_SLOPE if sensed else LOOSE_SLOPE
+    rules = FitRules(
+        sensed, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, WELL_FITTED, ROUNDS
+    )
+    lost = _lost(problem, table.inplane[rows, :2])
+    fitted = FittedPlanes(
+        np.full((rows.size, 3), np.nan), np.tile(np.eye(3), (rows.size, 1, 1)), np.zeros(rows.size)
+    )
+
+    def work(first: int, stop: int) -> None:
+        some = slice(first, stop)
+        fit_planes(
+            correlation[some],
+            used[some],
+            lost[some],
+            echo if len(echo.share) == 1 else EchoModels(echo.share[some], echo.gain[some]),
+            problem.levers,
+            problem.at_patches,
+            start[some],
+            told[some],
+            side[some],
+            rules,
+            FittedPlanes(*(array[some] for array in fitted)),
         )
 
-    def where(self, mask: BoolArray, others: PairPlanes) -> PairPlanes:
-        """These planes where the mask of pairs says so, and those of `others` elsewhere."""
-        chosen = []
-        for each in fields(self):
-            mine, theirs = getattr(self, each.name), getattr(others, each.name)
-            chosen.append(np.where(mask.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs))
-        return PairPlanes(*chosen)
+    in_parallel(work, rows.size, GRAIN)
+    coefficients, information, cost = fitted
+    scatter = np.maximum(1.0, cost / np.maximum(used.sum(axis=1) - 3, 1))
+    covariance = np.linalg.inv(information) * scatter[:, None, None]
+    covariance[:, 0, 0] += settings.bias_mm**2
+    # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
+    reach = float(problem.curves.distance_mm[-1])
+    determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
+    if not sensed:
+        coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
+    planes = PairPlanes(rows, table.first[rows], table.second[rows], coefficients, covariance, used)
+    return planes, determined
 
 
-class _Problem(NamedTuple):
-    """Some pairs' correlations, the models they are read with, patches that take part, and starts."""
-
-    correlation: Float32Array
-    model: EchoModel
-    used: BoolArray
-    middle_mm: FloatArray
+def _measured(problem: MotionProblem, correlation: Float32Array, echo: EchoModels) -> BoolArray:
+    """Patches that correlate more than at their curve's last distance."""
+    end = problem.end_amplitude
+    least = echo.gain * (echo.share + (1 - echo.share) * end) ** 2
+    return np.isfinite(correlation) & ((end == 0.0) | (correlation > least))
 
 
-class PlaneFitter:
-    """Fits planes to the correlations of a sweep's frame pairs."""
+def _lost(problem: MotionProblem, moved_mm: FloatArray) -> FloatArray:
+    """What in-plane motion takes from the patches' lateral positions and levers, shape (e, 2)."""
+    return np.ascontiguousarray(moved_mm * [1.0, float(problem.curves.tilt is not None)])
 
-    def __init__(
-        self, estimator: DistanceEstimator, at_mm: FloatArray, settings: PlaneSettings | None = None
-    ) -> None:
-        self.estimator = estimator
-        self.settings = settings or PlaneSettings()
-        self._curves = PatchCurves(estimator.amplitude, estimator.step_mm, estimator.cells, estimator.of_echo)
-        zero = np.zeros(len(at_mm))
-        tilt = estimator.tilt
-        # Where the curves know nothing of tilt, it is taken to turn about the focus, and the focus to be at
-        # the image's centre: all depths then see the centre's distance.
-        self.levers = Levers(
-            np.ascontiguousarray(at_mm[:, 0]),
-            zero if tilt is None else at_mm[:, 1] - tilt.pivot_mm,
-            zero if tilt is None else np.ascontiguousarray(tilt.spread_mm),
-        )
-        self._has_lever = tilt is not None
 
-    def distances(
-        self, correlation: Float32Array, coherence: Coherence | None, frame: IntArray
-    ) -> PatchDistances:
-        """Distances of the patches of some pairs, whose coherence is taken at a frame each."""
-        model = None if coherence is None else coherence.models(frame)
-        return self.estimator.distances(correlation.astype(float), model)
+def raised(problem: MotionProblem, moved_mm: FloatArray, slopes: FloatArray) -> FloatArray:
+    """How much farther patches are than the image's centre on planes of some slopes, shape (e, p).
 
-    def design(self) -> FloatArray:
-        """What a, b and c are multiplied by for each patch, without in-plane motion, shape (p, 3)."""
-        lateral, lever, _ = self.levers
-        return np.column_stack([np.ones(len(lateral)), lateral, lever])
+    Parameters
+    ----------
+    moved_mm : ndarray, shape (e, 2)
+        In-plane displacement of the second frame.
+    slopes : ndarray, shape (e, 2)
+        b and c.
+    """
+    lost = (slopes * _lost(problem, moved_mm)).sum(axis=1, keepdims=True)
+    return np.asarray(slopes @ np.stack([problem.levers.lateral_mm, problem.levers.lever_mm]) - lost)
 
-    def raised(self, moved_mm: FloatArray, slopes: FloatArray) -> FloatArray:
-        """How much farther patches are than the image's centre on planes of some slopes, shape (e, p).
 
-        Parameters
-        ----------
-        moved_mm : ndarray, shape (e, 2)
-            In-plane displacement of the second frame.
-        slopes : ndarray, shape (e, 2)
-            b and c.
-        """
-        lost = (slopes * self._lost(moved_mm)).sum(axis=1, keepdims=True)
-        return np.asarray(slopes @ self.design()[:, 1:].T - lost)
+def patch_distances(
+    problem: MotionProblem, correlation: Float32Array, models: EchoModels | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Unsigned elevational distance of each patch of each pair and its standard deviation, shape (e, p), mm.
 
-    def _lost(self, moved_mm: FloatArray) -> FloatArray:
-        """What in-plane motion takes from the patches' lateral positions and levers, shape (e, 2)."""
-        return np.ascontiguousarray(moved_mm * np.array([1.0, float(self._has_lever)]))
-
-    def fit(
-        self,
-        correlation: Float32Array,
-        moved_mm: FloatArray,
-        coherence: Coherence | None = None,
-        frame: IntArray | None = None,
-        subset: BoolArray | None = None,
-        slopes: FloatArray | None = None,
-        start_mm: FloatArray | None = None,
-        either_side: BoolArray | None = None,
-    ) -> PairPlanes:
-        """Robust maximum likelihood, pair by pair.
-
-        A pair determines no plane if fewer than six patches can take part, or if the image's centre comes to
-        lie farther away than the curves were measured, or might.
-
-        Parameters
-        ----------
-        correlation : ndarray of float32, shape (e, p)
-        moved_mm : ndarray, shape (e, 2)
-            In-plane displacement of the second frame.
-        coherence : Coherence, optional
-            With which the correlations are read; a phantom's, if not given.
-        frame : ndarray of int, shape (e,), optional
-            At which the coherence of each pair is taken.
-        subset : ndarray of bool, shape (e, p), optional
-            Patches allowed to take part.
-        slopes : ndarray, shape (e, 2), optional
-            b and c as a sensor has them. The planes' signs are then theirs, and a may be negative.
-        start_mm : ndarray, shape (e,), optional
-            About how far apart the frames are, if it is known.
-        either_side : ndarray of bool, shape (e,), optional
-            Whether a plane of known slopes may have a < 0; all may, if not given.
-        """
-        pairs = len(correlation)
-        told = np.zeros((pairs, 2)) if slopes is None else np.ascontiguousarray(slopes)
-        side = np.ones(pairs, dtype=bool) if either_side is None else either_side
-        rules, fitted = self._rules(slopes is not None), []
-        for first in range(0, max(pairs, 1), PAIRS_AT_ONCE):
-            some = slice(first, first + PAIRS_AT_ONCE)
-            problem = self._problem(
-                correlation[some],
-                None if coherence is None or frame is None else coherence.models(frame[some]),
-                None if subset is None else subset[some],
-                None if start_mm is None else start_mm[some],
-            )
-            fitted.append(self._fit_some(problem, self._lost(moved_mm[some]), told[some], side[some], rules))
-        return PairPlanes.concatenate(fitted)
-
-    def _problem(
-        self,
-        correlation: Float32Array,
-        model: EchoModel | None,
-        subset: BoolArray | None,
-        start_mm: FloatArray | None,
-    ) -> _Problem:
-        """Which patches take part, and about how far apart frames are."""
-        model = model or EchoModel.fully_developed(correlation.shape[1])
-        used = np.isfinite(correlation) & self._measured(correlation, model)
-        used = used if subset is None else used & subset
-        used &= (used.sum(axis=1) >= LEAST_PATCHES)[:, None]
-        middle = self._middle(correlation, used, model) if start_mm is None else np.maximum(start_mm, NEAR_MM)
-        return _Problem(correlation, model, used, middle)
-
-    def _fit_some(
-        self, problem: _Problem, lost: FloatArray, told: FloatArray, side: BoolArray, rules: FitRules
-    ) -> PairPlanes:
-        pairs, patches = problem.correlation.shape
-        fitted = FittedPlanes(
-            np.full((pairs, 3), np.nan),
-            np.tile(np.eye(3), (pairs, 1, 1)),
-            np.zeros(pairs),
-            np.full((pairs, patches), np.nan),
-            np.full((pairs, patches), np.nan),
-        )
-
-        def work(first: int, stop: int) -> None:
-            some = slice(first, stop)
-            fit_planes(
-                problem.correlation[some],
-                problem.used[some],
-                lost[some],
-                problem.model[some].for_kernels(),
-                self.levers,
-                self._curves,
-                problem.middle_mm[some],
-                told[some],
-                side[some],
-                rules,
-                FittedPlanes(*(array[some] for array in fitted)),
-            )
-
-        in_parallel(work, pairs, GRAIN)
-        return self._concluded(fitted, problem.used, turned=not rules.sensed)
-
-    def _rules(self, sensed: bool) -> FitRules:
-        return FitRules(
-            sensed,
-            SENSED_SLOPE if sensed else LOOSE_SLOPE,
-            LOOSE_SLOPE,
-            self.settings.huber,
-            OUTLYING,
-            CROSSING_EVIDENCE,
-            WELL_FITTED,
-            ROUNDS,
-        )
-
-    def _concluded(self, fitted: FittedPlanes, used: BoolArray, turned: bool) -> PairPlanes:
-        """Planes with their covariances; those with a < 0 turned over if `turned`."""
-        coefficients, information, cost, *residuals = fitted
-        patches = used.sum(axis=1)
-        scatter = np.maximum(1.0, cost / np.maximum(patches - 3, 1))
-        covariance = np.linalg.inv(information) * scatter[:, None, None]
-        covariance[:, 0, 0] += self.settings.bias_mm**2
-        # Where next to nothing of the echo is left, any distance fits as well: tens of metres have been seen.
-        reach = self.estimator.reach_mm
-        determined = (np.abs(coefficients[:, 0]) <= reach) & (covariance[:, 0, 0] <= reach**2)
-        if turned:
-            coefficients *= np.where(coefficients[:, :1] < 0, -1.0, 1.0)
-        excess, sigma = (each.astype(np.float32) for each in residuals)
-        return PairPlanes(coefficients, covariance, used, excess, sigma, determined)
-
-    def _measured(self, correlation: Float32Array, model: EchoModel) -> BoolArray:
-        """Patches that correlate more than at their curve's last distance."""
-        end = self.estimator.end_amplitude
-        if not end.any():
-            return np.ones(correlation.shape, dtype=bool)
-        least = model.gain * (model.share + (1 - model.share) * end) ** 2
-        return np.asarray((end == 0.0) | (correlation > least))
-
-    def _middle(self, correlation: Float32Array, used: BoolArray, model: EchoModel) -> FloatArray:
-        """About how far apart frames are, by the median of their patches' correlations, shape (e,)."""
-        known = np.sort(np.where(used, correlation, np.inf), axis=1)
-        count = np.maximum(used.sum(axis=1), 1)
-        pair = np.arange(len(known))
-        median = (known[pair, (count - 1) // 2].astype(float) + known[pair, count // 2]) / 2
-        share = model.share.mean(axis=1)
-        left = (np.sqrt(np.maximum(np.where(np.isfinite(median), median, 0.0), 0.0)) - share) / np.maximum(
-            1.0 - share, 0.1
-        )
-        return self.estimator.typical_distance(left)
+    NaN where a patch holds no distance. The deviation is the correlation's over the curve's slope; near zero,
+    where the slope vanishes, it is the squared distance whose deviation stays finite.
+    """
+    curves, grid = problem.at_patches, problem.curves.distance_mm
+    share, gain = models or fully_developed(correlation.shape[1])
+    amplitude = (np.sqrt(np.maximum(correlation, 0.0) / gain) - share) / (1.0 - share)
+    least = np.sqrt(np.maximum(LEAST_CORRELATION, curves.amplitude[:, -1] ** 2))
+    amplitude = np.where(amplitude > least, amplitude, np.nan)
+    distance, slope = np.empty(correlation.shape), np.empty(correlation.shape)
+    for patch, row in enumerate(curves.amplitude):
+        distance[:, patch] = np.interp(-amplitude[:, patch], -row, grid)
+        slope[:, patch] = np.interp(distance[:, patch], grid, -np.gradient(row, curves.step_mm))
+    echo = share + (1.0 - share) * amplitude
+    noise = correlation_variance(np.minimum(gain * echo**2, 0.999), curves.cells, curves.of_echo)
+    by_distance = 2.0 * gain * echo * (1.0 - share) * slope
+    sigma = np.sqrt(noise + INTERPOLATION**2) / np.maximum(by_distance, 1e-9)
+    return distance, np.minimum(sigma, np.sqrt(2.0 * np.maximum(distance, 1e-3) * sigma))

@@ -7,15 +7,16 @@ are followed until the frames that come later tell them apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.signs import PathRules, follow_paths
 from speckle3d.motion.planes import PairPlanes
 
 HYPOTHESES = 8
+"""Paths that are followed; 4 move lengths by at most 0.06 %."""
 PLAIN_ERROR, ADAPTED_ERROR = 0.25, 0.1
 """Relative error of distances by a phantom's curves and with coherence adapted to. Coherent tissue makes long
 distances too short, so that a misfit of a quarter is no sign of turning back."""
@@ -34,70 +35,9 @@ APART_SLOPE = 0.01
 APART_COST = 4.0
 """Squared deviations for a frame placed where it would resemble one that it does not resemble: less than
 `CAP`, because tissue that moved or a lost contact do that, too."""
-OPEN_FRAMES = 400
-"""Paths may differ over this many frames, some twenty millimetres; before, the best one so far stands."""
 
 
-@dataclass(frozen=True)
-class SignedPairs:
-    """Planes of frame pairs, and on which side of the first frame they lie.
-
-    Attributes
-    ----------
-    row : ndarray of int, shape (e,)
-        Of each pair in its `CorrelationTable`.
-    first, second : ndarray of int, shape (e,)
-        Its frames.
-    planes : PairPlanes
-    sign : ndarray, shape (e,)
-        +1 or -1.
-    """
-
-    row: IntArray
-    first: IntArray
-    second: IntArray
-    planes: PairPlanes
-    sign: FloatArray
-
-    def __len__(self) -> int:
-        return int(self.row.size)
-
-    def __getitem__(self, pairs: IntArray | BoolArray | slice) -> SignedPairs:
-        """Return some of the pairs."""
-        return SignedPairs(
-            self.row[pairs],
-            self.first[pairs],
-            self.second[pairs],
-            self.planes[pairs],
-            self.sign[pairs],
-        )
-
-    @property
-    def signless(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """Frames, offset and slope along x of the planes, and their covariance, for `settled_path`."""
-        moved, covariance = self.planes.coefficients[:, :2], self.planes.covariance[:, :2, :2]
-        return self.first, self.second, moved, covariance
-
-    def with_signs(self, sign: FloatArray) -> SignedPairs:
-        """Return the same planes on other sides."""
-        return replace(self, sign=sign)
-
-    def and_also(self, others: SignedPairs) -> SignedPairs:
-        """Return these pairs and others, in the order of their second and then their first frames."""
-        if not len(others):
-            return self
-        every = SignedPairs(
-            np.concatenate([self.row, others.row]),
-            np.concatenate([self.first, others.first]),
-            np.concatenate([self.second, others.second]),
-            self.planes.followed_by(others.planes),
-            np.concatenate([self.sign, others.sign]),
-        )
-        return every[np.lexsort((every.first, every.second))]
-
-
-@dataclass(frozen=True)
-class Strangers:
+class Strangers(NamedTuple):
     """Pairs of frames that do not resemble each other, and so are not near each other.
 
     Attributes
@@ -113,36 +53,27 @@ class Strangers:
     apart_mm: float
 
 
-def settled_path(
+def likeliest_path(
+    planes: PairPlanes,
     frames: int,
-    first: IntArray,
-    second: IntArray,
-    moved: FloatArray,
-    covariance: FloatArray,
-    relative_error: float = PLAIN_ERROR,
-    strangers: Strangers | None = None,
-    hold: bool = False,
+    relative_error: float,
+    strangers: Strangers,
     known: FloatArray | None = None,
 ) -> FloatArray:
     """Follow the most likely paths: elevational position and slope along x of one frame after the other.
 
     A frame is placed by its planes against earlier frames, of which the latest settles the direction. The
-    sweep's first motion counts as positive.
+    sweep's first motion counts as positive. Frames that no pair places stay where the one before them is.
 
     Parameters
     ----------
+    planes : PairPlanes
+        Sorted by the second frame.
     frames : int
         Of the sweep.
-    first, second : ndarray of int, shape (e,)
-        Frames of each pair, sorted by the second.
-    moved : ndarray, shape (e, 2)
-        Offset and slope along x of each pair's plane, whose signs belong together.
-    covariance : ndarray, shape (e, 2, 2)
     relative_error : float
         Of offsets and slopes, besides their covariance: `PLAIN_ERROR` or `ADAPTED_ERROR`.
-    strangers : Strangers, optional
-    hold : bool
-        Leave frames that no pair places where the one before them is; else they stay at zero.
+    strangers : Strangers
     known : ndarray, shape (m, 2), optional
         Position and slope of the first m frames, which stay.
 
@@ -151,8 +82,6 @@ def settled_path(
     ndarray, shape (n, 2)
         Position and slope of every frame on the best path.
     """
-    none = np.zeros(0, dtype=np.int64)
-    apart = strangers or Strangers(none, none, 0.0)
     rules = PathRules(
         HYPOTHESES,
         relative_error,
@@ -162,56 +91,32 @@ def settled_path(
         TREND_MM,
         SAME_MM,
         SAME_SLOPE,
-        apart.apart_mm,
+        strangers.apart_mm,
         APART_SLOPE,
         APART_COST,
-        OPEN_FRAMES,
-        hold,
     )
-    every = np.arange(frames + 1)
-    path = np.zeros((frames, 2))
-    begun, trend = 1, 1.0
-    if known is not None and len(known) > 1:
-        begun, trend = len(known), _trend(known[:, 0])
-        path[:begun] = known
+    path, every = np.zeros((frames, 2)), np.arange(frames + 1)
+    if known is not None:
+        path[: len(known)] = known
     follow_paths(
-        np.searchsorted(second, every),
-        np.ascontiguousarray(first),
-        np.ascontiguousarray(moved),
-        np.ascontiguousarray(covariance),
-        np.searchsorted(apart.second, every),
-        np.ascontiguousarray(apart.first),
+        np.searchsorted(planes.second, every),
+        np.ascontiguousarray(planes.first),
+        np.ascontiguousarray(planes.coefficients[:, :2]),
+        np.ascontiguousarray(planes.covariance[:, :2, :2]),
+        np.searchsorted(strangers.second, every),
+        np.ascontiguousarray(strangers.first),
         rules,
         path,
-        begun,
-        trend,
+        1 if known is None else len(known),
     )
     return path
 
 
-def _trend(position_mm: FloatArray) -> float:
-    """Direction in which frames went at last, averaged over travel as `follow_paths` does."""
-    step = np.diff(position_mm)
-    left = np.cumsum(np.abs(step[::-1]))[::-1]
-    kept = np.exp(-np.append(left, 0.0) / TREND_MM)
-    return float(kept[0] + np.sum(np.sign(step) * (kept[1:] - kept[:-1])))
-
-
-def pair_signs(
-    path: FloatArray, first: IntArray, second: IntArray, moved: FloatArray, covariance: FloatArray
-) -> FloatArray:
-    """Sign of each pair's plane with which it agrees best with a path; shape (e,).
-
-    Parameters
-    ----------
-    path : ndarray, shape (n, 2)
-    first, second : ndarray of int, shape (e,)
-    moved : ndarray, shape (e, 2)
-        As for `settled_path`.
-    covariance : ndarray, shape (e, 2, 2)
-    """
-    relative, weight = path[second] - path[first], np.linalg.inv(covariance)
+def on_path(planes: PairPlanes, path: FloatArray) -> PairPlanes:
+    """Planes on the sides of their first frames that agree best with a path of shape (n, 2)."""
+    relative, moved = path[planes.second] - path[planes.first], planes.coefficients[:, :2]
+    weight = np.linalg.inv(planes.covariance[:, :2, :2])
     plus, minus = (
         np.einsum("ei,eij,ej->e", off, weight, off) for off in (relative - moved, relative + moved)
     )
-    return np.where(plus <= minus, 1.0, -1.0)
+    return planes.signed(np.where(plus <= minus, 1.0, -1.0))

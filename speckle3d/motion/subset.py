@@ -8,52 +8,63 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.threads import in_parallel
-from speckle3d.kernels.planes import agreeing_patches
+from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.distances import PatchDistances
-from speckle3d.motion.estimate import Motion
-from speckle3d.motion.planes import GRAIN, PAIRS_AT_ONCE, PairPlanes
+from speckle3d.motion.planes import MotionProblem, PairPlanes, pair_planes, patch_distances, raised
 
 
 def consistent_planes(
-    motion: Motion, table: CorrelationTable, sensed: Rotation, direction: int
+    problem: MotionProblem,
+    pairs: PairPlanes,
+    table: CorrelationTable,
+    models: EchoModels | None,
+    scale: float,
+    sensed: Rotation,
+    direction: int,
 ) -> PairPlanes:
     """Planes of the sensed orientation, through the patches that agree with it; their own if too few do.
 
     Parameters
     ----------
+    pairs : PairPlanes
+        From all patches, signed.
+    models : EchoModels or None
+        With which the pairs were read.
+    scale : float
+        Of all distances.
     sensed : Rotation, length n
         Orientation of every frame.
     direction : int
         Sign of the elevational motion, with which that of every pair is multiplied.
     """
-    pairs, fitter = motion.pairs, motion.problem.fitter
+    sign = np.where(pairs.offset_mm < 0, -1.0, 1.0)
     relative = (sensed[pairs.first].inv() * sensed[pairs.second]).as_matrix()[:, 2, :2]
-    moved, slopes = table.inplane[pairs.row, :2], direction * pairs.sign[:, None] * relative
-    offset, correlation = pairs.planes.offset_mm, table.correlation[pairs.row]
-    agreed = np.empty(correlation.shape, dtype=bool)
-    open_side = np.empty(len(pairs), dtype=bool)
-    for start in range(0, len(pairs), PAIRS_AT_ONCE):
-        some = slice(start, start + PAIRS_AT_ONCE)
-        raised = fitter.raised(moved[some], slopes[some])
-        # Only frames that cross, or nearly, leave the side open.
-        open_side[some] = offset[some] < np.ptp(raised, axis=1)
-        distances = fitter.distances(correlation[some], motion.coherence, pairs.first[some])
-        distances = distances.scaled(motion.scale)
-        agreed[some] = consistent_subset(distances, raised, fitter.settings.support_sigma, open_side[some])
-    planes = fitter.fit(correlation, moved, motion.coherence, pairs.first, agreed, slopes, offset, open_side)
+    moved, slopes = table.inplane[pairs.row, :2], direction * sign[:, None] * relative
+    farther, offset = raised(problem, moved, slopes), np.abs(pairs.offset_mm)
+    # Only frames that cross, or nearly, leave the side open.
+    open_side = offset < np.ptp(farther, axis=1)
+    distances = (scale * v for v in patch_distances(problem, table.correlation[pairs.row], models))
+    agreed = consistent_subset(*distances, farther, open_side, problem.planes.support_sigma)
+    planes, determined = pair_planes(problem, table, pairs.row, models, offset, agreed, slopes, open_side)
     # Slopes are the sensor's; distances have the scale of all patches.
-    scaled = planes.scaled(motion.scale)
-    planes = replace(scaled, coefficients=np.column_stack([scaled.offset_mm, planes.coefficients[:, 1:]]))
-    return planes.where(planes.determined, pairs.planes)
+    coefficients = planes.coefficients * [scale, 1.0, 1.0] * sign[:, None]
+    own = replace(planes, coefficients=coefficients, covariance=planes.covariance * scale**2)
+    return PairPlanes(
+        pairs.row,
+        pairs.first,
+        pairs.second,
+        np.where(determined[:, None], own.coefficients, pairs.coefficients),
+        np.where(determined[:, None, None], own.covariance, pairs.covariance),
+        np.where(determined[:, None], own.used, pairs.used),
+    )
 
 
 def consistent_subset(
-    distances: PatchDistances,
+    distance_mm: FloatArray,
+    sigma_mm: FloatArray,
     raised_mm: FloatArray,
+    either_side: BoolArray,
     support_sigma: float = 1.0,
-    either_side: BoolArray | None = None,
 ) -> BoolArray:
     """Patches of each pair whose distances agree on one plane of the orientation that the sensor measured.
 
@@ -62,13 +73,12 @@ def consistent_subset(
 
     Parameters
     ----------
-    distances : PatchDistances
-        Of shape (e, p).
+    distance_mm, sigma_mm : ndarray, shape (e, p)
+        NaN where a patch holds no distance.
     raised_mm : ndarray, shape (e, p)
         How much farther each patch is than the image's centre, by the sensor's relative rotation.
-    either_side : ndarray of bool, shape (e,), optional
-        Whether the image's centre may lie on the other side of the first frame than `raised_mm` has it; it
-        may in all pairs, if not given.
+    either_side : ndarray of bool, shape (e,)
+        Whether the image's centre may lie on the other side of the first frame than `raised_mm` has it.
 
     Returns
     -------
@@ -80,18 +90,14 @@ def consistent_subset(
        orientation measurements", figure 4.
     """
     support = np.zeros(raised_mm.shape, dtype=bool)
-    side = np.ones(len(support), dtype=bool) if either_side is None else either_side
-
-    def work(first: int, stop: int) -> None:
-        some = slice(first, stop)
-        agreeing_patches(
-            distances.distance_mm[some],
-            distances.sigma_mm[some],
-            raised_mm[some],
-            side[some],
-            support_sigma,
-            support[some],
-        )
-
-    in_parallel(work, len(support), GRAIN)
+    for pair, known in enumerate(np.isfinite(distance_mm)):
+        if not known.any():
+            continue
+        d, sigma, farther = (v[pair, known] for v in (distance_mm, sigma_mm, raised_mm))
+        offset = np.concatenate([d - farther, -d - farther] if either_side[pair] else [d - farther])
+        misfit = np.abs(np.abs(offset[:, None] + farther) - d) / sigma
+        agree = misfit <= support_sigma
+        # Among placements of equal support, the one whose supporters lie closest.
+        score = agree.sum(axis=1) - (misfit * agree).sum(axis=1) / (d.size * support_sigma + 1.0)
+        support[pair, known] = agree[score.argmax()]
     return support

@@ -3,96 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.sparse import bsr_array
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.geometry import rotation_from_fixed_angles
+from speckle3d.core.geometry import rotation_from_fixed_angles, skew
+from speckle3d.core.leastsquares import huber_weights
 from speckle3d.core.relative import RelativePoses
-from speckle3d.kernels.graph import PoseGraph, marginals, relax
-from speckle3d.matching.schedule import TrajectorySettings
+from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import PairPlanes
 
-SETTLED = 1e-7
+SETTLED = 1e-4
+"""Largest step, mm or rad, after which no further round is made."""
 ROUNDS = 6
 HELD_MM, HELD_RAD = 1.0, 0.05
 """How far a probe may go between two frames: 25 mm and 70 degrees in a second at 25 frames."""
+KNOWN_FRAMES = 40
+"""Frames whose covariance is computed; those of the others are interpolated."""
+INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
+"""Variances of in-plane motion (mm^2, mm^2, rad^2) that interpolation leaves, however many patches agree."""
 FIXED_VARIANCE = 1e-8
 """Of poses that stay, mm^2 and rad^2: far less than any pair's."""
-KNOWN_FRAMES = 80
-"""Frames whose covariance is computed; those of the others are interpolated."""
-
-
-def relative_poses_of(
-    first: IntArray,
-    second: IntArray,
-    inplane: FloatArray,
-    inplane_covariance: FloatArray,
-    planes: PairPlanes,
-    sign: FloatArray,
-) -> RelativePoses:
-    """Relative poses from in-plane motion and signed planes.
-
-    Parameters
-    ----------
-    first, second : ndarray of int, shape (e,)
-    inplane, inplane_covariance : ndarray, shape (e, 3) and (e, 3, 3)
-        As of `CorrelationTable`.
-    planes : PairPlanes
-    sign : ndarray, shape (e,)
-    """
-    a, b, c = (planes.coefficients * sign[:, None]).T
-    yaw = -np.arcsin(np.clip(b, -1, 1))
-    tilt = np.arcsin(np.clip(c / np.cos(yaw), -1, 1))
-    x, y, roll = inplane.T
-    rotation = rotation_from_fixed_angles(roll, yaw, tilt)
-    poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
-    covariance = np.zeros((len(planes), 6, 6))
-    covariance[:, [[0], [1], [5]], [0, 1, 5]] = inplane_covariance + np.diag(INPLANE_FLOOR)
-    # (a, b, c) is (z, -yaw, tilt) for small angles.
-    order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
-    covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T
-    return RelativePoses(first, second, poses, covariance)
-
-
-INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
-"""Variances of in-plane motion that interpolation leaves, however many patches agree."""
-
-
-def held(first: IntArray, second: IntArray) -> RelativePoses:
-    """Edges that say no more than that a probe does not jump: for frames that no pair joins to others."""
-    deviation = np.array([HELD_MM, HELD_MM, HELD_MM, HELD_RAD, HELD_RAD, HELD_RAD])
-    poses = RigidTransform.from_translation(np.zeros((first.size, 3)))
-    return RelativePoses(first, second, poses, np.tile(np.diag(deviation**2), (first.size, 1, 1)))
-
-
-def fixed(poses: RigidTransform, centre_mm: FloatArray) -> RelativePoses:
-    """Edges from the first of some frames to the others that hold them where they are.
-
-    Parameters
-    ----------
-    poses : RigidTransform, length n
-        ``world_from_image`` of frames 0 to n - 1.
-    centre_mm : ndarray, shape (3,)
-        The image's centre.
-    """
-    centre, others = RigidTransform.from_translation(centre_mm), np.arange(1, len(poses))
-    relative = centre.inv() * (poses[0].inv() * poses[others]) * centre
-    return RelativePoses(
-        np.zeros_like(others), others, relative, np.tile(FIXED_VARIANCE * np.eye(6), (others.size, 1, 1))
-    )
-
-
-def joined(*edges: RelativePoses) -> RelativePoses:
-    """All of several sets of edges, those without any left out."""
-    some = [e for e in edges if len(e)]
-    return RelativePoses(
-        np.concatenate([e.first for e in some]),
-        np.concatenate([e.second for e in some]),
-        RigidTransform.concatenate([e.poses for e in some]),
-        np.concatenate([e.covariance for e in some]),
-    )
+_TWIST = np.array([3, 4, 5, 0, 1, 2])
+"""(x, y, z, tilt, yaw, roll) among exponential coordinates, whose rotation comes first; and back."""
 
 
 @dataclass(frozen=True)
@@ -116,22 +53,92 @@ def solve_trajectory(
     pairs: RelativePoses,
     frames: int,
     centre_mm: FloatArray,
-    settings: TrajectorySettings | None = None,
+    huber: float = 2.0,
     with_covariance: bool = False,
 ) -> Trajectory:
     """Poses of all frames from all pairs: robust Gauss-Newton on the graph of relative poses.
 
     Frames that no pair joins to earlier ones lie between their neighbours.
+
+    Parameters
+    ----------
+    huber : float
+        Standard deviations at which a pair begins to lose weight.
     """
-    s = settings or TrajectorySettings()
     lone = np.flatnonzero(unjoined(pairs.second, frames))
     after = lone[lone + 1 < frames]
     pairs = joined(pairs, held(np.concatenate([lone - 1, after]), np.concatenate([lone, after + 1])))
-    graph, poses = _graph(pairs, frames), _chain(pairs, frames)
-    relax(graph, poses, s.huber, ROUNDS, SETTLED)
-    covariance = _marginals(graph, poses, s.huber) if with_covariance else np.zeros((frames, 6, 6))
+    poses, root = _chain(pairs, frames), np.linalg.cholesky(np.linalg.inv(pairs.covariance))
+    for _ in range(ROUNDS):
+        jacobian, left = _linearised(pairs, root, poses, huber)
+        step = np.zeros((frames, 6))
+        step[1:] = _factored(jacobian).solve(-jacobian.T @ left).reshape(-1, 6)
+        poses = poses * RigidTransform.from_exp_coords(step[:, _TWIST])
+        if np.abs(step).max() < SETTLED:
+            break
+    covariance = np.zeros((frames, 6, 6))
+    if with_covariance:
+        covariance = _marginals(_factored(_linearised(pairs, root, poses, huber)[0]), frames)
     centre = RigidTransform.from_translation(centre_mm)
-    return Trajectory(centre * RigidTransform.from_matrix(poses) * centre.inv(), covariance)
+    return Trajectory(centre * poses * centre.inv(), covariance)
+
+
+def _linearised(
+    pairs: RelativePoses, root: FloatArray, poses: RigidTransform, huber: float
+) -> tuple[Any, FloatArray]:
+    """Sparse Jacobian of the weighted misfits by twists of all frames but the first, and the misfits.
+
+    Parameters
+    ----------
+    root : ndarray, shape (e, 6, 6)
+        Lower triangular roots of the pairs' information.
+    """
+    relative = poses[pairs.first].inv() * poses[pairs.second]
+    turn = relative.rotation.inv().as_matrix()
+    carried = np.zeros((len(pairs), 6, 6))
+    carried[:, :3, :3] = carried[:, 3:, 3:] = turn
+    carried[:, :3, 3:] = -turn @ skew(relative.translation)
+    whiten = root.transpose(0, 2, 1)
+    error = (pairs.poses.inv() * relative).as_exp_coords()[:, _TWIST, None]
+    size = np.sqrt(((whiten @ error) ** 2).mean(axis=(1, 2)))
+    whiten = np.sqrt(huber_weights(size, huber))[:, None, None] * whiten
+    blocks = np.stack([-whiten @ carried, whiten], axis=1).reshape(-1, 6, 6)
+    columns = np.column_stack([pairs.first, pairs.second]).ravel()
+    shape = 6 * len(pairs), 6 * len(poses)
+    every = bsr_array((blocks, columns, np.arange(0, columns.size + 1, 2)), shape=shape)
+    return every.tocsc()[:, 6:], (whiten @ error).ravel()
+
+
+def _factored(jacobian: Any) -> Any:
+    """Factors of the normal equations."""
+    return splu((jacobian.T @ jacobian).tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
+
+
+def _marginals(normal: Any, frames: int) -> FloatArray:
+    """Covariance of each frame's pose, shape (n, 6, 6); those between known frames are interpolated."""
+    known = np.unique(np.linspace(1, frames - 1, min(frames - 1, KNOWN_FRAMES)).astype(np.int64))
+    blocks = [np.zeros((6, 6))]
+    for frame in known:
+        own = slice(6 * frame - 6, 6 * frame)
+        unit = np.zeros((6 * (frames - 1), 6))
+        unit[own] = np.eye(6)
+        blocks.append(normal.solve(unit)[own])
+    at = np.append(0, known)
+    columns = [np.interp(np.arange(frames), at, column) for column in np.reshape(blocks, (-1, 36)).T]
+    covariance = np.stack(columns, axis=1).reshape(frames, 6, 6)
+    return np.asarray(covariance + covariance.transpose(0, 2, 1)) / 2
+
+
+def _chain(pairs: RelativePoses, frames: int) -> RigidTransform:
+    """Each frame from the pair whose distance is most certain."""
+    best = np.zeros(frames, dtype=np.int64)
+    backwards = np.lexsort((pairs.covariance[:, 2, 2], pairs.second))[::-1]
+    best[pairs.second[backwards]] = backwards  # the last that is written stays
+    first, step = pairs.first[best].tolist(), pairs.poses.as_matrix()[best]
+    matrices = np.tile(np.eye(4), (frames, 1, 1))
+    for frame in range(1, frames):
+        matrices[frame] = matrices[first[frame]] @ step[frame]
+    return RigidTransform.from_matrix(matrices)
 
 
 def unjoined(second: IntArray, frames: int) -> BoolArray:
@@ -142,48 +149,53 @@ def unjoined(second: IntArray, frames: int) -> BoolArray:
     return lone
 
 
-def _chain(pairs: RelativePoses, frames: int) -> FloatArray:
-    """Each frame from the pair whose distance is most certain."""
-    best = np.zeros(frames, dtype=np.int64)
-    backwards = np.lexsort((pairs.covariance[:, 2, 2], pairs.second))[::-1]
-    best[pairs.second[backwards]] = backwards  # the last that is written stays
-    first, step = pairs.first[best].tolist(), pairs.poses.as_matrix()[best]
-    matrices = np.tile(np.eye(4), (frames, 1, 1))
-    for frame in range(1, frames):
-        matrices[frame] = matrices[first[frame]] @ step[frame]
-    return matrices
+def held(first: IntArray, second: IntArray) -> RelativePoses:
+    """Edges that say no more than that a probe does not jump: for frames that no pair joins to others."""
+    deviation = np.repeat([HELD_MM, HELD_RAD], 3)
+    poses = RigidTransform.from_translation(np.zeros((first.size, 3)))
+    return RelativePoses(first, second, poses, np.tile(np.diag(deviation**2), (first.size, 1, 1)))
 
 
-# The covariance's order is translation, rotation; exponential coordinates' is rotation, translation.
-_SWAPPED = np.array([3, 4, 5, 0, 1, 2])
-
-
-def _graph(pairs: RelativePoses, frames: int) -> PoseGraph:
-    """The edges, and the envelope of their normal equations."""
-    first, second = (np.ascontiguousarray(each, dtype=np.int64) for each in (pairs.first, pairs.second))
-    earliest = np.arange(frames)
-    # Frames joined to the first, which is no unknown, reach back no farther for that.
-    lower = np.minimum(first, second)
-    np.minimum.at(earliest, np.maximum(first, second)[lower > 0], lower[lower > 0])
-    begin = np.repeat(6 * (earliest[1:] - 1), 6)
-    length = np.arange(begin.size) + 1 - begin
-    return PoseGraph(
-        first,
-        second,
-        pairs.poses.inv().as_matrix(),
-        np.ascontiguousarray(np.linalg.inv(pairs.covariance)[:, _SWAPPED[:, None], _SWAPPED]),
-        begin,
-        np.cumsum(length) - length - begin,
-        np.empty(int(length.sum())),
+def joined(pairs: RelativePoses, others: RelativePoses) -> RelativePoses:
+    """Two sets of edges."""
+    if not (len(pairs) and len(others)):
+        return pairs if len(pairs) else others
+    return RelativePoses(
+        np.concatenate([pairs.first, others.first]),
+        np.concatenate([pairs.second, others.second]),
+        RigidTransform.concatenate([pairs.poses, others.poses]),
+        np.concatenate([pairs.covariance, others.covariance]),
     )
 
 
-def _marginals(graph: PoseGraph, poses: FloatArray, huber: float) -> FloatArray:
-    """Covariance of each frame's pose, shape (n, 6, 6), in the order of `RelativePoses`."""
-    frames = len(poses)
-    known = np.unique(np.linspace(1, frames - 1, min(frames - 1, KNOWN_FRAMES)).astype(np.int64))
-    blocks = np.zeros((known.size + 1, 6, 6))
-    marginals(graph, poses, huber, known, blocks[1:])
-    at, columns = np.concatenate([[0], known]), blocks[:, _SWAPPED[:, None], _SWAPPED].reshape(-1, 36).T
-    every = [np.interp(np.arange(frames), at, column) for column in columns]
-    return np.stack(every, axis=1).reshape(frames, 6, 6)
+def edges_of(table: CorrelationTable, planes: PairPlanes) -> RelativePoses:
+    """Relative poses of frame pairs from their in-plane motion and signed planes."""
+    a, b, c = planes.coefficients.T
+    yaw = -np.arcsin(np.clip(b, -1, 1))
+    tilt = np.arcsin(np.clip(c / np.cos(yaw), -1, 1))
+    x, y, roll = table.inplane[planes.row].T
+    rotation = rotation_from_fixed_angles(roll, yaw, tilt)
+    poses = RigidTransform.from_components(np.column_stack([x, y, a]), rotation)
+    covariance = np.zeros((len(planes), 6, 6))
+    covariance[:, [[0], [1], [5]], [0, 1, 5]] = table.inplane_covariance[planes.row] + np.diag(INPLANE_FLOOR)
+    # (a, b, c) is (z, -yaw, tilt) for small angles.
+    order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+    covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T
+    return RelativePoses(planes.first, planes.second, poses, covariance)
+
+
+def fixed(poses: RigidTransform, centre_mm: FloatArray) -> RelativePoses:
+    """Edges from the first of some frames to the others that hold them where they are.
+
+    Parameters
+    ----------
+    poses : RigidTransform, length n
+        ``world_from_image`` of frames 0 to n - 1.
+    centre_mm : ndarray, shape (3,)
+        The image's centre.
+    """
+    centre, others = RigidTransform.from_translation(centre_mm), np.arange(1, len(poses))
+    relative = centre.inv() * (poses[0].inv() * poses[others]) * centre
+    return RelativePoses(
+        np.zeros_like(others), others, relative, np.tile(FIXED_VARIANCE * np.eye(6), (others.size, 1, 1))
+    )

@@ -8,9 +8,10 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.reconstruction import SharedErrors
 from speckle3d.core.relative import SCALE_CHANGE_MM, SHARED, STRUCTURE, TURN_CHANGE_MM
-from speckle3d.motion.planes import PairPlanes
+from speckle3d.motion.planes import PairPlanes, PlaneSettings
 
 
 def claimed_covariance(
@@ -78,6 +79,44 @@ def travelled(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
+WAY_STEPS = 40
+"""Equal parts of the way at whose ends errors that grow along it change; between, neighbours share them."""
+
+
+def joint_errors(
+    covariance: FloatArray,
+    world_from_image: RigidTransform,
+    centre_mm: FloatArray,
+    shared: SharedErrors | None = None,
+) -> PoseErrors:
+    """Errors of all frames together whose covariances, frame by frame, are those given.
+
+    What all frames have in common is carried as it was claimed. The rest has grown along the way: errors of
+    two frames are correlated as a random walk's, by the root of the ratio of their ways.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, 6, 6)
+        Of (x, y, z, tilt, yaw, roll) about the image's centre along the first frame's axes, mm and rad.
+    world_from_image : RigidTransform, length n
+    centre_mm : ndarray, shape (3,)
+    shared : SharedErrors, optional
+        Which part of `covariance` all frames have in common; without it, none.
+    """
+    poses = world_from_image[0].inv() * world_from_image
+    common = common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
+    rest = covariance - np.einsum("mia,mib->iab", common, common)
+    size = np.sqrt(np.maximum(np.diagonal(rest, axis1=1, axis2=2), 1e-24))
+    value, axes = np.linalg.eigh(rest / (size[:, :, None] * size[:, None, :]))
+    root = size[:, :, None] * (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
+    way = np.maximum(travelled(poses, centre_mm), 1e-6)
+    begin, width = np.linspace(0.0, way[-1], WAY_STEPS, endpoint=False), way[-1] / WAY_STEPS
+    share = np.sqrt(np.clip(way - begin[:, None], 0.0, width) / way)
+    grown = np.einsum("ki,iam->kmia", share, root).reshape(-1, len(poses), 6)
+    factors = np.concatenate([common, grown])
+    return PoseErrors(factors[np.abs(factors).max(axis=(1, 2)) > 1e-12])
+
+
 NEAR_MM = 0.1
 """Frames nearer than this may turn as if they were this far apart: a hand trembles in place."""
 UNEVENNESS = 0.4
@@ -87,15 +126,15 @@ BEYOND_DOUBT = 2.0
 
 
 @dataclass(frozen=True)
-class SlopeEvidence:
-    """What seen slopes are worth.
+class SlopeWeights:
+    """Weights of the slopes that a sweep's planes have, and what is left of their errors.
 
     Attributes
     ----------
     share : ndarray, shape (2,)
         Of the slopes seen along x and y, yaw and tilt, that is believed.
     deviation_per_mm : ndarray, shape (2,)
-        Standard deviation of the slopes per distance that is left, 1/mm.
+        Standard deviation of the slopes per distance that is left, rad/mm.
     """
 
     share: FloatArray
@@ -104,47 +143,32 @@ class SlopeEvidence:
     def applied(self, planes: PairPlanes) -> PairPlanes:
         """Keep only the believed shares of planes' slopes; their offsets follow as the fits have it."""
         covariance = planes.covariance
-        keep = np.zeros_like(covariance)
-        keep[:, 0, 0] = 1.0
-        keep[:, [1, 2], [1, 2]] = self.share
-        slopes = np.linalg.inv(covariance[:, 1:, 1:])
-        keep[:, :1, 1:] = -covariance[:, :1, 1:] @ slopes * (1.0 - self.share)
+        keep = np.tile(np.diag([1.0, *self.share]), (len(planes), 1, 1))
+        keep[:, :1, 1:] = -covariance[:, :1, 1:] @ np.linalg.inv(covariance[:, 1:, 1:]) * (1.0 - self.share)
         kept = (keep @ planes.coefficients[:, :, None])[:, :, 0]
         covariance = keep @ covariance @ keep.transpose(0, 2, 1)
         left = np.maximum(np.abs(kept[:, :1]), NEAR_MM) * self.deviation_per_mm
         covariance[:, [1, 2], [1, 2]] += left**2
-        sign = np.where(kept[:, :1] < 0, -1.0, 1.0)
-        return replace(planes, coefficients=sign * kept, covariance=covariance)
+        return replace(planes, coefficients=kept, covariance=covariance)
 
 
-def weigh_slopes(
-    design: FloatArray,
-    planes: PairPlanes,
-    scale_sigma: float,
-    expected_per_mm: float,
-) -> SlopeEvidence:
-    """Weigh the slopes that a sweep's planes have.
+def weigh_slopes(planes: PairPlanes, scale_sigma: float, settings: PlaneSettings) -> SlopeWeights:
+    """Weigh the slopes of all pairs of a sweep by what uneven errors of distances feign.
 
     Parameters
     ----------
-    design : ndarray, shape (p, 3)
-        What the planes' coefficients are multiplied by.
     scale_sigma : float
         Relative standard deviation of the scale of distances.
-    expected_per_mm : float
-        Slope per distance that sweeps have, standard deviation, rad/mm.
     """
-    coefficients = planes.coefficients
-    weight = np.nansum(planes.sigma_mm**-2.0, axis=0, dtype=float)
-    lever = np.array([_deviation(design[:, k], weight) for k in (1, 2)])
-    false = UNEVENNESS * scale_sigma / np.maximum(lever, 1e-6)
-    travelled = np.maximum((coefficients[:, 0] ** 2).sum(), 1e-12)
-    seen = (coefficients[:, 1:] * coefficients[:, :1]).sum(axis=0) / travelled
-    expected = np.maximum(expected_per_mm**2, seen**2 - (BEYOND_DOUBT * false) ** 2)
+    own = planes.covariance.copy()
+    own[:, 0, 0] -= settings.bias_mm**2
+    information = np.linalg.inv(own).sum(axis=0)
+    information = information / information[0, 0]
+    lever_mm = np.sqrt(np.diagonal(information)[1:] - information[0, 1:] ** 2)
+    false = UNEVENNESS * scale_sigma / np.maximum(lever_mm, 1e-6)
+    travel = np.maximum((planes.offset_mm**2).sum(), 1e-12)
+    seen = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / travel
+    usual = np.deg2rad(settings.turn_deg_per_mm) ** 2
+    expected = np.maximum(usual, seen**2 - (BEYOND_DOUBT * false) ** 2)
     share = expected / (expected + false**2)
-    return SlopeEvidence(share, np.sqrt(share) * false)
-
-
-def _deviation(values: FloatArray, weight: FloatArray) -> float:
-    mean = np.average(values, weights=weight)
-    return float(np.sqrt(np.average((values - mean) ** 2, weights=weight)))
+    return SlopeWeights(share, np.sqrt(share) * false)

@@ -10,7 +10,7 @@ from speckle3d.core.pose_errors import PosedErrors, PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
 from speckle3d.imaging.measures.belonging import require_inside
 from speckle3d.imaging.measures.measure import Measurement, measured
-from speckle3d.motion.joint_errors import joint_errors
+from speckle3d.motion.uncertainty import joint_errors
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.trajectories import poses_of
 
@@ -82,7 +82,7 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
 
     `image`: what the file holds. Other modes: their own claims; the claimed error of the length stretches the
     whole sweep, and what the covariances have beyond it has grown from frame to frame. `consistent-subset`,
-    and `orientation` and `pose` of older files, claim nothing and are taken to be no better than the images.
+    and `orientation` and `pose` of older files, claim nothing: the images' errors are taken.
 
     Parameters
     ----------

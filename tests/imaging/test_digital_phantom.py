@@ -78,7 +78,7 @@ def test_spheres_swept_at_reconstructed_poses_are_as_far_apart_and_as_large_as_c
     from speckle3d.core.pose_errors import PosedErrors
     from speckle3d.imaging.measures.belonging import belonging_of
     from speckle3d.imaging.measures.measure import measured
-    from speckle3d.motion.joint_errors import joint_errors
+    from speckle3d.motion.uncertainty import joint_errors
 
     sweep = s3.load_sweep(shipped / "phantom.h5")
     tracked = s3.track(sweep, s3.load_curves(shipped / "curves.h5"))
