@@ -25,8 +25,8 @@ from speckle3d.matching.patches import PatchSettings
 from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.motion.coherence import CoherenceSettings
-from speckle3d.motion.decorrelation import CurveSettings
 from speckle3d.motion.direction import SensorSettings
+from speckle3d.motion.phantom import CurveSettings
 from speckle3d.motion.planes import PlaneSettings
 
 _COMMENT_WIDTH = 100
@@ -38,13 +38,14 @@ REMOVED_SETTINGS = {
     "inplane.interpolate": "correlations are always read between samples",
     "inplane.passes": "lags are centred twice",
     "trajectory.block_frames": "a sweep is matched in one go",
+    "trajectory.revisit_mm": "ties between visits of the same tissue brought them no nearer to each other",
     "trajectory.join": "poses are always solved from all pairs",
     "volume.max_file_gb": "volumes are made in memory, which `max_memory_gb` limits",
     "inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first",
     "fused.contradiction_sigma": "where images and sensors differ both numbers are told",
 }
 """Settings, or whole stages, of older files, and what is there instead."""
-REMOVED = (("inertial", None), ("fused", "contradiction_sigma"))
+REMOVED = (("inertial", None), ("fused", "contradiction_sigma"), ("trajectory", "revisit_mm"))
 """Groups, and settings of groups, that older reconstructions' configurations hold and nothing reads now."""
 
 

@@ -17,8 +17,7 @@ from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.schedule import KnownSchedule
 from speckle3d.matching.texture import PHANTOM_FRAMES, mean_spectra
-from speckle3d.motion.decorrelation import fit_curves
-from speckle3d.motion.phantom import phantom_pairs, phantom_samples, phantom_speckle
+from speckle3d.motion.phantom import fit_curves, phantom_pairs, phantom_samples, phantom_speckle
 
 
 def calibrate_curves(

@@ -170,7 +170,7 @@ def patch_correlations(fixed, moving, first, size, shift, least_overlap, radius)
 
 
 def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
-    """Twin of `speckle3d.motion.planes.consistent_subset`: every plane, every patch, one after the other.
+    """Twin of `speckle3d.motion.subset.consistent_subset`: every plane, every patch, one after the other.
 
     Returns all best subsets: placements may tie but for rounding.
     """
@@ -218,28 +218,6 @@ def patch_coherences(fixed, moving, first, size, shift, ramp_rad, least_overlap,
             if energy > 0:
                 out[p, n] = np.abs(np.vdot(a, b)) ** 2 / energy
     return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)
-
-
-def pose_graph_step(poses, first, second, measured, information, huber):
-    """Twin of one round of `speckle3d.kernels.graph.relax`, dense: the normal equations and the gradient.
-
-    Parameters are exponential coordinates, rotation first, on the right of all poses but the first.
-    """
-    normal, gradient = 1e-9 * np.eye(6 * len(poses)), np.zeros(6 * len(poses))
-    for i, j, z, omega in zip(first, second, measured, information, strict=True):
-        relative = poses[i].inv() * poses[j]
-        error = (z.inv() * relative).as_exp_coords()
-        x, y, w = relative.inv().translation
-        turn = relative.inv().rotation.as_matrix()
-        carried = np.zeros((6, 6))
-        carried[:3, :3] = carried[3:, 3:] = turn
-        carried[3:, :3] = np.array([[0, -w, y], [w, 0, -x], [-y, x, 0]]) @ turn
-        weight = min(1.0, huber / max(np.sqrt(error @ omega @ error / 6), 1e-9))
-        jacobian = np.zeros((6, 6 * len(poses)))
-        jacobian[:, 6 * i : 6 * i + 6], jacobian[:, 6 * j : 6 * j + 6] = -carried, np.eye(6)
-        normal += weight * jacobian.T @ omega @ jacobian
-        gradient += weight * jacobian.T @ omega @ error
-    return normal[6:, 6:], gradient[6:]
 
 
 def consensus_line(column, row, inside, tolerance):
@@ -332,77 +310,6 @@ def look_up_on_planes(points_mm, volume, planes, pixels):
     return found
 
 
-def correlation_plane(rho, design, spread_mm, echo, curves, starts, prior, huber, outlying, evidence, enough,
-                      rounds):  # fmt: skip
-    """Twin of `speckle3d.kernels.planes.fit_planes` for one pair of which all patches take part.
-
-    echo: staying, moving, gain, stretch, staying_sd, stretch_sd, each (p,); prior: means, inverse variances.
-    Returns plane, information, cost, excess distances and their deviations.
-    """
-    patch = np.arange(rho.size)
-    staying, moving, gain, stretch, staying_sd, stretch_sd = echo
-
-    def predict(d):
-        at = np.minimum(d / stretch / curves.step_mm, curves.amplitude.shape[1] - 1.001)
-        k = at.astype(int)
-        low = curves.amplitude[patch, k]
-        rise = curves.amplitude[patch, k + 1] - low
-        g = low + (at - k) * rise
-        field = staying + moving * g
-        slope = 2 * gain * field * moving * (rise / curves.step_mm / stretch)
-        limited = np.minimum(gain * field * field, 0.999)
-        n = curves.cells
-        noise = 2 * limited * (1 - limited) ** 2 / n + (1 - limited) ** 2 / n**2
-        noise = noise if curves.of_echo else (1 - limited**2) ** 2 / n
-        uncertain = (staying_sd * (1 - g) * 2 * field * gain) ** 2 + (stretch_sd * slope * d) ** 2
-        return gain * field * field, slope, np.sqrt(noise + 0.003**2 + uncertain)
-
-    def compare(plane):
-        z = design[:, 0] * plane[0] + design[:, 1] * plane[1] + design[:, 2] * plane[2]
-        turned = spread_mm * plane[2]
-        d = np.sqrt(z * z + turned * turned)
-        model, slope, sigma = predict(d)
-        left = (rho - model) / sigma
-        weight = np.minimum(1.0, huber / np.maximum(np.abs(left), 1e-300))
-        change = z[:, None] * design
-        change[:, 2] += spread_mm * turned
-        return z, d, sigma, left, weight, (slope / np.maximum(d, 1e-9) / sigma)[:, None] * change
-
-    def descend(plane):
-        damping, last, trial = 1e-3, np.inf, plane
-        for _ in range(rounds + 1):
-            _, _, _, left, weight, jacobian = compare(trial)
-            size = np.abs(left)
-            total = (prior[1] * (trial - prior[0]) ** 2).sum()
-            total += np.where(size <= huber, left**2, huber * (2 * size - huber)).sum()
-            if total <= last:
-                settled, last, plane = last - total < 1e-6 * max(total, 1.0), total, trial
-                gradient = (weight * left) @ jacobian - prior[1] * (trial - prior[0])
-                hessian = (jacobian.T * weight) @ jacobian + np.diag(prior[1])
-                damping, capped = max(damping * 0.2, 1e-9), np.minimum(left**2, outlying).sum()
-                if settled:
-                    break
-            else:
-                damping *= 8.0
-            damped = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
-            trial = plane + np.linalg.solve(damped, gradient)
-        return capped, last, plane
-
-    best = (np.inf,)
-    for number, start in enumerate(starts):
-        capped, last, plane = descend(start)
-        capped += evidence if number else 0.0
-        best = min(best, (capped, last, plane), key=lambda each: each[0])
-        if capped < enough:
-            break
-    _, cost, plane = best
-    z, d, sigma, left, weight, _ = compare(plane)
-    steep = predict(np.maximum(d, 0.05))[1] / sigma
-    outer = (steep * np.sign(z) * np.maximum(np.abs(z), 0.05) / np.maximum(d, 0.05))[:, None] * design
-    deviation = 1 / np.maximum(-steep, 1e-6)
-    return plane, (outer.T * weight) @ outer + np.diag(prior[1]), cost, -left * deviation, deviation
-
-
 def likeliest_path(frames, first, second, moved, covariance, unlike, rules):
     """Twin of `speckle3d.kernels.signs.follow_paths`: all paths as arrays, frame by frame.
 
@@ -420,8 +327,7 @@ def likeliest_path(frames, first, second, moved, covariance, unlike, rules):
     for frame in range(1, frames):
         of = second == frame
         if not of.any():
-            if rules.hold:
-                paths[:, frame] = paths[:, frame - 1]
+            paths[:, frame] = paths[:, frame - 1]
             continue
         at, step = first[of], moved[of]
         weight = rules.placed * covariance[of]
@@ -456,9 +362,7 @@ def likeliest_path(frames, first, second, moved, covariance, unlike, rules):
                 kept.append((int(parent), seen, float(total[parent, which])))
         parents = np.array([parent for parent, _, _ in kept])
         places = np.array([seen[-1] for _, seen, _ in kept])
-        recent = max(0, frame - rules.open_frames)
-        best, paths = paths[np.argmin(cost)], paths[parents]
-        paths[:, :recent] = best[:recent]
+        paths = paths[parents]
         paths[:, frame] = places
         step = places[:, 0] - here[parents, latest, 0]
         share = 1.0 - np.exp(-np.abs(step) / rules.trend_mm)

@@ -1,40 +1,58 @@
-"""Frame pairs one at a time, for tests that look at single ones."""
+"""Problems and frame pairs of made correlations, one at a time or many, for tests of planes and paths."""
 
 from types import SimpleNamespace
 
 import numpy as np
 
-from speckle3d.motion.planes import PairPlanes
+from speckle3d.kernels.plane_misfit import EchoModels
+from speckle3d.matching.inplane import InPlaneMotion
+from speckle3d.matching.schedule import TrajectorySettings
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.motion.planes import MotionProblem, PairPlanes, PlaneSettings, pair_planes
 
 
-def pair(planes, k=0):
-    """One of several planes; None if its patches do not determine it."""
-    if not planes.determined[k]:
+def problem_of(curves, patches, grid, frames=2, **settings):
+    return MotionProblem(
+        curves, patches, grid.centre_mm, frames, PlaneSettings(**settings), TrajectorySettings()
+    )
+
+
+def table_of(rho, moved_mm=(0.0, 0.0), first=None, second=None):
+    """Pairs of frames 0 and 1, or of others, with correlations of shape (e, p)."""
+    rho = np.asarray(rho, np.float32)
+    median = np.nan_to_num(np.nanmedian(rho, axis=1)) if np.isfinite(rho).any() else np.zeros(len(rho))
+    motion = (InPlaneMotion(*moved_mm, 0.0, 1e-6 * np.eye(3)),) * len(rho)
+    first = np.zeros(len(rho), int) if first is None else np.asarray(first)
+    second = np.ones(len(rho), int) if second is None else np.asarray(second)
+    return CorrelationTable(first, second, rho, median, motion)
+
+
+def fit_many(problem, rho, moved_mm=(0.0, 0.0), **known):
+    """Planes of pairs from correlations of shape (e, p), and which are determined."""
+    return pair_planes(problem, table_of(rho, moved_mm), np.arange(len(rho)), **known)
+
+
+def fit(problem, rho, moved_mm=(0.0, 0.0), share=None, gain=None, **known):
+    """Plane of one pair, from correlations of shape (p,); None if they determine none."""
+    alone = {name: np.asarray(value)[None] for name, value in known.items()}
+    models = None if share is None else EchoModels(share[None], gain[None])
+    planes, determined = fit_many(problem, np.asarray(rho)[None], moved_mm, models=models, **alone)
+    if not determined[0]:
         return None
-    one = planes[[k]]
-    offset, slope_x, slope_y = one.coefficients[0]
-    fields = {name: value[0] for name, value in vars(one).items()}
+    offset, slope_x, slope_y = planes.coefficients[0]
+    fields = {name: value[0] for name, value in vars(planes).items()}
     return SimpleNamespace(offset_mm=offset, slope_x=slope_x, slope_y=slope_y, **fields)
 
 
-def fit(fitter, rho, moved_mm, coherence=None, subset=None, slopes=None, start_mm=None, either_side=True):
-    """Plane of one pair, from correlations of shape (p,); None if they determine none."""
-    alone = [None if x is None else np.asarray(x)[None] for x in (subset, slopes, start_mm, either_side)]
-    if alone[1] is not None:
-        alone[1] = alone[1].astype(float)
-    pairs = np.asarray(rho, np.float32)[None], np.asarray(moved_mm)[None]
-    return pair(fitter.fit(*pairs, coherence, np.zeros(1), *alone))
-
-
-def made(coefficients, covariance, sigma_mm=1.0, patches=1):
+def made(first, second, coefficients, covariance, patches=1):
     """Planes given by their coefficients, (e, 3), and covariances, (e, 3, 3) or one for all."""
     coefficients = np.asarray(coefficients, float).reshape(-1, 3)
-    shape = len(coefficients), patches
+    pairs = len(coefficients)
     return PairPlanes(
+        np.arange(pairs),
+        np.broadcast_to(first, pairs),
+        np.broadcast_to(second, pairs),
         coefficients,
-        np.array(np.broadcast_to(covariance, (len(coefficients), 3, 3)), float),
-        np.ones(shape, bool),
-        np.zeros(shape),
-        np.full(shape, sigma_mm),
-        np.ones(len(coefficients), bool),
+        np.array(np.broadcast_to(covariance, (pairs, 3, 3)), float),
+        np.ones((pairs, patches), bool),
     )

@@ -12,7 +12,6 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor
-from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.matcher import FrameMatcher
@@ -85,10 +84,6 @@ def test_progress_images_and_pairs_come_in_order(sweep, curves):
     assert all((table.first < table.second).all() for table in pairs)
 
 
-def test_the_first_image_pose_is_the_identity(tracked):
-    np.testing.assert_allclose(tracked.image[0].as_matrix(), np.eye(4), atol=1e-12)
-
-
 def test_a_tracker_settles_the_direction(sweep, tracked):
     assert tracked.direction_from == "tracker"
     assert not tracked.flags.any()
@@ -126,15 +121,6 @@ def test_a_sensor_that_does_not_turn_with_the_image_settles_nothing(sweep):
     assert settle_direction(oriented, RigidTransform.from_rotation(image), SensorSettings()) == (1, "assumed")
 
 
-def test_a_mirror_image_turns_and_travels_the_other_way():
-    turn = Rotation.from_rotvec([0.1, 0.2, 0.3])
-    pose = RigidTransform.from_components([[1.0, 2.0, 3.0]], Rotation.from_quat([turn.as_quat()]))
-    seen = mirrored(pose)
-    np.testing.assert_allclose(seen.translation, [[1, 2, -3]])
-    np.testing.assert_allclose(seen.rotation.as_rotvec(), [[-0.1, -0.2, 0.3]], atol=1e-12)
-    np.testing.assert_allclose(mirrored(seen).as_matrix(), pose.as_matrix(), atol=1e-12)
-
-
 def test_smoothing_keeps_slow_turns_and_loses_jitter():
     time_s = np.arange(200) / 25
     slow = np.outer(np.deg2rad(3) * np.sin(2 * np.pi * time_s / 8), [1.0, 0.5, 0.0])
@@ -143,19 +129,6 @@ def test_smoothing_keeps_slow_turns_and_loses_jitter():
     # A Gaussian of 5 frames averages about 2 sqrt(pi) 5 = 18 of them: jitter falls to a quarter.
     left = np.rad2deg(smooth - slow)[20:-20].std()
     assert left < 0.3 / 3
-
-
-def test_modes_that_cannot_be_are_refused(sweep, tracked):
-    with pytest.raises(InvalidInputError, match="got 'magic'"):
-        correct(tracked, sweep, ["magic"])
-    with pytest.raises(InsufficientDataError, match="/tracker"):
-        correct(tracked, replace(sweep, tracker=None), ["pose"])
-
-
-def test_a_simulation_without_sensors_takes_its_sign_from_the_truth_and_says_so(sweep, tracked):
-    alone = replace(sweep, tracker=None, orientation=None)
-    assert settle_direction(alone, tracked.image, SensorSettings()) == (1, "truth")
-    assert settle_direction(alone, mirrored(tracked.image), SensorSettings()) == (-1, "truth")
 
 
 class NoiseFrames:

@@ -73,7 +73,7 @@ def _refine(
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def _followed(trend: float, step: float, trend_mm: float) -> float:
     """Direction of a path after a step: averaged over travel and not time, so that a pause keeps it."""
-    return trend + (1.0 - np.exp(-abs(step) / trend_mm)) * (np.sign(step) - trend)
+    return float(trend + (1.0 - np.exp(-abs(step) / trend_mm)) * (np.sign(step) - trend))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -125,7 +125,7 @@ def follow_paths(
         weight, latest = np.empty((pairs, 3)), np.argmax(earlier)
         for e in range(pairs):
             _invert(covariance[start[f] + e], moves[e], rules, weight[e])
-        moving = moving or np.any(paths[:kept, f - 1] != 0.0)
+        moving = moving or bool(np.any(paths[:kept, f - 1] != 0.0))
         candidates, total = np.empty((2 * pairs * kept, 2)), np.empty(2 * pairs * kept)
         for n in range(total.size):
             h, e, side = n // (2 * pairs), n % pairs, 1.0 if n // pairs % 2 == 0 else -1.0
@@ -148,7 +148,7 @@ def follow_paths(
                 total[n] = np.inf
         size = 0
         for _ in range(min(4 * count, total.size)):
-            n = np.argmin(total)
+            n = int(np.argmin(total))
             if size == count or not np.isfinite(total[n]):
                 break
             h, place = n // (2 * pairs), candidates[n]

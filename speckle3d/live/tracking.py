@@ -237,7 +237,7 @@ class LiveTracker:
         )
         problem, known = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
         rows = alike_pairs(problem, table)
-        models = motion.coherence and motion.coherence.models(np.full(rows.size, LAST))
+        models = motion.models(np.full(rows.size, LAST))
         pairs, determined = pair_planes(problem, table, rows, models)
         pairs = pairs[determined].scaled(motion.scale)
         if not len(pairs):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -23,8 +21,6 @@ from speckle3d.matching.texture import FRAMES, Texture, spread_frames
 
 SEARCHED = 3
 """References against which the in-plane motion of a frame is searched, if it resembles none before."""
-KEPT_FRAMES = 24
-"""Frames kept ready while chosen pairs are matched: one, and all that it is matched with."""
 ImageSink = Callable[[int, Float32Array], None]
 """Called with each frame's number and intensity image (vector, sample), in order."""
 
@@ -183,42 +179,3 @@ class FrameByFrame:
             if some[-1] == before and pairs[before].median >= self._schedule.least_correlation:
                 self._motion[frame] = compose(self._motion[before], pairs[before].motion)
         return pairs
-
-
-def match_chosen(
-    sweep: Sweep,
-    matcher: FrameMatcher,
-    pairs: Sequence[tuple[int, int]],
-    usable: Sequence[BoolArray] | None = None,
-) -> CorrelationTable:
-    """Match chosen pairs of a sweep, reading frames anew; in-plane motion is searched for in each pair.
-
-    Fastest where pairs of one second frame follow each other.
-
-    Parameters
-    ----------
-    usable : sequence of ndarray of bool, shape (p,), optional
-        Patches of each frame that may be matched; by default all in the region.
-    """
-    kept: dict[int, ReadyFrame] = {}
-
-    def ready(frame: int) -> ReadyFrame:
-        echo = matcher.echo(read_frame(sweep.frames, frame))
-        return matcher.prepare(echo, None if usable is None else usable[frame])
-
-    def matches() -> Iterator[tuple[int, int, MatchedPair]]:
-        for second, some in groupby(pairs, key=itemgetter(1)):
-            firsts = [first for first, _ in some]
-            wanted = [*firsts, second]
-            missing = sorted(set(wanted) - kept.keys())
-            kept.update(zip(missing, ahead(ready, missing), strict=True))
-            for frame in wanted:  # The last asked for go last.
-                kept[frame] = kept.pop(frame)
-            for frame in list(kept)[: max(0, len(kept) - max(KEPT_FRAMES, len(wanted)))]:
-                del kept[frame]
-            fixed, moving = [kept[first] for first in firsts], kept[second]
-            starts = [matcher.search(other, moving) for other in fixed]
-            matches_of_frame = matcher.match_with_each(fixed, moving, starts)
-            yield from ((first, second, match) for first, match in zip(firsts, matches_of_frame, strict=True))
-
-    return CorrelationTable.of(matches(), len(matcher.patches))

@@ -40,12 +40,6 @@ class TrajectorySettings(BaseModel):
         "have enough such pairs: from there on what has decorrelated at the top of the image bends planes.",
     )
     huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
-    revisit_mm: float = Field(
-        1.0,
-        ge=0,
-        description="Travel between the frames of a sweep that comes back at which they are matched with "
-        "those of its way there; 0: never.",
-    )
 
 
 class Schedule(Protocol):

@@ -85,10 +85,6 @@ class CorrelationTable:
             tuple(motion for each in tables for motion in each.motion),
         )
 
-    def followed_by(self, other: CorrelationTable) -> CorrelationTable:
-        """Return a table of these pairs and, in the rows after them, another's."""
-        return CorrelationTable.joined([self, other]) if len(other) else self
-
     @cached_property
     def inplane(self) -> FloatArray:
         """In-plane motion (x, y, roll) of each pair's second frame, mm and rad, shape (e, 3)."""

@@ -54,8 +54,8 @@ LARGEST = 1.5
 LEAST_FREQUENCIES = 6
 """In the band, that a row's three numbers are fitted to: patches of 3 mm have 20 in 5 MHz."""
 WIDENING = 1.3
-"""Power of the echo's wavelength with which curves widen, mean over depth: 1.22 to 1.32 by diffraction for the
-probes of two simulators, 1 in front of the focus and 1.5 far behind it."""
+"""Power of the echo's wavelength with which curves widen, mean over depth: 1.22 to 1.32 by diffraction for
+the probes of two simulators, 1 in front of the focus and 1.5 far behind it."""
 OTHER_BAND = 6.0
 """Gain in the log-likelihood by one exponent in all rows, from skin to bottom, from which another transmit
 band or filter is told. Twenty-one sweeps of two simulators gain 0.3 to 4.3; with the band 0.3 MHz off they

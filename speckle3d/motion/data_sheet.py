@@ -88,7 +88,8 @@ class ProbeSheet(BaseModel):
             self.elevation_aperture_mm,
             self.elevation_focus_mm,
             self.elevation_focus_mm / self.f_number if transmit is None else transmit,
-            *(1e6 * f for f in self.band_mhz),
+            1e6 * self.band_mhz[0],
+            1e6 * self.band_mhz[1],
             self.attenuation_db_cm_mhz,
         )
 

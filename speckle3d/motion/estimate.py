@@ -13,6 +13,7 @@ from speckle3d.core.curves import EchoSpectra
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
+from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
 from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, RowScales, estimate_coherence
@@ -74,6 +75,10 @@ class Motion:
     def scale_sigma(self) -> float:
         """Relative standard deviation of the scale of all distances; the curves' own without adaptation."""
         return CURVES_SIGMA if self.coherence is None else self.coherence.scale_sigma
+
+    def models(self, frame: IntArray) -> EchoModels | None:
+        """Echo models of pairs about frames of shape (e,); None if not adapted to."""
+        return None if self.coherence is None else self.coherence.models(frame)
 
 
 @dataclass(frozen=True)
@@ -287,7 +292,7 @@ def consistent_poses(
     motion = solution.motion
     if sensed is None:
         return None, motion.pairs.used
-    models = None if motion.coherence is None else motion.coherence.models(motion.pairs.first)
+    models = motion.models(motion.pairs.first)
     planes = consistent_planes(
         motion.problem, motion.pairs, solution.table, models, motion.scale, sensed, direction
     )
@@ -304,7 +309,7 @@ def frame_pairs(solution: ImageMotion, used: BoolArray, direction: int) -> Itera
     flip, turn = np.diag([1.0, 1.0, direction, 1.0]), MIRROR if direction < 0 else np.eye(6)
     for start in range(0, max(len(pairs), 1), PAIRS_AT_ONCE):
         some = slice(start, start + PAIRS_AT_ONCE)
-        models = None if motion.coherence is None else motion.coherence.models(pairs.first[some])
+        models = motion.models(pairs.first[some])
         correlation = solution.table.correlation[pairs.row[some]]
         distance, sigma = (motion.scale * v for v in patch_distances(problem, correlation, models))
         yield FramePairs(

@@ -21,7 +21,7 @@ FOCUS_SIGMA = 0.15
 state, 15 %. With 0.087, as if uniform, a focus 15 % off leaves up to 5 % more of the length over tissue."""
 LEAST_ROWS = 4
 FOCI = np.linspace(-0.6, 0.6, 13)
-"""Logarithms of focal lengths over the sheet's for which curves are calculated, four deviations either way."""
+"""Logarithms of focal lengths over the sheet's for which curves are calculated: four deviations."""
 
 
 def stretched(curves: DecorrelationCurves, log_factor: FloatArray) -> DecorrelationCurves:

@@ -232,11 +232,13 @@ def pair_planes(
     if start_mm is None:
         share = echo.share.mean(axis=1)
         left = (np.sqrt(np.maximum(table.median[rows], 0.0)) - share) / np.maximum(1.0 - share, 0.1)
-        start_mm = problem.typical_distance(left)
+        start = problem.typical_distance(left)
+    else:
+        start = np.maximum(start_mm, NEAR_MM)
     sensed = slopes is not None
     told = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
     side = np.ones(rows.size, dtype=bool) if either_side is None else either_side
-    settings, start = problem.planes, np.maximum(start_mm, NEAR_MM)
+    settings = problem.planes
     slope_sd = SENSED_SLOPE if sensed else LOOSE_SLOPE
     rules = FitRules(
         sensed, slope_sd, LOOSE_SLOPE, settings.huber, OUTLYING, CROSSING_EVIDENCE, WELL_FITTED, ROUNDS
@@ -280,7 +282,7 @@ def _measured(problem: MotionProblem, correlation: Float32Array, echo: EchoModel
     """Patches that correlate more than at their curve's last distance."""
     end = problem.end_amplitude
     least = echo.gain * (echo.share + (1 - echo.share) * end) ** 2
-    return np.isfinite(correlation) & ((end == 0.0) | (correlation > least))
+    return np.asarray(np.isfinite(correlation) & ((end == 0.0) | (correlation > least)))
 
 
 def _lost(problem: MotionProblem, moved_mm: FloatArray) -> FloatArray:

@@ -43,8 +43,9 @@ def consistent_planes(
     farther, offset = raised(problem, moved, slopes), np.abs(pairs.offset_mm)
     # Only frames that cross, or nearly, leave the side open.
     open_side = offset < np.ptp(farther, axis=1)
-    distances = (scale * v for v in patch_distances(problem, table.correlation[pairs.row], models))
-    agreed = consistent_subset(*distances, farther, open_side, problem.planes.support_sigma)
+    distance, sigma = patch_distances(problem, table.correlation[pairs.row], models)
+    support_sigma = problem.planes.support_sigma
+    agreed = consistent_subset(scale * distance, scale * sigma, farther, open_side, support_sigma)
     planes, determined = pair_planes(problem, table, pairs.row, models, offset, agreed, slopes, open_side)
     # Slopes are the sensor's; distances have the scale of all patches.
     coefficients = planes.coefficients * [scale, 1.0, 1.0] * sign[:, None]

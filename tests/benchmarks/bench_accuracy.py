@@ -61,12 +61,11 @@ PLAIN = {
     "matching": {"correlate": "intensity"},
     "coherence": {"adapt": False},
     "planes": {"turn_deg_per_mm": 100.0},
-    "trajectory": {"revisit_mm": 0.0},
 }
 METHODS: Mapping[str, dict[str, object]] = {
     "ours": {},
     "plain": PLAIN,
-    "chained": {"trajectory": {"revisit_mm": 0.0}},
+    "chained": {},
 }
 CHAINED = ("plain", "chained")
 """Methods that take each frame's surest pair alone, as published, and solve no graph."""
@@ -162,7 +161,7 @@ def measure(case: Case, method: str, seed: int, curves: DecorrelationCurves, fol
     sweep = load_sweep(simulated(_settings({"preset": case.preset, "seed": seed, **case.options}), folder))
     config = Config.model_validate(METHODS[method])
     pairs: list[FramePairs] = []
-    with patch.object(trajectory, "relax") if method in CHAINED else nullcontext():
+    with patch.object(trajectory, "ROUNDS", 0) if method in CHAINED else nullcontext():
         tracked = track(sweep, curves, config, sink=pairs.append)
     centre = sweep.grid.centre_mm
     poses = {"image": align_sign(tracked.image, sweep.truth, centre)}

@@ -8,7 +8,7 @@ from speckle3d.kernels.signs import PathRules, follow_paths
 
 RULES = PathRules(
     hypotheses=8, relative_error=0.1, placed=2.0, cap=9.0, turning_cost=2.0, trend_mm=0.3, same_mm=0.05,
-    same_slope=0.005, apart_mm=0.3, apart_slope=0.01, apart_cost=4.0, open_frames=400, hold=True,
+    same_slope=0.005, apart_mm=0.3, apart_slope=0.01, apart_cost=4.0,
 )  # fmt: skip
 
 
@@ -36,12 +36,12 @@ def wandering(rng, frames):
     return first, second, moved, covariance, np.array(unlike, dtype=np.int64).reshape(-1, 2)
 
 
-@pytest.mark.parametrize("rules", [RULES, RULES._replace(open_frames=10, hold=False, relative_error=0.25)])
+@pytest.mark.parametrize("rules", [RULES, RULES._replace(relative_error=0.25)])
 def test_the_path_is_the_likeliest_of_all_that_are_kept(rules):
     frames = 60
     for seed in range(6):
         first, second, moved, covariance, unlike = wandering(np.random.default_rng(seed), frames)
-        every, path = np.arange(frames + 1), np.empty((frames, 2))
+        every, path = np.arange(frames + 1), np.zeros((frames, 2))
         starts = np.searchsorted(second, every), np.searchsorted(unlike[:, 1], every)
         earlier = np.ascontiguousarray(unlike[:, 0])
         follow_paths(starts[0], first.copy(), moved, covariance, starts[1], earlier, rules, path)
@@ -51,7 +51,7 @@ def test_the_path_is_the_likeliest_of_all_that_are_kept(rules):
 
 
 def test_without_pairs_all_frames_stay_where_they_are():
-    none, path = np.zeros(0, np.int64), np.ones((3, 2))
+    none, path = np.zeros(0, np.int64), np.zeros((3, 2))
     starts = np.zeros(4, np.int64)
     follow_paths(starts, none, np.zeros((0, 2)), np.zeros((0, 2, 2)), starts, none, RULES, path)
     assert (path == 0).all()

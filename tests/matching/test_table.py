@@ -21,18 +21,6 @@ def test_a_pairs_median_is_over_the_patches_that_have_a_correlation():
     assert pair(np.nan, np.nan, np.nan).median == 0.0
 
 
-def test_rows_keep_their_order_and_another_tables_rows_come_after_them():
-    ours = table((0, 1, pair(0.9, 0.8, 0.7, x_mm=0.1)), (0, 2, pair(0.5, 0.4, 0.3, y_mm=-0.2)))
-    both = ours.followed_by(table((0, 9, pair(0.6, np.nan, 0.2))))
-    assert len(both) == 3
-    assert both.first.tolist() == [0, 0, 0]
-    assert both.second.tolist() == [1, 2, 9]
-    np.testing.assert_array_equal(both.correlation[2], np.float32([0.6, np.nan, 0.2]))
-    np.testing.assert_array_equal(both.inplane[1], [0.0, -0.2, 0.0])
-    # The tables they were made of are as they were.
-    assert len(ours) == 2
-
-
 def test_a_frame_is_unmatched_when_its_best_pair_is_below_the_least_correlation():
     pairs = table(
         (0, 1, pair(0.9, 0.9, 0.9)),
@@ -49,4 +37,3 @@ def test_no_pairs_are_an_empty_table():
     empty = table()
     assert len(empty) == 0
     assert empty.correlation.shape == (0, 3)
-    assert len(empty.followed_by(table((0, 1, pair(1.0, 1.0, 1.0))))) == 1

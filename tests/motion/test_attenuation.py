@@ -6,21 +6,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra, NominalProbe
 from speckle3d.core.sweep import RFSettings
 from speckle3d.motion.attenuation import UNKNOWN_SIGMA, estimate_attenuation
-from speckle3d.motion.diffraction import (
-    Lens,
-    half_distance,
-    sheet_spectrum,
-    speckle_correlation,
-)
+from speckle3d.motion.diffraction import half_distance, sheet_spectrum, speckle_correlation
 
 BAND = (5e6, 10e6)
 DEPTH = np.arange(3.5, 40.0, 3.0)
 FREQUENCY = np.linspace(5e6, 10e6, 21)
 DISTANCE = 0.01 * np.arange(251)
-LENS = Lens(5.0, 20.0, 10.0)
+LENS = NominalProbe(5.0, 20.0, 10.0, *BAND, 0.5)
 CELLS = 4000.0
 """Independent values of a row's power at each frequency: 16 frames of 48 vectors."""
 
@@ -80,7 +75,9 @@ def test_curves_stretch_as_the_beam_widens(difference):
         np.array([half_distance(DISTANCE, row) for row in each.correlation])
         for each in (stretched, there, given)
     ]
-    assert np.abs(half[0] / half[1] - 1.0).max() < 0.016
+    # Length depends on the mean over depth; one power of wavelength for all depths is off by 2 % at some.
+    assert abs((half[0] / half[1]).mean() - 1.0) < 0.012
+    assert np.abs(half[0] / half[1] - 1.0).max() < 0.025
     assert np.abs(half[2] / half[1] - 1.0).max() > 0.05
     # Curves that have been stretched belong to the tissue, and are not stretched again.
     assert abs(_found(stretched, _power(0.5 + difference)).difference_db_cm_mhz) < 0.01

@@ -1,13 +1,9 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import speckle
 
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.matching.patches import PatchGrid
-from speckle3d.motion.decorrelation import CurveSettings, PhantomSamples, fit_curves
-from speckle3d.motion.distances import DistanceEstimator
+from speckle3d.motion.phantom import CurveSettings, PhantomSamples, fit_curves
 
 DEPTHS_MM = (8.0, 16.0, 24.0)
 WIDTHS_MM = (0.33, 0.5, 0.42)
@@ -41,11 +37,10 @@ def samples(law, distances, noise_floor=1.0, cells=np.inf, repeats=1, seed=0, de
 
 def read_distance(curves, correlation, depths=DEPTHS_MM):
     """Distance at each depth for each correlation, shape (depth, correlation)."""
-    centres = np.array([(10.0, depth) for depth in depths])
-    first, spacing = np.zeros((len(depths), 2), int), np.array([0.3, 0.06])
-    patches = PatchGrid(first, np.array([12, 50]), centres, spacing, np.ones(len(depths), bool))
-    estimator = DistanceEstimator(curves, patches)
-    return np.array([estimator.distances(row).distance_mm for row in np.transpose(correlation)]).T
+    rows = curves.at(np.array(depths)).correlation
+    return np.array(
+        [np.interp(-c, -row, curves.distance_mm) for c, row in zip(correlation, rows, strict=True)]
+    )
 
 
 STEPPED = np.arange(0.0, 2.5, 0.1)
@@ -75,17 +70,6 @@ def test_many_noisy_pairs_give_the_distances_back(law):
         np.testing.assert_allclose(read_distance(curves, asked)[depth], d, atol=0.015)
 
 
-def test_sweeps_are_pooled_whatever_part_of_the_curve_each_of_them_holds():
-    near = samples(speckle.gaussian_correlation, np.arange(0.0, 0.5, 0.1))
-    far = samples(speckle.gaussian_correlation, np.arange(0.5, 2.5, 0.1))
-    pooled = fit_curves(speckle.KEY, [near, far])
-    whole = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED)])
-    np.testing.assert_allclose(pooled.correlation, whole.correlation, atol=1e-3)
-    assert pooled.pairs_used == near.pairs + far.pairs
-    assert pooled.depth_mm.tolist() == list(DEPTHS_MM)
-    assert pooled.key == speckle.KEY
-
-
 def test_what_noise_costs_is_no_distance():
     """Electronic noise at 14 dB takes 4 % of every coefficient; the curve begins there."""
     curves = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED, noise_floor=0.96)])
@@ -108,16 +92,6 @@ def test_cells_are_those_that_explain_the_scatter(cells):
     np.testing.assert_allclose(curves.cells, cells, rtol=0.2)
 
 
-def test_patches_without_a_correlation_are_passed_over():
-    good = samples(speckle.gaussian_correlation, STEPPED)
-    rho = good.correlation.copy()
-    rho[::7] = np.nan
-    curves = fit_curves(speckle.KEY, [replace(good, correlation=rho)])
-    np.testing.assert_allclose(
-        curves.correlation[:, :60], fit_curves(speckle.KEY, [good]).correlation[:, :60], atol=0.002
-    )
-
-
 @pytest.mark.parametrize(
     ("distances", "message"),
     [
@@ -129,20 +103,6 @@ def test_too_few_distances_or_too_little_of_the_curve_are_refused(distances, mes
     with pytest.raises(InsufficientDataError, match=message) as error:
         fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, distances)])
     assert "\n" not in str(error.value)
-
-
-def test_the_depth_that_lacks_samples_is_named():
-    whole = samples(speckle.gaussian_correlation, STEPPED)
-    rho = np.where(whole.depth_mm == 16.0, np.nan, whole.correlation)
-    with pytest.raises(InsufficientDataError, match=r"16\.0 mm"):
-        fit_curves(speckle.KEY, [replace(whole, correlation=rho)])
-
-
-def test_curves_never_rise_however_noisy_the_samples():
-    for seed in range(5):
-        noisy = samples(speckle.triangle_correlation, FREEHAND, cells=12, seed=seed)
-        curves = fit_curves(speckle.KEY, [noisy], CurveSettings(terms=5))
-        assert (np.diff(curves.correlation, axis=1) <= 0).all()
 
 
 def test_curves_end_where_the_phantom_did():

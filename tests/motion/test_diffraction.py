@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from speckle3d.core.curves import NominalProbe
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.motion.data_sheet import ProbeSheet
-from speckle3d.motion.diffraction import Lens, Nominal, half_distance, speckle_correlation
+from speckle3d.motion.diffraction import half_distance, log_width, speckle_correlation
 from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.beam import Probe, tabulate_beam
 from speckle3d.simulation.medium import fully_developed
@@ -24,8 +25,8 @@ def widths(curves, depth_mm):
 def test_in_the_focus_the_field_is_the_apertures_transform_on_a_curved_wavefront():
     frequency, wavelength, height, focus = np.array([7.0e6, 7.5e6]), 1540e3 / 7.5e6, 4.0, 40.0
     distance = np.linspace(0.0, 1.0, 21)
-    only = np.array([[[0.0, 1.0]]])
-    found = speckle_correlation(Lens(height, focus), np.array([[focus]]), frequency, only, distance)[0]
+    only, probe = np.array([[[0.0, 1.0]]]), NominalProbe(height, focus, 0.0, 7e6, 8e6, 0.5)
+    found = speckle_correlation(probe, np.array([[focus]]), frequency, only, distance)[0]
     z = np.linspace(-20.0, 20.0, 40001)
 
     def field(at):
@@ -39,7 +40,7 @@ def test_in_the_focus_the_field_is_the_apertures_transform_on_a_curved_wavefront
 
 
 def test_off_the_focus_the_wavefront_decorrelates_and_not_the_width():
-    width = np.exp(Nominal(Lens(5.0, 20.0), (5e6, 10e6)).log_width(np.array([5.0, 10.0, 20.0])))
+    width = np.exp(log_width(NominalProbe(5.0, 20.0, 0.0, 5e6, 10e6, 0.5), np.array([5.0, 10.0, 20.0])))
     # The beam is 5 mm high at the probe and 0.8 mm at the focus; speckle lasts half as long there.
     assert width[0] < 0.6 * width[2]
     assert width[1] < 0.7 * width[2]

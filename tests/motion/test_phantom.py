@@ -17,8 +17,13 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchSettings
 from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import KnownSchedule
-from speckle3d.motion.decorrelation import CurveSettings, fit_curves
-from speckle3d.motion.phantom import known_positions, phantom_pairs, phantom_samples
+from speckle3d.motion.phantom import (
+    CurveSettings,
+    fit_curves,
+    known_positions,
+    phantom_pairs,
+    phantom_samples,
+)
 
 SIGMA_MM, FRAMES = 0.3, 44
 GRID = ImageGrid(48, 260, 0.3, 0.06)
@@ -97,11 +102,6 @@ def test_offsets_and_tilt_are_signed_and_those_of_the_patches(phantom, step_mm, 
     expected = step_mm + np.sin(tilt) * (samples.depth_mm - GRID.centre_mm[1])
     np.testing.assert_allclose(samples.offset_mm, expected, atol=1e-3)
     np.testing.assert_allclose(samples.tilt_rad, np.sin(tilt), atol=1e-9)
-
-
-def test_frames_that_do_not_turn_have_no_tilt(phantom):
-    samples = samples_of(phantom, SETTINGS)
-    assert np.abs(samples.tilt_rad).max() < 1e-9
 
 
 def test_frames_too_far_apart_or_without_positions_are_refused(phantom):

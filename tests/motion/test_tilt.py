@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import speckle
+from pair_planes import fit_many, problem_of
 
 from speckle3d.core.sweep import BModeSettings, ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import lay_patches
-from speckle3d.motion.decorrelation import PhantomSamples, effective_distance, fit_curves, fit_tilt_response
-from speckle3d.motion.distances import DistanceEstimator
-from speckle3d.motion.planes import PlaneFitter
+from speckle3d.motion.phantom import PhantomSamples, fit_curves
 
 DEPTHS_MM = np.arange(5.0, 36.0, 5.0)
 CELLS = 60
@@ -81,24 +80,6 @@ def learnt():
 # ---- the law ----------------------------------------------------------------------------------------------
 
 
-def test_effective_distance_is_that_of_the_closed_form():
-    """A degree about the patch at a wavelength of 0.205 mm, a beam of 0.45 mm."""
-    spread = 4 * np.pi / 0.205 * 0.45**2
-    at = effective_distance(np.array([0.0, 0.3, -0.3]), np.deg2rad([1.0, 1.0, 0.0]), 0.0, spread)
-    rho = np.exp(-(at**2) / (2 * 0.45**2))
-    np.testing.assert_allclose(rho[:2], [0.891, 0.713], atol=0.002)
-    assert np.isclose(at[2], 0.3)
-
-
-def test_about_the_pivot_only_the_spread_is_seen():
-    tilt = np.array([0.02, -0.02])
-    np.testing.assert_allclose(effective_distance(7.0 * tilt, tilt, 7.0, 3.0), 0.06)
-    np.testing.assert_allclose(effective_distance(7.0 * tilt, tilt, 7.0, 0.0), 0.0, atol=1e-15)
-    # Turning the other way moves the patch the other way.
-    there, back = effective_distance(np.array([0.2, 0.2]), tilt, 7.0, 0.0)
-    np.testing.assert_allclose([there, back], [0.06, 0.34])
-
-
 # ---- fitting ----------------------------------------------------------------------------------------------
 
 
@@ -107,34 +88,12 @@ def test_the_pivot_of_a_made_law_is_recovered(learnt):
     np.testing.assert_allclose(learnt.tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
 
 
-def test_the_spread_follows_from_the_curves_width(learnt):
-    np.testing.assert_allclose(learnt.tilt.spread_mm, spreads(DEPTHS_MM), rtol=0.08)
-
-
 def test_the_curves_are_those_of_frames_that_do_not_turn(learnt):
     d = learnt.distance_mm
     for row, width in zip(learnt.correlation, widths(DEPTHS_MM), strict=True):
         useful = (d > 0.1) & (d < 1.5 * width)
         read = np.interp(-np.exp(-(d[useful] ** 2) / (2 * width**2)), -row, d)
         np.testing.assert_allclose(read, d[useful], rtol=0.03)
-
-
-def test_frames_that_turn_do_not_bend_the_curves():
-    """Of hand-held sweeps alone, none of which moves without turning."""
-    made = learn([stepped(wander_deg=1.0, seed=seed) for seed in range(4)])
-    assert made.tilt is not None
-    width = np.array([np.interp(-0.5, -row, made.distance_mm) for row in made.correlation]) / np.sqrt(
-        2 * np.log(2)
-    )
-    np.testing.assert_allclose(width, widths(DEPTHS_MM), rtol=0.03)
-    # Told that nothing turned, the same samples bend them.
-    blind = [replace(stepped(wander_deg=1.0, seed=s)) for s in range(4)]
-    blind = [replace(s, tilt_rad=np.zeros_like(s.tilt_rad)) for s in blind]
-    bent = learn(blind)
-    bent = np.array([np.interp(-0.5, -row, bent.distance_mm) for row in bent.correlation]) / np.sqrt(
-        2 * np.log(2)
-    )
-    assert np.abs(bent / widths(DEPTHS_MM) - 1).max() > 0.06
 
 
 def test_the_pivots_sign_is_told():
@@ -147,20 +106,6 @@ def test_the_pivots_sign_is_told():
 
 def test_phantoms_that_do_not_turn_tell_nothing_of_it():
     assert learn([stepped(seed=seed) for seed in range(2)]).tilt is None
-
-
-def test_phantoms_that_hardly_turn_tell_too_little_of_it():
-    """A hundredth of a degree, as of a linear stage's ways, is lost in the noise of the correlations."""
-    assert learn([stepped(wander_deg=0.003, seed=seed) for seed in range(2)]).tilt is None
-
-
-def test_few_pairs_that_turn_are_not_enough():
-    few = stepped(frames=6, wander_deg=1.0)
-    distance = np.linspace(0.0, 2.0, 201)
-    curves = np.array([speckle.gaussian_correlation(distance, w) for w in widths(DEPTHS_MM)])
-    samples = (few.depth_mm, few.offset_mm, few.tilt_rad, few.correlation)
-    cells = np.full(DEPTHS_MM.size, float(CELLS))
-    assert fit_tilt_response(DEPTHS_MM, curves, cells, distance, K_PER_MM, True, samples) is None
 
 
 def test_bmode_images_of_unknown_frequency_have_a_pivot_without_spread():
@@ -193,16 +138,11 @@ def read_lengths(learnt, tilt_deg, step_mm):
     """Relative error of length without the response, with it, and with it and a sensed orientation."""
     depth = (5.0, 15.0, 35.0)
     still = replace(speckle.curves(sigma_mm=widths(depth), depth_mm=depth, cells=CELLS), key=ECHO)
-    without, with_it = (PlaneFitter(DistanceEstimator(made, PATCHES), AT) for made in (still, learnt))
     pairs = np.array([tilt_sweep(tilt_deg, step_mm, seed) for seed in range(40)], np.float32)
-    still_image = np.zeros((40, 2))
     slopes = np.tile([0.0, np.deg2rad(tilt_deg)], (40, 1))
-    read = (
-        without.fit(pairs, still_image),
-        with_it.fit(pairs, still_image),
-        with_it.fit(pairs, still_image, slopes=slopes),
-    )
-    return np.array([planes.offset_mm.mean() for planes in read]) / step_mm - 1
+    without, with_it = (problem_of(made, PATCHES, GRID) for made in (still, learnt))
+    read = (fit_many(without, pairs), fit_many(with_it, pairs), fit_many(with_it, pairs, slopes=slopes))
+    return np.array([planes.offset_mm.mean() for planes, _ in read]) / step_mm - 1
 
 
 @pytest.mark.parametrize("step_mm", [0.2, 0.3])
@@ -213,10 +153,3 @@ def test_a_degree_of_tilt_per_pair_no_longer_lengthens_the_sweep(learnt, step_mm
     assert abs(sensed) < 0.05
     # Images alone see little of the tilt itself, and the length is better for it all the same.
     assert abs(with_it) < 0.06
-
-
-def test_tilt_the_other_way_is_as_good(learnt):
-    """There, turning brings half the depths nearer, and errors cancel in part even without."""
-    _, with_it, sensed = read_lengths(learnt, -1.0, 0.2)
-    assert abs(sensed) < 0.05
-    assert abs(with_it) < 0.1

@@ -5,7 +5,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.reconstruction import SharedErrors
-from speckle3d.motion.uncertainty import SCALE_CHANGE_MM, SHARED, claimed_covariance
+from speckle3d.motion.uncertainty import (
+    SCALE_CHANGE_MM,
+    SHARED,
+    claimed_covariance,
+    joint_errors,
+    shared_covariance,
+)
 
 CENTRE_MM = np.array([7.0, 22.0, 0.0])
 Z_MM = np.concatenate([np.linspace(0, 10, 51), np.linspace(10, 0, 51)[1:]])
@@ -49,19 +55,6 @@ def test_structure_that_stays_makes_lateral_motion_and_roll_uncertain():
     np.testing.assert_allclose(grown[[Y, Z, TILT, YAW]], 1.0)
 
 
-def test_without_other_errors_what_is_left_is_the_graphs():
-    found = covariance(independent=1e-4)
-    np.testing.assert_allclose(found, np.tile(1e-4 * np.diag(SHARED**2), (len(POSES), 1, 1)), atol=1e-15)
-
-
-def test_parts_add_up():
-    """Independent of each other: variances of all errors are the sums of each one's."""
-    none = covariance()
-    parts = [covariance(scale=0.02), covariance(turn=(1e-3, 0.0)), covariance(turn=(0.0, 2e-3))]
-    whole = covariance(0.02, (1e-3, 2e-3))
-    np.testing.assert_allclose(whole - none, sum(part - none for part in parts), atol=1e-15)
-
-
 def test_a_turned_frames_own_errors_are_given_along_the_first_frames_axes():
     """A quarter turn of yaw: what the frame calls across is the sweep's elevation."""
     turns = Rotation.from_rotvec([[0, 0, 0], [0, np.pi / 2, 0]])
@@ -74,3 +67,46 @@ def test_a_turned_frames_own_errors_are_given_along_the_first_frames_axes():
     assert turned[X, X] == pytest.approx(1e-6 * SHARED[Z] ** 2)
     assert turned[ROLL, ROLL] == pytest.approx(1e-8 * SHARED[TILT] ** 2)
     assert turned[TILT, TILT] == pytest.approx(0, abs=1e-20)
+
+
+# ---- all frames together ----------------------------------------------------------------------------------
+
+CLAIMS = SharedErrors(0.02, 0.03, np.array([1e-3, 2e-3]))
+ONE_WAY = POSES[:51]
+
+
+def grown(poses):
+    """Covariance that grows with the way, in lines and in angles, which have some of it in common."""
+    root = np.diag([0.01, 0.01, 0.02, 5e-4, 5e-4, 3e-4]) @ (np.eye(6) + 0.3)
+    return np.linspace(0.0, 1.0, len(poses))[:, None, None] * (root @ root.T)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 51, 101])
+def test_each_frame_has_the_covariance_that_was_claimed(frames):
+    poses = POSES[:frames]
+    claimed = grown(poses) + shared_covariance(poses, CENTRE_MM, CLAIMS)
+    for shared in (CLAIMS, None):
+        found = joint_errors(claimed, poses, CENTRE_MM, shared).covariance()
+        np.testing.assert_allclose(found, claimed, rtol=1e-6, atol=1e-12)
+
+
+def test_what_is_shared_stretches_and_what_has_grown_is_a_random_walk():
+    claimed = grown(ONE_WAY) + shared_covariance(ONE_WAY, CENTRE_MM, CLAIMS)
+    errors = joint_errors(claimed, ONE_WAY, CENTRE_MM, CLAIMS)
+    own = grown(ONE_WAY)[-1, Z, Z] / 10.0 + SCALE_CHANGE_MM * 0.02**2
+    for i, j in ((0, 50), (10, 40), (20, 25)):
+        apart = errors.factors[:, j, Z] - errors.factors[:, i, Z]
+        away = (j - i) / 5.0
+        expected = np.hypot(0.02, 0.03) ** 2 * away**2 + own * away
+        assert apart @ apart == pytest.approx(expected, rel=0.02)
+
+
+def test_the_claim_of_two_frames_does_not_hang_on_rounding():
+    """A direction that is as good as certain stays so, however the covariance is rounded."""
+    claimed = grown(ONE_WAY)
+    claimed[:, :, YAW] = claimed[:, YAW, :] = 0.0
+    claimed[:, YAW, YAW] = 1e-20
+    rounded = claimed * (1.0 + 1e-15 * np.random.default_rng(1).normal(size=claimed.shape))
+    factors = [joint_errors(c, ONE_WAY, CENTRE_MM).factors for c in (claimed, rounded)]
+    one, other = (f[:, 10].T @ f[:, 40] for f in factors)
+    np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-15)

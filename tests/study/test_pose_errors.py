@@ -9,7 +9,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Reconstruction, SharedErrors, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.pose_errors import errors_of, measure
+from speckle3d.study.pose_errors import caution, errors_of, measure
 
 GRID = ImageGrid(41, 81, 0.5, 0.5)
 N = 61
@@ -47,6 +47,13 @@ def test_an_images_length_is_as_sure_as_the_file_claims():
 def test_a_mode_with_claims_of_its_own_has_these():
     errors = errors_of(made(), "fused")
     assert along(errors, 0, N - 1) == pytest.approx(np.sqrt((0.004 * 20) ** 2 + 1e-4 * 20), rel=1e-3)
+
+
+def test_modes_of_older_files_that_claim_nothing_take_the_images_errors_and_say_so():
+    for mode in ("orientation", "pose"):
+        np.testing.assert_array_equal(errors_of(made(), mode).factors, errors_of(made()).factors)
+        assert caution(made(), mode) is not None
+    assert caution(made(), "fused") is None
 
 
 def test_points_of_the_world_are_measured_at_once():
