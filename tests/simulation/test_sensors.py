@@ -73,7 +73,7 @@ def test_orientation_error_over_a_sweep_is_an_mt9s(trajectory):
     assert 0.17 < heading < 0.37
 
 
-def test_gyroscope_integrates_to_the_orientation(trajectory):
+def test_exact_raw_readings_integrate_to_the_orientation_and_the_path(trajectory):
     sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
     readings = sensor.readings
     rates = sensor.gyroscope_rad_s
@@ -83,9 +83,7 @@ def test_gyroscope_integrates_to_the_orientation(trajectory):
     worst = np.abs(steps).max()
     np.testing.assert_allclose(dt * (rates[1:] + rates[:-1]) / 2, steps, atol=0.06 * worst)
 
-
-def test_accelerometer_feels_gravity_and_the_sweep(trajectory):
-    sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
+    # The accelerometer feels gravity and the sweep.
     force = sensor.readings.world_from_sensor.apply(sensor.accelerometer_m_s2)
     assert force.mean(axis=0) == pytest.approx([0.0, 0.0, 9.81], abs=0.01)
     # Integrated twice, the specific force less gravity is the sensor's own path.
