@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
+from speckle3d.core.leastsquares import autocorrelation_time
 from speckle3d.correction.settings import FusedSettings
 
 CUBIC = 3
@@ -32,29 +33,6 @@ def length_sigma(poses: RigidTransform, covariance: FloatArray, centre_mm: Float
     return float(np.sqrt(covariance[farthest, 2, 2]) / max(abs(float(z_mm[farthest])), LEAST_LENGTH_MM))
 
 
-def correlated_readings(error: FloatArray, shapes: int) -> float:
-    """How many neighbouring readings err as one: the sum of their autocorrelation, at least one.
-
-    Parameters
-    ----------
-    error : ndarray, shape (m, k)
-        Residuals of a fit.
-    shapes : int
-        Slow shapes that the fit has taken out of each column: where it lies, its slope, its bend. These make
-        every autocovariance smaller by `shapes` / m of the sum of all, which is put back.
-    """
-    error = error - error.mean(axis=0)
-    m, energy = len(error), float((error**2).sum())
-    total, lags = energy, 1
-    while lags < m // 4:
-        alike = float((error[lags:] * error[:-lags]).sum())
-        if alike <= 0.0:
-            break
-        total, lags = total + 2.0 * alike, lags + 1
-    lost = min((2 * lags - 1) * shapes / m, 0.75) if lags > 1 else 0.0
-    return max(total / max(energy, np.finfo(float).tiny) / (1.0 - lost), 1.0)
-
-
 def curve_errors(error: FloatArray, frames: int) -> FloatArray:
     """Covariance of poses that cubics in time have bent onto readings, by what these leave, shape (n, 6, 6).
 
@@ -72,7 +50,7 @@ def curve_errors(error: FloatArray, frames: int) -> FloatArray:
     order = np.arange(CUBIC + 1)
     basis = legendre.legvander(np.linspace(-1.0, 1.0, frames), CUBIC) * np.sqrt(2.0 * order + 1.0)
     against_first = ((basis - basis[0]) ** 2).sum(axis=1) / len(error)
-    alike = [correlated_readings(column[:, None], CUBIC + 1) for column in error.T]
+    alike = [autocorrelation_time(column - column.mean()) for column in error.T]
     white = np.mean((error[2:] - 2.0 * error[1:-1] + error[:-2]) ** 2, axis=0) / 6.0
     left = 2.0 * np.maximum(error.var(axis=0) - white, 0.0)
     variance = against_first[:, None] * error.var(axis=0) * alike

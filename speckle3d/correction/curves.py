@@ -169,23 +169,19 @@ def correction_matrices(values: FloatArray) -> FloatArray:
     return matrices
 
 
-def angle_axes(roll: FloatArray, yaw: FloatArray) -> FloatArray:
-    """Axes about which tilt, yaw and roll turn Rz(roll) Ry(yaw) Rx(tilt), as columns, shape (n, 3, 3)."""
-    axes = np.zeros((roll.size, 3, 3))
-    axes[:, 0, 0], axes[:, 1, 0] = np.cos(yaw) * np.cos(roll), np.cos(yaw) * np.sin(roll)
-    axes[:, 2, 0] = -np.sin(yaw)
-    axes[:, 0, 1], axes[:, 1, 1] = -np.sin(roll), np.cos(roll)
-    axes[:, 2, 2] = 1.0
-    return axes
-
-
 def _world_axes(poses: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Twist in the world of each of a frame's six corrections, as columns: turn and shift, (n, 3, 6)."""
     rotation = correction_matrices(values)[:, :3, :3]
     before = poses[:, :3, :3] @ rotation.transpose(0, 2, 1)
     turn, shift = np.zeros((len(poses), 3, 6)), np.zeros((len(poses), 3, 6))
     shift[:, :, :3] = before
-    turn[:, :, 3:] = before @ angle_axes(values[:, 5], values[:, 4])
+    # Tilt, yaw and roll turn Rz(roll) Ry(yaw) Rx(tilt) about its own x, the y before it, and z.
+    axes = np.stack(
+        [rotation[:, :, 0], np.cross([0.0, 0.0, 1.0], rotation[:, :, 0]), 0 * rotation[:, :, 0]], axis=-1
+    )
+    axes[:, :, 1] /= np.linalg.norm(axes[:, :, 1], axis=1, keepdims=True)
+    axes[:, 2, 2] = 1.0
+    turn[:, :, 3:] = before @ axes
     # The turn is about the frame's own origin p: w x (X - p) = w x X + p x w.
     shift[:, :, 3:] = skew(poses[:, :3, 3]) @ turn[:, :, 3:]
     return turn, shift

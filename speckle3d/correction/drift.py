@@ -6,6 +6,7 @@ Smooth curves, too stiff to follow the jitter, bend the one onto the other.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt, skew
+from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
 from speckle3d.core.shown import shown
 from speckle3d.correction.claims import curve_errors, length_sigma
 from speckle3d.correction.curves import (
@@ -24,9 +25,9 @@ from speckle3d.correction.curves import (
     COEFFICIENTS,
     CorrectedChain,
     Curves,
-    angle_axes,
     curve_basis,
 )
+
 
 _MOST_EVALUATIONS = 200
 """Of the optimisation; sweeps need 10 to 20."""
@@ -146,18 +147,20 @@ def correct_pose(
     used = _require_coverage(covered, len(world_from_image), len(reference), settings)
     sensor_from_start = _register(_points(world_from_image[used], corners), _points(reference, corners))
     target = _points(sensor_from_start.inv() * reference, corners)
-    chain = _chain(world_from_image, corners.mean(axis=0), AXES, settings)
-    problem = _CornerProblem(chain, used, corners, target, settings.loss_epsilon_mm)
-    fit = _solve(problem, chain, settings)
-    bent = chain.poses(fit.x)
-    poses = sensor_from_start * RigidTransform.from_matrix(bent)
     centre = corners.mean(axis=0)
+    chain = _chain(world_from_image, centre, AXES, settings)
+
+    def misfit(poses: FloatArray) -> FloatArray:
+        """Equation (4): distances between corrected and measured corners of every covered frame."""
+        error = _points(RigidTransform.from_matrix(poses), corners) - target
+        softened = (error**2).sum(axis=-1, keepdims=True) + settings.loss_epsilon_mm**2
+        return np.asarray((error * softened**-0.25).reshape(len(poses), -1))
+
+    fit = _solve(misfit, chain, used, settings)
+    poses = sensor_from_start * RigidTransform.from_matrix(chain.poses(fit.x))
     left = poses[used].inv() * reference
     error = np.hstack([left.apply(centre) - centre, left.rotation.as_rotvec()])
-    covariance = curve_errors(error, len(poses))
-    sigma = length_sigma(poses, covariance, centre)
-    values = chain.values(fit.x)
-    return DriftCorrection(poses, fit, chain.names, values, float(used.mean()), settings, covariance, sigma)
+    return _correction(poses, fit, chain, used, settings, error, centre)
 
 
 def correct_orientation(
@@ -198,92 +201,46 @@ def correct_orientation(
         raise InvalidInputError(f"centre_mm: expected shape (3,), got {centre.shape}")
     used = _require_coverage(covered, len(world_from_image), len(reference), settings)
     sensor_from_start = (reference * world_from_image[used].rotation.inv()).mean()
-    target = (sensor_from_start.inv() * reference).as_matrix()
+    target = sensor_from_start.inv() * reference
     # With the frame's origin moved to the centre, a turn about the centre has no translation.
     image_from_centred = RigidTransform.from_translation(centre)
     chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
-    fit = _solve(_OrientationProblem(chain, used, target), chain, settings)
-    bent = chain.poses(fit.x)
-    angles = fit.fun.reshape(-1, 3)[:, ::-1]
-    covariance = curve_errors(np.hstack([np.zeros_like(angles), angles]), len(world_from_image))
-    centred = RigidTransform.from_matrix(bent)
+
+    def misfit(poses: FloatArray) -> FloatArray:
+        """Equation (5): roll, yaw and tilt of the measured orientation seen from the corrected frame."""
+        return roll_yaw_tilt(Rotation.from_matrix(poses[:, :3, :3]).inv() * target)
+
+    fit = _solve(misfit, chain, used, settings)
+    centred = RigidTransform.from_matrix(chain.poses(fit.x))
     turned = RigidTransform.from_rotation(sensor_from_start) * centred * image_from_centred.inv()
     poses = RigidTransform.from_translation(-turned[0].translation) * turned
-    sigma, values = length_sigma(poses, covariance, centre), chain.values(fit.x)
-    return DriftCorrection(poses, fit, chain.names, values, float(used.mean()), settings, covariance, sigma)
-
-
-@dataclass(frozen=True)
-class _CornerProblem:
-    """Equation (4): distances between corrected and measured corners of the covered frames."""
-
-    chain: CorrectedChain
-    covered: BoolArray
-    corners: FloatArray
-    target: FloatArray
-    epsilon_mm: float
-
-    def residuals(self, coefficients: FloatArray) -> FloatArray:
-        error = self._corners(self.chain.poses(coefficients)) - self.target
-        return np.asarray((error * self._softened(error)[..., None] ** -0.25).ravel())
-
-    def jacobian(self, coefficients: FloatArray) -> FloatArray:
-        poses = self.chain.poses(coefficients)
-        points = self._corners(poses)
-        turn, shift = self.chain.twists(coefficients, poses)
-        motion = np.concatenate([turn, shift], axis=1)[self.covered]
-        gain = self._gain(points - self.target)
-        per_motion = np.concatenate([-gain @ skew(points), gain], axis=-1)
-        rows = per_motion.reshape(len(points), -1, 6) @ motion
-        return np.asarray(rows.reshape(-1, coefficients.size))
-
-    def _corners(self, poses: FloatArray) -> FloatArray:
-        rotation, origin = poses[self.covered, :3, :3], poses[self.covered, :3, 3]
-        return np.asarray(self.corners @ rotation.transpose(0, 2, 1) + origin[:, None, :])
-
-    def _softened(self, error: FloatArray) -> FloatArray:
-        return np.asarray((error**2).sum(axis=-1) + self.epsilon_mm**2)
-
-    def _gain(self, error: FloatArray) -> FloatArray:
-        """Differentiate the robust residual by the error, shape (f, c, 3, 3)."""
-        softened = self._softened(error)[..., None, None]
-        outer = error[..., :, None] * error[..., None, :]
-        return np.asarray(softened**-0.25 * (np.eye(3) - 0.5 * outer / softened))
-
-
-@dataclass(frozen=True)
-class _OrientationProblem:
-    """Equation (5): roll, yaw and tilt of the measured orientation seen from the corrected frame."""
-
-    chain: CorrectedChain
-    covered: BoolArray
-    target: FloatArray
-
-    def residuals(self, coefficients: FloatArray) -> FloatArray:
-        return self._angles(self.chain.poses(coefficients)).ravel()
-
-    def jacobian(self, coefficients: FloatArray) -> FloatArray:
-        poses = self.chain.poses(coefficients)
-        turn, _ = self.chain.twists(coefficients, poses)
-        angles = self._angles(poses)
-        image_from_world = poses[self.covered, :3, :3].transpose(0, 2, 1)
-        seen = -image_from_world @ turn[self.covered]
-        tilt_yaw_roll = np.linalg.solve(angle_axes(angles[:, 0], angles[:, 1]), seen)
-        return np.asarray(tilt_yaw_roll[:, ::-1].reshape(-1, coefficients.size))
-
-    def _angles(self, poses: FloatArray) -> FloatArray:
-        image_from_world = poses[self.covered, :3, :3].transpose(0, 2, 1)
-        return roll_yaw_tilt(Rotation.from_matrix(image_from_world @ self.target))
+    angles = fit.fun.reshape(-1, 3)[:, ::-1]
+    error = np.hstack([np.zeros_like(angles), angles])
+    return _correction(poses, fit, chain, used, settings, error, centre)
 
 
 def _solve(
-    problem: _CornerProblem | _OrientationProblem, chain: CorrectedChain, settings: DriftSettings
+    misfit: Callable[[FloatArray], FloatArray],
+    chain: CorrectedChain,
+    used: BoolArray,
+    settings: DriftSettings,
 ) -> OptimizeResult:
-    start, tolerance = np.zeros(len(chain.names)), settings.tolerance
+    """Least squares of the misfits of the covered frames' poses, each of which depends on one pose alone."""
+    tick = 1e-7
+    small = RigidTransform.from_exp_coords(tick * np.eye(6)).as_matrix()
+
+    def jacobian(coefficients: FloatArray) -> FloatArray:
+        poses = chain.poses(coefficients)
+        twists = np.concatenate(chain.twists(coefficients, poses), axis=1)[used]
+        now = misfit(poses[used])
+        slopes = np.stack([misfit(each @ poses[used]) - now for each in small], axis=-1) / tick
+        return np.asarray((slopes @ twists).reshape(-1, coefficients.size))
+
+    tolerance = settings.tolerance
     return least_squares(
-        problem.residuals,
-        start,
-        problem.jacobian,
+        lambda coefficients: misfit(chain.poses(coefficients)[used]).ravel(),
+        np.zeros(len(chain.names)),
+        jacobian,
         method="lm",
         x_scale="jac",
         xtol=tolerance,
@@ -291,6 +248,21 @@ def _solve(
         gtol=tolerance,
         max_nfev=_MOST_EVALUATIONS,
     )
+
+
+def _correction(
+    poses: RigidTransform,
+    fit: OptimizeResult,
+    chain: CorrectedChain,
+    used: BoolArray,
+    settings: DriftSettings,
+    error: FloatArray,
+    centre_mm: FloatArray,
+) -> DriftCorrection:
+    """The result, with what the readings' scatter about the curves claims."""
+    covariance = curve_errors(error, len(poses))
+    sigma, values = length_sigma(poses, covariance, centre_mm), chain.values(fit.x)
+    return DriftCorrection(poses, fit, chain.names, values, float(used.mean()), settings, covariance, sigma)
 
 
 def _chain(

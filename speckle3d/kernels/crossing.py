@@ -7,6 +7,7 @@ import math
 from numba import njit
 
 from speckle3d.core.arrays import Float32Array, FloatArray
+from speckle3d.kernels.slicing import bilinear
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath=False)
@@ -27,7 +28,7 @@ def look_up(
     """Fill ``values`` with the grey level at each point and ``slopes`` with its change with the point.
 
     Between two neighbouring planes a point's coordinates in them, and the grey levels, are interpolated
-    linearly. Where the point lies outside, or beside a NaN, the value and its slopes are NaN.
+    linearly. Where the point lies outside, or beside a NaN, the value is NaN.
 
     Parameters
     ----------
@@ -42,63 +43,43 @@ def look_up(
     values, place : ndarray, shape (n,)
         Grey level, and number of the plane, with its fraction.
     slopes : ndarray, shape (n, 3)
-        Per mm, along the path's axes; empty if they are not wanted.
+        Per mm, along the path's axes; undefined where the value is NaN.
     """
     many, wide, high = volume.shape
-    with_slopes = slopes.shape[0] > 0
     at = many // 2
     for i in range(points.shape[0]):
         p0, p1, p2 = points[i, 0], points[i, 1], points[i, 2]
-        values[i] = math.nan
-        place[i] = math.nan
-        if with_slopes:
-            slopes[i] = math.nan
-        at = min(max(at, 0), many - 2)
+        values[i] = place[i] = math.nan
         d = _local(planes[at], p0, p1, p2, 2)
         # The planes are in order along the path; neighbouring points lie near each other.
         while d < 0.0 and at > 0:
             at -= 1
             d = _local(planes[at], p0, p1, p2, 2)
-        if d < 0.0:
-            continue
-        after = _local(planes[at + 1], p0, p1, p2, 2)
+        at = min(at, many - 2)
+        d, after = _local(planes[at], p0, p1, p2, 2), _local(planes[at + 1], p0, p1, p2, 2)
         while after >= 0.0 and at < many - 2:
             at += 1
-            d = after
-            after = _local(planes[at + 1], p0, p1, p2, 2)
-        if after > 0.0 or d - after <= 0.0:
+            d, after = after, _local(planes[at + 1], p0, p1, p2, 2)
+        if d < 0.0 or after > 0.0 or d - after <= 0.0:
             continue
         gap = d - after
         f = d / gap
         x, y = _local(planes[at], p0, p1, p2, 0), _local(planes[at], p0, p1, p2, 1)
-        dx = _local(planes[at + 1], p0, p1, p2, 0) - x
-        dy = _local(planes[at + 1], p0, p1, p2, 1) - y
-        u = (x + f * dx - pixels[2]) / pixels[0]
-        v = (y + f * dy - pixels[3]) / pixels[1]
+        dx, dy = _local(planes[at + 1], p0, p1, p2, 0) - x, _local(planes[at + 1], p0, p1, p2, 1) - y
+        u, v = (x + f * dx - pixels[2]) / pixels[0], (y + f * dy - pixels[3]) / pixels[1]
         if not (0.0 <= u <= wide - 1.0 and 0.0 <= v <= high - 1.0):
             continue
-        iu, iv = min(int(u), wide - 2), min(int(v), high - 2)
-        a, b = u - iu, v - iv
-        c00 = volume[at, iu, iv] * (1 - f) + volume[at + 1, iu, iv] * f
-        c01 = volume[at, iu, iv + 1] * (1 - f) + volume[at + 1, iu, iv + 1] * f
-        c10 = volume[at, iu + 1, iv] * (1 - f) + volume[at + 1, iu + 1, iv] * f
-        c11 = volume[at, iu + 1, iv + 1] * (1 - f) + volume[at + 1, iu + 1, iv + 1] * f
-        near, far = c00 + b * (c01 - c00), c10 + b * (c11 - c10)
-        values[i] = near + a * (far - near)
+        near, near_u, near_v = bilinear(volume[at], u, v)
+        far, far_u, far_v = bilinear(volume[at + 1], u, v)
+        values[i] = near + f * (far - near)
         place[i] = at + f
-        if not with_slopes or math.isnan(values[i]):
-            continue
-        by_u = (far - near) / pixels[0]
-        by_v = ((1 - a) * (c01 - c00) + a * (c11 - c10)) / pixels[1]
-        lower = (1 - a) * ((1 - b) * volume[at, iu, iv] + b * volume[at, iu, iv + 1])
-        lower += a * ((1 - b) * volume[at, iu + 1, iv] + b * volume[at, iu + 1, iv + 1])
-        upper = (1 - a) * ((1 - b) * volume[at + 1, iu, iv] + b * volume[at + 1, iu, iv + 1])
-        upper += a * ((1 - b) * volume[at + 1, iu + 1, iv] + b * volume[at + 1, iu + 1, iv + 1])
-        by_f = upper - lower + by_u * dx + by_v * dy
+        by_u, by_v = (near_u + f * (far_u - near_u)) / pixels[0], (near_v + f * (far_v - near_v)) / pixels[1]
+        by_f = far - near + by_u * dx + by_v * dy
         for axis in range(3):
             # f = d / (d - after), both of which are linear in the point.
-            near_d, after_d = planes[at, 2, axis], planes[at + 1, 2, axis]
-            moved = (near_d * (1 - f) + after_d * f) / gap
-            x_axis = planes[at, 0, axis] * (1 - f) + planes[at + 1, 0, axis] * f
-            y_axis = planes[at, 1, axis] * (1 - f) + planes[at + 1, 1, axis] * f
-            slopes[i, axis] = by_u * x_axis + by_v * y_axis + by_f * moved
+            a, b = planes[at, :, axis], planes[at + 1, :, axis]
+            slopes[i, axis] = (
+                by_u * (a[0] * (1 - f) + b[0] * f)
+                + by_v * (a[1] * (1 - f) + b[1] * f)
+                + by_f * (a[2] * (1 - f) + b[2] * f) / gap
+            )

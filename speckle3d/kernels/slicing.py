@@ -144,25 +144,22 @@ def compare_patches(
         out.share[p] = n / max(wanted, 1)
         if n < 6 or n < least_share * wanted:
             continue
-        mean_f = mean_g = 0.0
-        for i in range(n):
-            mean_f += f[i]
-            mean_g += g[i]
-        mean_f /= n
-        mean_g /= n
-        ff = gg = fg = 0.0
-        for i in range(n):
-            f[i] -= mean_f
-            g[i] -= mean_g
-            ff += f[i] * f[i]
-            gg += g[i] * g[i]
-            fg += f[i] * g[i]
-        if ff <= 1e-12 or gg <= 1e-12:
+        a, b = f[:n] - f[:n].mean(), g[:n] - g[:n].mean()
+        norm_a, norm_b = math.sqrt(a @ a), math.sqrt(b @ b)
+        if norm_a <= 1e-6 or norm_b <= 1e-6:
             continue
-        out.alike[p] = fg / math.sqrt(ff * gg)
-        out.energy[p, 0], out.energy[p, 1] = math.sqrt(ff / n), math.sqrt(gg / n)
+        a /= norm_a
+        b /= norm_b
+        out.alike[p] = a @ b
+        out.energy[p, 0], out.energy[p, 1] = norm_a / math.sqrt(n), norm_b / math.sqrt(n)
         if derivatives:
-            _differentiate(f[:n], g[:n], math.sqrt(ff), math.sqrt(gg), rows, out.normal[p], out.gradient[p])
+            # Neither brightness nor contrast counts.
+            fixed = np.full((2, n), 1.0 / math.sqrt(n))
+            fixed[1] = b
+            slopes = rows[:, :n] / norm_b
+            lost = slopes @ fixed.T
+            out.normal[p] = slopes @ slopes.T - lost @ lost.T
+            out.gradient[p] = slopes @ a - lost[:, 1] * out.alike[p]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
@@ -326,38 +323,3 @@ def _fill_rows(
         row[5] += bz - az
         row[6] += x * bx - px * ax
         row[7] += y * by - py * ay
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
-def _differentiate(
-    f: FloatArray,
-    g: FloatArray,
-    norm_f: float,
-    norm_g: float,
-    rows: FloatArray,
-    normal: FloatArray,
-    gradient: FloatArray,
-) -> None:
-    """Gauss-Newton matrix and gradient of one patch, from levels less their means; `g` is normalised."""
-    n = f.shape[0]
-    for i in range(n):
-        g[i] /= norm_g
-    for c in range(PARAMETERS):
-        mean = along = 0.0
-        for i in range(n):
-            mean += rows[c, i]
-        mean /= n
-        for i in range(n):
-            rows[c, i] = (rows[c, i] - mean) / norm_g
-            along += rows[c, i] * g[i]
-        change = 0.0
-        for i in range(n):
-            rows[c, i] -= along * g[i]
-            change += rows[c, i] * f[i] / norm_f
-        gradient[c] = change
-    for c in range(PARAMETERS):
-        for d in range(c + 1):
-            total = 0.0
-            for i in range(n):
-                total += rows[c, i] * rows[d, i]
-            normal[c, d] = normal[d, c] = total

@@ -15,7 +15,7 @@ the lines average that. No number of the reference depends on an estimate.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -94,29 +94,15 @@ class ModeError:
     part: str
     mode: str
     frames: int
-    reference_mm: float
-    estimate_mm: float
-    length_error_mm: float
-    length_error_percent: float
-    tilt_error_deg: float
-    yaw_error_deg: float
-    roll_error_deg: float
+    reference_mm: float = np.nan
+    estimate_mm: float = np.nan
+    length_error_mm: float = np.nan
+    length_error_percent: float = np.nan
+    tilt_error_deg: float = np.nan
+    yaw_error_deg: float = np.nan
+    roll_error_deg: float = np.nan
     reference_sigma_mm: float = 0.0
     sigma_mm: float = np.nan
-
-    @classmethod
-    def of_length(cls, part: str, mode: str, frames: int, length_mm: float) -> ModeError:
-        """Row of a length alone, where there is nothing to compare it with; errors NaN."""
-        nan = np.nan
-        return cls(part, mode, frames, nan, abs(length_mm), nan, nan, nan, nan, nan)
-
-    def of_reference(self, mode: str) -> ModeError:
-        """Row of the reference itself under a mode's name: its length, errors NaN."""
-        row, sigma_mm = (
-            ModeError.of_length(self.part, mode, self.frames, self.reference_mm),
-            self.reference_sigma_mm,
-        )
-        return replace(row, reference_mm=self.reference_mm, reference_sigma_mm=sigma_mm, sigma_mm=sigma_mm)
 
 
 def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> Accumulated:
@@ -226,24 +212,27 @@ def compare_modes(
         if got != expected:
             raise MismatchError(f"{name}: expected {expected} poses, got {got}")
     true = accumulated(true_poses, centre_mm)
-    jitter = 0.0 if end_frames == 1 else jitter_mm(true.length_mm)
     estimates = {mode: accumulated(each[used], centre_mm) for mode, each in poses.items()}
     rows = []
     for part in monotone_parts(true.length_mm):
-        true_changes, size = _changes(true, part, end_frames), part.last - part.first + 1
+        frames, (wanted, reference_sigma_mm) = part.last - part.first + 1, _changes(true, part, end_frames)
+        reference_mm, sign = abs(wanted[0]), -1.0 if wanted[0] < 0 else 1.0
         for mode, estimate in estimates.items():
-            ends = END_FRAMES if mode == TRACKER else end_frames
-            row = _mode_error(part, mode, _changes(estimate, part, ends), true_changes)
-            own_mm = jitter_mm(estimate.length_mm) * _end_factor(size, ends) if mode == TRACKER else np.nan
-            sigma_mm = jitter * _end_factor(size, end_frames)
-            rows.append(replace(row, reference_sigma_mm=sigma_mm, sigma_mm=own_mm))
+            changes, sigma_mm = _changes(estimate, part, END_FRAMES if mode == TRACKER else end_frames)
+            error_mm = sign * (changes[0] - wanted[0])
+            percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
+            turns = np.rad2deg(np.subtract(changes[1:], wanted[1:])).tolist()
+            lengths = reference_mm, reference_mm + error_mm, error_mm, percent
+            sigmas = reference_sigma_mm, sigma_mm if mode == TRACKER else np.nan
+            rows.append(ModeError(part.name, mode, frames, *lengths, *turns, *sigmas))
     return rows
 
 
 def travelled_mm(mode: str, world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> float:
     """Signed length of a whole sweep between its ends, read as the module says without a reference."""
     whole = Part("all", 0, len(world_from_image) - 1)
-    return _changes(accumulated(world_from_image, centre_mm), whole, END_FRAMES if mode == TRACKER else 1)[0]
+    motion = accumulated(world_from_image, centre_mm)
+    return _changes(motion, whole, END_FRAMES if mode == TRACKER else 1)[0][0]
 
 
 def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
@@ -286,26 +275,14 @@ def _width(size: int, end_frames: int) -> int:
     return max(1, min(end_frames, size // 10))
 
 
-def _end_factor(size: int, end_frames: int) -> float:
-    """Standard deviation of a part's change over that of a reading: of two ends of least-squares lines."""
-    width = _width(size, end_frames)
-    variance = _LINE_EXCESS * (4 * width - 2) / (width * (width + 1)) if width > 2 else 1.0
-    return float(np.sqrt(2.0 * variance))
-
-
-def _changes(motion: Accumulated, part: Part, end_frames: int) -> list[float]:
-    """Change of length, tilt, yaw and roll from the first to the last frame of a part."""
+def _changes(motion: Accumulated, part: Part, end_frames: int) -> tuple[list[float], float]:
+    """Change of length, tilt, yaw and roll over a part, and the length's deviation by jitter at both ends."""
     inside = [each[part.first : part.last + 1] for each in motion]
-    return [read_end(each, end_frames) - read_end(each[::-1], end_frames) for each in inside]
-
-
-def _mode_error(part: Part, mode: str, changes: list[float], true: list[float]) -> ModeError:
-    reference_mm, sign = abs(true[0]), -1.0 if true[0] < 0 else 1.0
-    error_mm = sign * (changes[0] - true[0])
-    percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
-    tilt, yaw, roll = np.rad2deg(np.subtract(changes[1:], true[1:])).tolist()
-    lengths = reference_mm, reference_mm + error_mm, error_mm, percent
-    return ModeError(part.name, mode, part.last - part.first + 1, *lengths, tilt, yaw, roll)
+    changes = [read_end(each, end_frames) - read_end(each[::-1], end_frames) for each in inside]
+    width = _width(inside[0].size, end_frames)
+    variance = _LINE_EXCESS * (4 * width - 2) / (width * (width + 1)) if width > 2 else 1.0
+    jitter = 0.0 if end_frames == 1 else jitter_mm(motion.length_mm)
+    return changes, jitter * float(np.sqrt(2.0 * variance))
 
 
 def _turning_frames(length: FloatArray) -> list[int]:

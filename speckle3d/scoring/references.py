@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -189,15 +189,16 @@ def error_rows(
         return []
     if reference is None or not others:
         return [
-            ModeError.of_length("all", mode, frames, travelled_mm(mode, each, centre_mm))
+            ModeError("all", mode, frames, estimate_mm=abs(travelled_mm(mode, each, centre_mm)))
             for mode, each in poses.items()
         ]
     true = reference.world_from_image
     rows = compare_modes(others, true, centre_mm, reference.covered, reference.end_frames)
     if reference.name == TRACKER:
-        last = {row.part: row for row in rows}
-        for row in last.values():
-            rows.insert(rows.index(row) + 1, row.of_reference(TRACKER))
+        for last in {row.part: row for row in rows}.values():
+            length, sigma = last.reference_mm, last.reference_sigma_mm
+            own = ModeError(last.part, TRACKER, last.frames, length, length)
+            rows.insert(rows.index(last) + 1, replace(own, reference_sigma_mm=sigma, sigma_mm=sigma))
     return rows
 
 

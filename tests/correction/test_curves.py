@@ -1,17 +1,14 @@
 import numpy as np
 import pytest
-from drifting import CENTRE_MM, accumulate, drifted, hand_sweep
+from drifting import CENTRE_MM, drifted, hand_sweep
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.geometry import elevational_steps, relative_poses, skew
+from speckle3d.core.geometry import elevational_steps, skew
 from speckle3d.correction.curves import (
     AXES,
     CorrectedChain,
-    angle_axes,
     correction_matrices,
-    cumulative_product,
     curve_basis,
 )
 
@@ -21,19 +18,6 @@ def chain_of(seed, frames=40, axes=AXES, curves="time", turns=0):
     poses = drifted(hand_sweep(rng, frames, turns=turns), rng)
     basis = curve_basis(axes, elevational_steps(poses, CENTRE_MM), curves)
     return poses, CorrectedChain.of(poses, axes, basis)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 9, 100])
-def test_cumulative_product_is_the_plain_loop(count):
-    rng = np.random.default_rng(count)
-    steps = RigidTransform.from_components(rng.normal(size=(count, 3)), Rotation.random(count, rng=rng))
-    looped = accumulate(steps).as_matrix()[1:]
-    np.testing.assert_allclose(cumulative_product(steps.as_matrix()), looped, atol=1e-12)
-
-
-def test_no_coefficients_leave_every_pose_as_it_is():
-    poses, chain = chain_of(1)
-    np.testing.assert_allclose(chain.poses(np.zeros(30)), poses.as_matrix(), atol=1e-12)
 
 
 @pytest.mark.parametrize("curves", ["time", "distance"])
@@ -96,31 +80,3 @@ def test_distance_curves_turn_round_with_the_probe_and_leave_in_plane_motion_alo
         np.testing.assert_allclose(values[:, AXES.index(axis)], steps / np.abs(steps).sum())
     for axis in ("x", "y", "roll"):
         np.testing.assert_allclose(values[:, AXES.index(axis)], 1 / 99)
-
-
-def test_a_subset_of_axes_leaves_the_others_at_zero():
-    _, chain = chain_of(5, axes=("tilt", "roll"))
-    values = chain.values(np.ones(10))
-    assert not values[:, [0, 1, 2, 4]].any()
-    assert values[:, [3, 5]].any(axis=0).all()
-    assert chain.names[0] == "tilt_offset"
-    assert chain.names[-1] == "roll_legendre3"
-
-
-def test_elevational_steps_are_the_centre_seen_from_the_frame_before():
-    poses = hand_sweep(np.random.default_rng(6), 30)
-    steps = relative_poses(poses)
-    expected = [(steps[i].apply(CENTRE_MM) - CENTRE_MM)[2] for i in range(29)]
-    np.testing.assert_allclose(elevational_steps(poses, CENTRE_MM), expected)
-
-
-def test_angle_axes_are_what_each_angle_turns_about():
-    tilt, yaw, roll = 0.3, -0.4, 0.7
-    axes = angle_axes(np.array([roll]), np.array([yaw]))[0]
-    h = 1e-6
-    for k in range(3):
-        step = np.zeros((1, 6))
-        step[0, 3 + k] = h
-        at = np.array([[0, 0, 0, tilt, yaw, roll]])
-        ends = [Rotation.from_matrix(correction_matrices(at + s * step)[0, :3, :3]) for s in (-1, 1)]
-        np.testing.assert_allclose((ends[1] * ends[0].inv()).as_rotvec() / (2 * h), axes[:, k], atol=1e-8)

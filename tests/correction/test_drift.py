@@ -1,8 +1,6 @@
 import numpy as np
 import pytest
 from drifting import CENTRE_MM, CORNERS_MM, drifted, hand_sweep, tracked
-from pydantic import ValidationError
-from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -86,43 +84,6 @@ def test_corners_come_closer_to_the_tracker_than_any_rigid_registration():
     assert found.fit.fun @ found.fit.fun == pytest.approx(cost(found.poses), rel=0.01)
 
 
-@pytest.mark.parametrize("curves", ["time", "distance"])
-def test_analytic_jacobians_match_finite_differences(curves, monkeypatch):
-    problems = []
-
-    def catch(residuals, start, jacobian, **options):
-        problems.append((residuals, jacobian, start.size))
-        return least_squares(residuals, start, jacobian, **options)
-
-    monkeypatch.setattr(drift, "least_squares", catch)
-    _, estimate, reference = sweep(22, frames=20)
-    covered = everywhere(estimate)
-    covered[7] = False
-    settings = DriftSettings(curves=curves)
-    correct_pose(estimate, reference[covered], covered, CORNERS_MM, settings)
-    correct_orientation(estimate, reference.rotation[covered], covered, CENTRE_MM, settings)
-    assert [size for _, _, size in problems] == [30, 15]
-    for residuals, jacobian, size in problems:
-        at = np.random.default_rng(size).normal(0.0, 0.05, size)
-        h = 1e-6
-        slopes = [(residuals(at + h * u) - residuals(at - h * u)) / (2 * h) for u in np.eye(size)]
-        # Rounding 1e-14 / h and h^2 times third derivatives of up to 1e3 near a corner that fits.
-        np.testing.assert_allclose(jacobian(at), np.array(slopes).T, atol=1e-5, rtol=1e-5)
-
-
-def test_outliers_harm_distances_less_than_squares():
-    errors = []
-    for epsilon in (0.01, 1e3):
-        settings = DriftSettings(loss_epsilon_mm=epsilon)
-        for seed in range(30, 34):
-            truth, estimate, reference = sweep(seed, outliers=0.15)
-            found = correct_pose(estimate, reference, everywhere(truth), CORNERS_MM, settings)
-            gap = drift._points(found.poses, CORNERS_MM) - drift._points(truth, CORNERS_MM)
-            errors.append(np.linalg.norm(gap, axis=-1).mean())
-    unsquared, squared = np.array(errors).reshape(2, -1).mean(axis=1)
-    assert unsquared < 0.85 * squared
-
-
 @pytest.mark.parametrize("settings", [TIME, DISTANCE], ids=["time", "distance"])
 def test_orientation_correction_removes_tilt_and_keeps_every_step_of_the_centre(settings):
     truth, estimate, reference = sweep(40, turns=1)
@@ -143,27 +104,21 @@ def test_orientation_result_is_in_the_sensors_world_with_the_first_image_origin_
     assert np.rad2deg((found.poses[0].rotation.inv() * truth[0].rotation).magnitude()) < 0.1
 
 
-@pytest.mark.parametrize("yaw_deg", [90.0, -90.0, 180.0])
-def test_a_sensor_world_at_the_angles_singularity_changes_nothing(yaw_deg):
+def test_neither_the_sensors_world_nor_the_images_matters():
     truth, estimate, reference = sweep(42)
-    world = RigidTransform.from_rotation(Rotation.from_euler("y", yaw_deg, degrees=True))
-    straight = world * reference[0].inv()
-    moved = straight * reference
+    # At the singularity of the angles.
+    world = RigidTransform.from_rotation(Rotation.from_euler("y", 90.0, degrees=True))
+    moved = world * reference[0].inv() * reference
+    elsewhere = RigidTransform.from_components([500.0, -200.0, 90.0], Rotation.from_rotvec([1.0, 2.0, -1.0]))
     for correct, measured, points in (
         (correct_pose, (reference, moved), CORNERS_MM),
         (correct_orientation, (reference.rotation, moved.rotation), CENTRE_MM),
     ):
-        here, there = (correct(estimate, each, everywhere(truth), points).poses for each in measured)
+        here = correct(estimate, measured[0], everywhere(truth), points).poses
+        there = correct(elsewhere * estimate, measured[1], everywhere(truth), points).poses
         np.testing.assert_allclose(
-            relative_poses(there).as_matrix(), relative_poses(here).as_matrix(), atol=1e-6
+            relative_poses(there).as_matrix(), relative_poses(here).as_matrix(), atol=1e-5
         )
-
-
-def test_the_image_world_does_not_matter():
-    _, estimate, reference = sweep(43)
-    elsewhere = RigidTransform.from_components([500.0, -200.0, 90.0], Rotation.from_rotvec([1.0, 2.0, -1.0]))
-    a, b = (correct_pose(e, reference, everywhere(e), CORNERS_MM) for e in (estimate, elsewhere * estimate))
-    np.testing.assert_allclose(a.poses.as_matrix(), b.poses.as_matrix(), atol=1e-4)
 
 
 def test_frames_without_a_reading_are_corrected_by_the_same_curves_at_no_cost():
@@ -178,70 +133,37 @@ def test_frames_without_a_reading_are_corrected_by_the_same_curves_at_no_cost():
     assert not np.isclose(full.curves[80, 2], 0.0, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("missing", "message"),
-    [
-        (slice(30, 70), "80 of 100 .* 60"),
-        (slice(0, 11), "10% of 100 .* 11 .* 0 "),
-        (slice(85, 100), "10% of 100 .* 0 .* 15 "),
-        (slice(0, 100), "80 of 100 .* 0"),
-    ],
-)
-@pytest.mark.parametrize("dof", [3, 6])
-def test_thin_coverage_is_refused_with_numbers(missing, message, dof):
+def test_thin_coverage_is_refused():
     _, estimate, reference = sweep(45, frames=100)
+    for missing in (slice(30, 70), slice(0, 11), slice(85, 100), slice(0, 100)):
+        covered = everywhere(estimate)
+        covered[missing] = False
+        with pytest.raises(InsufficientDataError):
+            correct_orientation(estimate, reference.rotation, covered, CENTRE_MM)
+    with pytest.raises(InsufficientDataError):
+        correct_pose(estimate[:9], reference[:9], everywhere(estimate[:9]), CORNERS_MM)
+
+
+def test_inputs_that_do_not_belong_together_are_refused():
+    _, estimate, reference = sweep(48, frames=20)
     covered = everywhere(estimate)
-    covered[missing] = False
-    correct, measured, points = {
-        3: (correct_orientation, reference.rotation, CENTRE_MM),
-        6: (correct_pose, reference, CORNERS_MM),
-    }[dof]
-    with pytest.raises(InsufficientDataError, match=message):
-        correct(estimate, measured, covered, points)
-
-
-def test_a_sweep_too_short_is_refused():
-    _, estimate, reference = sweep(46, frames=9)
-    with pytest.raises(InsufficientDataError, match="10 frames, got 9"):
-        correct_pose(estimate, reference, everywhere(estimate), CORNERS_MM)
+    for measured, frames in ((reference, covered[1:]), (reference[:18], covered)):
+        with pytest.raises(MismatchError):
+            correct_pose(estimate, measured, frames, CORNERS_MM)
+    with pytest.raises(InvalidInputError):
+        correct_pose(estimate, reference, covered, CORNERS_MM[:, :2])
+    with pytest.raises(InvalidInputError):
+        correct_orientation(estimate, reference.rotation, covered, CENTRE_MM[:2])
 
 
 def test_a_probe_at_rest_has_no_distance_curves_but_time_curves_work():
     rest = RigidTransform.identity(50)
     jitter = tracked(rest, np.random.default_rng(47))
-    with pytest.raises(InsufficientDataError, match=r"0.1 mm .* 0 mm"):
+    with pytest.raises(InsufficientDataError):
         correct_pose(rest, jitter, everywhere(rest), CORNERS_MM, DISTANCE)
     found = correct_pose(rest, jitter, everywhere(rest), CORNERS_MM)
     # Four cubic coefficients of 50 readings with 0.15 mm: 0.15 * 4 / sqrt(50) at the ends.
     assert abs(travel(found.poses)) < 0.3
-
-
-def test_inputs_that_do_not_belong_together_are_named():
-    _, estimate, reference = sweep(48, frames=20)
-    covered = everywhere(estimate)
-    with pytest.raises(MismatchError, match=r"covered: .*\(20,\).*\(19,\)"):
-        correct_pose(estimate, reference, covered[1:], CORNERS_MM)
-    with pytest.raises(MismatchError, match=r"reference: .*20 .* 18"):
-        correct_pose(estimate, reference[:18], covered, CORNERS_MM)
-    with pytest.raises(InvalidInputError, match=r"corners_mm: .*\(4, 3\).*\(4, 2\)"):
-        correct_pose(estimate, reference, covered, CORNERS_MM[:, :2])
-    with pytest.raises(InvalidInputError, match=r"centre_mm: .*\(3,\).*\(2,\)"):
-        correct_orientation(estimate, reference.rotation, covered, CENTRE_MM[:2])
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"curves": "space"},
-        {"loss_epsilon_mm": 0.0},
-        {"minimum_coverage": 1.5},
-        {"minimum_frames": 4},
-        {"k": 1},
-    ],
-)
-def test_settings_are_checked(wrong):
-    with pytest.raises(ValidationError, match=next(iter(wrong))):
-        DriftSettings(**wrong)
 
 
 def test_the_claims_of_pose_hold():

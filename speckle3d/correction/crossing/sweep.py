@@ -9,7 +9,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.correction.crossing.stack import ImageStack
 
 
@@ -111,17 +110,6 @@ class CrossingSweep:
     sensed: Rotation | None = None
     flags: IntArray | None = None
     frame_time_s: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("scale_sigma", "turn_sigma_per_mm"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InvalidInputError(f"{self.name}: {name}: expected a value above zero, got {value}")
-        for name, many in (("sensed", self.sensed), ("flags", self.flags)):
-            if many is not None and len(many) != len(self.poses):
-                raise InvalidInputError(
-                    f"{self.name}: {name}: expected one for each of {len(self.poses)} poses, got {len(many)}"
-                )
 
     @property
     def good(self) -> IntArray:

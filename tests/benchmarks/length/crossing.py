@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.spatial.transform import RigidTransform
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -21,10 +19,6 @@ from crossing_tissue import GRID, PairCase, made_pair
 from length.rows import Row
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.correction.crossing.pair import crossed
-from speckle3d.correction.crossing.path import straightened
-from speckle3d.correction.crossing.refine import Prior, refined
-from speckle3d.correction.crossing.similarity import Placing, Textured, compared
-from speckle3d.correction.crossing.texture import at_blur, prefiltered
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,6 @@ def measure(share: float = 1.0, first_seed: int = 970_001) -> list[Row]:
             "<= 5 s on two cores",
         )
     )
-    rows.append(_against_simplex(first_seed))
     return rows
 
 
@@ -143,40 +136,3 @@ def _coverage(sides):
     wrong = int(((off > 3 * claimed) & (off > 2.0)).sum())
     inside = [100 * np.mean(off < z * claimed) for z in (1.0, 1.96)]
     return f"{len(sides)} sweeps; 68 %: {inside[0]:.0f}, 95 %: {inside[1]:.0f}; {wrong} confident and wrong"
-
-
-def _against_simplex(seed):
-    """One blur, from one start, by our steps and by Nelder and Mead's on the same cost."""
-    pair = made_pair(PairCase(seed))
-    sweeps = [straightened(one, 3.0) for one in (pair.first, pair.second)]
-    textured = [
-        Textured.of(s, at_blur(prefiltered(s.volume, s.spacing_mm), 0.9, s.spacing_mm), 12_000)
-        for s in sweeps
-    ]
-    centred = RigidTransform.from_translation(GRID.centre_mm)
-    middles = [
-        truth[int(np.argmin(np.abs(s.frame_travel_mm)))] * centred
-        for s, truth in zip(sweeps, pair.truth, strict=True)
-    ]
-    start = Placing(middles[0].inv() * middles[1], np.zeros((2, 7)))
-    spread = np.array([0.08, 0.03, 0.03, 2e-3, 2e-3, 2e-3, 2e-3])
-    prior = Prior(np.diag(np.tile(spread, 2) ** -2.0), None, np.zeros((3, 3)))
-    began = time.process_time()
-    ours = refined(textured, start, prior, 500.0)
-    took = time.process_time() - began
-    size = np.concatenate([[0.5] * 3, [0.03] * 3, np.tile(spread, 2)])
-
-    def cost(unit):
-        there = start.stepped(unit * size)
-        ways = compared(textured, there)
-        return ours.weight * sum(1 - way.correlation(way.valid) for way in ways) + prior.pull(there)[2]
-
-    began = time.process_time()
-    theirs = minimize(cost, np.zeros(size.size), method="Nelder-Mead", options={"maxfev": 2000})
-    slow = time.process_time() - began
-    reached = ours.weight * 2 * (1 - ours.correlation) + ours.strain
-    return Row(
-        "one blur against Nelder-Mead on the same cost",
-        f"{took:.2f} s to {reached:.1f} against {slow:.1f} s to {theirs.fun:.1f}: {slow / took:.0f} times",
-        "a ratio, no bound",
-    )

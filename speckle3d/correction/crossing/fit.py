@@ -1,0 +1,259 @@
+"""Two crossing sweeps brought to agree: Levenberg and Marquardt's steps, and how far the answer may be off.
+
+Tissue that moved between the sweeps is partly taken up by scale, turns and place; what is left of it pulls
+neighbouring parts of the tissue alike, where speckle pulls each by itself. These two moments tell both.
+
+References
+----------
+.. [1] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", Proc. Fifth
+   Berkeley Symp. Math. Stat. Prob. 1, 1967 (the covariance).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from speckle3d.core.arrays import FloatArray
+from speckle3d.correction.crossing.planes import BENDS
+from speckle3d.correction.crossing.similarity import (
+    PARAMETERS,
+    RIGID,
+    BlurredSweep,
+    OneWay,
+    Placing,
+    compared,
+)
+
+_MOST_STEPS = 30
+_CONVERGED = 0.02
+"""Step, in the posterior's own standard deviations, at which a level has converged."""
+_LEAST_UNLIKE = 0.05
+"""Least 1 - correlation by which residuals are weighed."""
+PART_MM = 6.0
+"""Side of the parts of tissue that are taken to move, or to err, as one."""
+_REACH_MM = 12.0
+"""Over which the correlation of tissue's displacement falls to 1 / e: a probe's contact is centimetres wide,
+and what it presses moves in one piece."""
+_SEEN = 1.5
+"""What is there over what is found of displacements: parts see shifts through images that are alike in part
+only, and the smoothest of it passes for place and turn. Of simulated pairs."""
+_USUAL_MM = 0.3
+"""Displacement, mm over the deviation of speckle's part, for which it is found best."""
+FACES = 0.006
+"""Relative standard deviation of the scale by what is not understood: lengths of simulated pairs with exact
+poses came out 0.6 % long, cause unknown. Sweeps of simulated radio-frequency data do not show it."""
+OBLIQUE = 0.022
+"""The same of sweeps that cross obliquely, times the cosine of their angle: of four pairs of simulated
+radio-frequency sweeps at 45 degrees lengths came out 0.5 to 3.6 % short, 2.7 rms and cause unknown."""
+SCALES = [RIGID, RIGID + BENDS]
+"""Where the mean scales of both sweeps are among the parameters."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the parameters before looking.
+
+    Attributes
+    ----------
+    information : ndarray, shape (24, 24)
+        Inverse covariance of the parameters; zero where nothing is known.
+    turn : Rotation or None
+        Of the second path against the first, by sensors.
+    """
+
+    information: FloatArray
+    turn: Rotation | None = None
+
+    def deviation(self, placing: Placing) -> FloatArray:
+        """Parameters less what is expected, shape (24,)."""
+        away = np.concatenate([np.zeros(RIGID), placing.bends.ravel()])
+        if self.turn is not None:
+            away[3:RIGID] = (placing.first_from_second.rotation * self.turn.inv()).as_rotvec()
+        return away
+
+
+@dataclass(frozen=True)
+class CrossingFit:
+    """Two sweeps at a placing under one blur.
+
+    Attributes
+    ----------
+    independent : float
+        How many comparisons the images are worth.
+    """
+
+    pair: Sequence[BlurredSweep]
+    placing: Placing
+    prior: Prior
+    independent: float
+
+    @cached_property
+    def ways(self) -> tuple[OneWay, OneWay]:
+        """Points of either sweep looked up in the other."""
+        return compared(self.pair, self.placing)
+
+    @cached_property
+    def correlation(self) -> float:
+        """Mean of both ways."""
+        return float(np.mean([way.correlation(way.valid) for way in self.ways]))
+
+    @property
+    def strain(self) -> float:
+        """Half the squared deviation from the prior."""
+        away = self.prior.deviation(self.placing)
+        return 0.5 * float(away @ self.prior.information @ away)
+
+    @property
+    def weight(self) -> float:
+        """Half the squared residuals of both ways, which compare the same tissue, count so much."""
+        return 0.25 * self.independent / max(1.0 - self.correlation, _LEAST_UNLIKE)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the placing and its bends, up to what all placings of one pair share."""
+        return -0.5 * self.independent * float(np.log(max(1.0 - self.correlation, 1e-3))) - self.strain
+
+    @cached_property
+    def matrix(self) -> FloatArray:
+        """Of Gauss and Newton and of the prior, shape (24, 24)."""
+        rows = [way.residuals()[1] for way in self.ways]
+        return np.asarray(self.prior.information + self.weight * sum(each.T @ each for each in rows))
+
+    def step(self, damping: float) -> FloatArray:
+        """Damped step towards the least cost, shape (24,)."""
+        gradient = self.prior.information @ self.prior.deviation(self.placing)
+        for way in self.ways:
+            residuals, rows = way.residuals()
+            gradient = gradient + self.weight * (rows.T @ residuals)
+        return np.asarray(-np.linalg.solve(self.matrix + damping * np.diag(np.diag(self.matrix)), gradient))
+
+    def is_better(self, other: CrossingFit) -> bool:
+        """Whether the cost is below another's at the points that both show, by the other's weight."""
+        gain = other.strain - self.strain
+        for way, theirs in zip(self.ways, other.ways, strict=True):
+            both = way.valid & theirs.valid
+            # Else less overlap could pass for more likeness.
+            gain += other.weight * (way.correlation(both) - theirs.correlation(both))
+        return gain > 0.0
+
+    def refined(self) -> CrossingFit:
+        """At the placing of least cost nearby."""
+        fit, damping = self, 1e-2
+        for _ in range(_MOST_STEPS):
+            step = fit.step(damping)
+            trial = replace(fit, placing=fit.placing.stepped(step))
+            if not trial.is_better(fit):
+                damping *= 8.0
+                continue
+            converged = step @ fit.matrix @ step < _CONVERGED**2 * PARAMETERS
+            fit, damping = trial, max(damping / 6.0, 1e-6)
+            if converged:
+                break
+        return fit
+
+    @property
+    def angle_deg(self) -> float:
+        """Angle between the directions in which both sweeps' images run across, 0 to 90 degrees."""
+        across = self.placing.first_from_second.rotation.as_matrix()[:, 0]
+        return float(np.rad2deg(np.arccos(min(1.0, abs(float(across[0] / np.hypot(across[0], across[2])))))))
+
+    def overlap_mm(self, spacing_mm: float) -> float:
+        """Length along either sweep, the lesser, of which the other sees a good part of each image."""
+        lengths = []
+        for way, sweep in zip(self.ways, self.pair, strict=True):
+            many, shared = (
+                np.bincount(plane, minlength=len(sweep.volume))
+                for plane in (sweep.plane, sweep.plane[way.valid])
+            )
+            at = np.flatnonzero((many > 0) & (shared >= 0.25 * many))
+            lengths.append(spacing_mm * float(np.ptp(at)) if at.size else 0.0)
+        return min(lengths)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What parts of the tissue say about the parameters and about a shift of their own.
+
+    Attributes
+    ----------
+    pulls : ndarray, shape (n, 24)
+        Gradient of the cost with the parameters. The first three shift the second sweep against the first, so
+        that they are a part's own shift, too.
+    shared : ndarray, shape (n, 3, 24)
+        Matrix of Gauss and Newton between that shift, mm, and all parameters.
+    alike : ndarray, shape (3 n, 3 n)
+        Correlation of the displacements of all parts and directions.
+    """
+
+    pulls: FloatArray
+    shared: FloatArray
+    alike: FloatArray
+
+    @classmethod
+    def of(cls, fit: CrossingFit) -> Parts:
+        """Sum over the points of each part, both ways."""
+        points, values = [], []
+        for way in fit.ways:
+            residuals, rows = way.residuals()
+            points.append(way.points_mm[way.valid])
+            shared = (rows[:, :3, None] * rows[:, None, :]).reshape(len(rows), -1)
+            values.append(fit.weight * np.concatenate([rows * residuals[:, None], shared], axis=1))
+        places, rows = np.concatenate(points), np.concatenate(values)
+        cells, number = np.unique(np.floor(places / PART_MM), axis=0, return_inverse=True)
+        sums = np.zeros((len(cells), rows.shape[1]))
+        np.add.at(sums, number.ravel(), rows)
+        alike = np.kron(np.exp(-PART_MM * cdist(cells, cells) / _REACH_MM), np.eye(3))
+        return cls(sums[:, :PARAMETERS], sums[:, PARAMETERS:].reshape(-1, 3, PARAMETERS), alike)
+
+    def moved_mm(self, matrix: FloatArray) -> float:
+        """RMS of each component of the tissue's displacement between the sweeps, at least zero.
+
+        Parameters
+        ----------
+        matrix : ndarray, shape (24, 24)
+            Of Gauss and Newton and of the prior, of a fit under a blur that is wide against the displacement:
+            only then residuals are in proportion.
+        """
+        shared = self.shared.reshape(-1, PARAMETERS)
+        taken = np.linalg.solve(matrix, shared.T)
+        left = block_diag(*self.shared[:, :, :3]) - shared @ taken
+        pulls = self.pulls[:, :3].ravel() - self.pulls.sum(axis=0) @ taken
+        values, vectors = np.linalg.eigh(left)
+        # Of what the fit left nearly nothing, noise is all there is.
+        kept = values > 0.3 * np.median(values)
+        root = vectors[:, kept] * np.sqrt(values[kept])
+        white = (root / values[kept]).T @ pulls
+        # Squares grow with the power that a displacement would have: by its variance, beyond speckle's.
+        power, axes = np.linalg.eigh(root.T @ self.alike @ root)
+        weight = 1.0 / (1.0 + _USUAL_MM**2 * power)
+        slope = np.polyfit(power, (axes.T @ white) ** 2, 1, w=weight)[0]
+        return _SEEN * float(np.sqrt(max(slope, 0.0)))
+
+
+def covariance(fit: CrossingFit, moved_mm: float) -> FloatArray:
+    """Covariance of all parameters, shape (24, 24).
+
+    The images' curvature says how the answer moves with the residuals; what the parts of the tissue pull by
+    says how much residuals vary if they err independently, and what tissue that moved as one does to the
+    answer comes on top.
+
+    Parameters
+    ----------
+    moved_mm : float
+        RMS of each component of the tissue's displacement between the sweeps.
+    """
+    parts = Parts.of(fit)
+    shared, many = parts.shared.reshape(-1, PARAMETERS), len(parts.pulls)
+    pulled = parts.pulls.T @ parts.pulls * many / max(many - 1, 1)
+    pulled += moved_mm**2 * shared.T @ parts.alike @ shared
+    inverse = np.linalg.inv(fit.matrix)
+    whole = inverse @ (pulled + fit.prior.information) @ inverse
+    whole[SCALES, SCALES] += FACES**2 + (OBLIQUE * np.cos(np.deg2rad(fit.angle_deg))) ** 2
+    return np.asarray(whole)
