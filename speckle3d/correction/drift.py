@@ -28,7 +28,6 @@ from speckle3d.correction.curves import (
     curve_basis,
 )
 
-
 _MOST_EVALUATIONS = 200
 """Of the optimisation; sweeps need 10 to 20."""
 
@@ -236,9 +235,12 @@ def _solve(
         slopes = np.stack([misfit(each @ poses[used]) - now for each in small], axis=-1) / tick
         return np.asarray((slopes @ twists).reshape(-1, coefficients.size))
 
+    def residuals(coefficients: FloatArray) -> FloatArray:
+        return misfit(chain.poses(coefficients)[used]).ravel()
+
     tolerance = settings.tolerance
     return least_squares(
-        lambda coefficients: misfit(chain.poses(coefficients)[used]).ravel(),
+        residuals,
         np.zeros(len(chain.names)),
         jacobian,
         method="lm",

@@ -2,10 +2,10 @@
 
 A reading of orientation or pose at time t is, but for its jitter,
 
-    world * wander(t) * path(t) * (centre from sensor) * mounting
+    world * wander(t) * path(t + late) * (centre from sensor) * mounting
 
 with a tracker's places stretched by its millimetres. The unknowns are small and kept in one vector: turn and
-shift of the world, turn and shift of the mounting, log of the millimetres, and an orientation sensor's
+shift of the world, turn and shift of the mounting, clock, log of the millimetres, and an orientation sensor's
 wandering error at knots in time.
 """
 
@@ -19,8 +19,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.geometry import skew
-from speckle3d.core.leastsquares import autocorrelation_time, robust_sigma
+from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
+from speckle3d.correction.claims import correlated_readings
 from speckle3d.correction.image_path import ImagePath
 from speckle3d.correction.settings import FusedSettings
 
@@ -31,10 +32,11 @@ WANDER_KNOTS_PER_TIME, MOST_WANDER_KNOTS = 10, 60
 """Knots of the wandering error in the time in which it changes."""
 LEAST_JITTER = np.array([2e-5, 2e-3])
 """Of a turn, rad, and a place, mm: the last digits of sensors; simulated ones may have no noise."""
+TICK_S = 1e-3
 ANYWHERE = 1e4
 """Standard deviation of what is not known at all, mm and rad."""
 WORLD_TURN, WORLD_SHIFT, MOUNTING_TURN, MOUNTING_SHIFT = (slice(k, k + 3) for k in (0, 3, 6, 9))
-MILLIMETRES, RIGID = 12, 13
+CLOCK, MILLIMETRES, RIGID = 12, 13, 14
 
 
 @dataclass(frozen=True)
@@ -149,15 +151,15 @@ class SensorReadings:
         shift = RigidTransform.from_translation(unknowns[WORLD_SHIFT])
         return shift * pivot * turn * pivot.inv() * self.world
 
-    def _frames(self) -> tuple[IntArray, FloatArray]:
+    def _frames(self, unknowns: FloatArray) -> tuple[IntArray, FloatArray]:
         """The frame before each reading, and the reading's share of the time to the next."""
-        frames = self.frame_time_s
-        before = np.clip(np.searchsorted(frames, self.time_s, "right") - 1, 0, frames.size - 2)
-        return before, (self.time_s - frames[before]) / np.diff(frames)[before]
+        time_s, frames = self.time_s + unknowns[CLOCK], self.frame_time_s
+        before = np.clip(np.searchsorted(frames, time_s, "right") - 1, 0, frames.size - 2)
+        return before, (time_s - frames[before]) / np.diff(frames)[before]
 
     def _expected(self, path: FloatArray, unknowns: FloatArray) -> RigidTransform:
         """What would be read but for wander and wrong millimetres."""
-        before, share = self._frames()
+        before, share = self._frames(unknowns)
         poses = RigidTransform.from_matrix(path)
         step = (poses[:-1].inv() * poses[1:]).as_exp_coords()[before]
         between = poses[before] * RigidTransform.from_exp_coords(step * share[:, None])
@@ -190,11 +192,17 @@ class SensorReadings:
         """
         poses = path.chain.poses(coefficients)
         errors = self.errors(poses, unknowns)
-        expected = self._expected(poses, unknowns)
+        tick = np.zeros(self.size)
+        tick[CLOCK] = TICK_S
+        expected, later = self._expected(poses, unknowns), self._expected(poses, unknowns + tick)
+        ahead = (
+            (later.rotation * expected.rotation.inv()).as_rotvec() / TICK_S,
+            (later.translation - expected.translation) / TICK_S,
+        )
         twists = path.chain.twists(coefficients, poses)
         for first in range(0, self.time_s.size, PER_PIECE):
             rows = slice(first, first + PER_PIECE)
-            slopes = self._slopes(rows, twists, expected, unknowns)
+            slopes = self._slopes(rows, twists, expected, unknowns, ahead)
             for kind in range(1 + self.places):
                 yield errors[kind][rows] / self.jitter[kind], slopes[kind] / self.jitter[kind]
 
@@ -204,9 +212,10 @@ class SensorReadings:
         twists: tuple[FloatArray, FloatArray],
         expected: RigidTransform,
         unknowns: FloatArray,
+        ahead: tuple[FloatArray, FloatArray],
     ) -> tuple[FloatArray, FloatArray]:
         """Derivatives of some readings' turns and places."""
-        before, share = (values[rows, None, None] for values in self._frames())
+        before, share = (values[rows, None, None] for values in self._frames(unknowns))
         at = before[:, 0, 0]
         turn, shift = (part[at] * (1.0 - share) + part[at + 1] * share for part in twists)
         world, axes = self.world_of(unknowns), expected[rows].rotation.as_matrix()
@@ -216,6 +225,7 @@ class SensorReadings:
         turns[:, :, :c] = to_world @ turn
         own[:, :, WORLD_TURN] = np.eye(3)
         own[:, :, MOUNTING_TURN] = axes
+        own[:, :, CLOCK] = ahead[0][rows]
         own[:, :, RIGID:] = np.einsum("mk,ij->mikj", self._hats()[rows], np.eye(3)).reshape(len(at), 3, -1)
         if self.places:
             on_path = (world.inv() * expected[rows]).translation
@@ -224,6 +234,7 @@ class SensorReadings:
             own[:, :, WORLD_TURN] = -skew(place[rows] - self.measured.translation.mean(axis=0))
             own[:, :, WORLD_SHIFT] = np.eye(3)
             own[:, :, MOUNTING_SHIFT] = axes
+            own[:, :, CLOCK] = ahead[1][rows]
             own[:, :, MILLIMETRES] = place[rows] - place.mean(axis=0)
         return turns, places
 
@@ -231,7 +242,7 @@ class SensorReadings:
         """Residuals of what is known of mounting, clock, millimetres and wander, and their derivatives."""
         s = self.settings
         mounting = [*[s.mounting_sigma_rad] * 3, *[s.mounting_sigma_mm] * 3]
-        rigid = 1.0 / np.array([*[ANYWHERE] * 6, *mounting, s.tracker_scale_sigma])
+        rigid = 1.0 / np.array([*[ANYWHERE] * 6, *mounting, s.clock_sigma_s, s.tracker_scale_sigma])
         k = self.knots_s.size
         matrix = np.zeros((self.size, self.size))
         matrix[range(RIGID), range(RIGID)] = rigid
@@ -255,10 +266,10 @@ class SensorReadings:
         path : ndarray, shape (n, 4, 4)
             Too stiff to follow a sensor that wanders.
         """
-        jitter = []
-        for error, least in zip(self.errors(path, unknowns), self.jitter, strict=True):
-            alike = autocorrelation_time((error - error.mean(axis=0)).T.ravel())
-            jitter.append(max(robust_sigma(error), least) * np.sqrt(alike))
+        jitter = [
+            max(robust_sigma(error), least) * np.sqrt(correlated_readings(error))
+            for error, least in zip(self.errors(path, unknowns), self.jitter, strict=True)
+        ]
         return replace(self, jitter=np.array(jitter))
 
 

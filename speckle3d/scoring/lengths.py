@@ -222,9 +222,9 @@ def compare_modes(
             error_mm = sign * (changes[0] - wanted[0])
             percent = 100.0 * error_mm / reference_mm if reference_mm else np.nan
             turns = np.rad2deg(np.subtract(changes[1:], wanted[1:])).tolist()
-            lengths = reference_mm, reference_mm + error_mm, error_mm, percent
-            sigmas = reference_sigma_mm, sigma_mm if mode == TRACKER else np.nan
-            rows.append(ModeError(part.name, mode, frames, *lengths, *turns, *sigmas))
+            own = sigma_mm if mode == TRACKER else np.nan
+            errors = reference_mm + error_mm, error_mm, percent, *turns, reference_sigma_mm, own
+            rows.append(ModeError(part.name, mode, frames, reference_mm, *errors))
     return rows
 
 

@@ -210,7 +210,8 @@ class Parts:
         sums = np.zeros((len(cells), rows.shape[1]))
         np.add.at(sums, number.ravel(), rows)
         alike = np.kron(np.exp(-PART_MM * cdist(cells, cells) / _REACH_MM), np.eye(3))
-        return cls(sums[:, :PARAMETERS], sums[:, PARAMETERS:].reshape(-1, 3, PARAMETERS), alike)
+        pulls, products = np.split(sums, [PARAMETERS], axis=1)
+        return cls(pulls, products.reshape(-1, 3, PARAMETERS), np.asarray(alike, dtype=np.float64))
 
     def moved_mm(self, matrix: FloatArray) -> float:
         """RMS of each component of the tissue's displacement between the sweeps, at least zero.

@@ -109,7 +109,7 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
         )
     count = 1 + int((high - low) / SPACING_MM)
     travel -= low + count // 2 * SPACING_MM
-    at = (np.arange(count) - count // 2) * SPACING_MM
+    at = np.multiply(np.arange(count) - count // 2, SPACING_MM, dtype=np.float64)
     centred = sweep.poses * RigidTransform.from_translation(sweep.centre_mm)
     frames = _smoothed(travel[good], centred[good], np.zeros(1))[0].inv() * centred
     planes, base = (_smoothed(travel[good], frames[good], each) for each in (at, travel))
@@ -143,8 +143,6 @@ def _chain(poses: RigidTransform, travel_mm: FloatArray) -> CorrectedChain:
     basis[1:] = (elevational_steps(poses, np.zeros(3))[:, None] * legendre.legvander(along, ORDERS - 1))[
         :, None
     ]
-    # Rates of turn change evenly.
-    basis[:, 1:, 2] = 0.0
     return CorrectedChain.of(poses, ELEVATIONAL, basis)
 
 
@@ -181,4 +179,4 @@ def _onto_planes(images: Float32Array, travel: FloatArray, at: FloatArray) -> Fl
     kept = (shown > 0.25) & (gap < 2.0 * _WIDEST_GAP_MM)[:, None]
     total = weight @ np.where(there, flat, np.float32(0.0))
     volume = np.divide(total, shown, out=np.full_like(total, np.nan), where=kept)
-    return volume.reshape(len(at), *images.shape[1:])
+    return np.asarray(volume.reshape(len(at), *images.shape[1:]), dtype=np.float32)

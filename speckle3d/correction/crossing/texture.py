@@ -23,7 +23,8 @@ def local_contrast(volume: Float32Array, spacing_mm: FloatArray) -> Float32Array
     """Images in dB without trends, over their local standard deviation, shape (k, u, v); NaN stays."""
     for sigma_mm in _TRENDS_MM:
         volume = volume - blurred(volume, sigma_mm, spacing_mm)
-    return volume / np.maximum(np.sqrt(blurred(volume**2, (_LOCAL_MM,) * 3, spacing_mm)), _LEAST_DB)
+    contrast = np.sqrt(blurred(volume**2, (_LOCAL_MM,) * 3, spacing_mm))
+    return np.asarray(volume / np.maximum(contrast, _LEAST_DB), dtype=np.float32)
 
 
 def blurred(
