@@ -22,7 +22,7 @@ def test_values_are_the_twins_and_slopes_their_differences():
     volume[4, 3, 5] = np.nan
     planes, pixels = bent_planes(rng), np.array([0.3, 0.5, -1.2, -2.5])
     points = rng.uniform([-1.4, -2.8, -0.3], [1.4, 2.8, 4.8], (400, 3))
-    values, place, slopes = np.empty(400), np.empty(400), np.empty((400, 3))
+    values, place, slopes = np.empty(400), np.empty(400), np.zeros((400, 3))
     look_up(points, volume, planes, pixels, values, slopes, place)
     expected = oracles.look_up_on_planes(points, volume, planes, pixels)
     np.testing.assert_allclose(values, expected, atol=1e-6)
