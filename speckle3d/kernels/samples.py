@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy.typing as npt
 
-from speckle3d.core.arrays import Float32Array, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 
 POSITION_BITS = 40
 """Bits of a position behind the point; 23 before it and a sign."""
@@ -22,9 +22,9 @@ class Samples(NamedTuple):
     Attributes
     ----------
     images : ndarray, shape (n, line, sample)
-        NaN does not count.
-    weights : ndarray, shape (n, line, sample)
-        Samples whose weight is not above zero do not count.
+        NaN does not count, nor does infinity with the mean of the nearest.
+    weights : ndarray, shape (n,)
+        Of each image; images of weight zero must be left out.
     maps : ndarray, shape (n, 3, 3)
         From (line, sample, 1) to positions (i, j, k) in units of 2^-40 voxel. Where samples count in the
         voxel they lie in, voxel n reaches from n to n + 1 whole ones. Where they are shared out, its centre
@@ -39,7 +39,7 @@ class Samples(NamedTuple):
     """
 
     images: npt.NDArray[Any]
-    weights: Float32Array
+    weights: FloatArray
     maps: IntArray
     spans: IntArray
     first_tag: int

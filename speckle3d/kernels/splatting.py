@@ -13,10 +13,6 @@ from numba import njit
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.kernels.samples import POSITION_BITS, SHARE_BITS, Samples
 
-COUNT_BITS = 40
-"""Where a voxel's number of samples begins in the word that also holds their sum."""
-
-_ONE_SAMPLE = np.uint64(1 << COUNT_BITS)
 _WHOLE = 1 << POSITION_BITS
 _DROPPED = POSITION_BITS - SHARE_BITS
 _SHARE = 1.0 / (1 << SHARE_BITS)
@@ -24,7 +20,6 @@ _SHARES = (1 << SHARE_BITS) - 1
 _LEAST_SHARE = 0.125
 """Of a sample, for the maximum and the latest: its share if it lies in the middle of eight voxels."""
 
-Words = npt.NDArray[np.uint64]
 Tags = npt.NDArray[np.uint32]
 
 
@@ -56,33 +51,29 @@ def cut_to_box(span: IntArray, m: IntArray, box: IntArray, reach: int) -> tuple[
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _same_cell(x: int, y: int, z: int, i: int, j: int, k: int) -> bool:
-    """Whether a position is in a voxel, or between the same eight."""
-    return (((x >> POSITION_BITS) ^ i) | ((y >> POSITION_BITS) ^ j) | ((z >> POSITION_BITS) ^ k)) == 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def count_nearest(samples: Samples, box: IntArray, table: Words, offset: int) -> None:
-    """Add whole levels of several images to the voxels that their samples lie in; all weights are one.
+def add_nearest(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -> None:
+    """Add weighted levels of several images to the voxels that their samples lie in.
 
     Parameters
     ----------
     samples : Samples
-        Of whole numbers.
     box : ndarray, shape (3, 2)
         First voxel and end along i, j and k; others are left alone.
-    table : ndarray, shape (n_k, n_j, n_i), changed in place
-        Sum of levels in the lower 40 bits, number of samples above.
-    offset : int
-        Added to each level, so that none is below zero.
+    table : ndarray, shape (n_k, n_j, n_i, 2), changed in place
+        Sum of weighted levels, and of weights.
+    tags : ndarray, shape (n_k, n_j, n_i), changed in place
+        Tag of the image that a voxel's sum is of; not read without tags.
     """
-    images, _, maps, spans, _, _ = samples
-    n_j, n_i = table.shape[1:]
-    words = table.reshape(-1)
-    place = np.empty(images.shape[2] + 1, np.int64)
-    ends, sums = np.empty(images.shape[2] + 1, np.int64), np.empty(images.shape[2] + 1, np.uint64)
+    images, weights, maps, spans, first_tag, _ = samples
+    n_j, n_i = table.shape[1:3]
+    sums, marks = table.reshape(-1, 2), tags.reshape(-1)
+    length = images.shape[2] + 1
+    place, ends = np.empty(length, np.int64), np.empty(length, np.int64)
+    so_far, counts = np.empty(length), np.empty(length)
     for n in range(images.shape[0]):
         m = maps[n]
+        tag = first_tag + n if first_tag > 0 else 0
+        weight = weights[n]
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
         for span in range(spans.shape[0]):
             line, start, stop, x, y, z = cut_to_box(spans[span], m, box, 0)
@@ -95,57 +86,29 @@ def count_nearest(samples: Samples, box: IntArray, table: Words, offset: int) ->
             place[count] = -1
             # Several samples in a row lie in one voxel. What they add is the difference of sums along the
             # line up to the last of them: processors cannot foresee where a branch would end a row.
-            total, rows = np.uint64(0), 0
+            total, number, rows = 0.0, 0.0, 0
             for s in range(count):
-                total += _ONE_SAMPLE + np.uint64(np.int64(images[n, line, start + s]) + offset)
-                ends[rows], sums[rows] = place[s], total
+                level = np.float64(images[n, line, start + s])
+                if np.isfinite(level):
+                    total += level
+                    number += 1.0
+                ends[rows], so_far[rows], counts[rows] = place[s], total, number
                 rows += place[s] != place[s + 1]
-            total = np.uint64(0)
+            total = number = 0.0
             for row in range(rows):
-                words[np.uint64(ends[row])] += sums[row] - total
-                total = sums[row]
+                at = np.uint64(ends[row])
+                if tag > 0 and counts[row] > number and marks[at] != tag:
+                    marks[at] = tag
+                    sums[at, 0], sums[at, 1] = 0.0, 0.0
+                sums[at, 0] += weight * (so_far[row] - total)
+                sums[at, 1] += weight * (counts[row] - number)
+                total, number = so_far[row], counts[row]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def add_nearest(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -> None:
-    """Add weighted levels of several images to the voxels that their samples lie in.
-
-    Parameters
-    ----------
-    samples, box
-        As for `count_nearest`.
-    table : ndarray, shape (n_k, n_j, n_i, 2), changed in place
-        Sum of weighted levels, and of weights.
-    tags : ndarray, shape (n_k, n_j, n_i), changed in place
-        Tag of the image that a voxel's sum is of; not read without tags.
-    """
-    images, weights, maps, spans, first_tag, _ = samples
-    n_j, n_i = table.shape[1:3]
-    sums, marks = table.reshape(-1, 2), tags.reshape(-1)
-    for n in range(images.shape[0]):
-        m = maps[n]
-        tag = first_tag + n if first_tag > 0 else 0
-        dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
-        for span in range(spans.shape[0]):
-            line, sample, stop, x, y, z = cut_to_box(spans[span], m, box, 0)
-            while sample < stop:
-                i, j, k = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
-                total, weight = 0.0, 0.0
-                inside = True
-                while inside:
-                    level = np.float64(images[n, line, sample])
-                    share = np.float64(weights[n, line, sample])
-                    if level == level and share > 0.0:
-                        total += share * level
-                        weight += share
-                    x, y, z, sample = x + dx, y + dy, z + dz, sample + 1
-                    inside = sample < stop and _same_cell(x, y, z, i, j, k)
-                at = np.uint64((k * n_j + j) * n_i + i)
-                if weight > 0.0 and tag > 0 and marks[at] != tag:
-                    marks[at] = tag
-                    sums[at, 0], sums[at, 1] = 0.0, 0.0
-                sums[at, 0] += total
-                sums[at, 1] += weight
+def _same_cell(x: int, y: int, z: int, i: int, j: int, k: int) -> bool:
+    """Whether a position is in a voxel, or between the same eight."""
+    return (((x >> POSITION_BITS) ^ i) | ((y >> POSITION_BITS) ^ j) | ((z >> POSITION_BITS) ^ k)) == 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -171,13 +134,13 @@ def add_linear(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -
     """
     images, weights, maps, spans, first_tag, _ = samples
     n_j, n_i = table.shape[1:3]
-    row, plane, one = np.uint64(n_i), np.uint64(n_j * n_i), np.uint64(1)
     sums, marks = table.reshape(-1, 2), tags.reshape(-1)
     low_i, low_j, low_k = box[0, 0], box[1, 0], box[2, 0]
     last_i, last_j, last_k = box[0, 1] - 1, box[1, 1] - 1, box[2, 1] - 1
     for n in range(images.shape[0]):
         m = maps[n]
         tag = first_tag + n if first_tag > 0 else 0
+        weight = weights[n]
         dx, dy, dz = m[0, 1], m[1, 1], m[2, 1]
         for span in range(spans.shape[0]):
             line, sample, stop, x, y, z = cut_to_box(spans[span], m, box, 1)
@@ -190,8 +153,7 @@ def add_linear(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -
                 inside = True
                 while inside:
                     level = np.float64(images[n, line, sample])
-                    share = np.float64(weights[n, line, sample])
-                    if level == level and share > 0.0:
+                    if level == level:
                         fx, fy, fz = _fraction(x), _fraction(y), _fraction(z)
                         gx, gy, gz = 1.0 - fx, 1.0 - fy, 1.0 - fz
                         a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
@@ -200,35 +162,12 @@ def add_linear(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -
                         if tag > 0:
                             s0, s1, s2, s3 = _large(s0), _large(s1), _large(s2), _large(s3)
                             s4, s5, s6, s7 = _large(s4), _large(s5), _large(s6), _large(s7)
-                        w0, w1, w2, w3 = w0 + share * s0, w1 + share * s1, w2 + share * s2, w3 + share * s3
-                        w4, w5, w6, w7 = w4 + share * s4, w5 + share * s5, w6 + share * s6, w7 + share * s7
-                        level *= share
+                        w0, w1, w2, w3 = w0 + s0, w1 + s1, w2 + s2, w3 + s3
+                        w4, w5, w6, w7 = w4 + s4, w5 + s5, w6 + s6, w7 + s7
                         t0, t1, t2, t3 = t0 + level * s0, t1 + level * s1, t2 + level * s2, t3 + level * s3
                         t4, t5, t6, t7 = t4 + level * s4, t5 + level * s5, t6 + level * s6, t7 + level * s7
                     x, y, z, sample = x + dx, y + dy, z + dz, sample + 1
                     inside = sample < stop and _same_cell(x, y, z, i, j, k)
-                if tag == 0 and low_i <= i < last_i and low_j <= j < last_j and low_k <= k < last_k:
-                    at = np.uint64((k * n_j + j) * n_i + i)
-                    sums[at, 0] += t0
-                    sums[at, 1] += w0
-                    sums[at + one, 0] += t1
-                    sums[at + one, 1] += w1
-                    at += row
-                    sums[at, 0] += t2
-                    sums[at, 1] += w2
-                    sums[at + one, 0] += t3
-                    sums[at + one, 1] += w3
-                    at += plane
-                    sums[at, 0] += t6
-                    sums[at, 1] += w6
-                    sums[at + one, 0] += t7
-                    sums[at + one, 1] += w7
-                    at -= row
-                    sums[at, 0] += t4
-                    sums[at, 1] += w4
-                    sums[at + one, 0] += t5
-                    sums[at + one, 1] += w5
-                    continue
                 totals, shares = (t0, t1, t2, t3, t4, t5, t6, t7), (w0, w1, w2, w3, w4, w5, w6, w7)
                 for corner in range(8):
                     u, v, w = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
@@ -242,8 +181,8 @@ def add_linear(samples: Samples, box: IntArray, table: FloatArray, tags: Tags) -
                         if tag > 0 and marks[at] != tag:
                             marks[at] = tag
                             sums[at, 0], sums[at, 1] = 0.0, 0.0
-                        sums[at, 0] += totals[corner]
-                        sums[at, 1] += shares[corner]
+                        sums[at, 0] += weight * totals[corner]
+                        sums[at, 1] += weight * shares[corner]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -283,13 +222,3 @@ def keep_largest(samples: Samples, box: IntArray, table: Float32Array) -> None:
                         ):
                             table[k + w, j + v, i + u] = level
                 x, y, z = x + m[0, 1], y + m[1, 1], z + m[2, 1]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def means_of_counts(table: Words, offset: int, voxels: Float32Array) -> None:
-    """Turn what `count_nearest` made into means; NaN where no sample was."""
-    words, means = table.reshape(-1), voxels.reshape(-1)
-    for at in range(words.size):
-        count = np.int64(words[at] >> np.uint64(COUNT_BITS))
-        total = np.int64(words[at] & np.uint64((1 << COUNT_BITS) - 1))
-        means[at] = np.float32((total - count * offset) / count)

@@ -29,18 +29,13 @@ import numpy.typing as npt
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.threads import cores, in_parallel
-from speckle3d.imaging.images import Images, PosedImages
+from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.settings import Rule, Splat
 from speckle3d.kernels.samples import PLUS_BITS, POSITION_BITS, SHARE_BITS, Samples
 
-Weights = npt.NDArray[Any] | Images
-"""Weight of each frame, shape (n,), or of each sample: images of weights."""
-
 _DIRECT = ("uint8", "int16", "uint16", "float32")
 """Types that kernels read as they are; others become float32."""
-_MOST_COUNTED = 2**23
-"""Samples in a voxel for which sum and count fit into one word, and as many to spare."""
 _BORDER = 2.0**-24
 """Voxels. A sample less than this below a border lies on it, and belongs to the voxel above."""
 _FARTHEST = 2.0**22
@@ -56,7 +51,7 @@ def splat_images(
     voxel_grid: VoxelGrid,
     splat: Splat,
     rule: Rule,
-    weights: Weights | None = None,
+    weights: FloatArray | None = None,
     mask: BoolArray | None = None,
 ) -> tuple[Float32Array, ByteArray]:
     """Give images to the voxels of a grid.
@@ -67,8 +62,8 @@ def splat_images(
     voxel_grid : VoxelGrid
     splat, rule
         As `CompoundingSettings` has them.
-    weights : ndarray, shape (n,), or images of weights, optional
-        For the rule "weighted".
+    weights : ndarray, shape (n,), optional
+        Of the frames, for the rule "weighted".
     mask : ndarray of bool, shape (vector, sample), optional
         Samples that count.
 
@@ -91,78 +86,60 @@ def splat_images(
     mask = np.ones(side, dtype=bool) if mask is None else mask
     if mask.shape != side or not mask.any():
         raise InvalidInputError(f"region: expected a mask of shape {side} with samples inside, got none")
-    if rule != "weighted":
-        weights = np.ones(n)
-    if weights is None or (
-        isinstance(weights, np.ndarray)
-        and weights.ndim == 1
-        and not (len(weights) == n and (weights >= 0).all())
-    ):
-        raise InvalidInputError(f"weights: expected zero or more for each of {n} frames, or images of them")
+    share = np.ones(n) if rule != "weighted" else np.asarray(weights, dtype=float)
+    if share.shape != (n,) or not (share >= 0).all():
+        raise InvalidInputError(f"weights: expected zero or more for each of {n} frames")
     maps, shape = index_from_sample(source, voxel_grid), voxel_grid.shape[::-1]
-    near = _frames_near(maps, source, voxel_grid)
+    near = _frames_near(maps, source, voxel_grid, share > 0)
     if not near.size:
         return np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
     first = source.read_as_stored(int(near[0]))
-    kernel, tables = _kernel(splat, rule, first.dtype, _few_samples(source, voxel_grid), shape)
+    if rule == "plus" and first.dtype != np.uint8:
+        raise InvalidInputError(
+            f"rule plus: expected images of type uint8, B-mode as stored, got {first.dtype}"
+        )
+    kernel, tables = _kernel(splat, rule, shape)
     turned = rule == "plus" or (first.flags.f_contiguous and not first.flags.c_contiguous)
     spans = _spans(mask, turned)
     for images, frames in _batches(source, near, first, turned):
         fixed = _fixed_maps(maps[frames], splat, PLUS_BITS if rule == "plus" else POSITION_BITS, turned)
-        share = _weights_of(weights, source, frames, images, turned)
         tag = int(frames[0]) + 1 if rule == "latest" else 0
-        samples = Samples(images, share, fixed, spans, tag, splat == "linear")
+        samples = Samples(images, share[frames], fixed, spans, tag, splat == "linear")
         _share_out(partial(kernel, samples), tables, fixed, images.shape[1])
     voxels = _levels(rule, tables)
     return voxels, (~np.isnan(voxels)).view(np.uint8)
 
 
 def _kernel(
-    splat: Splat, rule: Rule, stored: np.dtype[Any], few_samples: bool, shape: tuple[int, ...]
-) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    splat: Splat, rule: Rule, shape: tuple[int, ...]
+) -> tuple[Callable[..., None], tuple[npt.NDArray[Any], ...]]:
     """What adds samples to the voxels of a box, and the tables that it adds them to."""
     from speckle3d.kernels import splatting as kernels
     from speckle3d.kernels.whole_levels import add_whole
 
     if rule == "plus":
-        if stored != np.uint8:
-            raise InvalidInputError(
-                f"rule plus: expected images of type uint8, B-mode as stored, got {stored}"
-            )
         return add_whole, (np.zeros(shape, np.uint8), np.zeros(shape, np.uint16))
     if rule == "maximum":
         return kernels.keep_largest, (np.full(shape, np.nan, np.float32),)
-    if (
-        (splat, rule) == ("nearest", "mean")
-        and few_samples
-        and stored.name in _DIRECT[:3]
-        and stored.isnative
-    ):
-        return kernels.count_nearest, (np.zeros(shape, np.uint64), 2**15 if stored.kind == "i" else 0)
     tags = np.zeros(shape if rule == "latest" else (1, 1, 1), np.uint32)
     return (kernels.add_linear if splat == "linear" else kernels.add_nearest), (np.zeros((*shape, 2)), tags)
 
 
-def _levels(rule: Rule, tables: tuple[Any, ...]) -> Float32Array:
+def _levels(rule: Rule, tables: tuple[npt.NDArray[Any], ...]) -> Float32Array:
     """Levels of voxels by what was added; NaN where no sample was."""
-    from speckle3d.kernels.splatting import means_of_counts
-
     table, other = tables[0], tables[-1]
     if rule == "maximum":
         return np.asarray(table)
+    if rule == "plus":
+        return np.asarray(np.where(other > 0, table, np.float32(np.nan)))
     voxels = np.empty(table.shape[:3], np.float32)
 
-    def work(first: int, stop: int) -> None:
-        part = slice(first, stop)
-        if rule == "plus":
-            voxels[part] = np.where(other[part] > 0, table[part], np.float32(np.nan))
-        elif table.dtype == np.uint64:
-            means_of_counts(table[part], other, voxels[part])
-        else:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                voxels[part] = table[part, :, :, 0] / table[part, :, :, 1]
+    def divide(first: int, stop: int) -> None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for k in range(first, stop):
+                voxels[k] = table[k, :, :, 0] / table[k, :, :, 1]
 
-    in_parallel(work, len(voxels))
+    in_parallel(divide, len(voxels))
     return voxels
 
 
@@ -176,17 +153,18 @@ def index_from_sample(source: PosedImages, voxel_grid: VoxelGrid) -> FloatArray:
     return maps
 
 
-def _frames_near(maps: FloatArray, source: PosedImages, voxel_grid: VoxelGrid) -> IntArray:
-    """Frames that may have a sample within one voxel of the grid."""
+def _frames_near(
+    maps: FloatArray, source: PosedImages, voxel_grid: VoxelGrid, counted: BoolArray
+) -> IntArray:
+    """Frames that may have a sample within one voxel of the grid, of those that count."""
     v, s = source.grid.vectors - 1, source.grid.samples - 1
     corners = maps @ np.array([[0, 0, 1], [v, 0, 1], [0, s, 1], [v, s, 1]]).T
     low, high = corners.min(axis=2), corners.max(axis=2)
-    near = ((high > -1.5) & (low < np.array(voxel_grid.shape) + 0.5)).all(axis=1)
-    far = near & (np.maximum(-low, high) > _FARTHEST).any(axis=1)
-    if far.any():
+    near = counted & ((high > -1.5) & (low < np.array(voxel_grid.shape) + 0.5)).all(axis=1)
+    if (np.maximum(-low, high)[near] > _FARTHEST).any():
         raise InvalidInputError(
-            f"images[{int(np.argmax(far))}]: expected to reach less than {_FARTHEST:.0f} voxels beyond "
-            "the grid: take larger voxels, or check the poses"
+            f"images: expected to reach less than {_FARTHEST:.0f} voxels beyond the grid: take larger "
+            "voxels, or check the poses"
         )
     return np.flatnonzero(near)
 
@@ -256,21 +234,3 @@ def _share_out(work: Callable[..., None], tables: tuple[Any, ...], maps: IntArra
 
     count = int(sides[axis])
     in_parallel(part, count, max(_LEAST_BLOCK, -(-count // (2 * cores()))))
-
-
-def _few_samples(source: PosedImages, voxel_grid: VoxelGrid) -> bool:
-    """Whether no voxel can get more samples than are counted in one word with their sum."""
-    steps = np.array([source.grid.vector_pitch_mm, source.grid.sample_spacing_mm])
-    across = np.linalg.norm(voxel_grid.spacing_mm) / steps + 2.0
-    return bool(len(source) * across.prod() < _MOST_COUNTED)
-
-
-def _weights_of(
-    weights: Weights, source: PosedImages, frames: IntArray, images: npt.NDArray[Any], turned: bool
-) -> Float32Array:
-    """Weights of the samples of a batch, shape (n, line, sample)."""
-    if isinstance(weights, np.ndarray) and weights.ndim == 1:
-        return np.broadcast_to(weights[frames].astype(np.float32)[:, None, None], images.shape)
-    placed = PosedImages(weights, source.grid, source.world_from_image)
-    read = [placed.read(int(frame)) for frame in frames]
-    return np.stack([image.T for image in read] if turned else read)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
+from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import ImageGrid
@@ -25,7 +25,7 @@ from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
 from speckle3d.imaging.voxels.holes import fill_holes
 from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
-from speckle3d.imaging.voxels.splatting import Weights, splat_images
+from speckle3d.imaging.voxels.splatting import splat_images
 
 DEFAULT_FILL_RADIUS = 3
 """Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
@@ -60,7 +60,7 @@ def compound(
     voxel_grid: VoxelGrid | None = None,
     splat: Splat = "nearest",
     rule: Rule = "mean",
-    weights: Weights | None = None,
+    weights: FloatArray | None = None,
     region: BoolArray | None = None,
     fill_radius: int = DEFAULT_FILL_RADIUS,
     backward_mm: float = 0.0,
@@ -92,8 +92,8 @@ def compound(
     splat : {"nearest", "linear"}
     rule : {"mean", "maximum", "latest", "weighted", "plus"}
         With "plus" images and voxels must be of uint8.
-    weights : ndarray of shape (n,), or images of weights, optional
-        For the rule "weighted"; samples whose weight is 0 or NaN do not count.
+    weights : ndarray, shape (n,), optional
+        Of the frames, zero or more, for the rule "weighted".
     region : ndarray of bool, shape (vector, sample), optional
         Samples that count; by default all.
     fill_radius : int
@@ -164,7 +164,7 @@ def compound_onto(
     voxel_grid: VoxelGrid,
     source: PosedImages,
     settings: CompoundingSettings,
-    weights: Weights | None = None,
+    weights: FloatArray | None = None,
     region: BoolArray | None = None,
 ) -> CompoundedVolume:
     """Compound images into the voxels of a grid, by settings; else as `compound`.
