@@ -8,6 +8,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.threads import in_parallel
 from speckle3d.imaging.axes import line_along
 from speckle3d.imaging.images import PosedImages
@@ -96,15 +97,21 @@ class NearestImages:
         state : ndarray of uint8, shape (n, points)
             `EMPTY`; `MEASURED` where an image is no farther away than `alone_mm`; elsewhere `FILLED`.
         """
-        from speckle3d.kernels.cuts import blend_nearest
-
         levels = np.empty(self._grey.shape[1:], np.float32)
         state = np.empty(levels.shape, np.uint8)
 
         def blend(first: int, stop: int) -> None:
             band = slice(first, stop)
-            sides = self._distance_mm[:, band], self._grey[:, band]
-            blend_nearest(*sides, alone_mm, levels[band], state[band])
+            (behind, front), (level, other) = self._distance_mm[:, band], self._grey[:, band]
+            shown = ~np.isnan(self._grey[:, band])
+            measured = (shown & (self._distance_mm[:, band] <= alone_mm)).any(axis=0)
+            with np.errstate(invalid="ignore"):
+                between = level + behind / (behind + front) * (other - level)
+            alone = np.where(shown[0], level, other)
+            counts = np.select([measured, shown.all(axis=0)], [MEASURED, FILLED], EMPTY)
+            levels[band] = np.where(np.isnan(between), alone, between)
+            levels[band][counts == EMPTY] = np.nan
+            state[band] = counts
 
         in_parallel(blend, len(levels), _GRAIN)
         return levels, state

@@ -33,36 +33,37 @@ def fill_planes(voxels: Float32Array, state: ByteArray, boxes: IntArray, first: 
     n_k, n_j, n_i = voxels.shape
     total, count = np.empty((n_j, n_i)), np.empty((n_j, n_i), np.uint32)
     row_total, row_count = np.empty(n_i), np.empty(n_i, np.uint32)
-    holes = np.empty(n_j, np.int64)
     for k in range(first, stop):
-        left = 0
-        for j in range(n_j):
-            holes[j] = 0
-            for i in range(n_i):
-                holes[j] += state[k, j, i] == EMPTY
-            left += holes[j]
-        if left == 0:
-            continue
         total[:], count[:] = 0.0, 0
-        _add_plane(voxels[k], state[k], total, count)
-        summed = 0
+        summed, holes = -1, True
         for box in range(boxes.shape[0]):
-            while summed < boxes[box, 0]:
-                summed += 1
-                if k - summed >= 0:
-                    _add_plane(voxels[k - summed], state[k - summed], total, count)
-                if k + summed < n_k:
-                    _add_plane(voxels[k + summed], state[k + summed], total, count)
-            half_j, half_i = boxes[box, 1], boxes[box, 2]
-            for j in range(n_j):
-                if holes[j] == 0:
-                    continue
-                _sum_rows(total, count, max(j - half_j, 0), min(j + half_j + 1, n_j), row_total, row_count)
-                done = _fill_row(voxels[k, j], state[k, j], half_i, row_total, row_count)
-                holes[j] -= done
-                left -= done
-            if left == 0:
+            if not holes:
                 break
+            half_k, half_j, half_i = boxes[box]
+            while summed < half_k:
+                summed += 1
+                for plane in range(k - summed, k + summed + 1, max(2 * summed, 1)):
+                    if 0 <= plane < n_k:
+                        _add_plane(voxels[plane], state[plane], total, count)
+            holes = False
+            for j in range(n_j):
+                if not (state[k, j] == EMPTY).any():
+                    continue
+                row_total[:], row_count[:] = 0.0, 0
+                for row in range(max(j - half_j, 0), min(j + half_j + 1, n_j)):
+                    row_total += total[row]
+                    row_count += count[row]
+                for i in range(n_i):
+                    if state[k, j, i] == EMPTY:
+                        level, number = 0.0, 0
+                        for cell in range(max(i - half_i, 0), min(i + half_i + 1, n_i)):
+                            level += row_total[cell]
+                            number += row_count[cell]
+                        if number > 0:
+                            voxels[k, j, i] = level / number
+                            state[k, j, i] = FILLED
+                        else:
+                            holes = True
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
@@ -73,35 +74,3 @@ def _add_plane(voxels: Float32Array, state: ByteArray, total: FloatArray, count:
             measured = state[j, i] == MEASURED
             total[j, i] += voxels[j, i] if measured else np.float32(0.0)
             count[j, i] += np.uint32(measured)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _sum_rows(
-    total: FloatArray, count: CountArray, first: int, stop: int, row_total: FloatArray, row_count: CountArray
-) -> None:
-    row_total[:], row_count[:] = total[first], count[first]
-    for j in range(first + 1, stop):
-        for i in range(row_total.shape[0]):
-            row_total[i] += total[j, i]
-            row_count[i] += count[j, i]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
-def _fill_row(
-    voxels: Float32Array, state: ByteArray, half: int, row_total: FloatArray, row_count: CountArray
-) -> int:
-    """Fill the holes of a row that have measured voxels within the box; return how many."""
-    n_i = voxels.shape[0]
-    done = 0
-    for i in range(n_i):
-        if state[i] != EMPTY:
-            continue
-        total, count = 0.0, 0
-        for c in range(max(i - half, 0), min(i + half + 1, n_i)):
-            total += row_total[c]
-            count += row_count[c]
-        if count > 0:
-            voxels[i] = total / count
-            state[i] = FILLED
-            done += 1
-    return done

@@ -7,22 +7,25 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import ByteArray, Float32Array
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.labels import EMPTY
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.planes import Cut, image_plane
 from speckle3d.imaging.cuts.planes import ReslicePlane as ReslicePlane
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.nearest import NearestImages, look_up
 
-_GRAIN = 32
-"""Lines of a cut below which a slice is not worth another thread's while."""
+_EDGE = 1e-6
+"""Fraction of a voxel by which a point may miss the border: rounding of poses."""
 
 
 def reslice_frames(
@@ -119,18 +122,28 @@ def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> 
     MismatchError
         If voxels and their states differ in shape.
     """
-    from speckle3d.kernels.cuts import cut_voxels
-
     if state is not None and state.shape != volume.shape:
         raise MismatchError(f"state: expected shape {volume.shape}, got {state.shape}")
-    held = np.empty((0, 0, 0), np.uint8) if state is None else state.astype(np.uint8, copy=False)
-    index_from_world = np.asarray(np.linalg.inv(volume.world_from_index)[:3], dtype=float)
-    lines = cut.lines()
-    out = np.empty((len(lines), cut.shape[0]), np.float32)
+    rows = np.arange(cut.shape[0]) * cut.pixel_mm
+    points = cut.base_mm + rows[:, None, None] * cut.down
+    index_from_world, last = np.linalg.inv(volume.world_from_index), np.array(volume.shape) - 1
+    at = points @ index_from_world[:3, :3].T + index_from_world[:3, 3]
+    inside = (np.abs(at - last / 2) <= last / 2 + _EDGE).all(axis=-1)
+    if not inside.any():
+        return np.full(cut.shape, np.nan, np.float32)
+    at = np.clip(at, 0, last)
+    low, high = at[inside].min(axis=0).astype(int), at[inside].max(axis=0).astype(int) + 2
+    part = tuple(map(slice, low, high))
+    voxels = volume.voxels[part]
+    held = np.isfinite(voxels) if state is None else state[part] != EMPTY
 
-    def fill(first: int, stop: int) -> None:
-        band = slice(first, stop)
-        cut_voxels(volume.voxels.T, held.T, index_from_world, lines[band], out[band])
+    def sample(values: npt.NDArray[Any]) -> Float32Array:
+        return np.asarray(map_coordinates(values, (at - low)[inside].T, np.float32, 1, "nearest"))
 
-    in_parallel(fill, len(lines), _GRAIN)
-    return np.ascontiguousarray(out.T)
+    out = np.full(cut.shape, np.nan, np.float32)
+    if held.all():
+        out[inside] = sample(voxels)
+    else:
+        weights, total = sample(held.view(np.uint8)), sample(np.where(held, voxels, 0))
+        out[inside] = np.where(weights >= 0.5 - _EDGE, total / np.maximum(weights, _EDGE), np.nan)
+    return out
