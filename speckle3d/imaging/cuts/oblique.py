@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.imaging.cuts.outlines import frame_outlines
+from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
 from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_around
 
 _LEAST_SINE = 1e-4
@@ -93,8 +93,7 @@ def covering_plane(
         If no frame comes near the plane; says where the sweep is.
     """
     outlines = frame_outlines(grid, world_from_image)
-    sides = np.stack([outlines[:, :-1], outlines[:, 1:]], axis=2).reshape(-1, 2, 3)
-    return _covering(placed, sides, reach_mm, pixel_mm, f"a frame within {reach_mm:g} mm")
+    return _covering(placed, outlines, reach_mm, pixel_mm, f"a frame within {reach_mm:g} mm")
 
 
 def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
@@ -113,22 +112,21 @@ def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float
     InvalidInputError
         If the plane misses the box; says where that is.
     """
-    edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
+    faces = corners_mm[[[0, 1, 3, 2, 0], [4, 5, 7, 6, 4], [0, 1, 5, 4, 0], [2, 3, 7, 6, 2]]]
     touching_mm = 1e-6 * float(np.ptp(corners_mm, axis=0).max())
-    return _covering(placed, corners_mm[edges], touching_mm, pixel_mm, "the volume")
+    return _covering(placed, faces, touching_mm, pixel_mm, "the volume")
 
 
 def _covering(
-    placed: RigidTransform, edges_mm: FloatArray, reach_mm: float, pixel_mm: float, what: str
+    placed: RigidTransform, outlines_mm: FloatArray, reach_mm: float, pixel_mm: float, what: str
 ) -> ReslicePlane:
-    """Plane as large as where it crosses edges, shape (n, 2, 3), or passes their ends."""
-    there = placed.inv().apply(edges_mm.reshape(-1, 3)).reshape(edges_mm.shape)
-    start, stop = there[there[:, 0, 2] * there[:, 1, 2] < 0].swapaxes(0, 1)
-    share = start[:, 2:] / (start[:, 2:] - stop[:, 2:])
-    away = np.abs(there[..., 2])
-    points = np.concatenate([there[away <= reach_mm], start + share * (stop - start)])[:, :2]
+    """Plane as large as where it crosses outlines, shape (n, 5, 3), or passes their corners."""
+    corners = placed.inv().apply(outlines_mm.reshape(-1, 3))
+    away = np.abs(corners[:, 2])
+    lines = crossings(outlines_mm, placed).reshape(-1, 2)
+    points = np.concatenate([corners[away <= reach_mm, :2], lines[np.isfinite(lines[:, 0])]])
     if not len(points):
-        low, high = edges_mm.min(axis=(0, 1)), edges_mm.max(axis=(0, 1))
+        low, high = outlines_mm.min(axis=(0, 1)), outlines_mm.max(axis=(0, 1))
         raise InvalidInputError(
             f"plane: expected one that meets {what}, all between {vector_words(low)} and "
             f"{vector_words(high)} mm, got one {away.min():.1f} mm from there"

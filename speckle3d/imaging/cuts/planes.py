@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import ImageGrid
+from speckle3d.imaging.axes import line_along
 from speckle3d.imaging.images import require_poses
 
 MAX_PIXELS = 100_000_000
@@ -22,8 +23,8 @@ MAX_PIXELS = 100_000_000
 DEFAULT_PIXEL_MM = 0.2
 """Between the axial and the lateral resolution of a 5-10 MHz probe."""
 
-_LEAST_CROSSING = 0.5
-"""Sine of the angle between a frame and a plane at which the frame is said to cross it."""
+_LEAST_ACROSS = 1e-3
+"""Sine of the angle between the travel and the line to show that spans a plane."""
 
 
 class Cut:
@@ -199,7 +200,7 @@ def planes_from_first_frame(
     InvalidInputError
         If there are no poses.
     InsufficientDataError
-        If the poses have no common elevational direction, or none along the line.
+        If the sweep moves along the line.
     """
     placed = {mode: _travelled(each, line_mm) for mode, each in poses.items()}
     ends = np.concatenate([each for _, each in placed.values()])
@@ -225,10 +226,9 @@ def _part(
 
 
 def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[RigidTransform, FloatArray]:
-    """Place a plane along the travel of a line, and say where on it the ends of that line are.
+    """Place a plane in the first frame's line and the mean travel, and say where on it all lines' ends are.
 
-    It lies in the mean plane of all lines; its origin is in the first frame, as far along it as the line
-    begins. Its y is the line in which the first frame crosses it.
+    Its origin is where the first frame's line begins, and its y is that line.
 
     Returns
     -------
@@ -236,32 +236,14 @@ def _travelled(world_from_image: RigidTransform, line_mm: FloatArray) -> tuple[R
     """
     require_poses(world_from_image)
     ends = np.stack([world_from_image.apply(point) for point in line_mm])
-    along = ends[1] - ends[0]
-    down = _unit(along.mean(axis=0), "the line to show")
-    normals = world_from_image.rotation.apply([0.0, 0.0, 1.0])
-    travel = _mean_travel(ends.mean(axis=0), _unit(normals.mean(axis=0), "elevational"))
-    normal = np.cross(_unit(travel - (travel @ down) * down, "travel"), down)
-    beside = np.cross(normals[0], along[0] / np.linalg.norm(along[0]))
-    # A frame that hardly crosses the plane has its line projected there instead.
-    beside = beside if abs(beside @ normal) > _LEAST_CROSSING else normal
-    beside = beside / (beside @ normal)
-    down = _unit(along[0] - (along[0] @ normal) * beside, "the first frame's line")
-    axes = Rotation.from_matrix(np.column_stack([np.cross(down, normal), down, normal]))
-    origin = ends[0, 0] + beside * ((ends.mean(axis=(0, 1)) - ends[0, 0]) @ normal)
-    placed = RigidTransform.from_components(origin, axes)
+    # A micrometre is no travel to take a direction from.
+    forward = 1e-3 * world_from_image[:1].rotation.apply([0.0, 0.0, 1.0])
+    travel = line_along(np.concatenate([forward, ends.mean(axis=0) - ends.mean(axis=(0, 1))]))
+    down = (ends[1, 0] - ends[0, 0]) / np.linalg.norm(ends[1, 0] - ends[0, 0])
+    right = travel - (travel @ down) * down
+    length = float(np.linalg.norm(right))
+    if length < _LEAST_ACROSS:
+        raise InsufficientDataError("the poses move along the line to show: expected travel across it")
+    axes = Rotation.from_matrix(np.column_stack([right / length, down, np.cross(right / length, down)]))
+    placed = RigidTransform.from_components(ends[0, 0], axes)
     return placed, placed.inv().apply(ends.reshape(-1, 3))[:, :2]
-
-
-def _mean_travel(points_mm: FloatArray, forward: FloatArray) -> FloatArray:
-    """Mean travel per mm forward, by regressing position on it; order does not matter."""
-    moved = points_mm - points_mm.mean(axis=0)
-    ahead = moved @ forward
-    # A micrometre rms is no travel to take a direction from.
-    return ahead @ moved / (ahead @ ahead) if ahead @ ahead > 1e-6 * len(moved) else forward
-
-
-def _unit(vector: FloatArray, what: str) -> FloatArray:
-    length = float(np.linalg.norm(vector))
-    if length < 1e-6:
-        raise InsufficientDataError(f"the poses have no common direction of {what}: expected one sweep")
-    return np.asarray(vector / length)

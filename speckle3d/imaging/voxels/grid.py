@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
@@ -85,16 +84,20 @@ def grid_around(
     """
     i, j, k = _three([spacing_mm] * 3 if np.ndim(spacing_mm) == 0 else spacing_mm, "spacing_mm")
     spacing, axes = (i, j, k), world_from_axes or Rotation.identity()
-    low, high = _bounds(grid, world_from_image, axes)
+    along = axes.inv().apply(image_corners(grid, world_from_image).reshape(-1, 3))
+    low, high = along.min(axis=0), along.max(axis=0)
     if origin_mm is not None:
         low = axes.inv().apply(_three(origin_mm, "origin_mm", -np.inf))
     if shape is not None and size_mm is not None:
         raise InvalidInputError("voxels: expected a shape or a size in mm, got both")
-    if size_mm is not None:
+    if shape is not None:
+        counts = np.array(_three(shape, "shape"))
+    elif size_mm is not None:
         # A hair less, so that rounding does not add a voxel to a whole number of them.
         counts = np.ceil(np.divide(_three(size_mm, "size_mm"), spacing) - 1e-6)
     else:
-        counts = _counts(low, high, spacing) if shape is None else np.array(_three(shape, "shape"))
+        # A corner half a voxel past the last centre rounds up, and so does one a rounding error short of it.
+        counts = np.floor((high - low) / spacing + 0.5 + 1e-6) + 1
     if (counts < 1).any():
         raise InvalidInputError("origin_mm: expected an origin before the images' end, got one beyond it")
     n_i, n_j, n_k = counts.astype(int).tolist()
@@ -113,20 +116,20 @@ def spacing_within(
     max_gb: float,
     world_from_axes: Rotation | None = None,
     voxel_type: VoxelType = "uint8",
+    origin_mm: npt.ArrayLike | None = None,
+    size_mm: Triple | None = None,
 ) -> float:
-    """Finest round spacing of cubic voxels with which the volume around the images stays within a size.
+    """Finest round spacing of cubic voxels with which a grid around images stays within a size.
 
     Spacings are 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6 and 8 times a power of ten. None is finer than the images'
     own samples: finer voxels would show no more.
 
     Parameters
     ----------
-    grid : ImageGrid
-    world_from_image : RigidTransform, length n
+    grid, world_from_image, world_from_axes, origin_mm, size_mm
+        As of `grid_around`.
     max_gb : float
         Of the voxels: what a file, unpacked, and a viewer hold.
-    world_from_axes : Rotation, optional
-        Directions of the voxel axes; without it, the world's.
     voxel_type : {"uint8", "int16", "uint16", "float32"}
 
     Returns
@@ -145,27 +148,13 @@ def spacing_within(
     0.15
     """
     finest = min(grid.vector_pitch_mm, grid.sample_spacing_mm) * (1 - 1e-9)
-    low, high = _bounds(grid, world_from_image, world_from_axes or Rotation.identity())
-    most = max_gb * 1e9 / np.dtype(voxel_type).itemsize
     # As decimal text, so that 0.3 is 0.3 and not 3 x 0.1.
     for spacing in (float(f"{step}e{power}") for power in range(-6, 3) for step in _ROUND_SPACINGS):
-        if spacing >= finest and np.prod(_counts(low, high, spacing)) <= most:
-            return spacing
+        if spacing >= finest:
+            place = grid, world_from_image, spacing, world_from_axes
+            if grid_around(*place, origin_mm=origin_mm, size_mm=size_mm).size_gb(voxel_type) <= max_gb:
+                return spacing
     raise InvalidInputError(f"max_gb: expected enough for some voxels, got {max_gb:g} GB")
-
-
-def _bounds(
-    grid: ImageGrid, world_from_image: RigidTransform, world_from_axes: Rotation
-) -> tuple[FloatArray, FloatArray]:
-    """Least and greatest coordinates along the axes of the images' corners."""
-    along = world_from_axes.inv().apply(image_corners(grid, world_from_image).reshape(-1, 3))
-    return along.min(axis=0), along.max(axis=0)
-
-
-def _counts(low: FloatArray, high: FloatArray, spacing: float | Triple) -> FloatArray:
-    """Voxels from a corner to another."""
-    # A corner half a voxel past the last centre would round up, and so may one a rounding error short of it.
-    return np.asarray(np.floor((high - low) / np.asarray(spacing) + 0.5 + 1e-6) + 1)
 
 
 def _three(values: npt.ArrayLike, name: str, above: float = 0.0) -> list[float]:

@@ -80,15 +80,16 @@ class GridRequest:
             if self != GridRequest(like=self.like):
                 raise InvalidInputError("--like: expected no other option of the grid beside it")
             return grid_like(read_volume(self.like))
-        if self.spacing_mm is not None and self.within_gb is not None:
-            raise InvalidInputError("--within-gb: expected no --spacing-mm beside it")
+        if self.within_gb is not None and (self.spacing_mm or self.shape):
+            raise InvalidInputError("--within-gb: expected no --spacing-mm and no --shape beside it")
         axes = Rotation.identity()
         if self.axes != "world":
             is_smallest = self.axes == "principal"
             axes = principal_axes(images, world_from_image) if is_smallest else sweep_axes(world_from_image)
         spacing: float | tuple[float, float, float] = self.spacing_mm or settings.voxel_mm
         if self.within_gb is not None:
-            spacing = spacing_within(images, world_from_image, self.within_gb, axes, settings.voxel_type)
+            bound = self.within_gb, axes, settings.voxel_type, self.origin_mm, self.size_mm
+            spacing = spacing_within(images, world_from_image, *bound)
         return grid_around(
             images,
             world_from_image,

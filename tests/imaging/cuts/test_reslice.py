@@ -125,6 +125,6 @@ def test_images_that_do_not_fit_are_refused():
             reslice_frames(images, GRID, poses, plane, reach_mm)
     with pytest.raises(InvalidInputError):
         lateral_line(GRID, 4.5)
-    opposed = RigidTransform.from_rotation(Rotation.from_rotvec([[0, 0, 0], [0, np.pi, 0]]))
+    sunk = RigidTransform.from_translation(np.outer(np.arange(5.0), [0, 1, 0]))
     with pytest.raises(InsufficientDataError):
-        plane_along(opposed, lateral_line(GRID, 1.0))
+        plane_along(sunk, lateral_line(GRID, 1.0))
