@@ -104,11 +104,10 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
         return start * Rotation.from_rotvec(turn)
 
     turned = lateral_first * _TURNS
-    starts = [lateral_first, *turned[np.argsort(log_volumes(turned), kind="stable")[:_REFINED]]]
+    starts = turned[np.argsort(log_volumes(turned), kind="stable")[:_REFINED]]
     found = Rotation.concatenate([lateral_first, Rotation.identity(), *map(smallest_near, starts)])
     volume = log_volumes(found)
-    smallest = found[int(np.flatnonzero(volume <= volume.min() + 1e-4)[0])]
-    alike = smallest * Rotation.create_group("O")
+    alike = found[int(np.argmax(volume <= volume.min() + 1e-4))] * Rotation.create_group("O")
     return alike[int((lateral_first.inv() * alike).magnitude().argmin())]
 
 

@@ -39,14 +39,6 @@ class CurvedSheet(Cut):
     pixel_mm: float
     first_mm: tuple[float, float] = (0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        require_pixels(self.width_mm, self.height_mm, self.pixel_mm)
-
-    @property
-    def width_mm(self) -> float:
-        """Distance between the first and the last column along the sheet."""
-        return (len(self.base_mm) - 1) * self.pixel_mm
-
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm; NaN beyond the ends."""
         x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
@@ -101,15 +93,13 @@ def curved_sheet(
     axis = axis / length
     flat = points - ((points - points[:1]) @ axis)[:, None] * axis
     # A point picked twice is one.
-    apart = np.linalg.norm(np.diff(flat, axis=0), axis=1) > 1e-9
-    if not apart.any():
+    flat = flat[np.append(True, np.diff(_arc(flat)) > 1e-9)]
+    if len(flat) < 2:
         raise InvalidInputError(
             "curve: expected at least two points apart from each other across the direction of its columns"
         )
-    flat = flat[np.append(True, apart)]
     top, bottom = height_mm
-    along = float(np.linalg.norm(np.diff(flat, axis=0), axis=1).sum())
-    require_pixels(along, bottom - top, pixel_mm)
+    require_pixels(float(_arc(flat)[-1]), bottom - top, pixel_mm)
     base = _even_steps(flat, pixel_mm, smooth) + top * axis
     return CurvedSheet(base, axis, bottom - top, pixel_mm, (0.0, top))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+from scipy.ndimage import zoom
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.pose_errors import PosedErrors
@@ -42,12 +42,8 @@ def deviation_volume(
     world = voxel_grid.world_from_grid.apply(points)
     parts = range(0, len(world), _AT_ONCE)
     values = np.concatenate([deviations(errors, grid, world[k : k + _AT_ONCE]) for k in parts])
-    values = values.reshape(counts)
-    # Linear along one axis after the other: a hundred times as fast as voxel by voxel.
-    for axis in (2, 1, 0):
-        at = np.linspace(0.0, counts[axis] - 1, voxel_grid.shape[axis])
-        values = make_interp_spline(np.arange(counts[axis]), values, k=1, axis=axis)(at)
-    found = np.ascontiguousarray(values.T, dtype=np.float32)
+    fine = zoom(values.reshape(counts), np.divide(voxel_grid.shape, counts), order=1)
+    found = np.ascontiguousarray(fine.T, dtype=np.float32)
     if state is not None:
         found[state == 0] = np.nan
     return found

@@ -27,12 +27,6 @@ from speckle3d.imaging.voxels.holes import fill_holes
 from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
 from speckle3d.imaging.voxels.splatting import splat_images
 
-DEFAULT_FILL_RADIUS = 3
-"""Voxels across which holes are filled: a gap between frames of up to six voxels closes."""
-
-MAX_MEMORY_GB = 8.0
-"""Default limit of memory: a larger volume is more often due to a wrong unit than to a large sweep."""
-
 _BYTES_PER_VOXEL = 25
 """Of work beside the voxels' own type: sum and weight, or two images beside it; tag, level and state."""
 
@@ -62,11 +56,11 @@ def compound(
     rule: Rule = "mean",
     weights: FloatArray | None = None,
     region: BoolArray | None = None,
-    fill_radius: int = DEFAULT_FILL_RADIUS,
+    fill_radius: int = 3,
     backward_mm: float = 0.0,
     voxel_type: VoxelType = "float32",
     world_from_axes: Rotation | None = None,
-    max_memory_gb: float = MAX_MEMORY_GB,
+    max_memory_gb: float = 8.0,
 ) -> CompoundedVolume:
     """Compound a sweep's images into voxels, cubic ones that hold all of it or those of a grid.
 
@@ -173,7 +167,12 @@ def compound_onto(
     them. With `backward_mm` neither are `splat`, `rule` and the filling's.
     """
     kind = settings.voxel_type
-    _require_room(voxel_grid, settings)
+    needed_gb = voxel_grid.size_gb(kind) + _BYTES_PER_VOXEL * voxel_grid.size_gb("uint8")
+    if needed_gb > settings.max_memory_gb:
+        raise InvalidInputError(
+            f"volume: expected at most {settings.max_memory_gb:g} GB of memory, got {needed_gb:.3g} GB for "
+            f"{voxel_grid}: take larger voxels, or check the poses"
+        )
     if settings.backward_mm > 0:
         voxels, state = look_up_voxels(source, voxel_grid, settings.backward_mm, region)
     else:
@@ -190,16 +189,6 @@ def compound_onto(
         raise InsufficientDataError("volume: expected samples with values inside the grid, got none")
     typed = voxels if kind == "float32" else _rounded(voxels, state, kind)
     return CompoundedVolume(typed.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid, state=state.T)
-
-
-def _require_room(voxel_grid: VoxelGrid, settings: CompoundingSettings) -> None:
-    """Raise `InvalidInputError` if a volume is too large for the memory to make it in."""
-    needed = voxel_grid.size_gb(settings.voxel_type) + _BYTES_PER_VOXEL * voxel_grid.size_gb("uint8")
-    if needed > settings.max_memory_gb:
-        raise InvalidInputError(
-            f"volume: expected at most {settings.max_memory_gb:g} GB of memory, got {needed:.3g} GB for "
-            f"{voxel_grid}: take larger voxels, or check the poses"
-        )
 
 
 def _rounded(voxels: Float32Array, state: ByteArray, voxel_type: VoxelType) -> npt.NDArray[Any]:
