@@ -35,7 +35,7 @@ _IMU: Table = {
     "info": "sensors.imu:info",
     "convert": "sensors.imu:convert",
     "orient": "sensors.imu:orient",
-    "accuracy": "sensors.imu:accuracy",
+    "accuracy": "sensors.accuracy:accuracy",
     "record": "sensors.imu:record",
 }
 _COMMANDS: Table = {
@@ -46,7 +46,7 @@ _COMMANDS: Table = {
     ),
     "volume": "look.volumes:volume",
     "view": "look.view:view",
-    "reslice": "look.volumes:reslice",
+    "reslice": "look.reslices:reslice",
     "measure": "look.measures:measure",
     "surface": "look.measures:surface",
     "scene": "look.volumes:scene",

@@ -3,8 +3,8 @@
 A command is a function with a numpydoc docstring. Options under *Parameters* are common and shown by
 ``--help`` in that order, those under *Other Parameters* by ``--help-all``. "With --origin or --curve:" and
 "Not with --paper." in a help are rules that are checked. A parameter annotated with `Fields` of a pydantic
-model becomes an option for each field, with the field's description as help; the function gets the values
-that were given as a dict.
+model or a dataclass becomes an option for each field, with a model's description of it as help; the function
+gets the values that were given as a dict, and of a dataclass the others as well.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from types import UnionType
@@ -56,16 +57,26 @@ _REMOVED = {
 
 
 class Fields(NamedTuple):
-    """Fields of a pydantic model as options: all, only some, or all but some."""
+    """Fields of a pydantic model or a dataclass as options: all, only some, or all but some."""
 
     model: str
     only: Sequence[str] = ()
     without: Sequence[str] = ()
 
-    def chosen(self) -> dict[str, FieldInfo]:
-        """Fields by name; the model is loaded."""
-        known = _loaded(self.model).model_fields
-        return {n: f for n, f in known.items() if n in (self.only or known) and n not in self.without}
+    def options(self, words: Words) -> dict[str, inspect.Parameter]:
+        """Options by the fields' names; the model is loaded."""
+        model = _loaded(self.model)
+        if is_dataclass(model):
+            kinds = get_type_hints(model)
+            made = {
+                f.name: _option(f.name, kinds[f.name], f.default, typer.Option(), words)
+                for f in fields(model)
+                if f.name in self.only
+            }
+        else:
+            made = {name: _of_field(name, field, words) for name, field in model.model_fields.items()}
+        chosen = self.only or made
+        return {name: made[name] for name in made if name in chosen and name not in self.without}
 
 
 def _loaded(place: str) -> Any:
@@ -104,9 +115,9 @@ def command_of(name: str, function: Command) -> TyperCommand:
         if get_origin(kind) is Annotated:
             kind, info = kind.__origin__, copy(kind.__metadata__[0])
         if isinstance(info, Fields):
-            chosen = {each: field for each, field in info.chosen().items() if each not in hints}
+            chosen = {each: option for each, option in info.options(words).items() if each not in hints}
             groups[parameter.name] = list(chosen)
-            options |= {each: _of_field(each, field, words) for each, field in chosen.items()}
+            options |= chosen
         else:
             options[parameter.name] = _option(parameter.name, kind, parameter.default, info, words)
     order = [*words.options, *options]

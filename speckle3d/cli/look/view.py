@@ -5,11 +5,12 @@ from __future__ import annotations
 import webbrowser
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, PixelMm, Written, from_options, note
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 
 
@@ -66,7 +67,7 @@ def view(
         With --calibrate: poses to use, by their name in an image sequence, as ToolToTracker (ProbeToTracker).
     pixel_mm
     dynamic_range_db
-        Of a recording's grey levels, if it does not say.
+        Of a recording's grey levels, if it does not say. Not with --calibrate.
 
     Examples
     --------
@@ -80,8 +81,8 @@ def view(
     from speckle3d.calibrating.settings import model_of
     from speckle3d.io.import_settings import ImportSettings
 
-    scan: dict[str, Any] = {"phantom": phantom, "points": points, "poses": poses, "transform": transform,
-                            "sensor": sensor, "level": level or None}  # fmt: skip
+    scan = {"phantom": phantom, "points": points, "poses": poses, "transform": transform, "sensor": sensor,
+            "level": level or None, "pixel_mm": pixel_mm}  # fmt: skip
     with ExitStack() as running:
         if calibrate is None:
             column_mm, row_mm = pixel_mm or (None, None)
@@ -95,10 +96,10 @@ def view(
                 opened(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
             )
         else:
-            model = model_of(calibrate)
-            scan["pixel_mm"] = pixel_mm
-            told = {n: v for n, v in scan.items() if n in model.model_fields and v is not None}
-            pages = phantom_pages(file, from_options(model, told))
+            model, stated = model_of(calibrate), {k: v for k, v in scan.items() if v is not None}
+            for name in stated.keys() - model.model_fields:
+                raise InvalidInputError(f"--{name.replace('_', '-')}: is of another method than {calibrate}")
+            pages = phantom_pages(file, from_options(model, stated))
         server = AppServer(pages, file.name, port)
         note(server.address)
         if browser:

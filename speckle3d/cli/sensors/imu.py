@@ -14,9 +14,6 @@ from speckle3d.cli.common import (
     MaybePath,
     OptionalOut,
     OutArgument,
-    Paths,
-    Written,
-    emit,
     emit_json,
     emit_rows,
     note,
@@ -27,7 +24,6 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
 
     from speckle3d.core.streams import TimedRotations
     from xsens.fusion.orient import Orientation
@@ -38,7 +34,7 @@ Method = Literal["smoother", "filter", "vqf", "vqf-online", "sensor"]
 
 
 def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> ImuLog:
-    """Read a log of any kind, or what a sweep holds of its orientation sensor (its world is known)."""
+    """Read a log of any kind, or what a recording holds of its orientation sensor."""
     from speckle3d.sensor_logs import held_log
     from xsens.logs.parts import Hints
     from xsens.logs.read import read_log
@@ -46,8 +42,9 @@ def read(path: Path, rate_hz: float | None = None, world: str | None = None) -> 
     held = held_log(path)
     if held is None:
         return read_log(path, Hints(rate_hz=rate_hz, world=world))
-    if world is not None:
-        note("--world is not used: it is for logs, and the world of a recording's stream is known")
+    if rate_hz is not None or world is not None:
+        flag = "--world" if rate_hz is None else "--rate-hz"
+        raise InvalidInputError(f"{flag}: expected a log with it, got {path.name}, which says it itself")
     return held
 
 
@@ -179,7 +176,7 @@ def orient(
     """
     from speckle3d.io.calibrations import read_calibration
     from speckle3d.io.load import load_sweep
-    from speckle3d.sensor_logs import attach_log, log_of, ridden_along, with_orientation
+    from speckle3d.sensor_logs import attach_log, ridden_along, with_orientation
     from xsens.logs.textlogs import write_csv
 
     if into is None and out is None:
@@ -192,7 +189,7 @@ def orient(
             f"{into}: expected no orientation sensor's stream, got one: --replace replaces it"
         )
     own = ridden_along(log_file)
-    log = read(log_file, rate_hz, world) if own is None else log_of(own, log_file.name)
+    log = read(log_file, rate_hz, world)
     with naming(str(log_file)):
         rotations, found = orientation_of(log, method, magnetometer)
     if into is not None:
@@ -301,108 +298,3 @@ def _orientation_rows(
         ):
             rows.append((f"{name}, RMS difference from the sensor's own", float(np.rad2deg(value)), "deg"))
     return rows
-
-
-def accuracy(
-    log_file: Path,
-    reference: MaybePath = None,
-    optical: MaybePath = None,
-    calibration: Paths = None,
-    turns: str = "roll, yaw, tilt",
-    fit_mounting: Annotated[bool, typer.Option("--fit-mounting/--aligned")] = True,
-    time_offset_s: float = 0.0,
-    method: Method = "smoother",
-    magnetometer: bool = True,
-    figure: Written = None,
-    rate_hz: MaybeNumber = None,
-    world: World = None,
-    as_json: Json = False,
-) -> None:
-    """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2).
-
-    Parameters
-    ----------
-    log_file
-    reference
-        Settings of a mechanism: CSV with tilt, yaw, roll in degrees, perhaps time_s and until_s.
-    optical
-        Orientation by a tracker: TUM text, or a log that carries its own orientation.
-    calibration
-        Calibration files; may be repeated.
-    method
-    figure
-        PNG of single turns, as Figure 5 of the paper.
-    as_json
-
-    Other Parameters
-    ----------------
-    turns
-        The mechanism's axes from its base to the probe.
-    fit_mounting
-        The target's axes on the probe: found from the motion, or those of the image.
-    time_offset_s
-        A reading of the sensor at t belongs to the tracker's time t + this.
-    magnetometer, rate_hz, world
-
-    Examples
-    --------
-    $ speckle3d imu accuracy log.mtb --optical tracker.tum --calibration imu.h5
-    """
-    from scipy.spatial.transform import Rotation
-
-    from speckle3d.io.calibrations import read_calibration
-    from speckle3d.study.figures import save_figure
-    from xsens.accuracy.angles import AccuracyTable, pair_errors
-    from xsens.accuracy.figures import figure_turns
-    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
-
-    if (reference is None) == (optical is None):
-        raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
-    require_finite("--time-offset-s", time_offset_s)
-    if figure is not None:
-        require_own_place(figure, "picture", log_file, reference, optical, *(calibration or ()))
-    log = read(log_file, rate_hz, world)
-    tell(log)
-    mountings = Rotation.identity(1)
-    if calibration:
-        mountings = Rotation.concatenate([read_calibration(path).rotation for path in calibration])
-    else:
-        note("no --calibration: the sensor's axes are taken for the image's")
-    with naming(str(log_file)):
-        rotations, _ = orientation_of(log, method, magnetometer)
-        if reference is not None:
-            settings = read_mechanism_csv(reference, turns)
-            measured, right = readings_at(rotations, settings), settings.base_from_image
-        elif optical is not None:
-            measured, right = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
-        errors = pair_errors(measured, right, mountings)
-    table = AccuracyTable.of({log_file.stem: errors})
-    if figure is not None:
-        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
-    if as_json:
-        emit_rows(table.values(), as_json)
-        return
-    emit(table.text())
-    emit(f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations")
-
-
-def _beside_tracker(
-    rotations: TimedRotations, optical: Path, time_offset_s: float, fit_mounting: bool, mountings: Rotation
-) -> tuple[Rotation, Rotation]:
-    """Readings of the sensor, and the image's orientation by the tracker at the same moments."""
-    from speckle3d.core.streams import TimedRotations
-    from speckle3d.io.tum import is_tum, read_tum
-    from xsens.accuracy.angles import common_readings, mounting_from_motion
-
-    if is_tum(optical):
-        poses = read_tum(optical)
-        tracked = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
-    else:
-        log = read(optical)
-        tell(log)
-        tracked = log.rotations()
-    measured, target = common_readings(rotations, tracked, time_offset_s)
-    if not fit_mounting:
-        return measured, target
-    note("the target's mounting is found from the motion: constant errors of calibration do not show")
-    return measured, target * mounting_from_motion(measured * mountings.mean(), target)

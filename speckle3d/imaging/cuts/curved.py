@@ -39,6 +39,11 @@ class CurvedSheet(Cut):
     pixel_mm: float
     first_mm: tuple[float, float] = (0.0, 0.0)
 
+    @property
+    def width_mm(self) -> float:
+        """Distance between the first and the last column along the sheet."""
+        return (len(self.base_mm) - 1) * self.pixel_mm
+
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm; NaN beyond the ends."""
         x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))

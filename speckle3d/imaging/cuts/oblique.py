@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -134,6 +136,6 @@ def _covering(
     return plane_around(placed, points, pixel_mm)
 
 
-def vector_words(vector: FloatArray) -> str:
+def vector_words(vector: Iterable[float]) -> str:
     """Text of a vector for messages."""
     return "(" + ", ".join(f"{each:.4g}" for each in vector) + ")"

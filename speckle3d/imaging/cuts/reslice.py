@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import ByteArray, Float32Array
+from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.labels import EMPTY
 from speckle3d.core.sweep import ImageGrid
@@ -74,15 +74,19 @@ def reslice_at(
     grid: ImageGrid,
     wanted: Sequence[tuple[RigidTransform, Cut]],
     max_distance_mm: float,
+    region: BoolArray | None = None,
 ) -> list[Float32Array]:
-    """Make several cuts, each at poses of its own, in one pass over the images; else as `reslice_frames`."""
+    """Make several cuts, each at poses of its own, in one pass over the images; else as `reslice_frames`.
+
+    Of the images only samples of a region count, shape (vector, sample).
+    """
     sought = [
         NearestImages(
             PosedImages(images, grid, poses), cut.lines(), cut.shape[0], cut.hull_mm, max_distance_mm
         )
         for poses, cut in wanted
     ]
-    look_up(sought)
+    look_up(sought, region)
     return [np.ascontiguousarray(each.blended()[0].T) for each in sought]
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
@@ -145,6 +146,7 @@ def cut_posed(
     voxels: tuple[Volume, ByteArray | None] | None = None,
     progress: Callable[[int, int], None] | None = None,
     made: tuple[Images, ImageGrid] | None = None,
+    region: Region | None = None,
 ) -> CutPicture:
     """Cut a sweep at the poses of every mode, from its frames or from voxels made of it and their states.
 
@@ -158,6 +160,8 @@ def cut_posed(
         Called with the number of images made and of all.
     made : tuple of Images and ImageGrid, optional
         What `opened.posed.images` gives, by those who have it.
+    region : Region, optional
+        Of the images; samples outside it do not count.
 
     Raises
     ------
@@ -169,7 +173,9 @@ def cut_posed(
     placed = place.counted_in(numbers).cuts(poses, grid, opened.reference)
     unit, limits = "dB, 0: maximum", (-dynamic_range_db, 0.0)
     if voxels is None:
-        levels = reslice_at(images, grid, [(poses[mode], placed[mode]) for mode in placed], place.reach_mm)
+        mask = None if region is None else region.mask(grid)
+        wanted = [(poses[mode], placed[mode]) for mode in placed]
+        levels = reslice_at(images, grid, wanted, place.reach_mm, mask)
         if opened.posed.range_is_known:
             levels = [((each - 255) * (dynamic_range_db / 255)).astype(np.float32) for each in levels]
         else:

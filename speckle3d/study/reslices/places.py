@@ -32,6 +32,7 @@ from speckle3d.imaging.cuts.planes import (
 )
 
 AnyCut = ReslicePlane | CurvedSheet
+Vector = FloatArray | tuple[float, float, float]
 
 _SAME_DIRECTION = np.cos(np.deg2rad(20.0))
 """An axis goes by the name of a direction of the sweep within so much of it."""
@@ -60,7 +61,7 @@ class Place:
     angle_deg : float
     points_mm : ndarray, shape (3, 3), optional
         Through three points of the world.
-    origin_mm, right, down : ndarray, shape (3,), optional
+    origin_mm, right, down : tuple of float or ndarray, shape (3,), optional
         From a point of the world along two directions.
     curve_mm : ndarray, shape (n, 3), optional
         Along a curve through points of the world, and down into the depth, or along `down`.
@@ -76,9 +77,9 @@ class Place:
     frame: int | None = None
     angle_deg: float = 0.0
     points_mm: FloatArray | None = None
-    origin_mm: FloatArray | None = None
-    right: FloatArray | None = None
-    down: FloatArray | None = None
+    origin_mm: Vector | None = None
+    right: Vector | None = None
+    down: Vector | None = None
     curve_mm: FloatArray | None = None
     smooth: bool = True
     pixel_mm: float = DEFAULT_PIXEL_MM
@@ -205,10 +206,12 @@ class Place:
         depth = float(at[np.argmin(np.abs(at[:, 2])), 1])
         return replace(sheet, first_mm=(0.0, sheet.first_mm[1] + depth))
 
-    def _swept(self, down: FloatArray, around_mm: FloatArray) -> CurvedSheet:
+    def _swept(self, down: Vector, around_mm: FloatArray) -> CurvedSheet:
         """Sweep the curve as far along its columns as there is something."""
         points = np.asarray(self.curve_mm, dtype=float)
-        along = (around_mm - points[:1].sum(axis=0)) @ down / max(float(np.linalg.norm(down)), 1e-9)
+        along = (
+            (around_mm - points[:1].sum(axis=0)) @ np.asarray(down) / max(float(np.linalg.norm(down)), 1e-9)
+        )
         return curved_sheet(points, down, (along.min(), along.max()), self.pixel_mm, self.smooth)
 
 

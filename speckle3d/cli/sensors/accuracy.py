@@ -1,0 +1,133 @@
+"""Accuracy of the orientation sensor against a mechanism or a tracker."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from speckle3d.cli.common import (
+    Json,
+    MaybeNumber,
+    MaybePath,
+    Paths,
+    Written,
+    emit,
+    emit_rows,
+    note,
+    require_finite,
+)
+from speckle3d.cli.outputs import require_own_place
+from speckle3d.cli.sensors.imu import Method, World, orientation_of, read, tell
+from speckle3d.core.errors import InvalidInputError, naming
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.core.streams import TimedRotations
+
+
+def accuracy(
+    log_file: Path,
+    reference: MaybePath = None,
+    optical: MaybePath = None,
+    calibration: Paths = None,
+    turns: str = "roll, yaw, tilt",
+    fit_mounting: Annotated[bool, typer.Option("--fit-mounting/--aligned")] = True,
+    time_offset_s: float = 0.0,
+    method: Method = "smoother",
+    magnetometer: bool = True,
+    figure: Written = None,
+    rate_hz: MaybeNumber = None,
+    world: World = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2).
+
+    Parameters
+    ----------
+    log_file
+    reference
+        Settings of a mechanism: CSV with tilt, yaw, roll in degrees, perhaps time_s and until_s.
+    optical
+        Orientation by a tracker: TUM text, or a log that carries its own orientation.
+    calibration
+        Calibration files; may be repeated.
+    method
+    figure
+        PNG of single turns, as Figure 5 of the paper.
+    as_json
+
+    Other Parameters
+    ----------------
+    turns
+        The mechanism's axes from its base to the probe.
+    fit_mounting
+        The target's axes on the probe: found from the motion, or those of the image.
+    time_offset_s
+        A reading of the sensor at t belongs to the tracker's time t + this.
+    magnetometer, rate_hz, world
+
+    Examples
+    --------
+    $ speckle3d imu accuracy log.mtb --optical tracker.tum --calibration imu.h5
+    """
+    from scipy.spatial.transform import Rotation
+
+    from speckle3d.io.calibrations import read_calibration
+    from speckle3d.study.figures import save_figure
+    from xsens.accuracy.angles import AccuracyTable, pair_errors
+    from xsens.accuracy.figures import figure_turns
+    from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
+
+    if (reference is None) == (optical is None):
+        raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
+    require_finite("--time-offset-s", time_offset_s)
+    if figure is not None:
+        require_own_place(figure, "picture", log_file, reference, optical, *(calibration or ()))
+    log = read(log_file, rate_hz, world)
+    tell(log)
+    mountings = Rotation.identity(1)
+    if calibration:
+        mountings = Rotation.concatenate([read_calibration(path).rotation for path in calibration])
+    else:
+        note("no --calibration: the sensor's axes are taken for the image's")
+    with naming(str(log_file)):
+        rotations, _ = orientation_of(log, method, magnetometer)
+        if reference is not None:
+            settings = read_mechanism_csv(reference, turns)
+            measured, right = readings_at(rotations, settings), settings.base_from_image
+        elif optical is not None:
+            measured, right = _beside_tracker(rotations, optical, time_offset_s, fit_mounting, mountings)
+        errors = pair_errors(measured, right, mountings)
+    table = AccuracyTable.of({log_file.stem: errors})
+    if figure is not None:
+        save_figure(figure_turns({log_file.stem: errors}, log_file.name), figure)
+    if as_json:
+        emit_rows(table.values(), as_json)
+        return
+    emit(table.text())
+    emit(f"{len(errors)} errors: pairs of {errors.frames} orientations, {len(mountings)} calibrations")
+
+
+def _beside_tracker(
+    rotations: TimedRotations, optical: Path, time_offset_s: float, fit_mounting: bool, mountings: Rotation
+) -> tuple[Rotation, Rotation]:
+    """Readings of the sensor, and the image's orientation by the tracker at the same moments."""
+    from speckle3d.core.streams import TimedRotations
+    from speckle3d.io.tum import is_tum, read_tum
+    from xsens.accuracy.angles import common_readings, mounting_from_motion
+
+    if is_tum(optical):
+        poses = read_tum(optical)
+        tracked = TimedRotations(poses.time_s, poses.world_from_sensor.rotation)
+    else:
+        log = read(optical)
+        tell(log)
+        tracked = log.rotations()
+    measured, target = common_readings(rotations, tracked, time_offset_s)
+    if not fit_mounting:
+        return measured, target
+    note("the target's mounting is found from the motion: constant errors of calibration do not show")
+    return measured, target * mounting_from_motion(measured * mountings.mean(), target)
