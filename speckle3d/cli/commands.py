@@ -68,11 +68,7 @@ class Fields(NamedTuple):
         model = _loaded(self.model)
         if is_dataclass(model):
             kinds = get_type_hints(model)
-            made = {
-                f.name: _option(f.name, kinds[f.name], f.default, typer.Option(), words)
-                for f in fields(model)
-                if f.name in self.only
-            }
+            made = {f.name: _option(f.name, kinds[f.name], f.default, None, words) for f in fields(model)}
         else:
             made = {name: _of_field(name, field, words) for name, field in model.model_fields.items()}
         chosen = self.only or made

@@ -31,14 +31,3 @@ def test_a_study_of_broken_sweeps_alone_is_refused_with_the_first_reason(refused
     line = refused("compare", torn, "-o", tmp_path / "study")
     assert str(torn) in line
     assert not (tmp_path / "study").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--scheduler", "tcp://a:1", "--workers", "2"), "--scheduler or --workers"),
-        (("--workers", "0"), "--workers"),
-    ],
-)
-def test_a_wrong_option_is_one_line(refused, bench, tmp_path, options, message):
-    assert message in refused("compare", bench / "sweep.h5", "-o", tmp_path / "study", *options)

@@ -61,18 +61,6 @@ def test_options_reach_the_sweep(done, tmp_path):
     np.testing.assert_allclose(sweep.tracker.readings.world_from_sensor.as_matrix(), expected, atol=1e-3)
 
 
-def test_places_that_are_taken_are_refused(refused, done, sequence, tmp_path):
-    assert "s.seg.nrrd" in refused("convert", sequence, tmp_path / "s.seg.nrrd")
-    assert "is an input" in refused("convert", sequence, sequence, *PIXELS)
-    (tmp_path / "x.mha").write_bytes(b"something else")
-    assert "another kind of file" in refused("convert", sequence, tmp_path / "x.mha", *PIXELS)
-    assert "x.nii" in refused("convert", sequence, tmp_path / "x.nii", *PIXELS)
-    # Pixels beside a header are as much an output as the header.
-    (tmp_path / "y.zraw").write_bytes(b"of another header")
-    assert "y.zraw" in refused("convert", sequence, tmp_path / "y.mhd", *PIXELS)
-    assert (tmp_path / "y.zraw").read_bytes() == b"of another header"
-
-
 def test_a_sweep_file_has_settings_of_its_own(refused, tmp_path):
     write_sweep(tmp_path / "a.h5", sweep_examples.bmode_sweep())
     names = tmp_path / "a.h5", tmp_path / "b.mha"
@@ -109,30 +97,6 @@ SWEEPS = {
 }
 """By file: the device set beside it, what neither says, the frames, and the poses of its tracker."""
 
-NO_SWEEPS = {
-    "WaterTankBottomTranslationTrackerBuffer.igs.mha": "images of size 0 x 0: the recording of a tracker",
-    "TimestampFilteringTest.igs.mha": "images of size 1 x 1: the recording of a tracker",
-    "TransformInterpolationTest.igs.mha": "images of size 1 x 1: the recording of a tracker",
-    "vtkVolumeReconstructorTestLNMEANvolumeRef.mha": "a volume",
-    "vtkVolumeReconstructorTestNNMEANvolumeRef.mha": "a volume",
-    "BoneUltrasound_L14_config.xml": "a device set of PLUS, which is for --plus-config",
-    SPINE: "a device set",
-    f"{CONFIG}VolumeReconstructionOnly_SpinePhantom_NN_MEAN.xml": "a device set",
-    WIRES: "--phantom of calibrate wires",
-    LINEAR: "a device set",
-    f"{CONFIG}fCal_Sim_TemporalCalibration.xml": "a device set",
-    RESULT: "the result of a probe calibration",
-    "TemporalCalibrationResultsBaseline.xml": "a tracker's delay",
-    "LineSegmentationResultsBaseline.xml": "lines found in images",
-}
-
-
-@pytest.mark.slow
-@pytest.mark.realdata
-def test_every_recording_of_plus_is_in_the_table(realdata):
-    held = {path.name for path in (realdata / "plus").iterdir()} - {"LICENSE"}
-    assert held >= {*NO_SWEEPS, *(name.removeprefix("plus/") for name in SWEEPS if name.startswith("plus/"))}
-
 
 @pytest.mark.slow
 @pytest.mark.realdata
@@ -163,13 +127,3 @@ def test_real_recordings_convert_at_the_first_try_and_back(realdata, run, done, 
     middle = shape[0] // 2
     np.testing.assert_array_equal(again.frames[middle], sweep.frames[middle])
     assert (again.grid, again.signal) == (sweep.grid, sweep.signal)
-
-
-@pytest.mark.slow
-@pytest.mark.realdata
-def test_what_is_no_sweep_says_why_in_one_line(realdata, done, refused, tmp_path):
-    for name, words in NO_SWEEPS.items():
-        path = realdata / "plus" / name
-        assert words in refused("convert", path, tmp_path / "o.h5")
-        rows = {row["description"]: row["value"] for row in json.loads(done("info", path, "--json")[0])}
-        assert rows["format"] == "volume" or words in rows["sweep"]

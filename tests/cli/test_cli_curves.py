@@ -36,8 +36,3 @@ def test_a_data_sheet_makes_curves(run, sheet, tmp_path):
 )
 def test_a_faulty_sheet_is_named_with_its_setting(refused, sheet, tmp_path, text, told):
     assert told in refused("calibrate", "curves", "--probe", sheet(text), "-o", tmp_path / "c.h5")
-
-
-@pytest.mark.parametrize("arguments", [(), ("--like", "x.h5", "y.h5"), ("--probe", "p.toml", "y.h5")])
-def test_options_that_do_not_go_together_are_told(refused, tmp_path, arguments):
-    assert "expected" in refused("calibrate", "curves", *arguments, "-o", tmp_path / "c.h5")

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
-from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
 
@@ -67,15 +66,6 @@ def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_pa
     assert np.rad2deg(error.max()) < 2.0
 
 
-def test_a_log_of_quaternions_alone_has_the_sensors_own_orientation(run, tmp_path):
-    time_s, turns = np.arange(50) / 50.0, Rotation.from_euler("z", np.linspace(0.0, 1.0, 50)[:, None])
-    write_csv(tmp_path / "log.csv", ImuLog(time_s, world_from_sensor=turns))
-    code, out, err = run("imu", "orient", tmp_path / "log.csv", "-o", tmp_path / "o.csv", "--json")
-    assert (code, json.loads(out)["method"]) == (0, "sensor"), err
-    found = read_log(tmp_path / "o.csv").world_from_sensor
-    assert (found * turns.inv()).magnitude().max() < 1e-9
-
-
 def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, tmp_path):
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
@@ -122,13 +112,6 @@ def sweep_file(tmp_path):
     return path
 
 
-def test_an_offset_that_is_no_number_is_refused(refused, log_file, sweep_file):
-    before = sweep_file.read_bytes()
-    said = refused("imu", "orient", log_file, "--into", sweep_file, "--replace", "--time-offset-s", "nan")
-    assert "--time-offset-s" in said
-    assert sweep_file.read_bytes() == before
-
-
 def test_a_stream_that_covers_no_frame_is_refused(run, refused, log_file, sweep_file):
     before = sweep_file.read_bytes()
     orient = ("imu", "orient", log_file, "--into", sweep_file, "--replace", "--time-offset-s")
@@ -138,13 +121,3 @@ def test_a_stream_that_covers_no_frame_is_refused(run, refused, log_file, sweep_
     code, _, err = run(*orient, "0")
     assert code == 0
     assert re.search(r"covers (\d+) of \1 frames", err)
-
-
-def test_without_a_magnetometer_the_heading_is_said_to_be_relative(run, tmp_path):
-    _, log = turning()
-    write_csv(tmp_path / "log.csv", ImuLog(log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s))
-    code, out, err = run("imu", "orient", tmp_path / "log.csv", "-o", tmp_path / "o.csv")
-    assert code == 0, err
-    assert "no magnetometer" in err
-    assert "heading relative to the start" in out
-    assert "magnetic field" not in out

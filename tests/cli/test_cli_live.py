@@ -13,9 +13,7 @@ from calibration_files import made
 from commands import command
 
 import speckle3d as s3
-from speckle3d.cli.stream.live import _trouble
 from speckle3d.io.calibrations import write_calibration
-from speckle3d.io.igtl.link import LinkState
 from speckle3d.io.load import import_notes
 from speckle3d.io.reconstructions import read_reconstruction
 
@@ -105,20 +103,6 @@ def test_told_to_end_it_closes_the_recording_first(player, shipped, tmp_path):
     assert "Traceback" not in told
     assert import_notes(out / "sweep.h5") == []
     assert len(s3.load_sweep(out / "sweep.h5")) >= 10
-
-
-@pytest.mark.parametrize(
-    ("state", "words"),
-    [
-        (LinkState(), "waiting for there:1"),
-        (LinkState(last_failure="refused"), "waiting for there:1 (refused)"),
-        (LinkState(connected=True, silent_s=0.1), ""),
-        (LinkState(connected=True, silent_s=9.0), "nothing comes from there:1"),
-        (LinkState(connected=True, refused=2, last_refused="check sum"), "2 messages refused (check sum)"),
-    ],
-)
-def test_the_line_says_what_is_wrong_with_the_connection(state, words):
-    assert _trouble(state, "there:1") == words
 
 
 @pytest.mark.parametrize(

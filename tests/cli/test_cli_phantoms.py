@@ -113,48 +113,12 @@ def test_a_clock_that_is_off_is_found(run, scans, tmp_path):
     assert error_of(out, scans / "bar.h5")[1] < 0.3
 
 
-@pytest.mark.parametrize(
-    ("name", "told"), [("in.h5", "an input"), ("probe.txt", "probe.txt"), ("none/probe.h5", "none")]
-)
-def test_results_take_the_place_of_nothing(refused, scans, tmp_path, name, told):
-    images = tmp_path / "in.h5"
-    images.write_bytes((scans / "bar.h5").read_bytes())
-    before = images.read_bytes()
-    assert told in refused("calibrate", "plane", images, "-o", tmp_path / name)
-    assert images.read_bytes() == before
-
-
 def test_a_missing_motion_is_refused_and_nothing_written(refused, scans, tmp_path):
     line = refused("calibrate", "plane", scans / "untilted.h5", "-o", tmp_path / "c.h5")
     assert "untilted.h5" in line
     assert "tilt" in line
     line = refused("calibrate", "orientation", scans / "untilted.h5", "-o", tmp_path / "c.h5")
     assert "untilted.h5" in line
-
-
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (("--region", "1,2 3"), "--region"),
-        (("--columns", "2"), "--columns: "),
-        (("--place", "middle"), "--place"),
-        (("--time-offset-s", "soon"), "--time-offset-s"),
-    ],
-)
-def test_bad_options_are_told_in_one_line(refused, scans, tmp_path, options, told):
-    assert told in refused("calibrate", "plane", scans / "bar.h5", "-o", tmp_path / "c.h5", *options)
-
-
-def test_recordings_without_the_sensor_or_the_phantom_are_refused(refused, shipped, scans, tmp_path):
-    without = changed(scans / "bar.h5", tmp_path / "without.h5", lambda file: file.pop("orientation"))
-    line = refused("calibrate", "orientation", without, "-o", tmp_path / "c.h5")
-    assert "--sensor tracker" in line
-    line = refused("calibrate", "plane", shipped / "phantom.h5", "-o", tmp_path / "c.h5")
-    assert "phantom.h5" in line
-    line = refused("calibrate", "wires", scans / "bar.h5", "-o", tmp_path / "c.h5", "--phantom", "three")
-    assert "--points" in line
-    # Nothing says how the image of a plane scan sits on the sensor.
-    assert "expected --calibration" in refused("calibrate", "clock", scans / "bar.h5", "--by", "images")
 
 
 def scan_of_wires(folder, kind, seed, count=90):

@@ -87,15 +87,3 @@ def test_bmode_stands_upright_and_a_loop_goes_on_in_time_until_it_is_stopped(tmp
         np.testing.assert_array_equal(frames[k].pixels, sweep.frames[k % 4])
     np.testing.assert_allclose(np.diff([each.time_s for each in frames]), 0.04, atol=1e-8)
     assert {each.device for each in frames} == {"Scan"}
-
-
-@pytest.mark.slow
-def test_what_cannot_be_served_is_one_line(tmp_path):
-    write_sweep(tmp_path / "s.h5", sweep_examples.bmode_sweep())
-    for options, said in ((("--as", "rf"), "expected echoes"), (("--image", "a" * 21), "at most 20 letters")):
-        done = subprocess.run(
-            command("play", tmp_path / "s.h5", *options), capture_output=True, text=True, timeout=WAIT_S
-        )
-        assert done.returncode == 2
-        assert said in done.stderr
-        assert len(done.stderr.splitlines()) == 1

@@ -30,19 +30,6 @@ def test_the_pose_of_a_frame_becomes_a_transform(run, made, tmp_path):
     np.testing.assert_allclose(found, [1.0, 2.0, 3.0], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("name", "frame", "words"),
-    [
-        ("t.tfm", (), "--frame N"),
-        ("t.tfm", ("--frame", 24), "from 0 to 23"),
-        ("t.tum", ("--frame", 3), "--frame"),
-    ],
-)
-def test_a_frame_that_is_none_is_refused(refused, made, tmp_path, name, frame, words):
-    assert words in refused("trajectory", "export", made, "-o", tmp_path / name, *frame)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, refused, made, bench, tmp_path):
     name = "s.seq.nrrd"
     code, out, err = run("convert", made, tmp_path / name, "--mode", "orientation")

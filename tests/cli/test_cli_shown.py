@@ -1,6 +1,5 @@
 """Names from outside reach terminal, folders and pictures as text: no escape sequence, line or markup."""
 
-import io
 import json
 import os
 import shutil
@@ -11,7 +10,6 @@ import h5py
 import pytest
 from calibration_files import made
 
-from speckle3d.cli import common
 from speckle3d.io.calibrations import write_calibration
 
 HOSTILE = "a\x1b]0;gone\x07\x1b[31m\n\u202e[red]{0}$x^$<script>"
@@ -57,11 +55,3 @@ def test_a_sweep_of_any_name_is_reconstructed(run, tmp_path, small_sweeps):
     assert is_plain(err)
     assert is_plain((tmp_path / "out" / "table.txt").read_text(encoding="utf-8"))
     json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
-
-
-def test_a_terminal_of_another_alphabet_shows_what_it_can(monkeypatch):
-    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
-    monkeypatch.setattr(sys, "stdout", out)
-    common.emit("3 µm \x1b[31m")
-    out.flush()
-    assert out.buffer.getvalue() == b"3 \\xb5m \\x1b[31m\n"

@@ -7,10 +7,9 @@ import subprocess
 import time
 
 import pytest
-from commands import SMALL, command
+from commands import command
 
 from speckle3d import cli
-from speckle3d.cli import signals
 from speckle3d.io.reconstructions import read_reconstruction
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
@@ -72,22 +71,6 @@ def test_a_signal_that_asks_for_the_end_is_one_line_and_a_code(told, number):
     assert signal.getsignal(number) is before
 
 
-def test_a_second_signal_does_not_disturb_the_cleaning_and_a_later_one_is_heard(told, monkeypatch):
-    cleaned = []
-
-    def work():
-        try:
-            signal.raise_signal(signal.SIGHUP)
-        finally:
-            signal.raise_signal(signal.SIGTERM)
-            cleaned.append(True)
-
-    for cleaning_s, count in ((WAIT_S, 1), (-1.0, 1)):
-        monkeypatch.setattr(signals, "_CLEANING_S", cleaning_s)
-        assert told(work)[0] == 128 + signal.SIGHUP
-        assert len(cleaned) == count
-
-
 def test_a_signal_that_python_drops_is_raised_again(told):
     class Finalised:
         def __del__(self):
@@ -99,29 +82,6 @@ def test_a_signal_that_python_drops_is_raised_again(told):
 
     assert told(work) == (143, "", "speckle3d: stopped\n")
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-
-
-def test_an_alarm_in_the_hook_of_what_is_dropped_rings_again(told, monkeypatch):
-    """A busy machine may take longer in the hook than the alarm waits; raised there it would be lost."""
-    set_timer = signal.setitimer
-
-    def slowly(*arguments):
-        set_timer(*arguments)
-        until = time.monotonic() + 5 * signals._AGAIN_S
-        while time.monotonic() < until:
-            pass
-
-    class Finalised:
-        def __del__(self):
-            signal.raise_signal(signal.SIGTERM)
-
-    def work():
-        with monkeypatch.context() as patch:
-            patch.setattr(signal, "setitimer", slowly)
-            Finalised()
-        until_stopped()
-
-    assert told(work) == (143, "", "speckle3d: stopped\n")
 
 
 def test_what_a_process_was_started_to_ignore_stays_ignored(told):
@@ -174,23 +134,6 @@ def test_two_runs_into_one_folder_and_one_that_is_killed(bench, reconstructed, r
     assert code == 0, err
     assert {path.name for path in out.iterdir()} == set(before)
     assert set(read_reconstruction(out / "reconstruction.h5").poses) == {"image"}
-
-
-def test_results_do_not_take_the_place_of_other_files(refused, bench, reconstructed, tmp_path):
-    (tmp_path / "table.txt").write_text("mine")
-    assert "table.txt" in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path)
-    assert "table.txt" in refused("compare", bench / "sweep.h5", "-o", tmp_path)
-    shutil.copytree(reconstructed, tmp_path / "o")
-    assert "table.txt" in refused("compare", bench / "sweep.h5", "-o", tmp_path / "o")
-
-
-@pytest.mark.slow
-def test_a_simulation_told_to_end_leaves_nothing(tmp_path):
-    process = started(
-        tmp_path, "simulate", tmp_path / "s.h5", *SMALL, "--preset", "crossed", "--frames", "200"
-    )
-    ended(process, signal.SIGHUP)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -87,11 +87,8 @@ def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "--point"),
-        (("--point", "5,5", "--point", "5,5,3"), "--point"),
         (("--point", "5,5,1", "--point", "5,5,30"), "point 2 (5, 5, 30)"),
         (("--point", "5,5,1", "--point", "5,5,2", "--mode", "pose"), "--mode"),
-        (("--point", "5,5,1", "--point", "5,5,2", "--pick-mm", "-1"), "--pick-mm"),
     ],
 )
 def test_what_cannot_be_measured_is_said_in_a_line(refused, rec, arguments, words):
@@ -135,10 +132,7 @@ def test_labels_and_empty_voxels_and_the_dark_side(run, ball, tmp_path):
     ("arguments", "words"),
     [
         (("-o", "a.stl"), "--level or --labels"),
-        (("-o", "a.obj", "--level", "128"), ".stl, .ply, .vtk"),
-        (("-o", "a.stl", "--level", "300"), "level"),
         (("-o", "a.stl", "--labels", "--below"), "--below: expected --level"),
-        (("-o", "a.stl", "--level", "128", "--mode", "fused"), "--mode"),
     ],
 )
 def test_what_has_no_surface_is_said_in_a_line(refused, ball, tmp_path, monkeypatch, arguments, words):

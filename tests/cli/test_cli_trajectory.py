@@ -35,20 +35,6 @@ def test_a_reconstruction_is_scored_as_its_exported_text_is(run, bench, reconstr
     assert (found[0]["poses"], found[0]["GLE_mm"]) == (24, None)
 
 
-def test_scores_are_printed(run, bench, reconstructed, tmp_path):
-    code, out, err = run("trajectory", "score", reconstructed / "reconstruction.h5", bench / "sweep.h5")
-    assert code == 0, err
-    assert out.splitlines()[1].split() == ["poses", "24"]
-    assert "final drift rate (FDR)" in out
-    assert "global pixel error (GPE)" in out
-    assert "landmark" not in out
-    run("trajectory", "export", reconstructed / "reconstruction.h5", "-o", tmp_path / "a.tum")
-    code, out, err = run("trajectory", "score", tmp_path / "a.tum", tmp_path / "a.tum")
-    assert code == 0, err
-    assert "pixels" in err
-    assert "GPE" not in out
-
-
 def test_a_sweep_that_was_not_reconstructed_is_said_to_be_another(run, changed, bench, reconstructed):
     other = changed(lambda file: file.attrs.__setitem__("comment", "saved again"))
     for sweep, same in ((bench / "sweep.h5", True), (other, False)):
@@ -62,8 +48,6 @@ def test_a_sweep_that_was_not_reconstructed_is_said_to_be_another(run, changed, 
     ("arguments", "message"),
     [
         (("export", "RECONSTRUCTION", "-o", "OUT", "--mode", "sideways"), "--mode"),
-        (("export", "SWEEP", "-o", "OUT"), "'speckle3d.reconstruction'"),
-        (("score", "TEXT", "SWEEP", "--mode", "pose"), "--mode pose"),
         (("score", "TEXT", "TEXT", "--reference", "truth"), "--reference truth"),
         (("score", "RECONSTRUCTION", "SWEEP", "--length-unit", "mm"), "--length-unit mm"),
     ],

@@ -115,9 +115,8 @@ def reslice(
     as_volume = out.name.lower().endswith(SUFFIXES)
     read = (input_file, sweep_file, curve, on, volume, state, *files_of(imported, calibration))
     require_own_place(out, "volume" if as_volume else "picture", *read)
-    points_mm = None if points is None else parse_places(points.split(), option="--points")
-    way = {"origin_mm": origin, "right": right, "down": down, "points_mm": points_mm, "smooth": not straight}
-    place = Place(**placed, **way)
+    corners = None if points is None else parse_places(points.split(), option="--points")
+    place = Place(**placed, points_mm=corners, origin_mm=origin, right=right, down=down, smooth=not straight)
 
     def located(opened: OpenedModes | None) -> Place:
         return place if curve is None else replace(place, curve_mm=_curve(curve, on, opened))

@@ -96,10 +96,10 @@ def view(
                 opened(file, record, reconstruction=reconstruction, sweep=sweep_file, settings=settings)
             )
         else:
-            model, stated = model_of(calibrate), {k: v for k, v in scan.items() if v is not None}
-            for name in stated.keys() - model.model_fields:
+            model, chosen = model_of(calibrate), {k: v for k, v in scan.items() if v is not None}
+            for name in chosen.keys() - model.model_fields:
                 raise InvalidInputError(f"--{name.replace('_', '-')}: is of another method than {calibrate}")
-            pages = phantom_pages(file, from_options(model, stated))
+            pages = phantom_pages(file, from_options(model, chosen))
         server = AppServer(pages, file.name, port)
         note(server.address)
         if browser:

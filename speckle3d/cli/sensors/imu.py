@@ -24,7 +24,6 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 
 if TYPE_CHECKING:
-
     from speckle3d.core.streams import TimedRotations
     from xsens.fusion.orient import Orientation
     from xsens.logs.samples import ImuLog
