@@ -137,7 +137,7 @@ def _levels(rule: Rule, tables: tuple[npt.NDArray[Any], ...]) -> Float32Array:
     def divide(first: int, stop: int) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
             for k in range(first, stop):
-                voxels[k] = table[k, :, :, 0] / table[k, :, :, 1]
+                np.divide(table[k, :, :, 0], table[k, :, :, 1], voxels[k], casting="same_kind")
 
     in_parallel(divide, len(voxels))
     return voxels
