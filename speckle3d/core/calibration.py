@@ -129,20 +129,6 @@ class Calibration:
     verdict: str = ""
     source: Source = field(default_factory=Source)
 
-    def facts(self) -> list[tuple[str, object]]:
-        """What the calibration shows of itself."""
-        place = self.rotation if self.translation_mm is None else self.sensor_from_image
-        return [
-            ("of", f"the {self.sensor}, by {self.method}"),
-            ("sensor_from_image", place),
-            ("pixels, mm", self.pixel_mm),
-            ("residual", f"{self.rms:.3g} {self.rms_unit} RMS"),
-            ("condition number", self.condition_number),
-            ("clock offset, s", self.time_offset_s),
-            ("frames", f"{len(self.frames.used)} of {self.frames.given} used"),
-            ("verdict", self.verdict),
-        ]
-
     def __post_init__(self) -> None:
         if self.sensor not in SENSORS:
             raise InvalidInputError(f"sensor: expected one of {', '.join(SENSORS)}, got {self.sensor!r}")

@@ -40,11 +40,6 @@ class TimedSamples(Generic[Samples]):
         if samples == 0:
             raise InvalidInputError("expected at least one sensor sample, got none")
 
-    def facts(self) -> list[tuple[str, object]]:
-        """What the stream shows of itself."""
-        span = f"{self.time_s[0]:.3f} to {self.time_s[-1]:.3f} s" if len(self) else "none"
-        return [("samples", len(self)), ("time", span), ("longest gap bridged", f"{self.max_gap_s:g} s")]
-
     def __len__(self) -> int:
         return int(self.time_s.size)
 

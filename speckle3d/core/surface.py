@@ -83,14 +83,14 @@ class Surface:
         return float((self.normals_mm2 * middles).sum() / 3.0)
 
     def volume_gradient(self) -> FloatArray:
-        """Derivative of the volume with respect to each vertex, shape (n, 3), mm2."""
-        return self._spread(np.repeat(self.normals_mm2[:, None] / 3.0, 3, axis=1))
+        """Derivative of the volume with respect to each triangle's corners, shape (m, 3, 3), mm2."""
+        return np.repeat(self.normals_mm2[:, None] / 3.0, 3, axis=1)
 
     def area_gradient(self) -> FloatArray:
-        """Derivative of the area with respect to each vertex, shape (n, 3), mm."""
+        """Derivative of the area with respect to each triangle's corners, shape (m, 3, 3), mm."""
         corners = self.vertices_mm[self.triangles]
         opposite = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
-        return self._spread(np.cross(self.normals[:, None], opposite) / 2.0)
+        return np.cross(self.normals[:, None], opposite) / 2.0
 
     def open_edges(self) -> IntArray:
         """Edges that only one triangle has, vertices of each, shape (e, 2): the border of an open surface."""
@@ -117,10 +117,3 @@ class Surface:
         return np.concatenate(
             [self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]]
         )
-
-    def _spread(self, of_corners: FloatArray) -> FloatArray:
-        """Sum of what each triangle gives to its corners, shape (m, 3, 3) to (n, 3)."""
-        corners = self.triangles.ravel()
-        shape = len(self.vertices_mm), corners.size
-        belonging = coo_array((np.ones(corners.size), (corners, np.arange(corners.size))), shape=shape)
-        return np.asarray(belonging @ of_corners.reshape(-1, 3))

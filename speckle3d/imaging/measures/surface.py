@@ -188,9 +188,9 @@ def measures_of(
     volume = closed.volume_mm3 if len(closed) else None
     area_sigma = volume_sigma = None
     if errors is not None and grid is not None:
-        area_sigma = _sigma(surface.vertices_mm, surface.area_gradient(), errors, grid)
+        area_sigma = _sigma(surface, surface.area_gradient(), errors, grid)
         if volume is not None:
-            volume_sigma = _sigma(closed.vertices_mm, closed.volume_gradient(), errors, grid)
+            volume_sigma = _sigma(closed, closed.volume_gradient(), errors, grid)
     return PartMeasures(len(surface), surface.area_mm2, volume, open_mm, area_sigma, volume_sigma)
 
 
@@ -218,9 +218,13 @@ def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
     return surface.of_triangles(whole[part])
 
 
-def _sigma(vertices: FloatArray, gradient: FloatArray, errors: PosedErrors, grid: ImageGrid) -> float:
-    near = belonging_of(vertices, grid, errors.world_from_image)
-    return float(np.linalg.norm(errors.of_gradient(vertices, gradient, near)))
+def _sigma(surface: Surface, gradient: FloatArray, errors: PosedErrors, grid: ImageGrid) -> float:
+    near, corners = (
+        belonging_of(surface.vertices_mm, grid, errors.world_from_image),
+        surface.triangles.ravel(),
+    )
+    by_errors = errors.of_gradient(surface.vertices_mm[corners], gradient.reshape(-1, 3), near[corners])
+    return float(np.linalg.norm(by_errors))
 
 
 def _marched(volume: Volume, values: FloatArray, level: float, inside: Inside, known: BoolArray) -> Surface:
