@@ -18,7 +18,6 @@ from speckle3d.core.extras import extra_module
 from xsens.messages.control import BASE_RATE_HZ, Configuration, MessageId, error_of
 from xsens.messages.framing import Framer, Message, encode
 from xsens.messages.mtdata import OutputMode, OutputSettings
-from xsens.messages.rawcounts import RawCalibration
 
 if TYPE_CHECKING:
     from serial import Serial
@@ -82,15 +81,10 @@ class DeviceSettings:
 
 
 class DeviceInfo(NamedTuple):
-    """Serial number, samples per second (NaN if not reported), and what a reader of the data needs.
-
-    `oriented` if the sensor is known to send its own orientation.
-    """
+    """Serial number, and the messages that a reader of the data needs before them."""
 
     device_id: int
-    rate_hz: float
     header: tuple[Message, ...]
-    oriented: bool = False
 
 
 class Device:
@@ -209,9 +203,9 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
         If its configuration is not as documented.
     """
     number = int.from_bytes(device.request(MessageId.REQ_DID).payload[:4], "big")
-    outputs, oriented = device.ask(MessageId.OUTPUT_CONFIGURATION), settings.content == "orientation"
+    outputs = device.ask(MessageId.OUTPUT_CONFIGURATION)
     if outputs is None:
-        oriented = _set_legacy(device, settings) and oriented
+        _set_legacy(device, settings)
     elif settings.content != "as set":
         rate = round(settings.rate_hz or 100.0)
         items = [(item, rate) for item in _CONTENTS[settings.content][1]]
@@ -219,12 +213,11 @@ def prepare(device: Device, settings: DeviceSettings) -> DeviceInfo:
         packed = b"".join(struct.pack(">HH", *item) for item in items)
         outputs = device.request(MessageId.OUTPUT_CONFIGURATION, packed)
     asked = (device.ask(MessageId.REQ_CONFIGURATION), device.ask(MessageId.REQ_EMTS), outputs)
-    header = tuple(message for message in asked if message is not None)
-    return DeviceInfo(number, _rate_hz(*asked), header, oriented)
+    return DeviceInfo(number, tuple(message for message in asked if message is not None))
 
 
-def _set_legacy(device: Device, settings: DeviceSettings) -> bool:
-    """Set the rate, and the content unless it is an MT9-B, which has none; whether it has."""
+def _set_legacy(device: Device, settings: DeviceSettings) -> None:
+    """Set the rate, and the content unless it is an MT9-B, which has none."""
     configuration = device.ask(MessageId.REQ_CONFIGURATION)
     units = () if configuration is None else Configuration.from_message(configuration).units
     mt9 = not units or units[0].output_mode & OutputMode.MT9
@@ -235,18 +228,3 @@ def _set_legacy(device: Device, settings: DeviceSettings) -> bool:
         device.request(MessageId.SKIP_FACTOR, bytes(2))
     if settings.rate_hz is not None:
         device.request(MessageId.PERIOD, round(BASE_RATE_HZ / settings.rate_hz).to_bytes(2, "big"))
-    return not mt9
-
-
-def _rate_hz(configuration: Message | None, calibration: Message | None, outputs: Message | None) -> float:
-    """Rate by the items, else the configuration, else the calibration block; NaN if none holds it."""
-    payload = b"" if outputs is None else outputs.payload
-    rates = [rate for _, rate in struct.iter_unpack(">HH", payload[: len(payload) // 4 * 4])]
-    if told := [rate for rate in rates if rate not in (0, _EVERY)]:
-        return float(max(told))
-    if configuration is not None:
-        return Configuration.from_message(configuration).rate_hz
-    with suppress(InvalidInputError):  # later sensors' blocks have another layout
-        if calibration is not None:
-            return RawCalibration.from_message(calibration).rate_hz
-    return float("nan")

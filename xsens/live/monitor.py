@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from speckle3d.core.shown import shown
-from xsens.fusion.field import ROUGH
-from xsens.live.device import DeviceInfo
+from xsens.fusion.field import ROUGH, dip_rad
 from xsens.logs.parts import Hints
 from xsens.logs.read import parse_stream
 from xsens.logs.samples import ImuLog
@@ -112,24 +111,24 @@ class Monitor:
         self._lock = Lock()
         self._since_s = time.monotonic()
         self._now = LiveState(False, 0.0, 0, 0, 0, 0.0, None, _NAN, _NAN, "")
-        self._begin(DeviceInfo(0, _NAN, ()))
+        self._begin(())
 
-    def _begin(self, info: DeviceInfo) -> None:
-        self._header = b"".join(map(encode, info.header))
-        self._hints = Hints(info.rate_hz if info.rate_hz > 0 else None, as_stated=True)
+    def _begin(self, header: tuple[Message, ...]) -> None:
+        self._header = b"".join(map(encode, header))
         self._framer, self._pending = Framer(), list[Message]()
         self._seen = deque([(time.monotonic(), self._now.samples)], maxlen=_SEEN)
         self._counter: int | None = None
-        self._attitude = _Attitude(1.0 / info.rate_hz if info.rate_hz > 0 else _NAN)
+        self._filter: OnlineFilter | None = None
+        self._step_s = _NAN
 
     def _set(self, **changes: Any) -> None:
         self._now = replace(self._now, **changes)
 
-    def started(self, info: DeviceInfo) -> None:
+    def started(self, header: tuple[Message, ...]) -> None:
         """Note that the sensor begins to measure; its counter may start anywhere."""
         with self._lock:
             self._digest()
-            self._begin(info)
+            self._begin(header)
             self._set(connected=True)
 
     def arrived(self, received: bytes) -> None:
@@ -164,7 +163,7 @@ class Monitor:
         if not data:
             return
         try:
-            log = parse_stream(self._header + data, self._hints)
+            log = parse_stream(self._header + data, Hints(as_stated=True))
         except Speckle3DError as error:
             self._set(note=str(error))
             return
@@ -173,37 +172,23 @@ class Monitor:
             if self._counter is not None:
                 missing = int(log.counter[0] - self._counter - 1) % (1 << 16)
             self._counter = int(log.counter[-1])
-        fused = self._attitude.follow(log, missing)
-        shown = None if fused is None else fused.world_from_sensor
+        fused = self._follow(log, missing)
+        world_from_sensor = None if fused is None else fused.world_from_sensor
         if log.world_from_sensor is not None and log.oriented.any():
-            shown = log.world_from_sensor[log.oriented][-1]
-        rates = log.gyroscope_rad_s
+            world_from_sensor = log.world_from_sensor[log.oriented][-1]
+        rates, field = log.gyroscope_rad_s, log.magnetometer_au
+        if field is not None and np.isfinite(field[-1]).all():
+            dip = _NAN if world_from_sensor is None else dip_rad(world_from_sensor.apply(field[-1:]))[0]
+            self._set(field=float(np.linalg.norm(field[-1])), dip_rad=float(dip))
         self._set(
             lost=self._now.lost + log.lost + missing,
-            world_from_sensor=shown,
+            world_from_sensor=world_from_sensor,
             fused=fused,
             rate_rad_s=None if rates is None else rates[-1],
-            **_field_of(log),
         )
 
-
-def warm_up() -> None:
-    """Load the filter, or compile it, which would keep a recording from reading its port for too long."""
-    from xsens.fusion.online import OnlineFilter
-
-    still = (np.tile(vector, (150, 1)) for vector in ([0.0, 0.0, 0.0], [0.0, 0.0, 9.8], [0.4, 0.0, -0.9]))
-    OnlineFilter().push(np.full(150, 0.01), *still)
-
-
-class _Attitude:
-    """The filter over the samples of a live sensor."""
-
-    def __init__(self, step_s: float) -> None:
-        self._filter: OnlineFilter | None = None
-        self._step_s = step_s
-
-    def follow(self, log: ImuLog, missing: int) -> OnlineState | None:
-        """Take in some samples, with the number of those missing before them."""
+    def _follow(self, log: ImuLog, missing: int) -> OnlineState | None:
+        """Filter some samples, with the number of those missing before them."""
         steps = np.diff(log.time_s)
         if steps.size:
             self._step_s = float(np.median(steps))
@@ -221,17 +206,9 @@ class _Attitude:
         return self._filter.state
 
 
-def _field_of(log: ImuLog) -> dict[str, float]:
-    """Norm of the magnetic field and its angle below the horizontal in some samples, if they tell."""
-    up = log.accelerometer_m_s2
-    if log.world_from_sensor is not None and log.oriented.all():
-        up = log.world_from_sensor.inv().apply([0.0, 0.0, 1.0])
-    if log.magnetometer_au is None or up is None:
-        return {}
-    norm, length = np.linalg.norm(log.magnetometer_au, axis=1), np.linalg.norm(up, axis=1)
-    there = (norm > 0) & (length > 0)  # NaN is not
-    if not there.any():
-        return {}
-    sine = np.einsum("ij,ij->i", log.magnetometer_au[there], up[there]) / (norm * length)[there]
-    dip = -np.arcsin(np.clip(sine, -1.0, 1.0))
-    return {"field": float(norm[there].mean()), "dip_rad": float(dip.mean())}
+def warm_up() -> None:
+    """Load the filter, or compile it, which would keep a recording from reading its port for too long."""
+    from xsens.fusion.online import OnlineFilter
+
+    still = (np.tile(vector, (150, 1)) for vector in ([0.0, 0.0, 0.0], [0.0, 0.0, 9.8], [0.4, 0.0, -0.9]))
+    OnlineFilter().push(np.full(150, 0.01), *still)

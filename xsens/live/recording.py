@@ -87,7 +87,7 @@ class Recorder:
         self, port: str, path: PathLike, settings: DeviceSettings | None = None, append: bool = False
     ) -> None:
         self._port, self._settings = port, settings or DeviceSettings()
-        self._baud, self._info = self._settings.baud, DeviceInfo(-1, float("nan"), ())
+        self._baud, self._info = self._settings.baud, DeviceInfo(-1, ())
         device = self._prepared()
         try:
             warm_up()
@@ -160,7 +160,7 @@ class Recorder:
 
     def _measure(self, device: Device) -> None:
         self._file.append(b"".join(map(encode, (*self._info.header, utc_message()))))
-        self._monitor.started(self._info)
+        self._monitor.started(self._info.header)
         device.tap = self._take
         device.request(MessageId.GO_TO_MEASUREMENT)
         self._listen(device)

@@ -7,10 +7,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.kernels.orientation.rotations import inverse
+from speckle3d.kernels.orientation.rotations import compiled, inverse
 
 ROOM, BIAS, IRON, PLACE, STRAY, LAG, SIZE = 0, 3, 6, 9, 12, 15, 16
 """Places in the state: the room's field (level axes), what is left of the gyroscope's bias (sensor axes), the
@@ -104,7 +103,7 @@ _LARGEST_SCORE, _LARGEST_CHANGE = 50.0, 0.5
 """Bounds of a reading's squared misfit, and of the change of that logarithm, in one bin."""
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def find_headings(
     bins: Any,
     models: Any,
@@ -146,7 +145,7 @@ def find_headings(
             out.stray, out.evidence, out.doubt = s.stray, s.evidence, s.doubt
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
     """Angle about up from the level axes to north, by the room's field, and its variance."""
     across, along = x[ROOM], x[ROOM + 1]
@@ -157,7 +156,7 @@ def turn_to_north(x: FloatArray, p: FloatArray) -> tuple[float, float]:
     return -math.atan2(along, across), min(max(variance / (square * square), 0.0), math.pi**2)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _begin(s: Any, b: Any, m: Any) -> None:
     """Begin with the bin's reading; after a pause with the iron and lag found so far."""
     if not s.ran:
@@ -174,7 +173,7 @@ def _begin(s: Any, b: Any, m: Any) -> None:
     s.begun, s.ran, s.rested = True, True, b.resting
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _forget(s: Any, first: int, count: int, sd: float) -> None:
     """Set states anew, to zero with that deviation."""
     for i in range(first, first + count):
@@ -182,7 +181,7 @@ def _forget(s: Any, first: int, count: int, sd: float) -> None:
         s.p[i, i] = sd * sd
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     """Predict over a bin; fill its transition and noise."""
     span, across, along = b.span_s, s.x[ROOM], s.x[ROOM + 1]
@@ -212,7 +211,7 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     s.p[:] = f @ s.p @ f.T + q
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatArray, out: Any) -> None:
     """Correct by a reading, the less the less likely it is: its errors have Student's distribution.
 
@@ -251,7 +250,7 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
     s.p[:] = 0.5 * (p + p.T)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _changed(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, total: FloatArray) -> bool:
     """Whether an outlier is iron put on the sensor, or iron beside it left behind; if so, foresee it."""
     if m.iron_put_on > 0.0 and s.holding_s <= 0.0:
@@ -271,7 +270,7 @@ def _changed(s: Any, m: Any, f: FloatArray, q: FloatArray, off: FloatArray, tota
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The reading less what is expected, its covariance with the state, and its own.
 
@@ -285,7 +284,7 @@ def _innovation(s: Any, b: Any, m: Any, rows: FloatArray) -> tuple[FloatArray, F
     return b.field / s.norm - rows @ s.x, cross, total
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _adapt(s: Any, b: Any, off: FloatArray, misfit: float, weight: FloatArray) -> None:
     """Follow the stray's variance by the slope of the reading's likelihood: the room may become another."""
     weighted = weight @ off

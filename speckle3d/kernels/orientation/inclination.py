@@ -25,12 +25,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.kernels.orientation.rotations import (
     Quaternion,
     Vector,
+    compiled,
     inverse,
     inverted,
     product,
@@ -132,17 +132,17 @@ _REST_MEMORY_S = 0.5
 """Time over which a resting sensor's readings are averaged."""
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _three(v: FloatArray) -> Vector:
     return v[0], v[1], v[2]
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _norm(v: FloatArray) -> float:
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def run_filter(
     step_s: FloatArray,
     rate_rad_s: FloatArray,
@@ -201,7 +201,7 @@ def run_filter(
     return n
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _open(s: Any, step: Any) -> None:
     """Begin an increment."""
     step.duration_s = step.fields = step.lost_rad2 = 0.0
@@ -209,7 +209,7 @@ def _open(s: Any, step: Any) -> None:
     step.start[:], step.start_bias[:] = s.level, s.bias
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
     """Add a sample to an increment, with the increment's bias."""
     half = _turn(rate, step.start_bias, 0.5 * dt)
@@ -224,7 +224,7 @@ def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: Float
     step.duration_s += dt
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _complete(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     """Predict over an increment, and correct; fill what it leaves behind, and its transition."""
     step.rate /= step.duration_s
@@ -244,14 +244,14 @@ def _complete(s: Any, r: Any, step: Any, f: FloatArray) -> None:
         step.sd[i] = math.sqrt(s.p[i, i])
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _turn(rate: FloatArray, bias: FloatArray, span_s: float) -> Quaternion:
     """Turn by a reading of the gyroscope over some time."""
     x, y, z = rate[0] - bias[0], rate[1] - bias[1], rate[2] - bias[2]
     return quaternion_of(x * span_s, y * span_s, z * span_s)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def orient_samples(
     step_s: FloatArray,
     rate_rad_s: FloatArray,
@@ -292,7 +292,7 @@ def orient_samples(
 # -- start and rest
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _upright(force: FloatArray) -> Quaternion:
     """The shortest rotation that takes a force to up."""
     norm = _norm(force)
@@ -303,7 +303,7 @@ def _upright(force: FloatArray) -> Quaternion:
     return x / length, y / length, 0.0, w / length
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _set_up(s: Any, r: Any, force: FloatArray) -> None:
     """Begin before the first sample: anew, or after a pause with the bias found so far."""
     kept = s.p[BIAS : BIAS + 3, BIAS : BIAS + 3].copy()
@@ -319,7 +319,7 @@ def _set_up(s: Any, r: Any, force: FloatArray) -> None:
     s.start_turn[:] = s.level  # in level axes: those of a sensor upside down would turn with every reading
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _begin(s: Any, step: Any) -> None:
     """Set up from the mean force since the start."""
     turn = quaternion(s.start_turn)
@@ -332,7 +332,7 @@ def _begin(s: Any, step: Any) -> None:
     s.starting = s.start_s < (_START_S if s.still_s > 0.5 * _START_S else _MOVING_START_S)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _rest(s: Any, r: Any, step: Any) -> None:
     """Note whether the sensor rests."""
     force = step.force / step.duration_s
@@ -355,7 +355,7 @@ def _rest(s: Any, r: Any, step: Any) -> None:
 # -- the Kalman filter
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     """Predict over one increment; fill its transition."""
     _rest(s, r, step)
@@ -388,7 +388,7 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     step.predicted[:], step.predicted_speed[:] = s.level, s.speed
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _correct_by_speed(s: Any, r: Any, step: Any) -> None:
     """Correct by a velocity of zero, whose error is a hand's, or smaller at rest, and persists.
 
@@ -404,7 +404,7 @@ def _correct_by_speed(s: Any, r: Any, step: Any) -> None:
 _LEVEL, _NO_TURN = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> FloatArray:
     """Correct a covariance by an observation of three states; return the gain, shape (9, 3).
 
@@ -423,7 +423,7 @@ def _correct(p: FloatArray, first: int, variance: float, up: FloatArray) -> Floa
     return gain
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def _inject(s: Any, error: FloatArray) -> None:
     """Apply the estimated error to the state."""
     turn = quaternion_of(error[0], error[1], error[2])
@@ -436,7 +436,7 @@ def _inject(s: Any, error: FloatArray) -> None:
 # -- backward
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def smooth_steps(
     steps: Any,
     covariance: FloatArray,

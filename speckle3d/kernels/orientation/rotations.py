@@ -8,11 +8,13 @@ from numba import njit
 
 from speckle3d.core.arrays import FloatArray
 
+compiled = njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Vector: TypeAlias = tuple[float, float, float]
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def quaternion(q: FloatArray) -> Quaternion:
     """The quaternion in an array, of unit length."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -20,7 +22,7 @@ def quaternion(q: FloatArray) -> Quaternion:
     return x / norm, y / norm, z / norm, w / norm
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def quaternion_of(x: float, y: float, z: float) -> Quaternion:
     """Quaternion of a rotation vector, rad."""
     square = x * x + y * y + z * z
@@ -29,7 +31,7 @@ def quaternion_of(x: float, y: float, z: float) -> Quaternion:
     return s * x, s * y, s * z, math.cos(0.5 * angle)
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def vector_of(q: Quaternion) -> Vector:
     """Rotation vector, rad, of a unit quaternion; the shorter one."""
     x, y, z, w = q
@@ -39,7 +41,7 @@ def vector_of(q: Quaternion) -> Vector:
     return s * x, s * y, s * z
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
     """Quaternion of the rotation by `q`, then by `p`."""
     px, py, pz, pw = p
@@ -52,13 +54,13 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def inverted(q: Quaternion) -> Quaternion:
     """Quaternion of the rotation back."""
     return -q[0], -q[1], -q[2], q[3]
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def rotated(q: Quaternion, v: Vector) -> Vector:
     """A vector turned by a unit quaternion."""
     x, y, z, w = q
@@ -68,7 +70,7 @@ def rotated(q: Quaternion, v: Vector) -> Vector:
     return v[0] + w * a + y * c - z * b, v[1] + w * b + z * a - x * c, v[2] + w * c + x * b - y * a
 
 
-@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+@compiled
 def inverse(m: FloatArray) -> tuple[FloatArray, float]:
     """Inverse of a symmetric matrix, shape (3, 3), and its determinant."""
     out = np.empty((3, 3))
