@@ -9,12 +9,12 @@ from .accuracy.figures import figure_turns as figure_turns
 from .accuracy.mechanism import MechanismSettings as MechanismSettings
 from .accuracy.mechanism import read_mechanism_csv as read_mechanism_csv
 from .accuracy.mechanism import readings_at as readings_at
-from .fusion.methods import Method as Method
 from .fusion.online import OnlineFilter as OnlineFilter
 from .fusion.online import OnlineState as OnlineState
 from .fusion.orient import Orientation as Orientation
 from .fusion.orient import orient as orient
 from .fusion.settings import FusionSettings as FusionSettings
+from .fusion.settings import Method as Method
 from .live.device import DeviceError as DeviceError
 from .live.device import DeviceSettings as DeviceSettings
 from .live.monitor import LiveState as LiveState

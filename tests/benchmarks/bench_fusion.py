@@ -39,9 +39,8 @@ from broad import (
 from field_scenes import scenes
 from vqf import VQF
 
-from xsens.fusion.methods import Method
 from xsens.fusion.online import OnlineFilter
-from xsens.fusion.settings import FusionSettings
+from xsens.fusion.settings import FusionSettings, Method
 
 METHODS = ONLINE + OFFLINE
 WORSE = 1.15

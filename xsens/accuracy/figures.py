@@ -58,18 +58,18 @@ def turns_about(angle: str, experiments: Mapping[str, PairErrors]) -> list[Turn]
 
 def _turns(name: str, errors: PairErrors, angle: str) -> Iterator[Turn]:
     axis, n = ANGLES.index(angle), errors.frames
-    pair = np.zeros((n, n), dtype=int)
-    pair[np.triu_indices(n, 1)] = np.arange(len(errors.reference_rad))
-    pair += pair.T
+    first, second = np.triu_indices(n, 1)
+    reference, error = np.zeros((n, n, 3)), np.zeros((len(errors.error_rad), n, n))
+    reference[first, second], reference[second, first] = errors.reference_rad, -errors.reference_rad
+    error[:, first, second] = errors.error_rad[..., axis]
+    error[:, second, first] = -errors.error_rad[..., axis]
+    alone = (np.abs(np.delete(reference, axis, axis=2)) <= OFF_AXIS_RAD).all(axis=2)
     for start in range(n):
-        sign = np.sign(np.arange(n) - start)
-        reference = sign[:, None] * errors.reference_rad[pair[start]]
-        alone = (np.abs(np.delete(reference, axis, axis=1)) <= OFF_AXIS_RAD).all(axis=1)
-        kept = np.flatnonzero(alone & (reference[:, axis] >= 0))
-        kept = kept[np.argsort(reference[kept, axis], kind="stable")]
-        if kept.size >= FEWEST_FRAMES and reference[kept[-1], axis] > 0:
-            error_rad = sign[kept] * errors.error_rad[:, pair[start, kept], axis]
-            yield Turn(name, angle, reference[kept, axis], error_rad)
+        angles = reference[start, :, axis]
+        kept = np.flatnonzero(alone[start] & (angles >= 0))
+        kept = kept[np.argsort(angles[kept], kind="stable")]
+        if kept.size >= FEWEST_FRAMES and angles[kept[-1]] > 0:
+            yield Turn(name, angle, angles[kept], error[:, start, kept])
 
 
 def figure_turns(experiments: Mapping[str, PairErrors], title: str = "") -> Figure:

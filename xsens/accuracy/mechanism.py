@@ -14,7 +14,6 @@ and ``until_s`` when it left. Without a header the columns are tilt, yaw and, if
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 
@@ -22,11 +21,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError
+from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.streams import TimedRotations
-from xsens.logs.read import read_bounded
 
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
+_TIMES = {"time": "time_s", "until": "until_s"}
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
 _LARGEST_BYTES = 16 * 2**20
 """Enough for a quarter of a million orientations, more than a mechanism is set to by hand or motor."""
@@ -51,7 +52,7 @@ class MechanismSettings:
     until_s: FloatArray | None = None
 
 
-def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, tilt") -> MechanismSettings:
+def read_mechanism_csv(path: PathLike, turns: str = "roll, yaw, tilt") -> MechanismSettings:
     """Read the settings of a mechanism, one orientation per line.
 
     Parameters
@@ -77,8 +78,11 @@ def read_mechanism_csv(path: str | os.PathLike[str], turns: str = "roll, yaw, ti
     sequence = re.split(r"[\s,-]+", turns.strip().lower())
     if sorted(sequence) != sorted(_AXIS):
         raise InvalidInputError(f"turns: expected roll, yaw and tilt in some order, got {turns!r}")
-    text = read_bounded(path, _LARGEST_BYTES).decode("utf-8-sig", errors="replace")
-    table = _table(text, str(path))
+    with open_regular(path) as file:
+        text = file.read(_LARGEST_BYTES + 1)
+    if len(text) > _LARGEST_BYTES:
+        raise FileError(f"{path}: expected at most {_LARGEST_BYTES} bytes, got more")
+    table = _table(text.decode("utf-8-sig", errors="replace"), str(path))
     angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
     order = "".join(_AXIS[name] for name in sequence)
     rotation = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
@@ -131,51 +135,37 @@ def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation
 
 def _table(text: str, where: str) -> dict[str, FloatArray]:
     """Columns by name."""
-    lines = [(at, cells) for at, line in enumerate(text.splitlines(), 1) if (cells := _cells(line))]
-    if not lines:
-        raise InvalidInputError(f"{where}: expected settings of tilt and yaw, got an empty file")
-    header = _names(lines[0][1], f"{where}:{lines[0][0]}")
-    names, rows = header or list(_COLUMNS[: len(lines[0][1])]), []
-    for at, cells in lines[bool(header) :]:
-        numbers = _numbers(cells)
-        if len(numbers) != len(names) or not np.isfinite(numbers).all():
+    names: list[str] = []
+    rows: list[list[float]] = []
+    for at, line in enumerate(text.splitlines(), 1):
+        cells = _cells(line)
+        numbers = [float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in cells]
+        if cells and not names:
+            # Tilt_deg, tilt/deg and tilt(deg) are all tilt; time is time_s.
+            words = [re.split(r"[^a-z]", cell.lower().strip('"'))[0] for cell in cells]
+            headless = np.isfinite(numbers).all() and len(cells) in (2, 3)
+            names = [*_COLUMNS[: len(cells)]] if headless else [_TIMES.get(word, word) for word in words]
+            needed = {"tilt", "yaw", "time_s"} if "until_s" in names else {"tilt", "yaw"}
+            if len(set(names)) != len(names) or not needed <= set(names) <= set(_COLUMNS):
+                raise InvalidInputError(
+                    f"{where}:{at}: expected columns tilt and yaw, perhaps roll, time_s and with it until_s, "
+                    f"got {', '.join(cells)[:80]}"
+                )
+            if not headless:
+                continue
+        if cells and (len(cells) != len(names) or not np.isfinite(numbers).all()):
             got = ", ".join(cells)[:60]
-            raise InvalidInputError(f"{where}:{at}: expected {len(names)} finite numbers, got {got!r}")
-        rows.append(numbers)
+            raise InvalidInputError(f"{where}:{at}: expected {len(names)} numbers, got {got!r}")
+        if cells:
+            rows.append(numbers)
     if not rows:
-        raise InvalidInputError(f"{where}: expected settings below the header, got none")
+        raise InvalidInputError(f"{where}: expected settings of tilt and yaw, got none")
     return dict(zip(names, np.array(rows).T.copy(), strict=True))
-
-
-def _names(cells: list[str], where: str) -> list[str]:
-    """Names of the columns; none if the first line is not a header."""
-    if _numbers(cells):
-        if len(cells) not in (2, 3):
-            raise InvalidInputError(f"{where}: expected a header or 2 or 3 columns, got {len(cells)}")
-        return []
-    # Tilt_deg, tilt/deg and tilt(deg) are all tilt; time is time_s.
-    words = [re.split(r"[^a-z]", cell.lower().strip('"'))[0] for cell in cells]
-    names = [f"{word}_s" if word in ("time", "until") else word for word in words]
-    needed = {"tilt", "yaw", "time_s"} if "until_s" in names else {"tilt", "yaw"}
-    if len(set(names)) != len(names) or not needed <= set(names) <= set(_COLUMNS):
-        raise InvalidInputError(
-            f"{where}: expected columns tilt and yaw, perhaps roll, time_s and with it until_s, "
-            f"got {', '.join(cells)[:80]}"
-        )
-    return names
 
 
 def _cells(line: str) -> list[str]:
     """Cells of a line without its comment; where semicolons separate, the decimal sign may be a comma."""
     content = line.partition("#")[0].strip()
     separator = next((mark for mark in ";,\t" if mark in content), None)
-    cells = [cell.strip() for cell in content.split(separator)]
+    cells = [cell.strip() for cell in content.split(separator)] if content else []
     return [cell.replace(",", ".") for cell in cells] if separator == ";" else cells
-
-
-def _numbers(cells: list[str]) -> list[float]:
-    """The cells' numbers; none if one is not a number."""
-    try:
-        return [float(cell) for cell in cells]
-    except ValueError:
-        return []

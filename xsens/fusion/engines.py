@@ -8,10 +8,9 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation.inclination import STEP
-from xsens.fusion.bins import averaged_bins, lasts_of_bins, steps_per_bin
-from xsens.fusion.heading import HeadingFilter
+from xsens.fusion.heading import HeadingFilter, averaged_bins, lasts_of_bins, steps_per_bin
 from xsens.fusion.inclination import CLAIMED, InclinationFilter, smooth, within_steps
-from xsens.fusion.samples import Estimate, Samples
+from xsens.fusion.readings import Estimate, Samples
 from xsens.fusion.settings import FusionSettings
 
 _UNKNOWN = (0.0, np.pi, False, np.nan, np.nan)

@@ -78,58 +78,39 @@ class FieldFound:
             return Trust.UNKNOWN
         if self.heading_sd_rad > LOST_RAD or self.disbelieved > _MOST or self.stray > POOR:
             return Trust.NO
-        return Trust.CARE if self._doubts() else Trust.YES
+        return Trust.CARE if any(self._doubts().values()) else Trust.YES
 
     def sentence(self) -> str:
         """Whether the magnetometer can be trusted, why, and what to do if it cannot."""
-        trust = self.trust
-        if trust is Trust.UNKNOWN:
-            return f"The magnetometer {trust} here: it has told nothing of the heading yet."
-        parts = [
-            f"The magnetometer {trust} here: with it the heading is known to {_deg(self.heading_sd_rad)}"
-        ]
-        if math.isfinite(self.drift_rad):
-            alone = f"the gyroscope alone drifts by {_deg(self.drift_rad)} in {self.duration_s:.0f} s"
-            parts.append(f"; {alone} (one standard deviation each)")
-        else:
-            parts.append(" (one standard deviation)")
-        even = f"the field changes by {100.0 * self.stray:.1f}\N{NO-BREAK SPACE}% from place to place"
-        parts.append(f". {_capital(even)}, and {_share(self.disbelieved)} of its readings are disbelieved.")
-        doubts = self._doubts()
-        if doubts:
-            parts.append(f" {_capital('; '.join(doubts))}.")
-        return "".join(parts) + self._advice(trust)
+        if self.trust is Trust.UNKNOWN:
+            return f"The magnetometer {self.trust} here: it has told nothing of the heading yet."
+        held, drift = math.degrees(self.heading_sd_rad), math.degrees(self.drift_rad)
+        alone = ""
+        if math.isfinite(drift):
+            alone = f"; the gyroscope alone drifts by {drift:.1f}\N{DEGREE SIGN} in {self.duration_s:.0f} s"
+        doubts = [words for words, so in self._doubts().items() if so]
+        advice = ""
+        if drift < held:
+            advice = " Within this recording the gyroscope alone does better (--no-magnetometer)."
+        elif self.trust is Trust.NO:
+            advice = " Move away from iron and motors, or leave it out (--no-magnetometer)."
+        return (
+            f"The magnetometer {self.trust} here: with it the heading is known to {held:.1f}\N{DEGREE SIGN}"
+            f"{alone} (standard deviation). The field changes by {100.0 * self.stray:.1f} % from place to "
+            f"place, and {100.0 * self.disbelieved:.1f} % of its readings are disbelieved."
+            + "".join(f" {words}." for words in doubts)
+            + advice
+        )
 
-    def _doubts(self) -> list[str]:
-        doubts = []
-        if self.iron > 0.5:
-            doubts.append("part of it turns with the sensor, as by iron on the probe, and is taken off")
-        if self.stray > ROUGH:
-            doubts.append("such a field is rough: iron or motors are near")
-        if self.disbelieved > _SOME:
-            doubts.append("something magnetic comes near at times")
-        if self.heading_sd_rad > HELD_RAD:
-            doubts.append(f"a good field holds the heading to {_deg(HELD_RAD)}")
-        return doubts
-
-    def _advice(self, trust: Trust) -> str:
-        if self.drift_rad < self.heading_sd_rad:
-            return " Within this recording the gyroscope alone does better (--no-magnetometer)."
-        if trust is Trust.NO:
-            return " Move away from iron and motors, or leave it out (--no-magnetometer)."
-        return ""
-
-
-def _deg(angle_rad: float) -> str:
-    return f"{math.degrees(angle_rad):.1f}\N{DEGREE SIGN}"
-
-
-def _share(share: float) -> str:
-    return "none" if share == 0.0 else f"{100.0 * share:.1f}\N{NO-BREAK SPACE}%"
-
-
-def _capital(words: str) -> str:
-    return words[:1].upper() + words[1:]
+    def _doubts(self) -> dict[str, bool]:
+        return {
+            "Part of it turns with the sensor, as by iron on the probe, and is taken off": self.iron > 0.5,
+            "Such a field is rough: iron or motors are near": self.stray > ROUGH,
+            "Something magnetic comes near at times": self.disbelieved > _SOME,
+            f"A good field holds the heading to {math.degrees(HELD_RAD):.1f}\N{DEGREE SIGN}": (
+                self.heading_sd_rad > HELD_RAD
+            ),
+        }
 
 
 def field_of(log: ImuLog, found: Orientation) -> FieldFound:

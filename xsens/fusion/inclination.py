@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import inclination as kernel
-from xsens.fusion.samples import Samples
+from xsens.fusion.readings import Samples
 from xsens.fusion.settings import FusionSettings
 
 CLAIMED = np.array([0.6, 0.6, 1.0])

@@ -14,8 +14,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.shown import shown
 from xsens.fusion.engines import Filter
-from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, lost_variance, require_metres
-from xsens.fusion.samples import Samples
+from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, Samples, lost_variance, require_metres
 from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
 from xsens.logs.faults import LiveFaults
 

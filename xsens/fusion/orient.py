@@ -12,10 +12,8 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
-from xsens.fusion.methods import DEFAULT_METHOD, Method, method_of
-from xsens.fusion.readings import PAUSE_S, UNKNOWN_HEADING_RAD, usable_samples
-from xsens.fusion.samples import Estimate, Samples
-from xsens.fusion.settings import FusionSettings
+from xsens.fusion.readings import PAUSE_S, UNKNOWN_HEADING_RAD, Estimate, Samples, usable_samples
+from xsens.fusion.settings import DEFAULT_METHOD, FusionSettings, Method, method_of
 from xsens.logs.samples import ImuLog
 
 _FORESEEN = 3

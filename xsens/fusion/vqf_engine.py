@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.fusion.samples import Estimate, Samples
+from xsens.fusion.readings import Estimate, Samples
 from xsens.logs.worlds import nwu_from
 
 _EVEN = 0.05

@@ -40,7 +40,7 @@ _SLOW_RAD_S = 0.05
 """Rate that may be repeated at rest: the bias of a gyroscope, and a coarse one's last digits."""
 
 _DROP_RAD_S = 0.3
-"""Change by which a gyroscope that reads zero amid movement is told from one at the turning point."""
+"""Change by which a gyroscope that comes to rest is told from one that is stuck in slow movement."""
 
 _STEADY_M_S2 = 1.0
 """Spread of the readings of a resting accelerometer; gravity turned by six degrees changes them as much."""
@@ -148,17 +148,16 @@ def _bad(
     if beyond.any() or not finite.all():
         rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
     runs = _Runs.of(rows)
-    step = np.concatenate([[np.nan], _norm(np.diff(rows, axis=0)), [np.nan]])
+    step = np.pad(_norm(np.diff(rows, axis=0)), 1, constant_values=np.nan)
     before, after = step[runs.start], step[runs.start + runs.length]
     moves = (after > limits.change * unit) | (np.isnan(after) & (runs.start > 0))
-    repeat, turning = runs.long & moves, _turning(rate, runs)
-    if name == VECTORS[1]:
+    repeat = runs.long & moves
+    if name == VECTORS[1]:  # a resting one may read its bias, or zero
         begun = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
-        still = (size[runs.start] < _SLOW_RAD_S) & begun & _steady(force, runs)
-        repeat &= ~still
-        zero &= dead | runs.marked(repeat | ((np.fmax(before, after) > _DROP_RAD_S) & ~still))
+        repeat &= ~((size[runs.start] < _SLOW_RAD_S) & begun & _steady(force, runs))
+        zero &= dead
     else:  # what is repeated to the log's end was left while the sensor turned
-        repeat &= ~np.isnan(after) | turning
+        repeat &= ~np.isnan(after) | _turning(rate, runs)
     repeated = runs.marked(repeat, runs.usual) & finite & ~zero
     return {
         "readings of zero": zero,
@@ -186,21 +185,18 @@ def _turning(rate: FloatArray | None, runs: _Runs) -> BoolArray:
 
 def _clipped(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
-    bad = np.zeros(len(rows), dtype=bool)
-    changes = np.append(0, np.cumsum(np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])))
+    bad, whole = np.zeros(len(rows), dtype=bool), _Runs.of(rows)
+    of_run = np.repeat(np.arange(len(whole.start)), whole.length)
     for axis in rows.T:
-        ends = (np.fmax.reduce(axis), np.fmin.reduce(axis))
-        if max(np.count_nonzero(axis == end) for end in ends) < 3:
-            continue
         steps = np.abs(np.diff(axis))
         digit = np.min(steps[steps > 0.0], initial=np.inf)
         runs = _Runs.of(axis[:, None])
-        first, last = runs.start, runs.start + runs.length - 1
         slopes = np.pad(steps, 2)  # into each sample from the second before it, and out of it
-        slope = np.minimum(slopes[first], slopes[last + 3])
-        value = axis[first]
-        top = ((value == ends[0]) | (value == ends[1])) & (value != 0.0)
-        bad |= runs.marked(top & (changes[last] - changes[first] > 1) & (slope > 3.0 * digit))
+        slope = np.minimum(slopes[runs.start], slopes[runs.start + runs.length + 2])
+        value = axis[runs.start]
+        top = ((value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))) & (value != 0.0)
+        others_go_on = of_run[runs.start + runs.length - 1] - of_run[runs.start] > 1
+        bad |= runs.marked(top & others_go_on & (slope > 3.0 * digit))
     return bad
 
 

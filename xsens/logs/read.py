@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from io import BufferedReader, TextIOWrapper
+from io import TextIOWrapper
 
 import numpy as np
 
 from speckle3d.core.arrays import ByteArray, IntArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.files import PathLike, open_regular
 from xsens.logs.datamessages import legacy_samples, mtdata2_samples
 from xsens.logs.parts import Hints, assembled
 from xsens.logs.samples import ImuLog
@@ -20,13 +19,10 @@ from xsens.logs.textlogs import parse_text
 from xsens.messages.control import MessageId
 from xsens.messages.framing import Frames, find_frames
 
-PathLike = str | os.PathLike[str]
-
 MOST_BYTES = 1 << 27
 """Of a log: five hours of raw counts at 256 Hz. Reading takes 2.5 times the memory of text, 3.1 to 5.2 times
 that of messages, whose numbers are shorter than a double: raw counts alone become 3.3 times as large."""
 
-_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 _SNIFFED = 1 << 16
 _DAMAGED = 0.01
 _TEXT_CONTROLS = np.array([code < 32 and chr(code) not in "\t\n\r\f" for code in range(256)])
@@ -70,48 +66,19 @@ def read_log(path: PathLike, hints: Hints | None = None) -> ImuLog:
     >>> len(log), log.lost
     (4, 2)
     """
-    with _opened(path, MOST_BYTES) as (file, size):
+    with open_regular(path) as file:
         head = file.read(_SNIFFED)
+        size = file.seek(0, os.SEEK_END)
         file.seek(0)
+        if size > MOST_BYTES:
+            raise FileError(f"{path}: expected at most {MOST_BYTES} bytes, got {size}")
         if not size:
             raise InvalidInputError(f"{path}: expected a log of the sensor, got an empty file")
         if _is_text(head):
             encoding = "utf-16" if head.startswith(_WIDE) else "utf-8-sig"
             with TextIOWrapper(file, encoding, errors="replace") as text:
                 return parse_text(text, hints, str(path))
-        return parse_stream(file.read(size), hints, str(path))  # which alone holds the bytes
-
-
-def read_bounded(path: PathLike, most_bytes: int) -> bytes:
-    """Read a file of bounded size whole; never wait on a pipe, never read from a device.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, is no file, or is larger than `most_bytes`.
-    """
-    with _opened(path, most_bytes) as (file, size):
-        return file.read(size)
-
-
-@contextmanager
-def _opened(path: PathLike, most_bytes: int) -> Iterator[tuple[BufferedReader, int]]:
-    """A file and its size, refused as `read_bounded` does."""
-    if "\0" in os.fspath(path):
-        raise FileError(f"{os.fspath(path)!r}: expected the name of a file, got one with a null byte")
-    try:
-        # A pipe is opened without waiting for its writer.
-        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT)) as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):
-                raise FileError(f"{path}: expected a file, got something else")
-            if found.st_size > most_bytes:
-                raise FileError(f"{path}: expected at most {most_bytes} bytes, got {found.st_size}")
-            yield file, found.st_size
-    except FileError:
-        raise
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror or error}") from error
+        return parse_stream(file.read(), hints, str(path))  # which alone holds the bytes
 
 
 def _is_text(first: bytes) -> bool:

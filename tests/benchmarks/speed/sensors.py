@@ -16,8 +16,8 @@ from calibration.plane import Equations, Plane, calibrate_plane, least_squares
 from calibration.points import CHAIN, columns_of
 from calibration.settings import ImageFit
 from speed.rows import Row, timed
-from xsens.fusion.methods import Method
 from xsens.fusion.orient import orient
+from xsens.fusion.settings import Method
 from xsens.logs.read import read_log
 from xsens.logs.samples import ImuLog
 from xsens.messages.mtdata import DataLayout, OutputMode, OutputSettings

@@ -8,8 +8,8 @@ from broad import coverage, estimate, read_trial, trials_in
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from xsens.fusion.methods import Method
 from xsens.fusion.orient import orient
+from xsens.fusion.settings import Method
 from xsens.logs.samples import ImuLog
 
 RATE_HZ = 100.0
