@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from broad import read_trial
-from field_scenes import scene, simulated, with_readings
 
-from xsens.fusion.field import POOR, ROUGH, FieldFound, Trust, field_of
+from xsens.fusion.field import POOR, FieldFound, Trust, field_of
 from xsens.fusion.orient import orient
 
 GOOD = FieldFound(np.radians(1.4), 0.02, 0.01, 0.0, np.radians(3.2), 186.0)
@@ -15,23 +14,6 @@ GOOD = FieldFound(np.radians(1.4), 0.02, 0.01, 0.0, np.radians(3.2), 186.0)
 
 def judged(log):
     return field_of(log, orient(log))
-
-
-def made(kind, amount):
-    rng = np.random.default_rng([20, *kind.encode()])
-    return scene(simulated(rng, 60.0), kind, amount, rng).log
-
-
-def test_an_even_field_is_trusted_and_none_is_not_judged():
-    rng = np.random.default_rng(3)
-    log = simulated(rng, 20.0).log
-    found = judged(log)
-    assert found.trust is Trust.YES
-    assert found.stray < ROUGH
-    assert judged(with_readings(log, magnetometer_au=None)).trust is Trust.UNKNOWN
-
-
-VECTORS = ("gyroscope_rad_s", "accelerometer_m_s2", "magnetometer_au")
 
 
 @pytest.mark.parametrize(

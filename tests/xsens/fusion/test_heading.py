@@ -59,21 +59,3 @@ def test_a_field_that_changes_for_a_while_does_not_turn_the_heading(method, most
     errors = heading_deg(found, truth)
     assert errors[log.time_s > 40.0].max() < 1.0
     assert errors.max() < most_deg
-
-
-@pytest.mark.parametrize("method", ["smoother", "filter"])
-def test_a_rest_changes_nothing(method):
-    log, truth = turned()
-    count = round(60.0 * RATE_HZ)
-    rng, last = np.random.default_rng(3), truth[-1]
-    still = [
-        last.inv().apply([0.0, 0.0, 9.80665]) + 0.02 * rng.standard_normal((count, 3)),
-        [0.004, -0.003, 0.005] + 0.003 * rng.standard_normal((count, 3)),
-        last.inv().apply(EARTH) + [2.0, 0.0, 0.0] + 0.3 * rng.standard_normal((count, 3)),
-    ]
-    vectors = (log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au)
-    joined = [np.concatenate(pair) for pair in zip(vectors, still, strict=True)]
-    time_s = np.arange(1, len(joined[0]) + 1) / RATE_HZ
-    found = orient(ImuLog(time_s, *joined), method=method)
-    whole = Rotation.concatenate([truth, Rotation.concatenate([last] * count)])
-    assert heading_deg(found, whole)[-100:].max() < 1.5

@@ -174,32 +174,3 @@ def test_a_rate_that_the_times_contradict_is_refused():
     parse_text("\n".join(["// Update Rate: 100.0Hz", names, *rows]))
     with pytest.raises(InvalidInputError, match="stated rate, 10 Hz, got 100 Hz"):
         parse_text("\n".join(["// Update Rate: 10.0Hz", names, *rows]))
-
-
-@pytest.mark.parametrize(("name", "factor"), [("time_ms", 1e3), ("time (us)", 1e6), ("timestamp [ns]", 1e9)])
-def test_units_in_names_are_read(name, factor):
-    log, _ = swinging(2.0)
-    names = [
-        name,
-        *(f"acc_{a} (g)" for a in "xyz"),
-        *(f"gyro_{a}_deg_s" for a in "xyz"),
-        *(f"mag_{a}" for a in "xyz"),
-    ]
-    columns = [
-        factor * log.time_s[:, None],
-        log.accelerometer_m_s2 / 9.80665,
-        np.rad2deg(log.gyroscope_rad_s),
-    ]
-    rows = np.column_stack([*columns, log.magnetometer_au])
-    text = "\n".join([",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())])
-    found = parse_text(text)
-    np.testing.assert_allclose(found.time_s, log.time_s, atol=1e-9)
-    np.testing.assert_allclose(found.accelerometer_m_s2, log.accelerometer_m_s2, atol=1e-9)
-    np.testing.assert_allclose(found.gyroscope_rad_s, log.gyroscope_rad_s, atol=1e-9)
-
-
-def test_a_clock_without_a_header_is_that_of_the_sensor_whose_rate_is_possible():
-    rows = [f"{i},{4294000000 + 10000 * i},0,0,9.81,90,0,0" for i in range(50)]
-    log = parse_text("PacketCounter,SampleTimeFine,Acc_X,Acc_Y,Acc_Z,Gyr_X,Gyr_Y,Gyr_Z\n" + "\n".join(rows))
-    assert log.rate_hz == pytest.approx(100.0)
-    np.testing.assert_allclose(log.gyroscope_rad_s[:, 0], np.pi / 2)

@@ -10,14 +10,12 @@ from imu_logs import (
     calibration,
     configured,
     framed,
-    items_of,
     legacy_messages,
     mt9_bin,
-    mt9_records,
     mtdata2_messages,
     samples,
 )
-from imu_messages import Item, calibration_message, items_payload
+from imu_messages import Item, items_payload
 from scipy.spatial.transform import Rotation
 
 from xsens.logs.read import parse_stream, read_log
@@ -63,20 +61,6 @@ def test_a_file_of_the_mt9_software(s, tmp_path):
     assert "temperature is not compensated" in log.notes[1]
 
 
-def test_lost_records_are_gaps_and_wrapped_counters_are_none(s):
-    records = mt9_records(s, UNIT, first=65500)
-    del records[120:123], records[50]
-    log = parse_stream(encode(calibration_message(UNIT)) + b"".join(records))
-    assert log.gaps == (
-        Gap(49, 1, pytest.approx(2 / 256)),
-        Gap(118, 3, pytest.approx(4 / 256)),
-    )
-    assert log.lost == 4
-    assert log.counter[0] == 65500
-    assert log.counter[-1] == 65699
-    np.testing.assert_allclose(log.time_s[-1], 199 / 256)
-
-
 # Legacy data messages
 
 
@@ -107,29 +91,6 @@ def test_self_describing_data_in_every_format_and_world(s, form, world, orientat
     assert_same_samples(log, s, atol=2e-6)
     assert (log.notes, log.gaps) == ((), ())
     np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-9)
-
-
-def test_items_at_lower_rates_are_missing_in_between(s):
-    payloads = [
-        items_payload(
-            [item for item in items_of(s, i) if i % 4 == 0 or item.identifier not in (0xC020, 0x2010)]
-        )
-        for i in range(200)
-    ]
-    log = parse_stream(b"".join(framed(payloads, MessageId.MT_DATA2)))
-    there = np.arange(200) % 4 == 0
-    np.testing.assert_array_equal(np.isfinite(log.magnetometer_au).all(axis=1), there)
-    np.testing.assert_array_equal(log.oriented, there)
-    assert_same_samples(
-        dataclasses.replace(
-            log,
-            magnetometer_au=s["magnetometer_au"],
-            world_from_sensor=s["world_from_sensor"],
-        ),
-        s,
-    )
-    assert len(log.rotations()) == 50
-    assert any(note.startswith("150 samples") for note in log.notes)
 
 
 def test_increments_stand_in_for_rates(s):

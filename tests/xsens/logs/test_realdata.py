@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from xsens.logs.read import read_log
-from xsens.messages.control import MessageId
-from xsens.messages.framing import Message, encode, find_frames
+from xsens.messages.framing import find_frames
 from xsens.messages.mtdata2 import read_items
 
 pytestmark = pytest.mark.realdata
@@ -93,31 +92,6 @@ def test_messages_of_an_mti_g_are_the_golden_ones(realdata, which):
 
 
 # Single packets of an MTi-300, with the vendor's decoding
-
-
-def vendor_packets(text):
-    """Payload and decoded items (name, values) of every packet in the notes."""
-    for data, decoded in re.findall(
-        r"Raw Data\n\n```\n([0-9A-F \n]+)```\n\n## Decoded Info\n\n```\n\{(.*?)\}\n", text
-    ):
-        items = re.findall(r"\((\w+)(?:\|Float)?(?:\|ENU)?, \d+ bytes, (.*?)\)(?:, (?=\()|$)", decoded)
-        yield (
-            bytes.fromhex(data),
-            [(name, re.findall(r"(?<![\w.])-?\d+\.?\d*(?![\w:])", v)) for name, v in items],
-        )
-
-
-def test_packets_of_an_mti_are_as_the_vendors_program_decodes_them(realdata):
-    text = (realdata / "xsens-mti" / "mtmanager_packets.md").read_text()
-    packets = list(vendor_packets(text))
-    assert len(packets) == 6
-    for payload, decoded in packets:
-        (found,) = decoded_rows(find_frames(encode(Message(MessageId.MT_DATA2, payload))))
-        expected = {NAMES[name]: [float(n) for n in numbers] for name, numbers in decoded if name in NAMES}
-        assert found.keys() == expected.keys()
-        for name, values in expected.items():
-            # The program shows eight decimals.
-            np.testing.assert_allclose(found[name], values, rtol=0, atol=5.1e-9)
 
 
 # Text

@@ -34,15 +34,6 @@ def test_angles_of_the_mt9_software(s):
     assert (log.accelerometer_m_s2, log.counter, log.gaps) == (None, None, ())
 
 
-@pytest.mark.parametrize("temperature", [True, False])
-def test_vectors_of_the_mt9_software_with_and_without_temperature(s, temperature):
-    columns = [s["time_s"], *(s[name] for name in VECTORS), np.full(60, 31.25)]
-    log = parse_text(lines(columns if temperature else columns[:-1]))
-    for name in VECTORS:
-        np.testing.assert_allclose(getattr(log, name), s[name], atol=1e-6)
-    assert log.world_from_sensor is None
-
-
 def test_matrices_of_the_mt9_software_are_told_from_vectors(s):
     log = parse_text(lines([s["time_s"], s["world_from_sensor"].as_matrix().reshape(-1, 9)]))
     assert angle_to(log, s["world_from_sensor"]) < 2e-6
@@ -80,16 +71,6 @@ def test_column_major_matrices_and_blank_cells_whatever_the_separator(s, separat
     np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-9)
     assert len(log.notes) == 1
     assert "ENU, the program's default" in log.notes[0]
-
-
-def test_a_clock_of_ten_thousandths_and_its_wrap(s):
-    turned = (WORLDS["ENU"] * s["world_from_sensor"]).as_quat(scalar_first=True)
-    ticks = (2**32 - 3000 + 100 * np.delete(np.arange(60), [30, 31])) % 2**32
-    names = "SampleTimeFine\tQuat_q0\tQuat_q1\tQuat_q2\tQuat_q3\n"
-    log = parse_text(names + lines([ticks, np.delete(turned, [30, 31], axis=0)]))
-    assert [(g.after_index, g.lost) for g in log.gaps] == [(29, 2)]
-    assert log.duration_s == pytest.approx(0.59)
-    assert angle_to(log, s["world_from_sensor"][np.delete(np.arange(60), [30, 31])]) < 2e-6
 
 
 # Xsens DOT's

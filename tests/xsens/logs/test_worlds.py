@@ -52,23 +52,6 @@ def test_readings_that_contradict_the_orientation_are_refused_unless_a_world_is_
     assert "NWU, as given, although" in log.notes[0]
 
 
-# One line each of what others recorded with MTw and MT Manager: acceleration, field, and the orientation as
-# quaternion or as matrix, column after column. Published with opensim-core (testIMUHelper.cpp, Apache-2.0)
-# and with gaittoolbox (its description of files, MIT); the latter's field points up: Sydney.
-RECORDED = {
-    "opensim-core": (
-        [3.030769, 5.254238, -7.714005],
-        [-0.045410, -0.266113, 0.897217],
-        [0.609684, 0.730843, 0.306845, 0.519480, -0.660808, 0.541732, 0.598686, -0.170885, -0.782543],
-    ),
-    "gaittoolbox": (
-        [8.696773, 0.341363, 4.715198],
-        [0.886719, 0.420898, 0.468506],
-        [0.651925, -0.318177, -0.399341, -0.560611],
-    ),
-}
-
-
 # RepoIMU's text, whose columns are named in two lines
 
 
