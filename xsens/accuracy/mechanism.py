@@ -27,7 +27,6 @@ from speckle3d.core.streams import TimedRotations
 
 _COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
 _TIMES = {"time": "time_s", "until": "until_s"}
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
 _LARGEST_BYTES = 16 * 2**20
 """Enough for a quarter of a million orientations, more than a mechanism is set to by hand or motor."""
@@ -135,32 +134,25 @@ def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation
 
 def _table(text: str, where: str) -> dict[str, FloatArray]:
     """Columns by name."""
-    names: list[str] = []
-    rows: list[list[float]] = []
-    for at, line in enumerate(text.splitlines(), 1):
-        cells = _cells(line)
-        numbers = [float(cell) if _NUMBER.fullmatch(cell) else np.nan for cell in cells]
-        if cells and not names:
-            # Tilt_deg, tilt/deg and tilt(deg) are all tilt; time is time_s.
-            words = [re.split(r"[^a-z]", cell.lower().strip('"'))[0] for cell in cells]
-            headless = np.isfinite(numbers).all() and len(cells) in (2, 3)
-            names = [*_COLUMNS[: len(cells)]] if headless else [_TIMES.get(word, word) for word in words]
-            needed = {"tilt", "yaw", "time_s"} if "until_s" in names else {"tilt", "yaw"}
-            if len(set(names)) != len(names) or not needed <= set(names) <= set(_COLUMNS):
-                raise InvalidInputError(
-                    f"{where}:{at}: expected columns tilt and yaw, perhaps roll, time_s and with it until_s, "
-                    f"got {', '.join(cells)[:80]}"
-                )
-            if not headless:
-                continue
-        if cells and (len(cells) != len(names) or not np.isfinite(numbers).all()):
-            got = ", ".join(cells)[:60]
-            raise InvalidInputError(f"{where}:{at}: expected {len(names)} numbers, got {got!r}")
-        if cells:
-            rows.append(numbers)
-    if not rows:
-        raise InvalidInputError(f"{where}: expected settings of tilt and yaw, got none")
-    return dict(zip(names, np.array(rows).T.copy(), strict=True))
+    lines = [cells for line in text.splitlines() if (cells := _cells(line))]
+    names = list(_COLUMNS[:3][: len(lines[0])]) if lines else []
+    if lines and re.match(r"[\"a-z]", lines[0][0], re.IGNORECASE):
+        # Tilt_deg, tilt/deg and tilt(deg) are all tilt; time is time_s.
+        words = [re.split(r"[^a-z]", cell.lower().strip('"'))[0] for cell in lines.pop(0)]
+        names = [_TIMES.get(word, word) for word in words]
+    needed = {"tilt", "yaw", "time_s"} if "until_s" in names else {"tilt", "yaw"}
+    if len(set(names)) != len(names) or not needed <= set(names) <= set(_COLUMNS) or not lines:
+        raise InvalidInputError(
+            f"{where}: expected settings of tilt and yaw, perhaps roll, time_s and with it until_s, "
+            f"got {len(lines)} of {', '.join(names)[:80] or 'nothing'}"
+        )
+    try:
+        columns = np.array(lines, dtype=float).T.copy()
+    except ValueError:
+        columns = np.zeros(0)
+    if len(columns) != len(names) or not np.isfinite(columns).all():
+        raise InvalidInputError(f"{where}: expected {len(names)} finite numbers in every line")
+    return dict(zip(names, columns, strict=True))
 
 
 def _cells(line: str) -> list[str]:

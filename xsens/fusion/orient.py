@@ -104,8 +104,8 @@ def orient(
 
     VQF claims no errors of the orientation. So its variance about each of the world's axes is that of the
     smoother beside off-line VQF, or of the filter beside on-line VQF, plus the squared distance between the
-    two orientations, averaged over some seconds. Bias, rest and disturbance are VQF's own; it takes a field
-    that it has not yet come to know for disturbed.
+    two orientations. Bias, rest and disturbance are VQF's own; it takes a field that it has not yet come to
+    know for disturbed.
 
     Examples
     --------

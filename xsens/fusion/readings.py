@@ -197,8 +197,8 @@ def _plain(values: FloatArray) -> FloatArray:
 def _lacking(log: ImuLog) -> str:
     """Names of the missing sensors, and the note on columns that may have been meant for them."""
     vectors = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
-    none = " and ".join(f"no {name}" for name, values in vectors.items() if values is None)
-    return none + "".join(f"; {note}" for note in log.notes if note.startswith("columns not understood"))
+    missing = [f"no {name}" for name, values in vectors.items() if values is None]
+    return "; ".join([*missing, *(note for note in log.notes if note.startswith("columns"))])
 
 
 def _require_seconds(steps_s: FloatArray, source: str) -> None:

@@ -7,10 +7,7 @@ this package's own engine, and what that engine claims, and how far VQF is from 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
 from speckle3d.core.arrays import FloatArray
@@ -21,12 +18,6 @@ from xsens.logs.worlds import nwu_from
 _EVEN = 0.05
 """Largest distance of a sample from its place on an even clock, in steps, that is left as it is: at 5 rad/s
 and 100 samples/s it is 0.15 degrees, and does not add up."""
-
-_COMPARED_S = 1.0 / 32.0
-"""How often VQF is compared with the other engine: as often as that one corrects itself."""
-
-_AVERAGED_S = 5.0
-"""Time over which their squared distance is averaged, so that it is not zero where the two cross."""
 
 
 class VqfEngine:
@@ -54,7 +45,6 @@ class VqfEngine:
         self._vqf = vqf
         self._magnetic = magnetic
         self._uneven = 0
-        self._fields: list[bool] = []
 
     @property
     def notes(self) -> list[str]:
@@ -63,11 +53,6 @@ class VqfEngine:
         if self._uneven:
             notes.append(
                 f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"
-            )
-        if self._fields and not any(self._fields):
-            notes.append(
-                "VQF came to know no magnetic field, for which it wants 5 s of turning by over 20 deg/s: it "
-                "takes all of it for disturbed"
             )
         return notes
 
@@ -79,7 +64,7 @@ class VqfEngine:
         stretch : Samples
         own : Estimate
             The same by this package's engine: its variances, plus the squared distance of VQF from it about
-            each of the world's axes, averaged over some seconds, are VQF's variances.
+            each of the world's axes, are VQF's variances.
         offline : bool
             Use later readings as well.
         """
@@ -111,12 +96,12 @@ class VqfEngine:
         disturbed = np.zeros(len(stretch), dtype=bool)
         if magnetic:
             disturbed = found["magDistDetected"][at]
-            self._fields.append(not disturbed.all())
-        xyzw = turns.as_quat()
-        apart = _apart_variance(xyzw, own.xyzw, float(np.mean(stretch.step_s)))
-        sd = np.minimum(np.sqrt(own.sd_rad**2 + apart), np.pi)
+        apart = (turns * Rotation.from_quat(own.xyzw).inv()).as_rotvec()
+        sd = np.minimum(np.hypot(own.sd_rad, apart), np.pi)
         resting = found["restDetected"][at]
-        return Estimate(xyzw, sd, found["bias"][at], disturbed, resting, own.field_stray, own.field_iron)
+        return Estimate(
+            turns.as_quat(), sd, found["bias"][at], disturbed, resting, own.field_stray, own.field_iron
+        )
 
 
 def _field_carried(stretch: Samples, xyzw: FloatArray) -> FloatArray:
@@ -143,13 +128,3 @@ def _on_even_clock(readings: list[FloatArray], place: FloatArray) -> list[FloatA
     rate, *others = readings
     angle = np.cumsum(np.vstack([np.zeros(3), rate[1:] * np.diff(place)[:, None]]), axis=0)
     return [np.vstack([rate[:1], np.diff(at_grid(angle), axis=0)]), *map(at_grid, others)]
-
-
-def _apart_variance(xyzw: FloatArray, other: FloatArray, step_s: float) -> FloatArray:
-    """Squared distance of two orientations about the world's axes, shape (m, 3): past mean or now."""
-    stride = max(1, round(_COMPARED_S / step_s))
-    one, two = (Rotation.from_quat(each[::stride]) for each in (xyzw, other))
-    square = (one * two.inv()).as_rotvec() ** 2
-    keep = math.exp(-stride * step_s / _AVERAGED_S)
-    mean, _ = lfilter([1.0 - keep], [1.0, -keep], square, axis=0, zi=keep * square[:1])
-    return np.repeat(np.maximum(mean, square), stride, axis=0)[: len(xyzw)]

@@ -126,16 +126,9 @@ class ImuLog:
         steps = np.diff(self.time_s)
         if not steps.size:
             return float("nan")
-        taken = np.ones(steps.size)
-        for gap in self.gaps:
-            if 0 <= gap.after_index < steps.size:
-                taken[gap.after_index] = gap.lost + 1 if gap.lost else np.inf
-        known = np.isfinite(taken)
-        if not known.any():
-            return float(1.0 / np.median(steps))
-        period_s = np.median(steps[known] / taken[known])
-        regular = known & (steps < _PAUSE * period_s * taken)  # without pauses that are no known gap
-        return float(taken[regular].sum() / steps[regular].sum())
+        regular = steps < _PAUSE * np.median(steps)
+        regular[[gap.after_index for gap in self.gaps if gap.after_index < steps.size]] = False
+        return float(1.0 / (steps[regular].mean() if regular.any() else np.median(steps)))
 
     @property
     def duration_s(self) -> float:

@@ -101,7 +101,7 @@ def _named(table: TextTable) -> Parts:
     force, rate, field = (table.group(quantity, "xyz") for quantity in ("acc", "gyr", "mag"))
     if rate is not None and not table.states_unit("gyr_x"):
         rate = rate * program.gyroscope_to_rad
-    odd = _not_understood(table.names, "time" in stamps)
+    odd = _not_understood(table, "time" in stamps)
     claim: Claim | None = program.claim
     if (own := table.group("optical", "wxyz")) is not None:
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
@@ -173,21 +173,17 @@ def _mt9_export(table: TextTable) -> Parts:
     return Parts(stamps, (values[:, :3], values[:, 3:6], values[:, 6:9]))
 
 
-def _not_understood(names: Names, plain: bool) -> Names:
-    """Notes on unknown columns and on incomplete groups.
+def _not_understood(table: TextTable, plain: bool) -> Names:
+    """Note on unknown columns, and on those of a quantity some of whose axes are missing.
 
     A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.
     """
-    columns = {name: column_of(name) for name in names}
-    keys = {name: column.key if column else "" for name, column in columns.items()}
-    unknown = [name for name, key in keys.items() if name and not key and (plain or _SENSOR_LIKE.match(name))]
-    notes = [not_understood(unknown)] if unknown else []
+    keys = {name: column.key for name in table.names if (column := column_of(name))}
+    odd = [name for name in table.names if name not in keys and (plain or _SENSOR_LIKE.match(name))]
     for quantity, axes in (("acc", "xyz"), ("gyr", "xyz"), ("mag", "xyz"), ("quat", "wxyz")):
-        missing = [axis for axis in axes if f"{quantity}_{axis}" not in keys.values()]
-        if missing and len(missing) < len(axes):
-            there = ", ".join(name for name, key in keys.items() if key.startswith(f"{quantity}_"))
-            notes.append(f"{there} left out: expected {', '.join(missing)} beside")
-    return tuple(notes)
+        there = [name for name, key in keys.items() if key.startswith(f"{quantity}_")]
+        odd += there if len(there) < len(axes) else []
+    return (not_understood(filter(None, odd)),) if any(odd) else ()
 
 
 # -- writing

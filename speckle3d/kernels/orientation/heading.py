@@ -190,14 +190,12 @@ def _predict(s: Any, b: Any, m: Any, f: FloatArray, q: FloatArray) -> None:
     s.rested = b.resting
     s.x[BIAS : BIAS + 3] -= b.bias - s.bias
     s.bias[:] = b.bias
-    f[:], q[:] = 0.0, 0.0
-    f[LAG, LAG] = 1.0
+    f[:], q[:] = np.eye(SIZE), 0.0
     for i in range(3):
         turn = moving * span * keep_bias * b.level[2, i]
         f[ROOM, BIAS + i], f[ROOM + 1, BIAS + i] = -turn * along, turn * across
-        f[IRON + i, IRON + i], f[BIAS + i, BIAS + i] = 1.0, keep_bias
-        f[ROOM + i, ROOM + i], f[STRAY + i, STRAY + i] = 1.0, keep_stray
-        f[PLACE + i, PLACE + i] = 0.0 if moves_on and not s.beside else 1.0
+        f[BIAS + i, BIAS + i], f[STRAY + i, STRAY + i] = keep_bias, keep_stray
+        f[PLACE + i, PLACE + i] = 1.0 if s.beside or not moves_on else 0.0
         q[ROOM + i, ROOM + i] = _WALK_SQRT_S**2 * span
         q[BIAS + i, BIAS + i] = (1.0 - keep_bias**2) * b.bias_variance
         q[IRON + i, IRON + i] = m.iron_put_on**2 if s.holding_s > 0.0 else 0.0

@@ -361,15 +361,11 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     _rest(s, r, step)
     level, duration = quaternion(s.level), step.duration_s
     f[:] = np.eye(SIZE)
-    vx, vy, vz = _three(s.speed)
+    span = 0.0 if s.resting else duration
     for j in range(3):
-        axis = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
-        x, y, z = rotated(level, axis)
-        span = 0.0 if s.resting else duration
-        f[0, BIAS + j], f[1, BIAS + j], f[2, BIAS + j] = -span * x, -span * y, -span * z
-        f[6, BIAS + j] = span * (vz * y - vy * z)
-        f[7, BIAS + j] = span * (vx * z - vz * x)
-        f[8, BIAS + j] = span * (vy * x - vx * y)
+        axis = np.array(rotated(level, _three(_AXES[j])))
+        f[:BIAS, BIAS + j] = -span * axis
+        f[SPEED:, BIAS + j] = span * np.cross(axis, s.speed)
     f[6, 1], f[7, 0] = r.gravity_m_s2 * duration, -r.gravity_m_s2 * duration
     shock = max(_norm(step.force) - _SHOCK_M_S2 * duration, 0.0)  # a knock, whose reading may be cut off
     noise = r.gyro_noise_rad_sqrt_s**2 + (r.gyro_scale_noise_sqrt_s * _norm(step.rate - s.bias)) ** 2
@@ -401,7 +397,7 @@ def _correct_by_speed(s: Any, r: Any, step: Any) -> None:
     _inject(s, -gain @ s.speed)
 
 
-_LEVEL, _NO_TURN = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+_LEVEL, _AXES, _NO_TURN = np.zeros(3), np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @compiled
