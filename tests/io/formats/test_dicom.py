@@ -1,9 +1,6 @@
-from io import BytesIO
-
 import numpy as np
 import pytest
 from format_examples import TISSUE, region, write_dicom
-from PIL import Image
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid
@@ -107,21 +104,6 @@ def test_grey_in_three_colours_and_inverted(written):
     coloured[2, 12, 9] = 200, 100, 0
     with pytest.raises(InvalidInputError, match="colour Doppler or an overlay"):
         load_sweep(written(coloured, photometric="RGB"), RANGE)
-
-
-def test_packed_pixels_are_those_of_unpacked_ones(written):
-    from pydicom.uid import JPEGBaseline8Bit, RLELossless
-
-    np.testing.assert_array_equal(read(load_sweep(written(syntax=RLELossless), RANGE)), cropped(images()))
-    shown = np.array([np.add.outer(np.arange(50), 2 * np.arange(30)) + i for i in range(4)]).astype(np.uint8)
-    streams = [BytesIO() for _ in shown]
-    for image, stream in zip(shown, streams, strict=True):
-        Image.fromarray(image).save(stream, "JPEG", quality=95)
-    packed = [stream.getvalue() for stream in streams]
-    path = written(shown, claimed=JPEGBaseline8Bit, packed=packed, LossyImageCompression="01")
-    # A smooth image at quality 95 comes back within 3 levels.
-    assert np.abs(read(load_sweep(path, RANGE)).astype(int) - cropped(shown)).max() <= 3
-    assert ("pixels", "packed with loss, which smooths speckle", "") in describe(path)
 
 
 @pytest.mark.parametrize("kept", [0.5, 0.99])

@@ -90,12 +90,6 @@ def test_the_mapping_of_matlab_arrays(tmp_path, page, new):
     np.testing.assert_array_equal(sweep.frame_time_s, np.arange(4) / 25)
 
 
-def test_the_settings_shown_are_settings(page):
-    for text in blocks(page, "toml"):
-        if "entry-points" not in text:
-            ImportSettings.model_validate(tomllib.loads(text))
-
-
 def test_every_format_is_in_the_table(page):
     for reader in readers.readers():
         assert re.search(rf"^\| `?{re.escape(reader.format)}`? \|", page, flags=re.MULTILINE), reader.format

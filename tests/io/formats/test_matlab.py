@@ -4,7 +4,7 @@ import pytest
 from format_examples import FRAMES, SAMPLES, VECTORS, grey, iq, matlab_order, rf, write_mat
 from scipy.io import savemat
 
-from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
@@ -114,14 +114,3 @@ def test_without_a_mapping_the_arrays_are_listed_in_one_line(tmp_path, new):
         assert name in said
     assert "kind" not in said
     assert ("array RData", "40 x 6 x 4", "int16") in describe(path)
-
-
-@VERSIONS
-@pytest.mark.parametrize("left", [0.3, 0.95])
-def test_a_truncated_file_is_an_error_of_one_line(tmp_path, new, left):
-    path = saved(tmp_path, new)
-    content = path.read_bytes()
-    path.write_bytes(content[: int(left * len(content))])
-    with pytest.raises(Speckle3DError) as caught:
-        read(load_sweep(path, mapped(rf="RData")))
-    assert "\n" not in str(caught.value)

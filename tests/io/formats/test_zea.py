@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
-from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, open_recording
 
@@ -70,17 +69,6 @@ def test_iq_of_the_other_sign_are_refused_and_noise_is_asked_about(tmp_path):
     np.testing.assert_array_equal(read(load_sweep(path, given)), iq())
 
 
-def test_grey_levels_of_a_track_beside_channel_data(tmp_path):
-    path = write_zea(tmp_path / "a.hdf5", rf(), "raw_data", home="tracks/track_0/")
-    with pytest.raises(InvalidInputError, match="channel data need beamforming"):
-        load_sweep(path)
-    assert describe(path)[-1][0] == "sweep"
-    sweep = load_sweep(write_zea(path, grey(), "image", home="tracks/track_1/"), GREY)
-    np.testing.assert_array_equal(read(sweep), grey())
-    require_grid(sweep.grid)
-    assert sweep.signal == BModeSettings(60.0)
-
-
 @pytest.mark.parametrize("decibels", [False, True])
 def test_amplitudes_and_decibels_become_grey_levels(tmp_path, decibels):
     amplitude = np.abs(iq())
@@ -107,20 +95,6 @@ def test_the_earliest_product_of_the_only_track_is_read_unless_another_is_named(
         load_sweep(path, GIVEN)
     given = GIVEN.model_copy(update={"arrays": {"data": "tracks/b/data/beamformed_data"}})
     np.testing.assert_array_equal(read(load_sweep(path, given)), rf(3))
-
-
-@pytest.mark.parametrize("bad", [0.0, np.nan])
-@pytest.mark.parametrize("stamped", [False, True])
-def test_a_frame_without_a_time_of_its_own_is_left_out(tmp_path, bad, stamped):
-    between = np.full((FRAMES, 1), 0.05)
-    between[1] = bad
-    path = write_zea(tmp_path / "a.h5", grey(), "image", scan={"time_to_next_transmit": between})
-    if stamped:
-        with h5py.File(path, "a") as file:
-            file["data/image/timestamps"] = [0.0, 0.05, 0.05 + bad, 0.1]
-    recording = open_recording(path, ImportSettings(dynamic_range_db=60.0))
-    np.testing.assert_array_equal(read(recording.sweep), np.delete(grey(), 2, axis=0))
-    assert any("images: 1 of 4 left out" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize("kind", ["quaternion_wxyz", "quaternion_xyzw", "euler_xyz"])

@@ -93,20 +93,6 @@ def test_pixels_alone_come_from_the_transducer_or_the_scan_conversion(tmp_path, 
     assert caught.value.settings == ("column_pitch_mm", "row_spacing_mm")
 
 
-def test_names_of_frames_are_those_of_the_set(tmp_path):
-    frames = [
-        {name.replace("ProbeToTracker", "ToolToBed"): value for name, value in each.items()}
-        for each in tracked(3)[2]
-    ]
-    path = write_mha(tmp_path / "a.mha", grey(), frames=frames)
-    names = '<vtkPlusProbeCalibrationAlgo ImageCoordinateFrame="Slice" ProbeCoordinateFrame="Tool"/>'
-    device = '<Device ToolReferenceFrame="Bed"/>'
-    config = written(tmp_path / "set.xml", ("Slice", "Tool", matrix()), more=names + device)
-    sweep = load_sweep(path, given(config))
-    assert len(sweep.tracker.readings) == 3
-    np.testing.assert_allclose(sweep.tracker.sensor_from_image.translation, [10, 20, 30])
-
-
 def test_the_machine_orientation_counts_where_the_header_has_none(tmp_path):
     config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()),
                      more='<DataSource PortUsImageOrientation="UN"/>')  # fmt: skip

@@ -111,14 +111,6 @@ def test_poses_may_be_those_of_the_image_s_pixels(tmp_path, name):
     np.testing.assert_allclose(placed, matrices[:3, :, [0, 1, 3]], atol=1e-9)
 
 
-def test_pixels_have_unit_spacing_only_where_a_transform_gives_their_size(tmp_path):
-    sweep = sweep_examples.bmode_sweep()
-    write_sequence(tmp_path / "with.mha", sweep)
-    write_sequence(tmp_path / "without.mha", replace(sweep, tracker=None, orientation=None))
-    assert read_header(tmp_path / "with.mha").spacing_mm is None
-    assert read_header(tmp_path / "without.mha").spacing_mm == (0.085, 0.09)
-
-
 @pytest.mark.parametrize("compressed", [True, False])
 def test_itk_reads_the_same_pixels(tmp_path, compressed):
     import SimpleITK
