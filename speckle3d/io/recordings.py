@@ -142,18 +142,14 @@ class Recording:
     @property
     def notes(self) -> list[str]:
         """What a user should know of how the sweep was made."""
-        assumed = [
-            " ".join(number_row(name, one.value))
-            for name, one in self.needed.items()
-            if one.is_assumed and getattr(self.settings, name) is None
-        ]
-        assumed += self.assumptions
-        told = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
-        return [*self.contradictions(), *self._timed[2], *self.remarks, *self._checked[1], *told]
+        told = [self._told(name, one) for name, one in self.needed.items()]
+        assumed = [*filter(None, (assumption for _, _, assumption in told)), *self.assumptions]
+        words = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
+        return [*self.contradictions(), *self._timed[2], *self.remarks, *self._checked[1], *words]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
-        numbers = [] if self.fault else [self._row(name, one) for name, one in self.needed.items()]
+        numbers = [] if self.fault else [self._told(name, one)[0] for name, one in self.needed.items()]
         remarks = [*self._timed[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._checked[1]
@@ -161,15 +157,25 @@ class Recording:
 
     def contradictions(self) -> list[str]:
         """Tell each number that is given and is another than the recording says, by more than 1 %."""
-        notes = []
-        for name, one in self.needed.items():
-            given = getattr(self.settings, name)
-            if given is None or one.value is None or one.is_assumed or not differs(given, one.value):
-                continue
-            source = f" ({one.source})" if one.source else ""
-            says = f"{one.said_by} says {number_row(name, one.value)[1]}{source}"
-            notes.append(f"{' '.join(number_row(name, given))}, {self._giver(name)}: {says}")
-        return notes
+        told = (self._told(name, one)[1] for name, one in self.needed.items())
+        return [*filter(None, told)]
+
+    def _told(self, name: str, one: Value) -> tuple[Row, str, str]:
+        """A number's row, what contradicts it if it is given, and words for what is assumed."""
+        given, source = getattr(self.settings, name), f" ({one.source})" if one.source else ""
+        words, own, unit = number_row(name, () if one.value is None else one.value)
+        if given is None:
+            asked = f"missing: --{self.asked.get(name, name).replace('_', '-')}"
+            assumption = f"{words} {own} {unit}" if one.is_assumed else ""
+            return (words, f"{own}{source}" if own else asked, unit if own else ""), "", assumption
+        file, shown = settings_file(self.path), number_row(name, given)[1]
+        is_of_file = file is not None and getattr(settings_for(self.path), name) == given
+        by = f"given by {file.name}" if file is not None and is_of_file else "given"
+        if not own or one.is_assumed or shown == own:
+            return (words, f"{shown} ({by})", unit), "", ""
+        against, is_far = f"{one.said_by} says {own}", differs(given, one.value)
+        told = f"{words} {shown} {unit}, {by}: {against}{source}" if is_far else ""
+        return (words, f"{shown} ({by}, {against})", unit), told, ""
 
     @cached_property
     def needed(self) -> dict[str, Value]:
@@ -250,24 +256,6 @@ class Recording:
             name=printable(self.name or self.path.name.split(".")[0]),
             probe=self.probe or self.settings.probe or "",
         )
-
-    def _giver(self, name: str) -> str:
-        """Who gives a setting: the file of settings beside the recording, or an option."""
-        file = settings_file(self.path)
-        own = None if file is None else getattr(settings_for(self.path), name)
-        return "given" if file is None or own != getattr(self.settings, name) else f"given by {file.name}"
-
-    def _row(self, name: str, one: Value) -> Row:
-        given = getattr(self.settings, name)
-        words, own, unit = number_row(name, () if one.value is None else one.value)
-        if given is not None:
-            shown = number_row(name, given)[1]
-            is_other = not one.is_assumed and own not in ("", shown)
-            against = f", {one.said_by} says {own}" if is_other else ""
-            return words, f"{shown} ({self._giver(name)}{against})", unit
-        if not own:
-            return words, f"missing: --{self.asked.get(name, name).replace('_', '-')}", ""
-        return words, f"{own} ({one.source})" if one.source else own, unit
 
 
 def rate_by_spacing(spacing: Value, settings: ImportSettings, values: Mapping[str, Value]) -> Value:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.extras import extra_module
 from speckle3d.core.files import PathLike
 from speckle3d.core.surface import Surface
-from speckle3d.io.hdf5 import atomic_path, one_line, reading
+from speckle3d.io.hdf5 import atomic_path, one_line
 
 SUFFIXES = (".stl", ".ply", ".vtk")
 SPACE = "SPACE=LPS"
@@ -89,11 +88,9 @@ def read_surface(path: PathLike) -> Surface:
     """
     suffix = require_suffix(path)
     meshio = extra_module("meshio", "surface", "a surface's file")
-    with reading(path):
-        content = Path(path).read_bytes()
     try:
-        if suffix == ".ply" and b"end_header" not in content:  # which meshio would search for ever
-            raise ValueError("its header has no end")
+        if suffix == ".ply" and b"end_header" not in Path(path).read_bytes():
+            raise ValueError("its header has no end")  # which meshio would search for ever
         mesh = meshio.read(path)
     # A damaged file shows in whatever meshio happens to stumble over.
     except (Exception, SystemExit) as error:
@@ -101,9 +98,6 @@ def read_surface(path: PathLike) -> Surface:
     triangles = [block.data for block in mesh.cells if block.type == "triangle"]
     if not triangles or any(block.dtype.kind not in "iu" for block in triangles):
         raise InvalidInputError(f"{path}: expected triangles by numbers of their vertices, got none")
-    count = re.search(rb"\nCELLS (\d+) ", content)  # of VTK; other readers find missing cells themselves
-    if count and int(count[1]) != sum(len(block.data) for block in mesh.cells):
-        raise FileError(f"{path}: cannot be read: it ends before its {int(count[1])} triangles do")
     # Not-a-numbers of a damaged file warn when they are cast; the surface refuses them.
     with naming(str(path)), np.errstate(invalid="ignore"):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
