@@ -15,7 +15,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.io.carrier import CARRIED, carried_share
 from speckle3d.io.frames import FileFrames, ReadFrame
 from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
@@ -58,24 +58,6 @@ class SequenceFile:
         return lambda i: self.layout.frame(images[i])
 
 
-def read_metaimage(path: PathLike, settings: ImportSettings | None = None) -> Sweep:
-    """Read an image sequence with the poses in its header; the frames stay on disk.
-
-    Frames are turned so that vectors run from the unmarked to the marked side and samples away from the
-    probe. Frames whose image status is not OK are left out.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
-    InvalidInputError
-        Naming the field that is wrong, or why the file is no sweep.
-    MissingSettingsError
-        Naming all that the file does not say.
-    """
-    return open_sequence(Path(path), settings or ImportSettings()).sweep
-
-
 def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracker:
     """Read the tracked poses in a header, whether or not there are images.
 
@@ -103,7 +85,10 @@ def lacking_poses(path: PathLike) -> str:
 
 
 def open_sequence(path: Path, settings: ImportSettings) -> Recording:
-    """Read what a header says of its images and poses.
+    """Read what a header says of its images and poses; the frames stay on disk.
+
+    Frames are turned so that vectors run from the unmarked to the marked side and samples away from the
+    probe. Frames whose image status is not OK are left out.
 
     Raises
     ------

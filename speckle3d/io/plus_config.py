@@ -1,7 +1,7 @@
 """Wire phantoms as PLUS describes them: the XML file of a device set.
 
 The points and rectangles in PLUS's files count pixels of the image after PLUS turned it to its standard
-orientation, columns to the marked side and rows away from the probe; so do the frames of `read_metaimage`,
+orientation, columns to the marked side and rows away from the probe; so do the frames of `load_sweep`,
 whatever the orientation in the image file, and no mapping is needed: column is vector and row is sample.
 
 References

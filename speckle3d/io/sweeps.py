@@ -30,7 +30,6 @@ from speckle3d.core.sweep import (
 )
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
-    PathLike,
     file_format,
     has_member,
     locate,
@@ -82,21 +81,8 @@ def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
     return pairs.astype(np.float32).view(np.complex64)[..., 0]
 
 
-def read_sweep(path: PathLike) -> Sweep:
-    """Read a sweep file; its frames stay on disk until they are asked for.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, truncated or not HDF5.
-    InvalidInputError
-        Naming the file, the data set and the first bad index.
-    """
-    return _read(path)[0]
-
-
-def _read(path: PathLike) -> tuple[Sweep, str | None]:
-    """A sweep, and words if its recording goes on or was not closed."""
+def _open(path: Path, _: ImportSettings) -> Recording:
+    """Read a sweep file; its frames stay on disk until they are asked for."""
     with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
         times = _read_times(file, "frame_time_s")
         if not times.size:
@@ -111,14 +97,17 @@ def _read(path: PathLike) -> tuple[Sweep, str | None]:
             orientation=_read_orientation(file),
             tracker=_read_tracker(file),
             truth=None if truth is None else read_transforms(truth, "world_from_image", times.size),
-            name=printable(Path(path).stem),
+            name=printable(path.stem),
             probe=read_text(file, "probe") if "probe" in file.attrs else "",
         )
-        note = (
-            f"{path}: the recording goes on, or was ended without being closed: {times.size} frames so far, "
-            "of which speckle3d convert makes a whole file"
-        )
-        return sweep, note if _is_growing(file) else None
+        if not _is_growing(file):
+            return Recording(path, ready=sweep)
+    words = "goes on, or was ended without being closed"
+    note = (
+        f"{path}: the recording {words}: {times.size} frames so far, of which speckle3d convert makes a "
+        "whole file"
+    )
+    return Recording(path, ready=sweep, rows=(("recording", words, ""),), remarks=(note,))
 
 
 def _is_growing(file: h5py.File) -> bool:
@@ -219,14 +208,6 @@ def _read_tracker(file: h5py.File) -> Tracker | None:
     offset_s, skew_rad = (read_attribute(group, name, 0.0) for name in ("time_offset_s", "image_skew_rad"))
     with naming(locate(group)):
         return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
-
-
-def _open(path: Path, _: ImportSettings) -> Recording:
-    sweep, note = _read(path)
-    if note is None:
-        return Recording(path, ready=sweep)
-    rows = (("recording", "goes on, or was ended without being closed", ""),)
-    return Recording(path, ready=sweep, rows=rows, remarks=(note,))
 
 
 READER = Reader(

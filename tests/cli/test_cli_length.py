@@ -4,8 +4,8 @@ import json
 
 import pytest
 
+from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.sweeps import read_sweep
 
 CURVES = "curves.h5"
 
@@ -37,7 +37,7 @@ def test_sweeps_that_do_not_cross_leave_the_mode_out_and_keep_the_others(run, pa
     found = read_reconstruction(folder / "crossed" / "reconstruction.h5")
     assert list(found.poses) == ["image", "fused"]
     assert found.provenance.crossing.path.endswith("sweep.h5")
-    assert found.frame_time_s.tolist() == read_sweep(sweep).frame_time_s[:12].tolist()
+    assert found.frame_time_s.tolist() == load_sweep(sweep).frame_time_s[:12].tolist()
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from calibration_files import made
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.io.calibrations import apply_calibrations, write_calibration
-from speckle3d.io.describe import describe
 from speckle3d.io.hdf5 import sha256_of
 
 
@@ -35,17 +34,3 @@ def test_two_for_one_sensor_or_one_for_none_are_refused_with_the_file(path):
         apply_calibrations(sweep_examples.rf_sweep(), [path, again])
     with pytest.raises(MismatchError, match=r"cal\.h5: example"):
         apply_calibrations(replace(sweep_examples.rf_sweep(), tracker=None), [path])
-
-
-def test_a_trackers_calibration_is_described_for_people(path):
-    rows = {name: (value, unit) for name, value, unit in describe(path)}
-    assert rows["format"] == ("speckle3d.calibration", "")
-    assert rows["sensor"] == ("tracker", "")
-    angles = [rows[f"sensor_from_image {name}"] for name in ("roll", "yaw", "tilt")]
-    assert angles == [("-0.550", "deg"), ("44.220", "deg"), ("-90.370", "deg")]
-    assert rows["sensor_from_image x, y, z"] == ("-270.860, 4.860, -65.080", "mm")
-    assert rows["parameter gamma"] == ("28.648 +- 0.573", "deg")
-    assert rows["frames used"] == ("4 of 9", "")
-    assert rows["dropped: no line"] == ("2", "frames")
-    assert rows["verdict"] == ("The motion was sufficient.", "")
-    assert rows["input"] == ("plane.mha", "")

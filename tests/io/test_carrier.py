@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.carrier import demodulation_of
 
 FREQUENCY, RATE = 6e6, 30e6
@@ -22,11 +21,6 @@ def echoes(carried_hz, near=1.0, seed=0):
 def test_attenuated_carriers_under_a_strong_near_field(lowered, near):
     assert demodulation_of(echoes(lowered * FREQUENCY, near), FREQUENCY, RATE) == 0.0
     assert demodulation_of(echoes((lowered - 1) * FREQUENCY, near), FREQUENCY, RATE) == FREQUENCY
-
-
-def test_q_of_the_other_sign_is_refused():
-    with pytest.raises(InvalidInputError, match="Q has the other sign"):
-        demodulation_of(np.conj(echoes(FREQUENCY)), FREQUENCY, RATE)
 
 
 def test_nothing_is_told_of_noise_of_emptiness_or_of_samples_far_apart():

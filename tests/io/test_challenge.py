@@ -1,14 +1,12 @@
 import pickle
 
 import challenge_examples as examples
-import h5py
 import numpy as np
 import pytest
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
-from speckle3d.io.describe import describe
-from speckle3d.io.load import load_landmarks, load_sweep, open_recording, recording_files
+from speckle3d.io.load import load_landmarks, load_sweep
 
 
 @pytest.fixture(params=["one file", "two files"])
@@ -43,15 +41,6 @@ def test_landmarks_are_counted_from_frame_0_and_pixel_1(scan):
     assert not found.points_mm[:, 2].any()
 
 
-def test_a_scan_is_described_and_its_companions_are_known(tmp_path):
-    path, *_ = examples.write_data_set(tmp_path)
-    rows = {name: value for name, value, _ in describe(path)}
-    assert rows["format"] == "TUS-REC scan"
-    assert (rows["frames"], rows["landmarks"], rows["tracker covers"]) == ("12", "20", "12")
-    others = {f"{examples.SCAN}.h5", "calib_matrix.csv", "landmark_050.h5"}
-    assert {file.name for file in recording_files(path)[1:]} == others
-
-
 def test_a_test_scan_has_no_tracker_and_no_landmarks_and_needs_a_calibration(tmp_path):
     path, *_ = examples.write_data_set(tmp_path, landmarks=False)
     (tmp_path / "transfs" / examples.SUBJECT / path.name).unlink()
@@ -60,15 +49,3 @@ def test_a_test_scan_has_no_tracker_and_no_landmarks_and_needs_a_calibration(tmp
     (tmp_path / "calib_matrix.csv").unlink()
     with pytest.raises(InvalidInputError, match=r"calib_matrix\.csv"):
         load_sweep(path)
-
-
-@pytest.mark.parametrize("bad", [np.nan, 1.01, np.diag([-1.0, 1.0, 1.0])])
-def test_a_pose_of_no_use_is_left_out_and_told(tmp_path, bad):
-    path, _, poses, _ = examples.write_data_set(tmp_path, split=False)
-    poses[4, :3, :3] = poses[4, :3, :3] @ np.asarray(bad * np.eye(3))
-    with h5py.File(path, "r+") as file:
-        file["tforms"][:] = poses
-    recording = open_recording(path)
-    assert len(recording.sweep.tracker.readings) == 11
-    assert any("poses: 1 of 12 left out" in note for note in recording.notes)
-    assert any("11 poses, 12 images, 12 matched" in note for note in recording.notes)

@@ -8,12 +8,12 @@ import pytest
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.calibrations import read_calibration, write_calibration
 from speckle3d.io.curves import read_curves, write_curves
+from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.io.sweeps import read_sweep
 
 READ = {
-    "rf": read_sweep,
+    "rf": load_sweep,
     "curves": read_curves,
     "calibration": read_calibration,
     "reconstruction": read_reconstruction,

@@ -12,8 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import open_recording
-from speckle3d.io.metaimage import read_metaimage, read_poses
+from speckle3d.io.load import load_sweep, open_recording
+from speckle3d.io.metaimage import read_poses
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
 RF = ImportSettings(
@@ -40,7 +40,7 @@ def given_over(base, **more):
 )
 def test_every_orientation_is_turned_to_vector_and_depth(tmp_path, orientation, turn):
     path = write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": orientation})
-    sweep = read_metaimage(path, BMODE)
+    sweep = load_sweep(path, BMODE)
     np.testing.assert_array_equal(frames_of(sweep), turn(grey()))
     np.testing.assert_allclose(sweep.frame_time_s, [5.0, 5.1, 5.2])
     assert sweep.signal == BModeSettings(60.0)
@@ -50,13 +50,13 @@ def test_every_orientation_is_turned_to_vector_and_depth(tmp_path, orientation, 
 def test_spacing_of_rf_gives_pitch_and_sampling_rate(tmp_path):
     rf = np.random.default_rng(0).integers(-2000, 2000, (2, 4, 30)).astype(np.int32)
     path = write_mha(tmp_path / "a.mha", rf, {"UltrasoundImageType": "RF_REAL"}, spacing="0.01925 0.25 1")
-    sweep = read_metaimage(path, given_over(RF, sampling_rate_hz=None, vector_pitch_mm=None))
+    sweep = load_sweep(path, given_over(RF, sampling_rate_hz=None, vector_pitch_mm=None))
     assert sweep.signal.sampling_rate_hz == pytest.approx(1540e3 / (2 * 0.01925))
     assert sweep.grid.vector_pitch_mm == 0.25
     assert sweep.frames.dtype == np.int16
     np.testing.assert_array_equal(frames_of(sweep), rf)
     wide = np.array([[[0, 40000, -5, 7]]], dtype=np.int32)
-    assert read_metaimage(write_mha(tmp_path / "b.mha", wide), RF).frames.dtype == np.float32
+    assert load_sweep(write_mha(tmp_path / "b.mha", wide), RF).frames.dtype == np.float32
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_i_and_q_become_an_analytic_signal_of_positive_frequency(tmp_path, orien
     pairs = np.stack([stored.real, sign * stored.imag], axis)
     pixels = pairs.reshape(1, *((6, 64) if axis == 1 else (3, 128))).astype(np.int16)
     fields = {"UltrasoundImageOrientation": orientation, "UltrasoundImageType": kind}
-    sweep = read_metaimage(write_mha(tmp_path / "a.mha", pixels, fields), given_)
+    sweep = load_sweep(write_mha(tmp_path / "a.mha", pixels, fields), given_)
     assert sweep.frames.dtype == np.complex64
     np.testing.assert_array_equal(frames_of(sweep)[0], signal)
 
@@ -176,7 +176,7 @@ def test_transforms_are_chosen_by_name(tmp_path):
     other = ImportSettings(tracker_transform="ReferenceToTrackerTransform", reference_transform="none")
     swapped = read_poses(path, other).readings.world_from_sensor
     np.testing.assert_allclose(swapped.as_matrix(), reference.as_matrix(), atol=1e-3)
-    assert read_metaimage(path, given_over(BMODE, tracker_transform="none")).tracker is None
+    assert load_sweep(path, given_over(BMODE, tracker_transform="none")).tracker is None
     with pytest.raises(InvalidInputError, match=r"StylusToTracker.*ProbeToTracker"):
         read_poses(path, ImportSettings(tracker_transform="StylusToTracker"))
 
@@ -200,7 +200,7 @@ def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(
     matrix[:3, 0], matrix[:3, 1], matrix[:3, 3] = scale[0] * x, scale[1] * y, place
     matrix[:3, 2] = np.cross(x, y)
     path = write_mha(tmp_path_factory.mktemp("calibration") / "a.mha", grey(), frames=path_of(3)[1])
-    sweep = read_metaimage(
+    sweep = load_sweep(
         path, given_over(LEVELS, image_to_probe=tuple(map(tuple, matrix)), first_sample_depth_mm=first_mm)
     )
     assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == pytest.approx(scale)
@@ -248,7 +248,7 @@ def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange, unit,
     else:
         fields = form.format(unit, unit, *steps) if "{3}" not in form else form.format("", "", "", *steps)
     path = nrrd(tmp_path / "a.nrrd", np.ascontiguousarray(arrange(grey())), fields)
-    sweep = read_metaimage(path, given_over(LEVELS, **({} if "0.05" in form else {"frame_rate_hz": 20.0})))
+    sweep = load_sweep(path, given_over(LEVELS, **({} if "0.05" in form else {"frame_rate_hz": 20.0})))
     assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == pytest.approx((0.2, 0.1))
     np.testing.assert_array_equal(frames_of(sweep), grey().transpose(0, 2, 1))
     np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
@@ -257,13 +257,13 @@ def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange, unit,
 @pytest.mark.realdata
 def test_recordings_of_others(realdata):
     liver = ImportSettings(centre_frequency_hz=12e6, bandwidth_hz=(8e6, 16e6), frame_rate_hz=30.0)
-    sweep = read_metaimage(realdata / "rf" / "MouseLiverRF.mha", liver)
+    sweep = load_sweep(realdata / "rf" / "MouseLiverRF.mha", liver)
     assert sweep.frames.shape == (4, 128, 1536)
     # The header's 0.0128417 mm per sample at 1540 m/s is 60 MHz to 0.1 %.
     assert sweep.signal.sampling_rate_hz == pytest.approx(60e6, rel=2e-3)
     spaced = given_over(BMODE, column_pitch_mm=0.085, row_spacing_mm=0.085)
     for name, count in (("BoneUltrasound_L14.igs.mha", 21), ("NwirePhantomFreehand.igs.nrrd", 97)):
-        sweep = read_metaimage(realdata / "plus" / name, spaced)
+        sweep = load_sweep(realdata / "plus" / name, spaced)
         assert sweep.frames.shape == (count, 820, 616)
         assert sweep.tracker.covers(sweep.frame_time_s).all()
         assert 20 < sweep.frames[0].max() <= 255
@@ -274,7 +274,7 @@ def test_tracker_recordings_without_images(realdata, tmp_path):
     buffer = realdata / "plus" / "WaterTankBottomTranslationTrackerBuffer.igs.mha"
     assert len(read_poses(buffer).readings) == 5000
     with pytest.raises(InvalidInputError, match="expected pixels"):
-        read_metaimage(buffer, BMODE)
+        load_sweep(buffer, BMODE)
     # Newer versions of PLUS write no type of pixels.
     empty = write_mha(
         tmp_path / "a.mha", np.zeros((3, 0, 0), np.uint8), {"ElementType": "MET_OTHER"}, path_of(3)[1]

@@ -13,8 +13,8 @@ import sweep_examples
 from speckle3d.core.errors import FileError
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.frames import FileFrames
+from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.io.sweeps import read_sweep
 
 
 @pytest.fixture
@@ -32,8 +32,8 @@ def all_frames(sweep):
 def test_i_and_q_are_stored_as_they_were_read(tmp_path, paired):
     sweep = sweep_examples.iq_sweep(paired)
     write_sweep(tmp_path / "s.h5", sweep)
-    write_sweep(tmp_path / "t.h5", read_sweep(tmp_path / "s.h5"))
-    got = read_sweep(tmp_path / "t.h5")
+    write_sweep(tmp_path / "t.h5", load_sweep(tmp_path / "s.h5"))
+    got = load_sweep(tmp_path / "t.h5")
     np.testing.assert_array_equal(all_frames(got), all_frames(sweep))
     assert stored_dtype(got.part(1, 3).frames) == (np.int16 if paired else np.complex64)
     with h5py.File(tmp_path / "t.h5") as file:
@@ -53,7 +53,7 @@ def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):
         file["tracker/time_s"] = [0.0, 0.01, 0.02]
         file["tracker/world_from_sensor"] = np.stack([np.eye(4), np.full((4, 4), np.nan), np.eye(4)])
         file["tracker/valid"] = np.array([1, 0, 1], dtype=np.uint8)
-    sweep = read_sweep(tmp_path / "s.h5")
+    sweep = load_sweep(tmp_path / "s.h5")
     np.testing.assert_array_equal(all_frames(sweep), np.arange(24).reshape(2, 3, 4))
     assert sweep.orientation.time_offset_s == 0.0
     assert sweep.orientation.sensor_from_image is None
@@ -69,14 +69,14 @@ def test_reading_a_frame_touches_no_other(path):
     for chunk in chunks[:3] + chunks[4:]:
         content[chunk.byte_offset : chunk.byte_offset + chunk.size] = b"\xff" * chunk.size
     path.write_bytes(bytes(content))
-    sweep = read_sweep(path)
+    sweep = load_sweep(path)
     np.testing.assert_array_equal(sweep.frames[3], sweep_examples.rf_sweep().frames[3])
     with pytest.raises(FileError, match=r"frame 2: cannot be read"):
         sweep.frames[2]
 
 
 def test_frames_may_be_closed_indexed_and_sent_elsewhere(path):
-    frames = read_sweep(path).frames
+    frames = load_sweep(path).frames
     assert isinstance(frames, FileFrames)
     last = frames[-1]
     frames.close()
@@ -93,7 +93,7 @@ def test_rewriting_keeps_unknown_groups(path, tmp_path):
         file["annotations/landmarks_mm"] = np.eye(3)
         file["annotations"].attrs["by"] = "someone"
         file.attrs["operator_note"] = "left arm"
-    write_sweep(path, replace(read_sweep(path), tracker=None))
+    write_sweep(path, replace(load_sweep(path), tracker=None))
     with h5py.File(path) as file:
         np.testing.assert_array_equal(file["annotations/landmarks_mm"], np.eye(3))
         assert file["annotations"].attrs["by"] == "someone"
@@ -107,9 +107,9 @@ import itertools, sys
 from dataclasses import replace
 import numpy as np
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.io.sweeps import read_sweep
+from speckle3d.io.load import load_sweep
 whole, target = sys.argv[1:]
-sweep = read_sweep(whole)
+sweep = load_sweep(whole)
 frame = sweep.frames[0]
 print("started", flush=True)
 if target == "none":

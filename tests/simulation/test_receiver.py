@@ -7,8 +7,8 @@ from scipy import signal as filters
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep
+from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.io.sweeps import read_sweep
 from speckle3d.simulation.receiver import received_as_bmode, received_as_iq
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 
@@ -55,7 +55,7 @@ def test_a_rate_that_does_not_hold_the_band_is_refused():
 def test_i_and_q_are_whole_counts_that_come_back_from_a_file(tmp_path):
     sweep = received_as_iq(sweep_examples.rf_sweep(samples=400, dtype=np.int16), 6e6)
     write_sweep(tmp_path / "s.h5", sweep)
-    got = read_sweep(tmp_path / "s.h5")
+    got = load_sweep(tmp_path / "s.h5")
     assert got.frames.stored_dtype == np.int16
     for i in range(len(sweep)):
         np.testing.assert_array_equal(got.frames[i], sweep.frames[i])

@@ -9,7 +9,8 @@ from calibration.detection.lines import detect_lines
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.metaimage import read_metaimage, read_poses
+from speckle3d.io.load import load_sweep
+from speckle3d.io.metaimage import read_poses
 
 DELAY_S = 0.08
 
@@ -81,7 +82,7 @@ def test_what_tells_no_one_delay_is_refused():
 def test_the_real_water_tank_has_the_published_delay(realdata):
     plus = realdata / "plus"
     needed = ImportSettings(column_pitch_mm=0.078, row_spacing_mm=0.078, dynamic_range_db=60.0)
-    sweep = read_metaimage(plus / "WaterTankBottomTranslationVideoBuffer.igs.mha", needed)
+    sweep = load_sweep(plus / "WaterTankBottomTranslationVideoBuffer.igs.mha", needed)
     readings = read_poses(plus / "WaterTankBottomTranslationTrackerBuffer.igs.mha").readings
     lines = detect_lines(sweep.frames, (0.078, 0.078))
     signal = line_signal(lines.pixels, np.array([0.078, 0.078]), 409.5)

@@ -6,7 +6,7 @@ from wire_scenes import PIXEL_MM, picture, plus_results, scene
 
 from calibration.detection.dots import dots_in_frames
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.metaimage import read_metaimage
+from speckle3d.io.load import load_sweep
 from speckle3d.io.plus_config import read_wire_phantom
 
 
@@ -55,7 +55,7 @@ def test_real_wires_are_found_where_others_found_them(realdata):
     folder = realdata / "plus"
     config = read_wire_phantom(folder / "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml")
     known = ImportSettings(column_pitch_mm=0.08, row_spacing_mm=0.0745, dynamic_range_db=60.0)
-    sweep = read_metaimage(folder / "fCal_Test_Validation_3NWires_fCal2.0.igs.mha", known)
+    sweep = load_sweep(folder / "fCal_Test_Validation_3NWires_fCal2.0.igs.mha", known)
     frames, points, _, _ = plus_results(folder, "Validation")
     away = []
     for frame, point in list(zip(frames, points, strict=True))[::4]:

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.detection.lines import detect_lines
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.metaimage import read_metaimage
+from speckle3d.io.load import load_sweep
 
 pytestmark = pytest.mark.realdata
 
@@ -19,7 +19,7 @@ FAN = [(215, 41), (583, 41), (583, 551), (215, 551)]
 @pytest.fixture(scope="module")
 def frames(realdata):
     needed = ImportSettings(column_pitch_mm=0.078, row_spacing_mm=0.078, dynamic_range_db=60.0)
-    return read_metaimage(realdata / "plus" / "WaterTankBottomTranslationVideoBuffer.igs.mha", needed).frames
+    return load_sweep(realdata / "plus" / "WaterTankBottomTranslationVideoBuffer.igs.mha", needed).frames
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from scipy.io import savemat
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
-from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 
@@ -101,16 +100,3 @@ def test_an_element_of_an_array_of_structs(tmp_path, new):
     np.testing.assert_array_equal(read(load_sweep(path, mapped(rf="Receive(2).data"))), rf(1))
     with pytest.raises(InvalidInputError, match=r"expected an array Receive.data, got"):
         load_sweep(path, mapped(rf="Receive.data"))
-
-
-@VERSIONS
-def test_without_a_mapping_the_arrays_are_listed_in_one_line(tmp_path, new):
-    path = saved(tmp_path, new)
-    with pytest.raises(InvalidInputError) as caught:
-        load_sweep(path)
-    said = str(caught.value)
-    assert "\n" not in said
-    for name in ("RData 40 x 6 x 4 int16", "Cells{1} 40 x 6 x 4 int16", "Trans.spacingMm 1 x 1", "t 1 x 4"):
-        assert name in said
-    assert "kind" not in said
-    assert ("array RData", "40 x 6 x 4", "int16") in describe(path)

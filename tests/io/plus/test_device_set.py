@@ -78,21 +78,6 @@ def test_the_image_on_the_probe_whichever_way_it_is_written(tmp_path, sequence, 
     np.testing.assert_allclose(mounting.rotation.as_matrix(), TURN, atol=1e-9)
 
 
-def test_pixels_alone_come_from_the_transducer_or_the_scan_conversion(tmp_path, sequence):
-    origin = [("Image", "TransducerOrigin", matrix())]
-    sweep = load_sweep(sequence, given(written(tmp_path / "set.xml", *origin)))
-    assert sweep.grid.vector_pitch_mm == pytest.approx(0.1)
-    assert sweep.tracker.sensor_from_image is None
-    spacing = 'OutputImageSpacingMmPerPixel="0.3 0.4"'
-    scan = f'<ScanConversion TransducerName="L9" OutputImageSizePixel="{{}}" {spacing}/>'
-    sweep = load_sweep(sequence, given(written(tmp_path / "set.xml", scan=scan.format("5 4"))))
-    assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == (0.3, 0.4)
-    assert sweep.probe == "L9"
-    with pytest.raises(MissingSettingsError) as caught:  # the machine's image is of another size
-        load_sweep(sequence, given(written(tmp_path / "set.xml", scan=scan.format("820 616"))))
-    assert caught.value.settings == ("column_pitch_mm", "row_spacing_mm")
-
-
 def test_the_machine_orientation_counts_where_the_header_has_none(tmp_path):
     config = written(tmp_path / "set.xml", ("Image", "Probe", matrix()),
                      more='<DataSource PortUsImageOrientation="UN"/>')  # fmt: skip
