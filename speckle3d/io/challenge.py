@@ -93,14 +93,14 @@ def open_scan(scan: Path, _: ImportSettings) -> Recording:
         If a file cannot be read.
     """
     size_mm, tool_from_image = read_challenge_calibration(_calibration_file(scan))
-    with reading(scan), open_hdf5(scan) as file:
+    with open_hdf5(scan) as file:
         node = require_dataset(file, "frames")
         n, height, width = node.shape
         slices = HDF5Slices(scan.absolute(), ("frames",), np.transpose)
         frames = slices.frames((n, width, height), node.dtype)
     tracker, remarks = None, list[str]()
     source = _transforms_file(scan) or scan
-    with reading(source), open_hdf5(source) as file:
+    with open_hdf5(source) as file:
         if has_member(file, "tforms"):
             matrices = read_checked(file, "tforms", (n, 4, 4))
             readings, remarks = timed_poses(np.arange(n) / FRAME_RATE_HZ, matrices)

@@ -18,7 +18,9 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.load import kind_of, open_recording
+from speckle3d.io.import_settings import settings_for
+from speckle3d.io.load import family_format, recording_of
+from speckle3d.io.readers import find_reader
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.recordings import Row, number_row
 from speckle3d.io.voxels.volumes import is_volume, read_volume
@@ -38,12 +40,13 @@ def describe(path: PathLike) -> list[Row]:
     """
     if Path(path).is_file() and is_volume(path):
         return [("format", "volume", ""), *_describe_volume(path)]
-    kind = kind_of(path)
-    rows: list[Row] = [("format", kind, "")]
-    if kind in _DESCRIBERS:
-        return [*rows, *_DESCRIBERS[kind](path)]
-    recording = open_recording(path)
-    rows += recording.describe()
+    if (reader := find_reader(path)) is None:
+        kind = family_format(path)
+        if kind not in _DESCRIBERS:
+            raise InvalidInputError(f"{path}: expected {' or '.join(_DESCRIBERS)}, got {kind}")
+        return [("format", kind, ""), *_DESCRIBERS[kind](path)]
+    recording = recording_of(reader, Path(path), settings_for(path))
+    rows = [("format", reader.format, ""), *recording.describe()]
     try:
         return [*rows, *sweep_rows(recording.sweep)]
     except (InvalidInputError, FileError) as error:

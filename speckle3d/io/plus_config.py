@@ -23,7 +23,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
-from speckle3d.io.plus.device_set import read_xml, vector
+from speckle3d.io.plus.device_set import device_set, read_xml, vector
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
 """How many wires a pattern of each type has."""
@@ -63,10 +63,10 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
     root = read_xml(path)
     with naming(str(path)):
         segmentation = root.find(".//Segmentation")
-        return WireConfig(_phantom(root), *(() if segmentation is None else _hints(segmentation)))
+        return WireConfig(_phantom(path, root), *(() if segmentation is None else _hints(segmentation)))
 
 
-def _phantom(root: Element) -> WirePhantom:
+def _phantom(path: PathLike, root: Element) -> WirePhantom:
     names: list[str] = []
     ends, patterns = [], []
     for number, pattern in enumerate(root.iterfind(".//PhantomDefinition/Geometry/Pattern")):
@@ -83,23 +83,21 @@ def _phantom(root: Element) -> WirePhantom:
             ends.append([vector(wire, f"EndPoint{end}", 3) for end in ("Front", "Back")])
     if not names:
         raise InvalidInputError("PhantomDefinition/Geometry: expected elements Pattern with wires, got none")
-    pose = _phantom_pose(root)
+    pose = _phantom_pose(path, root)
     return WirePhantom.from_ends(tuple(names), np.reshape(ends, (-1, 2, 3)), tuple(patterns), pose)
 
 
-def _phantom_pose(root: Element) -> RigidTransform | None:
+def _phantom_pose(path: PathLike, root: Element) -> RigidTransform | None:
     """Find the phantom in PLUS's reference frame, whichever way round the file has it."""
     algorithm = root.find(".//vtkPlusProbeCalibrationAlgo")
     named = {} if algorithm is None else algorithm.attrib
     phantom = named.get("PhantomCoordinateFrame", "Phantom")
     reference = named.get("ReferenceCoordinateFrame", "Reference")
-    for transform in root.iterfind(".//CoordinateDefinitions/Transform"):
-        ends = (transform.get("From"), transform.get("To"))
-        if set(ends) == {phantom, reference}:
-            matrix = np.reshape(vector(transform, "Matrix", 16), (1, 4, 4))
-            pose = transforms_from_matrices(matrix, f"Transform {ends[0]} to {ends[1]}: Matrix")[0]
-            return pose if ends[0] == phantom else pose.inv()
-    return None
+    matrix = device_set(str(path), root).transform(phantom, reference)
+    if matrix is None:
+        return None
+    pose: RigidTransform = transforms_from_matrices(matrix[None], f"{phantom} to {reference}")[0]
+    return pose
 
 
 def _hints(segmentation: Element) -> tuple[float | None, FloatArray | None]:
@@ -107,16 +105,9 @@ def _hints(segmentation: Element) -> tuple[float | None, FloatArray | None]:
     spacing, clip = None, None
     if "ApproximateSpacingMmPerPixel" in segmentation.attrib:
         (spacing,) = vector(segmentation, "ApproximateSpacingMmPerPixel", 1)
-        if spacing <= 0:
-            raise InvalidInputError(
-                f"Segmentation: ApproximateSpacingMmPerPixel: expected above zero, got {spacing:g}"
-            )
     if {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
-        left, top = map(int, vector(segmentation, "ClipRectangleOrigin", 2))
-        columns, rows = map(int, vector(segmentation, "ClipRectangleSize", 2))
-        if min(left, top) < 0 or min(columns, rows) < 1:
-            got = f"{columns} x {rows} from {left}, {top}"
-            raise InvalidInputError(f"Segmentation: clip: expected a rectangle inside an image, got {got}")
+        left, top = vector(segmentation, "ClipRectangleOrigin", 2)
+        columns, rows = vector(segmentation, "ClipRectangleSize", 2)
         right, bottom = left + columns - 1, top + rows - 1
-        clip = np.array([[left, top], [right, top], [right, bottom], [left, bottom]], dtype=float)
+        clip = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     return spacing, clip

@@ -67,7 +67,7 @@ class Member:
     def read(self, start: int = 0, size: int | None = None) -> bytes:
         """Read bytes from `start` on, all by default; fewer where the member ends."""
         left = max(self.size - start, 0)
-        with reading(self.where), open_regular(self.path) as stream:
+        with open_regular(self.path) as stream:
             stream.seek(self.start + start)
             return stream.read(left if size is None else min(size, left))
 

@@ -43,7 +43,7 @@ from speckle3d.io.clarius.sidecars import Description, read_gains
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
-from speckle3d.io.recordings import Recording, Row, Value
+from speckle3d.io.recordings import Recording, Row, Value, step_of
 
 FORMAT = "Clarius raw package"
 
@@ -55,9 +55,6 @@ CONVEX = ("C3", "C7", "EC7", "PH", "PA2", "PA", "TV")
 
 BEFORE_DEPTH_S = 1e-6
 """Delay that is not depth; see above."""
-
-_EVEN = 1e-3
-"""How far a line may be from its place, in pitches; places are written to 17 digits."""
 
 _ORDER = ("RF", "IQ", "envelope")
 _SAID = (
@@ -156,7 +153,7 @@ class Package:
         InvalidInputError
             Naming the line that is steered, unevenly spaced or repeated, or a curved array.
         """
-        said, first = self.said, self.kept[0].start
+        said = self.said
         others = [member.name for kind, member in self.raw.items() if kind != self.chosen]
         advice = f"; or give another of its raw files: {', '.join(others)}" if others else ""
         if radius_mm := said.of_probe("radius"):
@@ -170,16 +167,10 @@ class Package:
                 f"steering and Doppler{advice}"
             )
         elements = elements[self.kept[0]]
-        step = float((elements[-1] - elements[0]) / max(elements.size - 1, 1))
-        off = np.abs(elements - elements[0] - step * np.arange(elements.size))
-        if elements.size < 2 or not (np.diff(elements) > 0).all() or off.max() > _EVEN * step:
-            i = int(np.argmax(off > _EVEN * abs(step)))
-            raise InvalidInputError(
-                f"{said.where}: lines[{first + i}]: rx element: expected lines evenly spaced from the lowest "
-                f"element up, one a place, got {elements[i]:g} where {elements[0] + step * i:g} is even: "
-                f"packets of a Doppler mode are no image{advice}"
-            )
-        return float(elements[0]), step
+        try:
+            return float(elements[0]), step_of(elements, f"{said.where}: lines, rx element")
+        except InvalidInputError as error:
+            raise InvalidInputError(f"{error}: packets of a Doppler mode are no image{advice}") from error
 
     def _polar(self, what: str) -> str:
         return (

@@ -37,7 +37,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
 from speckle3d.io.formats.hdf5_values import Grid, text_of
 from speckle3d.io.frames import HDF5Slices
-from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, reading
+from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Row, Value, step_of
@@ -146,7 +146,7 @@ def _loaded(path: Path) -> dict[str, Any]:
     """Variables of versions 5 to 7, read whole by SciPy."""
     from scipy.io import loadmat
 
-    with warnings.catch_warnings(), reading(path):
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
 
@@ -292,8 +292,7 @@ def _scaled(variables: _Variables, name: str, text: str) -> FloatArray:
     parts, where = _SCALED.fullmatch(text.strip()), f"{variables.path}: {name}"
     if parts is None or not float(parts["factor"] or 1.0):
         raise InvalidInputError(f"{where}: expected as NAME, NAME * 1e6 or NAME / 2, got {printable(text)}")
-    with reading(where):
-        values = np.asarray(variables.array(parts["name"])[()])
+    values = np.asarray(variables.array(parts["name"])[()])
     if values.dtype.kind not in "fiu" or (name != "time_s" and not np.isfinite(values).all()):
         raise InvalidInputError(f"{where} = {printable(text)}: expected finite numbers, got others")
     factor = float(parts["factor"] or 1.0)

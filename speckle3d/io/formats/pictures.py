@@ -17,7 +17,7 @@ import numpy.typing as npt
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.images import ImageFrames, Images
-from speckle3d.io.hdf5 import one_line, reading
+from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Value
@@ -57,12 +57,8 @@ class Video:
     def __init__(self, path: Path) -> None:
         self._path, self._iio = path, extra_module("imageio.v3", "video", "a video")
         self._next, self._frames = 0, iter(list[npt.NDArray[Any]]())
-        try:
-            first, self.rate_hz = self[0], self._iio.immeta(path, exclude_applied=False).get("fps")
-            count = sum(1 for _ in self._iio.imiter(path))
-        # A plugin that is missing or a damaged file shows in whatever imageio's plugins raise.
-        except Exception as error:
-            raise FileError(f"{path}: cannot be read as video: {one_line(error)}") from error
+        first, self.rate_hz = self[0], self._iio.immeta(path, exclude_applied=False).get("fps")
+        count = sum(1 for _ in self._iio.imiter(path))
         self.shape, self.dtype = (count, *first.shape), first.dtype
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
@@ -95,8 +91,7 @@ def open_pictures(path: Path, settings: ImportSettings) -> Recording:
     elif path.suffix.lower() in _VIDEOS:
         images = Video(path)
     else:
-        with reading(path):
-            images = np.load(path, mmap_mode="r", allow_pickle=False)
+        images = np.load(path, mmap_mode="r", allow_pickle=False)
     rate = {"frame_rate_hz": Value(getattr(images, "rate_hz", None), "of the video")}
     colours = "pictures are in colour: taken as grey by luminance; what is drawn over the image stays"
     return Recording(

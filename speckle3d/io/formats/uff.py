@@ -32,7 +32,6 @@ from speckle3d.io.hdf5 import (
     find_member,
     locate,
     open_hdf5,
-    reading,
     require_dataset,
     require_group,
 )
@@ -52,7 +51,7 @@ def is_uff(file: h5py.File) -> bool:
 
 def open_uff(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q on a linear scan; real data of one sign become grey levels."""
-    with reading(path), open_hdf5(path) as file:
+    with open_hdf5(path) as file:
         rows: list[Row] = [("object", f"{name}: {kind}", "") for name, kind in _objects(file).items()]
         return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
 

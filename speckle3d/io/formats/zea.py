@@ -40,7 +40,6 @@ from speckle3d.io.hdf5 import (
     locate,
     open_hdf5,
     read_checked,
-    reading,
     require_dataset,
 )
 from speckle3d.io.import_settings import ImportSettings
@@ -92,7 +91,7 @@ def is_zea(file: h5py.File) -> bool:
 
 def open_zea(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
-    with reading(path), open_hdf5(path) as file:
+    with open_hdf5(path) as file:
         facts = {"written by zea": "zea_version", "scanner": "us_machine"}
         told = {words: text_of(file.attrs.get(name)) for words, name in facts.items()}
         rows: list[Row] = [(words, text, "") for words, text in told.items() if text]

@@ -210,10 +210,11 @@ def read_device_set(path: PathLike) -> DeviceSet:
             f"got {root.tag}"
         )
     with naming(str(path)):
-        return _device_set(str(path), root)
+        return device_set(str(path), root)
 
 
-def _device_set(path: str, root: Element) -> DeviceSet:
+def device_set(path: str, root: Element) -> DeviceSet:
+    """What a document says, its first element being `root`."""
     usual, named = Names(), dict[str, str]()
     for place in _ALGORITHMS:
         for element in root.iterfind(place):

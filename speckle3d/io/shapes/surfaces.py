@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,9 @@ def read_surface(path: PathLike) -> Surface:
     triangles = [block.data for block in mesh.cells if block.type == "triangle"]
     if not triangles or any(block.dtype.kind not in "iu" for block in triangles):
         raise InvalidInputError(f"{path}: expected triangles by numbers of their vertices, got none")
+    count = re.search(rb"\nCELLS (\d+) ", Path(path).read_bytes())  # of VTK; others find missing cells
+    if count and int(count[1]) != sum(len(block.data) for block in mesh.cells):
+        raise FileError(f"{path}: cannot be read: it ends before its {int(count[1])} triangles do")
     # Not-a-numbers of a damaged file warn when they are cast; the surface refuses them.
     with naming(str(path)), np.errstate(invalid="ignore"):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
