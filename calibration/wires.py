@@ -201,12 +201,10 @@ def solve_wires(
 
 def _about_middle(geometry: WirePhantom) -> WirePhantom:
     """The same wires in a frame whose origin is their middle, about which the phantom may be turned."""
-    ends = geometry.points_mm if geometry.ends_mm is None else geometry.ends_mm.reshape(-1, 3)
-    middle = ends.mean(axis=0)
+    middle = geometry.points_mm.mean(axis=0)
     place = geometry.world_from_phantom
     moved = None if place is None else place * RigidTransform.from_translation(middle)
-    shifted = None if geometry.ends_mm is None else geometry.ends_mm - middle
-    return replace(geometry, points_mm=geometry.points_mm - middle, ends_mm=shifted, world_from_phantom=moved)
+    return replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=moved)
 
 
 def _sized(start: Chain, pixel_mm: FloatArray | None) -> Chain:

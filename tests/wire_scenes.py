@@ -32,7 +32,7 @@ NAMES = tuple("abcdefghi")
 
 
 def n_phantom(pose=None, ends=ENDS_MM, patterns=PATTERNS):
-    return WirePhantom.from_ends(NAMES[: len(ends)], ends, patterns, pose)
+    return WirePhantom(NAMES[: len(ends)], ends, patterns, pose)
 
 
 @dataclass(frozen=True)

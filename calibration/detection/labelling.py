@@ -224,8 +224,6 @@ def _off_by(ratio: FloatArray, limits: tuple[float, float]) -> str:
 
 def _within_ends(share: FloatArray, layer: _Layer, phantom: WirePhantom) -> npt.NDArray[np.bool_]:
     """Whether the middle wire is seen at a place between its ends."""
-    if phantom.ends_mm is None:
-        return np.ones(share.shape, dtype=bool)
     start, end = layer.crossings_mm
     direction = phantom.directions[layer.wires[1]]
     place = (start + share[:, None] * (end - start)) @ direction

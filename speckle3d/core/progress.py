@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from speckle3d.core.printable import printable
 
@@ -39,24 +38,15 @@ def progress_bar(what: str) -> Iterator[Progress]:
     >>> with s3.progress_bar("tracking") as told:  # doctest: +SKIP
     ...     tracked = s3.track(sweep, curves, progress=told)
     """
-    from rich.progress import MofNCompleteColumn, TimeRemainingColumn
-
-    with bar_on_stderr(what, MofNCompleteColumn(), TimeRemainingColumn()) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-@contextmanager
-def bar_on_stderr(what: str, *columns: Any) -> Iterator[Any]:
-    """Show rich's progress under a description on stderr, with more columns behind the bar."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     # In a log a bar is noise, and an error must stay one line.
     hidden = not (console.is_terminal or console.is_jupyter)
     # The name of a file is neither markup nor a template.
-    name = printable(what).replace("{", "{{").replace("}", "}}")
-    shown = (TextColumn(name, markup=False), BarColumn(), *columns)
-    with Progress(*shown, console=console, transient=True, disable=hidden) as bar:
-        yield bar
+    name = TextColumn(printable(what).replace("{", "{{").replace("}", "}}"), markup=False)
+    columns = (name, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=hidden) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -433,8 +433,8 @@ class Sweep:
             ("frames", f"{n} of {vectors} vectors x {samples} samples, {kind}, {self.frames.dtype}"),
             ("time", f"{time_s[0]:.3f} to {time_s[-1]:.3f} s{rate}"),
             ("image", f"{grid.width_mm:.4g} x {grid.depth_mm:.4g} mm"),
-            ("orientation", self.orientation and _stream(self.orientation)),
-            ("tracker", self.tracker and _stream(self.tracker)),
+            ("orientation readings", self.orientation and len(self.orientation.readings)),
+            ("tracker readings", self.tracker and len(self.tracker.readings)),
             ("truth", None if self.truth is None else f"{n} poses"),
             ("probe", self.probe or "not named"),
         ]
@@ -479,13 +479,6 @@ class Sweep:
     def orientation_source(self) -> OrientationSensor | Tracker | None:
         """The orientation sensor, or the tracker where there is none."""
         return self.orientation or self.tracker
-
-
-def _stream(sensor: OrientationSensor | Tracker) -> str:
-    mounted = "calibrated" if sensor.sensor_from_image is not None else "not calibrated to the image"
-    time_s = sensor.readings.time_s
-    span = f", {time_s[0]:.3f} to {time_s[-1]:.3f} s" if time_s.size else ""
-    return f"{time_s.size} readings{span}, {mounted}"
 
 
 def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.ArrayLike) -> Rotation:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -53,7 +53,10 @@ class Volume:
             raise InvalidInputError(f"voxels: expected shape (n_i, n_j, n_k), got {self.voxels.shape}")
         if self.voxels.dtype.name not in VOXEL_TYPES:
             raise InvalidInputError(f"voxels: expected {', '.join(VOXEL_TYPES)}, got {self.voxels.dtype}")
-        object.__setattr__(self, "spacing_mm", require_spacing(self.spacing_mm))
+        spacing = tuple(float(step) for step in self.spacing_mm)
+        if len(spacing) != 3 or not all(np.isfinite(step) and step > 0 for step in spacing):
+            raise InvalidInputError(f"spacing_mm: expected three values above zero, got {spacing}")
+        object.__setattr__(self, "spacing_mm", spacing)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -82,11 +85,3 @@ class Volume:
         """Affine matrix from voxel indices to world mm, shape (4, 4)."""
         scale = np.diag([*self.spacing_mm, 1.0])
         return np.asarray(self.world_from_grid.as_matrix() @ scale)
-
-
-def require_spacing(spacing_mm: Sequence[float]) -> tuple[float, ...]:
-    """Give spacing as floats; raise `InvalidInputError` unless it is three finite values above zero."""
-    spacing = tuple(float(step) for step in spacing_mm)
-    if len(spacing) != 3 or not all(np.isfinite(step) and step > 0 for step in spacing):
-        raise InvalidInputError(f"spacing_mm: expected three values above zero, got {spacing}")
-    return spacing

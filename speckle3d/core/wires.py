@@ -17,6 +17,8 @@ _PARALLEL_SINE = 0.02
 over tens of millimetres, a quarter of that."""
 _FLAT_MM = 0.5
 """Largest distance at which two wires of one layer still cross: about half a wire's thickness."""
+_LONG_MM = 500.0
+"""Half the length of wires whose ends are not known: more than any bath holds."""
 
 
 @dataclass(frozen=True)
@@ -27,49 +29,56 @@ class WirePhantom:
     ----------
     names : tuple of str, length k
         All different.
-    points_mm : ndarray, shape (k, 3)
-        A point on each wire.
-    directions : ndarray, shape (k, 3)
-        Along each wire, in either sense, of unit length.
+    ends_mm : ndarray, shape (k, 2, 3)
+        Between which each wire is stretched.
     patterns : tuple of tuple of int
         Wires that lie in one plane, in the order in which an image shows them from one side to the other.
         Three of which the outer two are parallel and the middle one is not are an N (`n_shapes`).
-    ends_mm : ndarray, shape (k, 2, 3), optional
-        Where each wire ends.
     world_from_phantom : RigidTransform, optional
         Where the phantom is in the position sensor's world, if that was measured.
 
     Raises
     ------
     InvalidInputError
-        If there are no wires, values are not finite, names repeat, or a pattern is not of wires.
+        If there are no wires, one has no length, values are not finite, names repeat, or a pattern is not of
+        wires.
     MismatchError
-        If names, points, directions and ends differ in number.
+        If names and ends differ in number.
     """
 
     names: tuple[str, ...]
-    points_mm: FloatArray
-    directions: FloatArray
+    ends_mm: FloatArray
     patterns: tuple[tuple[int, ...], ...] = ()
-    ends_mm: FloatArray | None = None
     world_from_phantom: RigidTransform | None = None
 
     def __post_init__(self) -> None:
         k = len(self.names)
         if k == 0:
             raise InvalidInputError("wires: expected at least one, got none")
-        _require_vectors(self.points_mm, (k, 3), "points_mm")
-        _require_vectors(self.directions, (k, 3), "directions")
-        if self.ends_mm is not None:
-            _require_vectors(self.ends_mm, (k, 2, 3), "ends_mm")
-        repeated = [name for i, name in enumerate(self.names) if name in self.names[:i]]
-        if repeated:
-            raise InvalidInputError(f"names: expected different ones, got {repeated[0]!r} twice")
+        if self.ends_mm.shape != (k, 2, 3):
+            raise MismatchError(f"ends_mm: expected shape {(k, 2, 3)}, got {self.ends_mm.shape}")
+        require_finite(self.ends_mm, "ends_mm")
+        if len(set(self.names)) < k:
+            raise InvalidInputError(f"names: expected different ones, got {', '.join(self.names)}")
+        for name, (start, end) in zip(self.names, self.ends_mm, strict=True):
+            if (start == end).all():
+                raise InvalidInputError(f"wire {name}: expected two different ends, got the same twice")
         for number, pattern in enumerate(self.patterns):
             if not pattern or len(set(pattern)) < len(pattern) or not set(pattern) <= set(range(k)):
                 raise InvalidInputError(
                     f"patterns[{number}]: expected different wires from 0 to {k - 1}, got {pattern}"
                 )
+
+    @cached_property
+    def points_mm(self) -> FloatArray:
+        """The middle of each wire, shape (k, 3)."""
+        return np.asarray(self.ends_mm.mean(axis=1))
+
+    @cached_property
+    def directions(self) -> FloatArray:
+        """Along each wire, of unit length, shape (k, 3)."""
+        along = self.ends_mm[:, 1] - self.ends_mm[:, 0]
+        return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -122,30 +131,6 @@ class WirePhantom:
         rows = self.normals[wire]
         return rows, np.asarray(np.einsum("...ri,...i->...r", rows, self.points_mm[wire]))
 
-    @classmethod
-    def from_ends(
-        cls,
-        names: tuple[str, ...],
-        ends_mm: FloatArray,
-        patterns: tuple[tuple[int, ...], ...] = (),
-        world_from_phantom: RigidTransform | None = None,
-    ) -> WirePhantom:
-        """Wires stretched between two ends each, shape (k, 2, 3), mm.
-
-        Raises
-        ------
-        InvalidInputError
-            Also if a wire has no length.
-        """
-        _require_vectors(ends_mm, (len(names), 2, 3), "ends_mm")
-        along = ends_mm[:, 1] - ends_mm[:, 0]
-        with np.errstate(over="ignore"):
-            length = np.linalg.norm(along, axis=1, keepdims=True)
-        if not (length > 0).all():
-            name = names[int(np.flatnonzero(length[:, 0] <= 0)[0])]
-            raise InvalidInputError(f"wire {name}: expected two different ends, got the same twice")
-        return cls(names, ends_mm[:, 0], along / length, patterns, ends_mm, world_from_phantom)
-
 
 def three_wires(world_from_phantom: RigidTransform | None = None) -> WirePhantom:
     """Three wires that meet at right angles, along the axes of the phantom's frame: ``x``, ``y`` and ``z``.
@@ -154,10 +139,5 @@ def three_wires(world_from_phantom: RigidTransform | None = None) -> WirePhantom
     ----------
     .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, section 3.2.
     """
-    return WirePhantom(("x", "y", "z"), np.zeros((3, 3)), np.eye(3), world_from_phantom=world_from_phantom)
-
-
-def _require_vectors(values: FloatArray, shape: tuple[int, ...], name: str) -> None:
-    if np.shape(values) != shape:
-        raise MismatchError(f"{name}: expected shape {shape}, got {np.shape(values)}")
-    require_finite(values, name)
+    ends_mm = _LONG_MM * np.stack([-np.eye(3), np.eye(3)], axis=1)
+    return WirePhantom(("x", "y", "z"), ends_mm, world_from_phantom=world_from_phantom)

@@ -84,7 +84,7 @@ def _phantom(path: PathLike, root: Element) -> WirePhantom:
     if not names:
         raise InvalidInputError("PhantomDefinition/Geometry: expected elements Pattern with wires, got none")
     pose = _phantom_pose(path, root)
-    return WirePhantom.from_ends(tuple(names), np.reshape(ends, (-1, 2, 3)), tuple(patterns), pose)
+    return WirePhantom(tuple(names), np.reshape(ends, (-1, 2, 3)), tuple(patterns), pose)
 
 
 def _phantom_pose(path: PathLike, root: Element) -> RigidTransform | None:

@@ -18,7 +18,7 @@ PLACE = RigidTransform.from_components([100.0, -50.0, 200.0], Rotation.from_eule
 ALL_FRAMES = WireFit(outlier_sigma=np.inf)
 IMAGE = ("gamma", "beta", "alpha", "x", "y", "z")
 
-SKEW = WirePhantom.from_ends(
+SKEW = WirePhantom(
     ("a", "b", "c", "d"),
     np.array(
         [

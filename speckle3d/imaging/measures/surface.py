@@ -219,10 +219,8 @@ def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
 
 
 def _sigma(surface: Surface, gradient: FloatArray, errors: PosedErrors, grid: ImageGrid) -> float:
-    near, corners = (
-        belonging_of(surface.vertices_mm, grid, errors.world_from_image),
-        surface.triangles.ravel(),
-    )
+    near = belonging_of(surface.vertices_mm, grid, errors.world_from_image)
+    corners = surface.triangles.ravel()
     by_errors = errors.of_gradient(surface.vertices_mm[corners], gradient.reshape(-1, 3), near[corners])
     return float(np.linalg.norm(by_errors))
 

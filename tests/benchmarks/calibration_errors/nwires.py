@@ -130,7 +130,7 @@ def simulate(trial: Trial) -> tuple[ImagePoints, WirePhantom, np.ndarray, np.nda
     about = RigidTransform.from_translation(middle)
     wrong = about * RigidTransform.from_components(shift, Rotation.from_rotvec(turn)) * about.inv()
     names = tuple(f"w{k}" for k in range(len(ends)))
-    stated = WirePhantom.from_ends(names, ends, patterns, world_from_phantom * wrong)
+    stated = WirePhantom(names, ends, patterns, world_from_phantom * wrong)
     truth = mounting.as_matrix() @ np.diag([*pixel, 1.0, 1.0])
     far = np.array([width_mm, depth_mm]) / pixel
     corners = np.array([[0.0, 0.0], [far[0], 0.0], [0.0, far[1]], far])
