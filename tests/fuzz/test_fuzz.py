@@ -49,39 +49,23 @@ def write_images(folder):
     write_sequence(folder / "c.mhd", sweeps()["bmode"][0])
 
 
-def write_volumes(folder):
+def write_shapes(folder):
     from old_files import POSES
 
     from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
-    from speckle3d.core.volume import Volume
+    from speckle3d.core.surface import Surface
+    from speckle3d.io.points import PickedPoints, write_points
+    from speckle3d.io.shapes import surfaces
+    from speckle3d.io.tum import write_tum
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
 
-    voxels = np.arange(120, dtype=np.uint8).reshape(4, 5, 6)
-    volume = Volume(voxels, (0.5, 0.25, 1.0), POSES[1], {"levels": "linear"})
-    for suffix in SUFFIXES:
-        write_volume(folder / f"v{suffix}", volume)
-    labels = LabelMap(voxels % 3, volume.spacing_mm, POSES[1], {}, STATE_SEGMENTS)
-    write_volume(folder / "s.seg.nrrd", labels)
-
-
-def write_surfaces(folder):
-    from speckle3d.core.surface import Surface
-    from speckle3d.io.shapes.surfaces import SUFFIXES, write_surface
-
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
-    for suffix in SUFFIXES:
-        write_surface(folder / f"s{suffix}", Surface(corners, np.array([[0, 1, 2], [0, 2, 3]])))
-
-
-def write_texts(folder):
-    from old_files import POSES
-
-    from speckle3d.config import Config
-    from speckle3d.io.points import PickedPoints, write_points
-    from speckle3d.io.tum import write_tum
-
+    place = np.arange(120, dtype=np.uint8).reshape(4, 5, 6) % 3, (0.5, 0.25, 1.0), POSES[1], {"a": "b"}
+    for suffix in (".seg.nrrd", *SUFFIXES):
+        write_volume(folder / f"v{suffix}", LabelMap(*place, STATE_SEGMENTS))
+    for suffix in surfaces.SUFFIXES:
+        surface = Surface(np.eye(4)[:, :3], np.array([[0, 1, 2], [0, 2, 3]]))
+        surfaces.write_surface(folder / f"s{suffix}", surface)
     write_tum(folder / "t.tum", np.arange(4) / 10, POSES)
-    (folder / "c.toml").write_text(Config().to_toml(), encoding="utf-8")
     write_points(folder / "p.csv", PickedPoints(np.arange(3), np.arange(6.0).reshape(3, 2)))
 
 
@@ -97,51 +81,24 @@ def write_others(folder):
     np.save(folder / "f.npy", examples.grey())
 
 
-def read(path):
-    """Read all of a file, as its users would."""
-    from speckle3d.io.describe import describe
-
-    if path.suffix in READERS:
-        READERS[path.suffix](path)
-        return
-    describe(path)
-    if path.parent.name in ("family", "images", "others") and not RECORDS & {path.stem.split("_")[0]}:
-        from speckle3d.io.load import load_sweep
-
-        sweep = load_sweep(path)
-        for i in range(len(sweep)):
-            sweep.frames[i]
-
-
+KINDS = {kind.__name__[6:]: kind for kind in (write_family, write_images, write_shapes, write_others)}
 RECORDS = {"curves", "calibration", "reconstruction"}
 
 
-def _surface(path):
-    from speckle3d.io.shapes.surfaces import read_surface
-
-    read_surface(path)
-
-
-def _text(path):
-    from speckle3d.config import load_config
+def read(path):
+    """Read all of a file, as its users would."""
+    from speckle3d.io.describe import describe
+    from speckle3d.io.load import load_sweep
     from speckle3d.io.points import read_points
+    from speckle3d.io.shapes.surfaces import SUFFIXES, read_surface
     from speckle3d.io.tum import read_tum
 
-    {".tum": read_tum, ".toml": load_config, ".csv": read_points}[path.suffix](path)
-
-
-READERS = {
-    **dict.fromkeys((".stl", ".ply", ".vtk"), _surface),
-    **dict.fromkeys((".tum", ".toml", ".csv"), _text),
-}
-KINDS = {
-    "family": write_family,
-    "images": write_images,
-    "volumes": write_volumes,
-    "surfaces": write_surfaces,
-    "texts": write_texts,
-    "others": write_others,
-}
+    others = {".tum": read_tum, ".csv": read_points, **dict.fromkeys(SUFFIXES, read_surface)}
+    others.get(path.suffix, describe)(path)
+    if path.parent.name != "shapes" and not RECORDS & {path.stem.split("_")[0]}:
+        sweep = load_sweep(path)
+        for i in range(len(sweep)):
+            sweep.frames[i]
 
 
 def damaged(content, rng):
@@ -175,8 +132,7 @@ def run(kind, first, count):
         folder = Path(place) / kind
         folder.mkdir()
         KINDS[kind](folder)
-        beside = {".raw", ".zraw", *(() if kind == "texts" else (".toml",))}
-        paths = sorted(path for path in folder.iterdir() if path.suffix not in beside)
+        paths = sorted(path for path in folder.iterdir() if path.suffix not in (".raw", ".zraw"))
         if kind in ("images", "others"):
             (folder / "import.toml").write_text(IMPORT)
         for path in paths:
