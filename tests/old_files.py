@@ -161,9 +161,8 @@ def write_all(folder):
     """Write the set."""
     from speckle3d.io.calibrations import write_calibration
     from speckle3d.io.curves import write_curves
-    from speckle3d.io.growing_sweep import GrowingSweep
     from speckle3d.io.reconstructions import ReconstructionWriter
-    from speckle3d.io.sweep_writer import write_sweep
+    from speckle3d.io.sweep_writer import GrowingSweep, write_sweep
 
     for name, (content, compression) in sweeps().items():
         simulation = {"seed": 3, "medium": {"a": [1, 2]}} if name == "rf_plain" else None

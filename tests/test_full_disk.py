@@ -21,7 +21,7 @@ from speckle3d.io.curves import write_curves
 from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.points import PickedPoints, write_points
 from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.io.shapes.polylines import write_polylines
+from speckle3d.io.shapes.surfaces import write_polylines
 from speckle3d.io.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.study.figures import new_figure, save_figure

@@ -15,6 +15,7 @@ from __future__ import annotations
 import bz2
 import math
 import re
+import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +27,30 @@ import numpy.typing as npt
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike, open_regular
-from speckle3d.io.deflate import unpacker
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.text import numbers
+
+_library: Any = zlib
+try:
+    from isal import isal_zlib
+
+    _library = isal_zlib
+except ImportError:
+    pass
+
+ZLIB, GZIP, EITHER = 15, 31, 47
+"""Windows of deflate, and by them what is around it; either is told when unpacking."""
+
+
+def packer(window: int) -> Any:
+    """Packer of level 1: at higher levels speckle hardly shrinks further, and takes several times as long."""
+    return _library.compressobj(1, zlib.DEFLATED, window)
+
+
+def unpacker() -> Any:
+    """Unpacker of zlib's or gzip's stream."""
+    return _library.decompressobj(EITHER)
+
 
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
 _MM_PER = {

@@ -24,8 +24,8 @@ import numpy as np
 import sweep_examples
 
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.io.growing_sweep import GrowingSweep
 from speckle3d.io.load import import_notes, load_sweep
+from speckle3d.io.sweep_writer import GrowingSweep
 
 LONGEST_S = 0.6
 KINDS = (

@@ -23,11 +23,10 @@ from commands import command
 from sweep_examples import RF
 
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
-from speckle3d.io.growing_sweep import GrowingSweep
 from speckle3d.io.igtl.link import Connection
 from speckle3d.io.igtl.messages import ImageReceived
 from speckle3d.io.load import load_sweep
-from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.sweep_writer import GrowingSweep, write_sweep
 
 RATE_HZ, FRAMES = 25.0, 50
 

@@ -16,9 +16,8 @@ from speckle3d.core.parts import locks
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io import records
 from speckle3d.io.describe import describe
-from speckle3d.io.growing_sweep import GrowingSweep
 from speckle3d.io.load import import_notes, load_sweep
-from speckle3d.io.sweep_writer import write_sweep
+from speckle3d.io.sweep_writer import GrowingSweep, write_sweep
 
 SWEEPS = {
     "rf": sweep_examples.rf_sweep(),

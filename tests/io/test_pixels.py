@@ -1,4 +1,4 @@
-"""Pixels of image files lie in the header's own folder, and take no more memory than is plausible."""
+"""Pixels of image files lie in the header's own folder."""
 
 import os
 

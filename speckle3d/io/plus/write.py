@@ -21,15 +21,17 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
-from speckle3d.io.deflate import GZIP, ZLIB, packer
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.headers import (
+    GZIP,
     NRRD_NAMES,
+    ZLIB,
     header_bytes,
     meta_start,
     meta_type,
     nrrd_type,
+    packer,
     put_packed_size,
     read_header,
 )

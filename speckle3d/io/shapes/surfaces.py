@@ -1,12 +1,15 @@
-"""Surfaces as STL, PLY or VTK files, by meshio; headers say that axes are LPS, as 3D Slicer reads it."""
+"""Surfaces as STL, PLY or VTK files, by meshio, and lines as VTK; headers say LPS, as 3D Slicer reads it."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.extras import extra_module
 from speckle3d.core.files import PathLike
@@ -120,3 +123,43 @@ def _replace_line(part: Path, begins: bytes, line: str) -> None:
     held = part.read_bytes()
     start = held.index(begins)
     part.write_bytes(held[:start] + line.encode() + held[held.index(b"\n", start) :])
+
+
+def write_polylines(
+    path: PathLike, lines_mm: FloatArray, values: Mapping[str, npt.NDArray[np.floating]] | None = None
+) -> None:
+    """Write lines of equally many points; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        With the suffix .vtk.
+    lines_mm : ndarray, shape (n, points, 3)
+        In a world whose axes lead left, posterior and superior; stored in single precision.
+    values : mapping of str to ndarray, shape (n,), optional
+        What each line is coloured by; names without blanks.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is no line, or points are not finite.
+    FileError
+        If the file cannot be written.
+    """
+    if not lines_mm.size or not np.isfinite(lines_mm).all():
+        raise InvalidInputError(f"{path}: expected lines of finite points, got shape {lines_mm.shape}")
+    count, points = lines_mm.shape[:2]
+    cells = np.insert(np.arange(count * points).reshape(count, points), 0, points, axis=1)
+    pieces: list[bytes] = [
+        f"# vtk DataFile Version 4.2\nspeckle3d lines. {SPACE}\nBINARY\nDATASET POLYDATA\n".encode(),
+        f"POINTS {count * points} float\n".encode(),
+        lines_mm.astype(">f4").tobytes(),
+        f"\nLINES {count} {cells.size}\n".encode(),
+        cells.astype(">i4").tobytes(),
+        f"\nCELL_DATA {count}\n".encode() if values else b"",
+    ]
+    for name, numbers in (values or {}).items():
+        pieces.append(f"SCALARS {name} float 1\nLOOKUP_TABLE default\n".encode())
+        pieces.append(numbers.astype(">f4").tobytes())
+    with atomic_path(path) as part:
+        part.write_bytes(b"".join(pieces) + b"\n")

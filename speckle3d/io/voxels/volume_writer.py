@@ -24,9 +24,17 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
-from speckle3d.io.deflate import GZIP, ZLIB, packer
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.headers import header_bytes, meta_start, meta_type, nrrd_type, put_packed_size
+from speckle3d.io.headers import (
+    GZIP,
+    ZLIB,
+    header_bytes,
+    meta_start,
+    meta_type,
+    nrrd_type,
+    packer,
+    put_packed_size,
+)
 from speckle3d.io.text import unescaped
 from speckle3d.io.voxels.nifti import nifti_header
 from speckle3d.io.voxels.segments import segment_fields
