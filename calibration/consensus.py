@@ -117,15 +117,11 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
         The one with the fewest false alarms; the caller judges them (`Consensus.require`).
     """
     rng, best = np.random.default_rng(0), (np.inf, GATES_MM[-1], np.zeros(12))
-    # A pixel size may be stated wrongly.
-    for size, batches in ((pixel_mm, _BATCHES), (None, _BATCHES[:2])):
-        voters = _Candidates(points.of_some_frames(_MOST_FRAMES), size)
-        for count in batches:
-            for model in voters.promising(voters.samples(rng, count)):
-                best = min(best, (*voters.false_alarms(model), model), key=lambda one: one[0])
-            if best[0] < _SURE * len(voters.frames):
-                break
-        if best[0] < np.log10(FALSE_ALARMS):
+    voters = _Candidates(points.of_some_frames(_MOST_FRAMES), pixel_mm)
+    for count in _BATCHES:
+        for model in voters.promising(voters.samples(rng, count)):
+            best = min(best, (*voters.false_alarms(model), model), key=lambda one: one[0])
+        if best[0] < _SURE * len(voters.frames):
             break
     log_alarms, gate, model = best
     axes = model[3:9].reshape(2, 3) / voters.spread

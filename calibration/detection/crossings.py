@@ -20,13 +20,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy import fft, ndimage
 
 from calibration.detection.dots import centred
-from calibration.detection.region import checked_pixel, in_every_frame, region_mask
+from calibration.detection.region import checked_pixel, region_mask, seen_in_frames
 from calibration.points import Seen
-from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
@@ -83,15 +82,10 @@ def crossings_in_frames(
     InvalidInputError
         If an argument is not what it must be.
     """
-    size, count = checked_pixel(pixel_mm), frames.shape[0]
+    size, standing = checked_pixel(pixel_mm), standing_still(frames)
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    standing = standing_still(frames)
-    found = in_every_frame(frames, lambda image: _crossings(image, size, inside, standing), progress)
-    held = [len(pixels) for pixels in found]
-    return Seen(
-        np.repeat(np.arange(count), held),
-        np.concatenate([np.zeros((0, 2)), *found]),
-        dropped={i: "no lines that cross" for i, n in enumerate(held) if n == 0},
+    return seen_in_frames(
+        frames, lambda image: _crossings(image, size, inside, standing), "no lines that cross", progress
     )
 
 
@@ -112,7 +106,7 @@ def _crossings(
     pixel_mm: FloatArray,
     inside: BoolArray | None,
     standing: Float32Array | None,
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     grey = np.asarray(image, dtype=np.float32)
     require_finite(grey, "image")
     if standing is not None:
@@ -126,7 +120,7 @@ def _crossings(
         response = _two_lines(coarse, step_px * pixel_mm, width)
         near = max(1, int(_APART_MM / 2.0 / float((step_px * pixel_mm).max())))
         peaks = features.peak_local_max(response, near, num_peaks=_PEAKS, exclude_border=False)
-        places.append((peaks + _between(response, peaks)) * step_px)
+        places.append(peaks * step_px)
         scores.append(response[tuple(peaks.T)])
     pixels, score = np.concatenate(places), np.concatenate(scores)
     if inside is not None:
@@ -137,7 +131,8 @@ def _crossings(
         away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
         if score[one] > 0 and (away >= _APART_MM).all() and len(kept) < _MOST_CANDIDATES:
             kept.append(int(one))
-    return np.reshape([centred(grey, one, pixel_mm) for one in pixels[kept]], (-1, 2))
+    places = np.reshape([centred(grey, one, pixel_mm) for one in pixels[kept]], (-1, 2))
+    return places, score[kept].astype(float)
 
 
 def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tuple[Float32Array, FloatArray]:
@@ -180,12 +175,3 @@ def _two_lines(grey: Float32Array, step_mm: FloatArray, width_mm: float) -> Floa
         np.maximum(second, lines[number], out=second, where=apart)
     first = np.maximum(lines.max(axis=0), 0.0)
     return np.asarray(np.sqrt(first * np.maximum(second - _LEAK * first, 0.0)))
-
-
-def _between(response: Float32Array, peaks: IntArray) -> FloatArray:
-    """How far from a sample each maximum lies along both axes, by parabolas through its neighbours."""
-    padded = np.pad(response, 1, mode="edge")
-    window = sliding_window_view(padded, (3, 3))[tuple(peaks.T)].astype(float)
-    before, here, after = np.stack([window[:, :, 1], window[:, 1]]).transpose(2, 1, 0)
-    bend = np.maximum(2.0 * here - before - after, np.finfo(np.float32).tiny)
-    return np.asarray(np.clip(0.5 * (after - before) / bend, -0.5, 0.5))

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from calibration.detection.region import checked_pixel, in_every_frame, region_mask
+from calibration.detection.region import checked_pixel, region_mask, seen_in_frames
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.extras import extra_module
@@ -29,7 +29,7 @@ _ANGLES = 24
 _LINE_REACH = 2.5
 """Distance from a peak, in `_SURROUND_MM`, at which it is tested for a line; the 24 directions are then less
 than half a millimetre apart."""
-_SHIFTS, _NEAR_MM = 5, 1.0
+_SHIFTS, _NEAR_MM = 8, 1.0
 """Steps of the mean shift that centres a dot, and the standard deviation of its window; a bead is then placed
 to 0.02 mm."""
 
@@ -65,15 +65,9 @@ def dots_in_frames(
     InvalidInputError
         If an argument is not what it must be.
     """
-    size, count = checked_pixel(pixel_mm), frames.shape[0]
+    size = checked_pixel(pixel_mm)
     inside = None if region_px is None else region_mask(frames.shape[1:], region_px)
-    found = in_every_frame(frames, lambda image: _dots(image, size, inside), progress)
-    held = [len(score) for _, score in found]
-    pixels, score = zip((np.zeros((0, 2)), np.zeros(0)), *found, strict=True)
-    dropped = {i: "no dot" for i, n in enumerate(held) if n == 0}
-    return Seen(
-        np.repeat(np.arange(count), held), np.concatenate(pixels), None, dropped, np.concatenate(score)
-    )
+    return seen_in_frames(frames, lambda image: _dots(image, size, inside), "no dot", progress)
 
 
 def _dots(
@@ -95,8 +89,7 @@ def _dots(
 def _limit(contrast: Float32Array) -> float:
     # Every seventh pixel: enough for the noise, in a seventh of the time.
     noise = robust_sigma(contrast.ravel()[::7])
-    rounding = float(np.finfo(np.float32).eps * np.abs(contrast).max())
-    return float(np.max([_NOISE_SDS * noise, _FAINTEST * float(contrast.max()), rounding]))
+    return max(_NOISE_SDS * noise, _FAINTEST * float(contrast.max()))
 
 
 def _maxima(contrast: Float32Array, limit: float, pixel_mm: FloatArray, inside: BoolArray | None) -> IntArray:

@@ -34,10 +34,6 @@ _LIKE_MM = 0.1
 """Of hypotheses whose misfit is within this of the best, the one with the strongest dots counts."""
 _LEAST_MM = 0.5
 """A middle dot nearer to an outer one than this is the same dot: dots are found at least so far apart."""
-_BEYOND_MM = 5.0
-"""How far beyond a wire's stated ends it may be seen: ends are where it is fastened, roughly."""
-
-
 _COLLINEAR_MM = 0.8
 """How far a dot may be off the line of the outer two."""
 _RESIDUAL_MM = 0.5
@@ -132,7 +128,6 @@ class _Layer:
     """A layer of wires, an N, and its place relative to the first layer."""
 
     wires: IntArray
-    crossings_mm: FloatArray
     width_mm: float
     height_mm: float
     turned: float
@@ -156,7 +151,7 @@ def _layers(phantom: WirePhantom) -> list[_Layer]:
             )
         above = crossings[0] - phantom.points_mm[shapes[0][0]]
         height = float(above @ np.cross(along, first))
-        layers.append(_Layer(np.array(shape), crossings, width, height, float(np.sign(straight))))
+        layers.append(_Layer(np.array(shape), width, height, float(np.sign(straight))))
     return layers
 
 
@@ -201,13 +196,11 @@ def _triples(dots_mm: FloatArray, layer: _Layer, phantom: WirePhantom) -> IntArr
     long = ((ratio > _WIDTHS[0]) & (ratio < _WIDTHS[1]))[..., None]
     inner, straight = (reach > _LEAST_MM) & (reach < length[..., None] - _LEAST_MM), off < _COLLINEAR_MM
     first, last, middle = np.nonzero(long & inner & straight)
-    inside = _within_ends(reach[first, last, middle] / length[first, last], layer, phantom)
-    if inside.any():
-        return np.stack([first, middle, last], axis=1)[inside]
-    why = "the middle one is beyond the ends of its wire"
-    if not len(first) and (long & inner).any():
+    if len(first):
+        return np.stack([first, middle, last], axis=1)
+    if (long & inner).any():
         why = f"the middle one is {off[long & inner].min():.1f} mm off it, {_COLLINEAR_MM:g} allowed"
-    elif not len(first):
+    else:
         why = _off_by(np.broadcast_to(ratio[..., None], inner.shape)[inner & straight], _WIDTHS)
     names = "-".join(phantom.names[k] for k in layer.wires)
     raise InsufficientDataError(f"no three dots in a line for a layer ({names}): {why}")
@@ -220,15 +213,6 @@ def _off_by(ratio: FloatArray, limits: tuple[float, float]) -> str:
     nearest = ratio[np.argmin(np.maximum(limits[0] - ratio, ratio - limits[1]))]
     side = "wider" if nearest > 1 else "narrower"
     return f"spacing {100 * abs(nearest - 1.0):.0f} % {side} than the wires'"
-
-
-def _within_ends(share: FloatArray, layer: _Layer, phantom: WirePhantom) -> npt.NDArray[np.bool_]:
-    """Whether the middle wire is seen at a place between its ends."""
-    start, end = layer.crossings_mm
-    direction = phantom.directions[layer.wires[1]]
-    place = (start + share[:, None] * (end - start)) @ direction
-    ends = np.sort(phantom.ends_mm[layer.wires[1]] @ direction)
-    return np.asarray((place > ends[0] - _BEYOND_MM) & (place < ends[1] + _BEYOND_MM))
 
 
 def _combined(

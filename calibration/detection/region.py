@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
+from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.region import polygon_mask
 from speckle3d.core.sweep import Frames
-
-Result = TypeVar("Result")
 
 _GLANCES = 48
 """Frames compared to see what stands still in all of them."""
@@ -152,24 +151,33 @@ def checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
     return pixel
 
 
-def in_every_frame(
+def seen_in_frames(
     frames: Frames,
-    find: Callable[[npt.NDArray[Any]], Result],
+    find: Callable[[npt.NDArray[Any]], tuple[FloatArray, FloatArray]],
+    nothing: str,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Result]:
-    """Apply a detector to every frame, read one at a time; an error names the frame.
+) -> Seen:
+    """Apply a detector of dots to every frame, read one at a time; an error names the frame.
 
     Parameters
     ----------
     frames : Frames, shape (n, column, row)
     find : callable
+        Returns places, shape (k, 2), and their scores, the best first.
+    nothing : str
+        Why a frame shows nothing.
     progress : callable, optional
         Called with the number of frames done and their total.
     """
-    found, count = [], frames.shape[0]
+    count, pixels, scores = frames.shape[0], [np.zeros((0, 2))], [np.zeros(0)]
     for index in range(count):
         with naming(f"frame {index}"):
-            found.append(find(np.asarray(frames[index])))
+            places, score = find(np.asarray(frames[index]))
+        pixels.append(places)
+        scores.append(score)
         if progress:
             progress(index + 1, count)
-    return found
+    held = [len(score) for score in scores[1:]]
+    dropped = {index: nothing for index, number in enumerate(held) if number == 0}
+    frame = np.repeat(np.arange(count), held)
+    return Seen(frame, np.concatenate(pixels), None, dropped, np.concatenate(scores))
