@@ -104,14 +104,3 @@ def test_a_mode_that_a_sweep_has_no_sensor_for_is_its_reason(sweeps, tmp_path):
     asked = compare_sweeps([bare], tmp_path / "asked", ["pose"])
     assert re.search("bare.*tracker", asked.outcomes[0].reason)
     assert stored(compare_sweeps([bare], tmp_path / "all").directory)["modes"] == ["image"]
-
-
-def test_copies_of_a_recording_count_once(study, sweeps, tmp_path):
-    shutil.copytree(study.directory, tmp_path / "again")
-    shutil.copy(sweeps[0], tmp_path / "a.h5")
-    curves = sweeps[0].parent / "curves.h5"
-    again = compare_sweeps([*sweeps, tmp_path / "a.h5"], tmp_path / "again", curves=curves)
-    assert [each.status for each in again.outcomes] == ["done", "failed", "done", "failed"]
-    assert "s5" in again.outcomes[3].reason
-    # Three files, of which two are one sweep: no statistics.
-    assert stored(again.directory)["intervals"] == []

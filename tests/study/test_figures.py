@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from drifting import CENTRE_MM, drifted, hand_sweep, tracked
 
-from speckle3d.core.errors import MismatchError
 from speckle3d.scoring.lengths import accumulated
 from speckle3d.scoring.references import Reference, sweep_curves
 from speckle3d.study.figures import figure_drift
@@ -41,15 +40,3 @@ def test_every_mode_the_reference_and_the_95_percent_interval_are_drawn_and_name
         (path,) = band.get_paths()
         span = [np.ptp(path.vertices[path.vertices[:, 0] == k, 1]) for k in range(1, FRAMES)]
         np.testing.assert_allclose(span, 2 * 1.96 * width[1:], atol=1e-9)
-
-
-def test_the_reference_has_gaps_and_is_its_own_whatever_it_is_compared_with(sweep):
-    image, tracker = sweep
-    covered = np.ones(FRAMES, dtype=bool)
-    covered[20:30] = False
-    reference = Reference("tracker", tracker[covered], covered)
-    drawn, again = (sweep_curves({"m": each}, CENTRE_MM, reference).reference for each in (image, tracker))
-    np.testing.assert_array_equal(np.isnan(drawn[0]), ~covered)
-    np.testing.assert_array_equal(drawn, again)
-    with pytest.raises(MismatchError):
-        sweep_curves({"image": image}, CENTRE_MM, Reference("truth", tracker[1:], covered))

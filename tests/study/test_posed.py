@@ -10,7 +10,6 @@ from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import CalibrationFile, Provenance, Reconstruction
 from speckle3d.io.calibrations import write_calibration
-from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import recording_sha256
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import sweep_of
@@ -51,22 +50,6 @@ def test_frames_without_a_valid_pose_are_left_out_and_counted(tmp_path):
     np.testing.assert_array_equal(source.images[0], grey(4)[1].T)
     assert posed.notes() == ["a: 2 of 4 frames have no valid pose and are left out"]
     assert open_posed(sequence(tmp_path)).notes() == []
-
-
-def test_a_calibration_of_ours_takes_the_place_of_all_of_it(tmp_path):
-    mounting = RigidTransform.from_translation([1.0, 2.0, 3.0])
-    calibration = Calibration(
-        "plane", "tracker", mounting.rotation, mounting.translation, np.array([0.11, 0.21]),
-        1e-6 * np.eye(6), (), 0.1, "mm", 9.0, FramesUsed(3, (0, 1, 2)),
-    )  # fmt: skip
-    write_calibration(tmp_path / "c.h5", calibration)
-    posed = open_posed(sequence(tmp_path, LEANING), calibrations=[tmp_path / "c.h5"])
-    grid = posed.source()[0].grid
-    assert (grid.vector_pitch_mm, grid.sample_spacing_mm, grid.skew_rad) == (0.11, 0.21, 0.0)
-    np.testing.assert_allclose(posed.sweep.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())
-    given = ImportSettings(column_pitch_mm=0.3)
-    kept = open_posed(tmp_path / "a.mha", settings=given, calibrations=[tmp_path / "c.h5"])
-    assert (kept.sweep.grid.vector_pitch_mm, kept.sweep.grid.sample_spacing_mm) == (0.3, 0.21)
 
 
 def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_path):

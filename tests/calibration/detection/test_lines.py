@@ -159,18 +159,6 @@ def assert_on_floors(found, depths, degrees):
         assert_on_floor(type("Line", (), {"points_px": points}), depths[k], degrees[k])
 
 
-def test_a_sequence_has_its_lines_and_its_reasons():
-    images, depths, degrees = moving_floor(8)
-    images[3] = np.zeros_like(images[3])
-    images[5] = np.random.default_rng(0).integers(0, 256, SHAPE, dtype=np.uint8)
-    calls = []
-    found = detect_lines(Reading(images), PIXEL_MM, FRONT, progress=lambda *done: calls.append(done))
-    assert found.frame.tolist() == [0, 1, 2, 4, 6, 7]
-    assert_on_floors(found, depths, degrees)
-    assert set(found.dropped) == {3, 5}
-    assert calls == [(k + 1, 8) for k in range(8)]
-
-
 def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
     images, depths, degrees = moving_floor()
     ring = 255 * (np.sin(np.arange(36) / 36 * 6 * np.pi) ** 2)

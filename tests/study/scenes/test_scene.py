@@ -1,8 +1,6 @@
 """A folder for 3D Slicer, looked at by what is at hand of its readers: ITK, VTK, slicerio, XML."""
 
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from speckle3d.study.scenes.scene import SceneRequest, write_scene
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
-BUILT_IN = {"vtkMRMLColorTableNodeGrey", "vtkMRMLColorTableNodeFileViridis.txt"}
 
 
 def posed_sweep(mode="image", frames=8):
@@ -41,30 +38,6 @@ def folder(tmp_path_factory):
     other = replace(posed_sweep("pose"), world_from_image=posed_sweep().world_from_image.inv())
     write_scene(target, [posed_sweep(), other], REQUEST)
     return target
-
-
-def nodes_of(folder):
-    return list(ElementTree.parse(folder / "scene.mrml").getroot())
-
-
-def references_of(node):
-    """Of a node by role, as Slicer parses them: a scene's own, and the colours that it has built in."""
-    held = node.get("references", "")
-    assert held == "" or held.endswith(";")
-    found = dict(part.split(":") for part in held.split(";") if part)
-    return found | {name: node.get(name) for name in ("colorNodeID", "backgroundVolumeID") if node.get(name)}
-
-
-def test_every_reference_leads_to_a_node_before_it_and_every_file_is_there(folder):
-    seen = set(BUILT_IN)
-    files = {"scene.mrml"}
-    for node in nodes_of(folder):
-        assert set(references_of(node).values()) <= seen
-        assert node.get("id") not in seen
-        seen.add(node.get("id"))
-        if node.get("fileName") is not None:
-            files.add(unquote(node.get("fileName")))
-    assert files == {path.name for path in folder.iterdir()}
 
 
 def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
