@@ -21,9 +21,11 @@ from speckle3d.core.progress import Progress, after
 from speckle3d.core.reconstruction import Provenance, SourceFile
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
-from speckle3d.correction.crossing.pair import CrossedPair
+from speckle3d.correction.crossing.pair import CrossedPair, crossed
+from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.modes import PUBLISHED
 from speckle3d.corrections import Correction, correct
+from speckle3d.crossing_sweeps import crossing_side, curves_from, require_pair, stack_for
 from speckle3d.examine.disagreements import differing_lengths
 from speckle3d.examine.sensors import believed, require_believed
 from speckle3d.io.calibrations import apply_calibrations
@@ -37,7 +39,6 @@ from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
 from speckle3d.scoring.modes import length_claims, relative_claims
 from speckle3d.scoring.references import Reference, error_rows, sweep_curves, tracker_alone
-from speckle3d.study.crossed import Companion
 from speckle3d.study.details import details_of, doubted_modes, trust_of
 from speckle3d.study.figures import figure_drift, save_figure
 from speckle3d.study.images import Strip
@@ -132,25 +133,25 @@ def run_job(
     require_own_results(directory)
     sweep, mounted = apply_calibrations(sweep, calibrations)
     compared = require_possible(sweep, drift, reference, settings, crossing is not None)
-    strip, frames, side, second_file = Strip(sweep, settings), len(sweep), None, None
+    strip, sweeps, second_file = Strip(sweep, settings), [sweep], None
     if crossing is not None:
-        second, _ = apply_calibrations(crossing[0], calibrations)
+        sweeps.append(apply_calibrations(crossing[0], calibrations)[0])
         second_file = SourceFile(written_path(crossing[1]), recording_sha256(crossing[1]))
-        side, frames = Companion((sweep, second), curves, settings), frames + len(second)
-    sinks = [strip.keep] if side is None else [strip.keep, side.keep]
+        require_pair(*sweeps)
+    stacks = [] if crossing is None else [stack_for(each, settings) for each in sweeps]
     pair, corrected, refusal = None, None, ""
     with RESULTS.replaced(directory) as part:
         with ReconstructionWriter(part / RESULTS.primary, sweep.frame_time_s, sweep.grid) as writer:
 
             def keep(index: int, intensity: Float32Array) -> None:
-                for sink in sinks:
-                    sink(index, intensity)
+                for sink in (strip, *stacks[:1]):
+                    sink.keep(index, intensity)
 
-            told = after(progress, 0, frames)
+            told = after(progress, 0, sum(map(len, sweeps)))
             tracked = track(sweep, curves, settings, told, writer.append_pairs, keep)
-            if side is not None:
+            if stacks:
                 try:
-                    pair, corrected = side.cross(tracked, progress)
+                    pair, corrected = _crossed(sweeps, stacks, tracked, curves, settings, progress)
                 except (InsufficientDataError, MismatchError) as error:
                     refusal = f"{sweep.name}: drift mode crossed: {error}"
             poses, corrections, left_out = _corrected(tracked, sweep, drift, settings, pair, refusal)
@@ -199,6 +200,28 @@ def run_job(
     return JobResult(directory, summary, summary_text([summary]), details["seconds"], corrected)
 
 
+def _crossed(
+    sweeps: Sequence[Sweep],
+    stacks: Sequence[ImageStack],
+    tracked: Tracked,
+    curves: DecorrelationCurves,
+    config: Config,
+    progress: Progress | None,
+) -> tuple[CrossedPair, DecorrelationCurves]:
+    """Track the second sweep and cross it with the first, which is tracked; the curves corrected by it.
+
+    Raises
+    ------
+    MismatchError, InsufficientDataError
+        As `cross_sweeps`.
+    """
+    shown = after(progress, len(sweeps[0]), sum(map(len, sweeps)))
+    both = tracked, track(sweeps[1], curves, config, shown, images=stacks[1].keep)
+    sides = [crossing_side(*each, config) for each in zip(sweeps, both, stacks, strict=True)]
+    pair = crossed(sides[0], sides[1], config.crossing)
+    return pair, curves_from(both, pair, curves)
+
+
 def require_own_results(directory: Path) -> None:
     """Refuse a folder in which a job's names stand for something else.
 
@@ -220,7 +243,7 @@ def _corrected(
     sweep: Sweep,
     modes: Sequence[str],
     config: Config,
-    crossed: CrossedPair | None,
+    pair: CrossedPair | None,
     refusal: str,
 ) -> tuple[dict[str, RigidTransform], dict[str, Correction], dict[str, str]]:
     """Poses by mode, corrections by mode, and why modes are left out.
@@ -244,7 +267,7 @@ def _corrected(
                     f"{where}: expected readings over every frame, got gaps where some are left out"
                 )
             elif mode not in left_out:
-                corrections |= correct(tracked, sweep, [mode], config, crossed)
+                corrections |= correct(tracked, sweep, [mode], config, pair)
         except (MismatchError, InsufficientDataError) as error:
             if mode in PUBLISHED and isinstance(error, InsufficientDataError):
                 raise
