@@ -220,44 +220,6 @@ def patch_coherences(fixed, moving, first, size, shift, ramp_rad, least_overlap,
     return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)
 
 
-def consensus_line(column, row, inside, tolerance):
-    """Twin of `speckle3d.kernels.lines.consensus_line`: all pairs at once, then `np.polyfit` until it stays.
-
-    Returns which points agree (n,), how many could, and the line's start and slope.
-    """
-
-    def compare(start, slope):
-        at = start + slope * column
-        nearest = np.floor(at + 0.5).astype(int)
-        could = (nearest >= 0) & (nearest < inside.shape[1])
-        could[could] = inside[np.flatnonzero(could), nearest[could]]
-        return (
-            could & (np.abs(row - at) <= tolerance),
-            could,
-            np.nansum(((row - at) ** 2)[could & (np.abs(row - at) <= tolerance)]),
-        )
-
-    best = (0, -np.inf, 0.0, 0.0)
-    there = np.flatnonzero(np.isfinite(row))
-    for a, j in enumerate(there):
-        for k in there[a + 1 :]:
-            slope = (row[k] - row[j]) / (column[k] - column[j])
-            start = row[j] - slope * column[j]
-            agree, _, squares = compare(start, slope)
-            best = max(best, (agree.sum(), -squares, start, slope), key=lambda each: each[:2])
-    start, slope = best[2:]
-    agree, could, _ = compare(start, slope)
-    for _ in range(20):
-        if agree.sum() < 3:
-            break
-        before = agree
-        slope, start = np.polyfit(column[agree], row[agree], 1)
-        agree, could, _ = compare(start, slope)
-        if np.array_equal(before, agree):
-            break
-    return agree, could.sum(), start, slope
-
-
 def cut_at(point, images, image_from_world, pixels, max_gap_mm):
     """Grey level of a world point between the nearest images on either side of it; None without support."""
     best = [None, None]

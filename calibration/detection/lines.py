@@ -24,8 +24,8 @@ from calibration.settings import LineSettings, Place
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.sweep import Frames
-from speckle3d.kernels.lines import consensus_line
 
+_ROUNDS = 20
 _FINE = 0.25
 """Smoothing for placing an echo, as a share of that for finding it: enough against noise, little against
 the rise of an echo."""
@@ -222,8 +222,7 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
         strength = score[np.arange(len(edge)), edge]
         row = _placed(levels, slope, inside, edge, sigma, s.place)
         row[strength <= 0] = np.nan
-        agree = np.zeros(row.size, dtype=bool)
-        line = consensus_line(columns.column.astype(float), row, inside, tolerance, agree)
+        agree, *line = consensus_line(columns.column.astype(float), row, inside, tolerance)
         tried.append(_Candidate(row, agree, *line, float(strength[agree].mean()) if agree.any() else 0.0))
     accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
     if not accepted:
@@ -238,6 +237,59 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
     depths = [line.start + line.slope * middle for line in strong]
     upper = [line for line, depth in zip(strong, depths, strict=True) if depth <= min(depths) + tolerance]
     return _measured(max(upper, key=lambda line: line.agreed), columns)
+
+
+def consensus_line(
+    column: FloatArray, row: FloatArray, inside: BoolArray, tolerance: float
+) -> tuple[BoolArray, int, float, float]:
+    """Fit a line to the points that agree on it: those of the best pair's line, until they stay the same.
+
+    Most points agree with the best pair's line; of equals, it is the one closest to them.
+
+    Parameters
+    ----------
+    column, row : ndarray, shape (n,)
+        Points; row NaN where there is none.
+    inside : ndarray of bool, shape (n, r)
+        Which rows of each column belong to the region; a line counts where it is in it.
+    tolerance : float
+        Rows above or below the line.
+
+    Returns
+    -------
+    tuple of ndarray, int, float and float
+        Which points agree, how many could, the line's row in column 0, and its slope; zeros without two.
+    """
+
+    def compare(start: npt.ArrayLike, slope: npt.ArrayLike) -> tuple[BoolArray, BoolArray, FloatArray]:
+        """Which points agree with lines and which could, shape (lines, n), and the squares of the former."""
+        at = np.add.outer(start, 0.0 * column) + np.multiply.outer(slope, column)
+        nearest = np.floor(at + 0.5)
+        could = (nearest >= 0) & (nearest < inside.shape[1])
+        could &= inside[np.arange(column.size), np.where(could, nearest, 0).astype(np.int64)]
+        off = row - at
+        agree = could & (np.abs(off) <= tolerance)
+        return agree, could, np.where(agree, off**2, 0.0).sum(axis=-1)
+
+    there = np.flatnonzero(np.isfinite(row))
+    if there.size < 2:
+        return np.zeros(row.size, bool), 0, 0.0, 0.0
+    j, k = there[np.stack(np.triu_indices(there.size, 1))]
+    slopes = (row[k] - row[j]) / (column[k] - column[j])
+    starts = row[j] - slopes * column[j]
+    agree, _, squares = compare(starts, slopes)
+    best = np.lexsort((squares, -agree.sum(axis=1)))[0]
+    start, slope = float(starts[best]), float(slopes[best])
+    agree, could, _ = compare(start, slope)
+    for _ in range(_ROUNDS):
+        if agree.sum() < 3:
+            break
+        before = agree
+        slope, start = np.polyfit(column[agree], row[agree], 1).tolist()
+        agree, could, _ = compare(start, slope)
+        if np.array_equal(agree, before):
+            break
+    return agree, int(could.sum()), start, slope
 
 
 def _typical(score: Float32Array) -> float:
