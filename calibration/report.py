@@ -161,23 +161,19 @@ def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: 
 
 def json_report(calibration: Calibration, beam: Sequence[BeamBias] = ()) -> dict[str, Any]:
     """Numbers of the report, angles in radians."""
-    translation = calibration.translation_mm
+    lengths = calibration.translation_mm, calibration.pixel_mm
+    translation, pixel = (None if one is None else one.tolist() for one in lengths)
+    plain = ("method", "sensor", "rms", "rms_unit", "condition_number", "time_offset_s", "verdict")
     return {
-        "method": calibration.method,
-        "sensor": calibration.sensor,
+        **{name: getattr(calibration, name) for name in plain},
         "parameters": [vars(parameter) for parameter in calibration.parameters],
         "sensor_from_image_wxyz": calibration.rotation.as_quat(scalar_first=True).tolist(),
-        "translation_mm": None if translation is None else translation.tolist(),
-        "pixel_mm": None if calibration.pixel_mm is None else calibration.pixel_mm.tolist(),
+        "translation_mm": translation,
+        "pixel_mm": pixel,
         "standard_errors": np.sqrt(np.diag(calibration.covariance)).tolist(),
-        "rms": calibration.rms,
-        "rms_unit": calibration.rms_unit,
-        "condition_number": calibration.condition_number,
         "frames_given": calibration.frames.given,
         "frames_used": list(calibration.frames.used),
         "frames_dropped": {str(frame): why for frame, why in calibration.frames.dropped.items()},
-        "time_offset_s": calibration.time_offset_s,
-        "verdict": calibration.verdict,
         "beam": [
             {"width_mm": one.width_mm, "shift_mm": one.simulated_mm.tolist(), "rms_mm": one.rms_mm}
             for one in beam

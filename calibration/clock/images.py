@@ -26,7 +26,7 @@ from calibration.clock.smoothing import SmoothReadings
 from calibration.images.similarity import LEAST_OVERLAP, Comparison, Estimate, whole_images
 from calibration.images.stacks import TrackedImages, read_stack
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import ImageGrid
 
 STEP_S = 0.01
@@ -64,7 +64,6 @@ def delay_from_images(
     tracked: TrackedImages,
     sensor_from_image: RigidTransform,
     search_s: float = SEARCH_S,
-    queries: int = FINE,
     progress: Callable[[int, int], None] | None = None,
 ) -> ClockOffset:
     """Find the delay at which images of either way correlate best with cuts of the other.
@@ -77,8 +76,6 @@ def delay_from_images(
         A rough one is enough.
     search_s : float
         Delays within it of the recording's own are tried.
-    queries : int
-        Images of each way that place the peak.
 
     Raises
     ------
@@ -87,8 +84,6 @@ def delay_from_images(
         where they were taken, the best delay is at the end of the range, or another is as good, as with a
         periodic motion.
     """
-    if queries < 2:
-        raise InvalidInputError(f"queries: expected at least 2, got {queries}")
     around_s, readings = tracked.time_offset_s, tracked.readings
     frames = np.flatnonzero(covered(readings, tracked.frame_time_s, around_s, search_s))
     times, steady = tracked.frame_time_s[frames], SmoothReadings(readings)
@@ -119,7 +114,7 @@ def delay_from_images(
 
     tried, rows = delays_around(around_s, search_s, STEP_S), []
     for number, delay in enumerate(tried):
-        rows.append(correlations(min(COARSE, queries), float(delay)))
+        rows.append(correlations(COARSE, float(delay)))
         if progress is not None:
             progress(number + 1, len(tried))
     curves = np.array(rows)
@@ -132,7 +127,7 @@ def delay_from_images(
     width = _half_width(tried, misfit, best)
     low, high = max(tried[best] - width, tried[0]), min(tried[best] + width, tried[-1])
     places = np.linspace(low, high, _PLACES)
-    fine = np.array([correlations(queries, float(one)) for one in places])
+    fine = np.array([correlations(FINE, float(one)) for one in places])
     seconds, scatter = _placed(places, fine)
     # A peak must be located to well within its own width.
     if not (SIGMAS * scatter < width and low <= seconds <= high):

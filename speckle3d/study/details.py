@@ -69,19 +69,7 @@ def details_of(
         "rejected_patch_share": tracked.rejected_share,
         "direction": tracked.direction,
         "direction_from": tracked.direction_from,
-        "coherence": _coherence_details(tracked),
         "corrections": {mode: _correction_details(c) for mode, c in corrections.items()},
-    }
-
-
-def _coherence_details(tracked: Tracked) -> dict[str, Any] | None:
-    coherence = tracked.coherence
-    if coherence is None:
-        return None
-    return {
-        "mean_share": float(coherence.share.mean()),
-        "mean_gain": float(coherence.gain.mean()),
-        "scale_sigma": coherence.scale_sigma,
     }
 
 
