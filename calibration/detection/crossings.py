@@ -131,8 +131,8 @@ def _crossings(
         away = np.linalg.norm((pixels[kept] - pixels[one]) * pixel_mm, axis=1)
         if score[one] > 0 and (away >= _APART_MM).all() and len(kept) < _MOST_CANDIDATES:
             kept.append(int(one))
-    places = np.reshape([centred(grey, one, pixel_mm) for one in pixels[kept]], (-1, 2))
-    return places, score[kept].astype(float)
+    centres = [centred(grey, one, pixel_mm) for one in pixels[kept]]
+    return np.reshape(centres, (-1, 2)), score[kept].astype(float)
 
 
 def _resampled(grey: Float32Array, pixel_mm: FloatArray, width_mm: float) -> tuple[Float32Array, FloatArray]:

@@ -222,8 +222,9 @@ def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, colu
         strength = score[np.arange(len(edge)), edge]
         row = _placed(levels, slope, inside, edge, sigma, s.place)
         row[strength <= 0] = np.nan
-        agree, *line = consensus_line(columns.column.astype(float), row, inside, tolerance)
-        tried.append(_Candidate(row, agree, *line, float(strength[agree].mean()) if agree.any() else 0.0))
+        agree, possible, start, rise = consensus_line(columns.column.astype(float), row, inside, tolerance)
+        mean = float(strength[agree].mean()) if agree.any() else 0.0
+        tried.append(_Candidate(row, agree, possible, start, rise, mean))
     accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
     if not accepted:
         best = max(tried, key=lambda line: line.agreed)

@@ -144,8 +144,9 @@ def run_job(
         with ReconstructionWriter(part / RESULTS.primary, sweep.frame_time_s, sweep.grid) as writer:
 
             def keep(index: int, intensity: Float32Array) -> None:
-                for sink in (strip, *stacks[:1]):
-                    sink.keep(index, intensity)
+                strip.keep(index, intensity)
+                if stacks:
+                    stacks[0].keep(index, intensity)
 
             told = after(progress, 0, sum(map(len, sweeps)))
             tracked = track(sweep, curves, settings, told, writer.append_pairs, keep)
