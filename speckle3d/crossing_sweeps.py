@@ -120,4 +120,5 @@ def curves_from(
         The first and the second sweep.
     """
     sides = pair.first, pair.second
-    return corrected_curves(curves, tracked, [Length(s.log_scale, s.log_scale_sigma) for s in sides])
+    lengths = [Length(side.log_scale, side.log_scale_sigma) for side in sides]
+    return corrected_curves(curves, [own.curves for own in tracked], lengths)

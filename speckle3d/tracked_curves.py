@@ -66,7 +66,7 @@ def tracked_curves(
     for _ in range(ROUNDS):
         tracked = [track(sweep, curves, settings, progress) for sweep in bare]
         lengths = [tracker_scale(sweep, found) for sweep, found in zip(bare, tracked, strict=True)]
-        curves = corrected_curves(curves, tracked, lengths)
+        curves = corrected_curves(curves, [found.curves for found in tracked], lengths)
     return replace(curves, origin="tracked")
 
 

@@ -25,6 +25,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
+from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.matching.frames import FrameByFrame, FrameMaker, ImageSink
@@ -34,7 +35,7 @@ from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.estimate import Motion, alike_pairs, elevation_of, estimate_motion, strangers
 from speckle3d.motion.planes import pair_planes
 from speckle3d.motion.signs import ADAPTED_ERROR, likeliest_path, on_path
-from speckle3d.motion.trajectory import edges_of, fixed, joined, solve_trajectory
+from speckle3d.motion.trajectory import edges_of, solve_trajectory
 from speckle3d.pipeline import matcher_for, motion_problem
 
 ANEW = 4
@@ -246,8 +247,11 @@ class LiveTracker:
         apart = strangers(problem, table)
         pairs = on_path(pairs, likeliest_path(pairs, frames.size, ADAPTED_ERROR, apart, earlier))
         edges = edges_of(table, motion.slopes.applied(pairs))
-        held = joined(fixed(known, problem.centre_mm), edges) if len(known) > 1 else edges
-        placed = solve_trajectory(held, frames.size, problem.centre_mm, problem.trajectory.huber).poses
+        # Earlier frames stay: every edge then starts at the first of them.
+        centre, start = RigidTransform.from_translation(problem.centre_mm), np.zeros_like(edges.first)
+        relative = centre.inv() * known[0].inv() * known[edges.first] * centre * edges.poses
+        both = RelativePoses(start, start + 1, relative, edges.covariance)
+        placed = solve_trajectory(both, 2, problem.centre_mm, problem.trajectory.huber).poses
         self._poses = RigidTransform.concatenate([self._poses[:-1], known[0] * placed[-1:]])
 
     def _revise_now(self) -> None:

@@ -126,8 +126,7 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     middle = float(frequency_mhz.mean())
     exponent, sigma = middle * fall, np.hypot(middle * sigma, ROW_SIGMA)
     per_unit = middle * _loss(spectra.depth_mm)
-    beta, error = _difference(exponent, sigma, per_unit)
-    shift, gain = _common_exponent(exponent, sigma, per_unit)
+    beta, error, shift, gain = _difference(exponent, sigma, per_unit)
     if gain > OTHER_BAND:
         return replace(unknown, doubts=(_other_band(shift, middle),))
     error = float(np.hypot(error, MODEL_SIGMA))
@@ -203,8 +202,12 @@ def _fit_rows(
     return values[row, best, 1], np.sqrt(variance * covariance[:, 1, 1]), _NOISES[best]
 
 
-def _difference(exponent: FloatArray, sigma: FloatArray, per_unit: FloatArray) -> tuple[float, float]:
+def _difference(
+    exponent: FloatArray, sigma: FloatArray, per_unit: FloatArray
+) -> tuple[float, float, float, float]:
     """Posterior mean and deviation of the difference in attenuation, dB/cm/MHz.
+
+    And the most likely exponent that all rows have in common, with what it gains in the log-likelihood.
 
     Parameters
     ----------
@@ -213,20 +216,15 @@ def _difference(exponent: FloatArray, sigma: FloatArray, per_unit: FloatArray) -
     per_unit : ndarray, shape (r,)
         What 1 dB/cm/MHz adds to it.
     """
-    beta = np.arange(-LARGEST, LARGEST, 0.005)
-    log_posterior = _log_likelihood(exponent - beta[:, None] * per_unit, sigma)
-    weight = np.exp(log_posterior - log_posterior.max())
+    beta, common = np.arange(-LARGEST, LARGEST, 0.01), np.arange(-4.0, 4.1, 0.2)
+    left = exponent - beta[:, None] * per_unit - common[:, None, None]
+    likelihood = _log_likelihood(left, sigma)
+    without = likelihood[common.size // 2]
+    weight = np.exp(without - without.max())
     mean = float(np.average(beta, weights=weight))
-    return mean, float(np.sqrt(np.average((beta - mean) ** 2, weights=weight)))
-
-
-def _common_exponent(exponent: FloatArray, sigma: FloatArray, per_unit: FloatArray) -> tuple[float, float]:
-    """Most likely exponent that all rows have in common, and what it gains in the log-likelihood."""
-    beta, common = np.arange(-LARGEST, LARGEST, 0.02), np.arange(-4.0, 4.1, 0.2)
-    without = exponent - beta[:, None] * per_unit
-    best = _log_likelihood(without - common[:, None, None], sigma).max(axis=1)
-    most = int(best.argmax())
-    return float(common[most]), float(best[most] - _log_likelihood(without, sigma).max())
+    deviation = float(np.sqrt(np.average((beta - mean) ** 2, weights=weight)))
+    most = int(likelihood.max(axis=1).argmax())
+    return mean, deviation, float(common[most]), float(likelihood[most].max() - without.max())
 
 
 def _log_likelihood(left: FloatArray, sigma: FloatArray) -> FloatArray:

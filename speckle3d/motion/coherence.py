@@ -102,14 +102,13 @@ class RowScales:
 
     Attributes
     ----------
-    depth_mm, logarithm, gain, share : ndarray, shape (r,)
+    depth_mm, logarithm, gain : ndarray, shape (r,)
         Medians over the patches of a row.
     """
 
     depth_mm: FloatArray
     logarithm: FloatArray
     gain: FloatArray
-    share: FloatArray
 
 
 @dataclass(frozen=True)
@@ -296,7 +295,7 @@ def estimate_coherence(
     # Patches that tell nothing are taken for the sweep's typical ones.
     gain, share = (np.where(determined, v, _median(v[determined])) for v in (gain, share))
     logarithm = row_medians(np.mean(fits, axis=0)[:, 0]) - log_scale
-    rows = RowScales(problem.patches.row_depth_mm, logarithm, row_medians(gain), row_medians(share))
+    rows = RowScales(problem.patches.row_depth_mm, logarithm, row_medians(gain))
     # Standard error of a median of rows, by their median absolute deviation from a line: tilt makes one.
     finite = np.isfinite(logarithm)
     count, spread = int(finite.sum()), ROW_SIGMA

@@ -12,6 +12,8 @@ from speckle3d.core.sweep import Sweep, image_orientation
 
 _LEAST_CORRELATION, _LEAST_DEVIATIONS = 0.5, 2.5
 """Correlation of turns that tells the direction, in itself and over what chance gives."""
+LEAST_FRAMES = 20
+"""Frames with readings from which turns are compared."""
 _SAME_CORRELATION, _ALIKE_SIZE = 0.95, 1.5
 """Correlation, and ratio of sizes, at which turns are one motion's, however few of them there are."""
 
@@ -75,41 +77,28 @@ def settle_direction(
     """
     if settings.direction:
         return settings.direction, "setting"
-    centre = sweep.grid.centre_mm
-    if sweep.tracker is not None and sweep.tracker.sensor_from_image is not None:
-        covered = np.flatnonzero(sweep.tracker.covers(sweep.frame_time_s))
+    tracker, sensor, time_s = sweep.tracker, sweep.orientation, sweep.frame_time_s
+    if tracker is not None and tracker.sensor_from_image is not None:
+        covered = np.flatnonzero(tracker.covers(time_s))
         if covered.size > 1:
-            measured = sweep.tracker.world_from_image(sweep.frame_time_s[covered])
-            agreement = float(np.sum(_travel(measured, centre) * _travel(image[covered], centre)))
-            return (1 if agreement >= 0 else -1), "tracker"
-    calibrated = sweep.orientation is not None and sweep.orientation.sensor_from_image is not None
-    if calibrated and turn_confirmed:
-        turned = _turn_agreement(sweep, image)
-        if turned is not None:
-            return turned, "orientation sensor"
+            measured = tracker.world_from_image(time_s[covered])
+            return _same_way(measured, image[covered], sweep.grid.centre_mm), "tracker"
+    if sensor is not None and sensor.sensor_from_image is not None and turn_confirmed:
+        covered = np.flatnonzero(sensor.covers(time_s))
+        if covered.size >= LEAST_FRAMES:
+            both = sensor.world_from_image(time_s[covered]), image.rotation[covered]
+            told = same_turns(*((turn[0].inv() * turn).as_rotvec()[:, :2] for turn in both))
+            if told is not None:
+                return told, "orientation sensor"
     if sweep.truth is not None:
-        agreement = float(np.sum(_travel(sweep.truth, centre) * _travel(image, centre)))
-        return (1 if agreement >= 0 else -1), "truth"
+        return _same_way(sweep.truth, image, sweep.grid.centre_mm), "truth"
     return 1, "assumed"
 
 
-def _travel(world_from_image: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    """Elevational position of the image's centre in the first frame, less its mean."""
-    z = (world_from_image[0].inv() * world_from_image).apply(centre_mm)[:, 2]
-    return np.asarray(z - z.mean())
-
-
-def _turn_agreement(sweep: Sweep, image: RigidTransform) -> int | None:
-    """Whether image and sensor turn the same way, drift aside; None if they do not turn enough to tell."""
-    sensor = sweep.orientation
-    assert sensor is not None
-    covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
-    if covered.size < 20:
-        return None
-    measured = sensor.world_from_image(sweep.frame_time_s[covered])
-    sensed = (measured[0].inv() * measured).as_rotvec()[:, :2]
-    seen = (image.rotation[covered[0]].inv() * image.rotation[covered]).as_rotvec()[:, :2]
-    return same_turns(sensed, seen)
+def _same_way(one: RigidTransform, other: RigidTransform, centre_mm: FloatArray) -> int:
+    """Whether two records of poses go the same way along the first frame's normal (1) or not (-1)."""
+    z, own = ((poses[0].inv() * poses).apply(centre_mm)[:, 2] for poses in (one, other))
+    return 1 if (z - z.mean()) @ (own - own.mean()) >= 0 else -1
 
 
 def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
@@ -129,24 +118,19 @@ def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
        Journal of the Royal Statistical Society 98, 1935: the variance of a correlation of series that change
        slowly.
     """
-    trend = np.vander(np.linspace(-1, 1, len(sensed)), 3)
+    n = len(sensed)
+    trend = np.vander(np.linspace(-1, 1, n), 3)
     ours, theirs = (v - trend @ np.linalg.lstsq(trend, v, rcond=None)[0] for v in (sensed, seen))
     powers = float(np.sum(ours**2)), float(np.sum(theirs**2))
     if not min(powers) > 0:
         return None
     product = float(np.sum(ours * theirs))
-    correlation = product / np.sqrt(powers[0] * powers[1])
-    by_chance = float(np.sqrt(max(_chance_variance(ours, theirs), 0.0)))
-    of_one_size = _ALIKE_SIZE**-2 <= powers[0] / powers[1] <= _ALIKE_SIZE**2
-    told = abs(correlation) >= _LEAST_CORRELATION and abs(product) >= _LEAST_DEVIATIONS * by_chance
-    the_same = abs(correlation) >= _SAME_CORRELATION and of_one_size
-    return int(np.sign(correlation)) if told or the_same else None
-
-
-def _chance_variance(ours: FloatArray, theirs: FloatArray) -> float:
-    """Variance of the sum of products of independent series with these autocovariances (Bartlett)."""
-    n = len(ours)
-    weights = 1.0 - np.abs(np.arange(1 - n, n)) / n
+    correlation = abs(product) / np.sqrt(powers[0] * powers[1])
+    # Variance of the sum of products of independent series with these autocovariances (Bartlett).
     columns = zip(ours.T, theirs.T, strict=True)
-    own = (np.correlate(a, a, "full") * np.correlate(b, b, "full") for a, b in columns)
-    return float(sum(np.sum(weights * each) for each in own)) / n
+    by_lag = sum(np.correlate(a, a, "full") * np.correlate(b, b, "full") for a, b in columns)
+    by_chance = np.sqrt(max(float((1.0 - np.abs(np.arange(1 - n, n)) / n) @ by_lag) / n, 0.0))
+    told = correlation >= _LEAST_CORRELATION and abs(product) >= _LEAST_DEVIATIONS * by_chance
+    of_one_size = _ALIKE_SIZE**-2 <= powers[0] / powers[1] <= _ALIKE_SIZE**2
+    same = correlation >= _SAME_CORRELATION and of_one_size
+    return int(np.sign(product)) if told or same else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -88,22 +87,21 @@ class Length:
     sigma: float
 
 
-class TrackedSweep(Protocol):
-    """A sweep that was read with curves, such as `speckle3d.pipeline.Tracked`."""
-
-    @property
-    def curves(self) -> DecorrelationCurves:
-        """Curves it was read with."""
-
-
 def corrected_curves(
-    curves: DecorrelationCurves, tracked: Sequence[TrackedSweep], lengths: Sequence[Length]
+    curves: DecorrelationCurves, read_with: Sequence[DecorrelationCurves], lengths: Sequence[Length]
 ) -> DecorrelationCurves:
     """Correct the curves of a probe by sweeps whose true length is known from a crossing or a tracker.
 
     All distances are multiplied by one factor; where the sweeps were read with another lens than `curves`
     have, its factors by depth go before it. Tissue whose structure reads short is corrected with it: curves
     learnt over tissue are right over tissue.
+
+    Parameters
+    ----------
+    curves : DecorrelationCurves
+    read_with : sequence of DecorrelationCurves
+        With which each sweep was read in the end.
+    lengths : sequence of Length
 
     Returns
     -------
@@ -117,18 +115,18 @@ def corrected_curves(
         If there is no sweep, or none whose length is known.
     """
     scale, sigma = (np.array([getattr(each, name) for each in lengths]) for name in ("log_scale", "sigma"))
-    if not tracked or scale.size != len(tracked) or not (np.isfinite(scale) & (sigma > 0)).all():
+    if not read_with or scale.size != len(read_with) or not (np.isfinite(scale) & (sigma > 0)).all():
         raise InsufficientDataError(
             "corrected curves: expected for every sweep a finite log scale with a deviation above zero, got "
-            f"{scale.tolist()} and {sigma.tolist()} for {len(tracked)} sweeps"
+            f"{scale.tolist()} and {sigma.tolist()} for {len(read_with)} sweeps"
         )
     weight = sigma**-2.0 / (sigma**-2.0).sum()
-    lens = np.mean([_log_widths(each.curves) - _log_widths(curves) for each in tracked], axis=0)
+    lens = np.mean([_log_widths(own) - _log_widths(curves) for own in read_with], axis=0)
     left = float(
         np.sqrt((weight * (scale - weight @ scale) ** 2).sum() / scale.size + 1.0 / (sigma**-2.0).sum())
     )
     # Widened for the attenuation of these sweeps, the curves go with a spectrum that has it.
-    better = replace(stretched(curves, lens + weight @ scale), spectrum=tracked[0].curves.spectrum)
+    better = replace(stretched(curves, lens + weight @ scale), spectrum=read_with[0].spectrum)
     return replace(better, scale_sigma=float(np.hypot(left, ATTENUATION_SIGMA)), origin="crossing")
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -48,16 +46,11 @@ def consistent_planes(
     agreed = consistent_subset(scale * distance, scale * sigma, farther, open_side, support_sigma)
     planes, determined = pair_planes(problem, table, pairs.row, models, offset, agreed, slopes, open_side)
     # Slopes are the sensor's; distances have the scale of all patches.
-    coefficients = planes.coefficients * [scale, 1.0, 1.0] * sign[:, None]
-    own = replace(planes, coefficients=coefficients, covariance=planes.covariance * scale**2)
-    return PairPlanes(
-        pairs.row,
-        pairs.first,
-        pairs.second,
-        np.where(determined[:, None], own.coefficients, pairs.coefficients),
-        np.where(determined[:, None, None], own.covariance, pairs.covariance),
-        np.where(determined[:, None], own.used, pairs.used),
-    )
+    planes.coefficients[:] *= [scale, 1.0, 1.0] * sign[:, None]
+    planes.covariance[:] *= scale**2
+    for name in ("coefficients", "covariance", "used"):
+        getattr(planes, name)[~determined] = getattr(pairs, name)[~determined]
+    return planes
 
 
 def consistent_subset(

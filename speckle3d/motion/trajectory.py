@@ -26,8 +26,6 @@ KNOWN_FRAMES = 40
 """Frames whose covariance is computed; those of the others are interpolated."""
 INPLANE_FLOOR = (1e-6, 1e-6, 1e-9)
 """Variances of in-plane motion (mm^2, mm^2, rad^2) that interpolation leaves, however many patches agree."""
-FIXED_VARIANCE = 1e-8
-"""Of poses that stay, mm^2 and rad^2: far less than any pair's."""
 _TWIST = np.array([3, 4, 5, 0, 1, 2])
 """(x, y, z, tilt, yaw, roll) among exponential coordinates, whose rotation comes first; and back."""
 
@@ -182,20 +180,3 @@ def edges_of(table: CorrelationTable, planes: PairPlanes) -> RelativePoses:
     order = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
     covariance[:, 2:5, 2:5] = order @ planes.covariance @ order.T
     return RelativePoses(planes.first, planes.second, poses, covariance)
-
-
-def fixed(poses: RigidTransform, centre_mm: FloatArray) -> RelativePoses:
-    """Edges from the first of some frames to the others that hold them where they are.
-
-    Parameters
-    ----------
-    poses : RigidTransform, length n
-        ``world_from_image`` of frames 0 to n - 1.
-    centre_mm : ndarray, shape (3,)
-        The image's centre.
-    """
-    centre, others = RigidTransform.from_translation(centre_mm), np.arange(1, len(poses))
-    relative = centre.inv() * (poses[0].inv() * poses[others]) * centre
-    return RelativePoses(
-        np.zeros_like(others), others, relative, np.tile(FIXED_VARIANCE * np.eye(6), (others.size, 1, 1))
-    )

@@ -76,7 +76,7 @@ def test_no_hand_is_faster_than_a_hand(mm_s, doubted):
 def bent(by, rows=9, gain=1.0):
     """Scales that rise by so much from the first row to the middle."""
     line = by * np.linspace(-1, 1, rows)
-    return RowScales(np.linspace(3, 30, rows), line, np.full(rows, gain), np.zeros(rows))
+    return RowScales(np.linspace(3, 30, rows), line, np.full(rows, gain))
 
 
 def test_rows_that_stand_out_alone_are_no_bend():
