@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -15,7 +17,7 @@ from speckle3d.motion.diffraction import (
     SPEED_M_S,
     SUB_DEPTHS,
     band_nodes,
-    sensitivity,
+    log_width,
     sheet_spectrum,
     speckle_correlation,
     tilt_pivot,
@@ -179,17 +181,23 @@ def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -
     Tissue is within the attenuation's tolerance. With the echo's spectrum known, neither attenuation nor
     frequency matters any more.
     """
-    known = 0.0 if spectrum_known else 1.0
-    sigma = UNIFORM * np.array(
-        [
-            sheet.focus_tolerance,
-            sheet.aperture_tolerance,
-            known * sheet.attenuation_tolerance,
-            known * sheet.frequency_tolerance,
+    probe = sheet.nominal
+
+    def widths(side: float) -> FloatArray:
+        """Mean logarithm of the curves' widths with one number at a time at the end of its tolerance."""
+        pitch = 1.0 + side * sheet.frequency_tolerance
+        attenuation = max(probe.attenuation_db_cm_mhz + side * sheet.attenuation_tolerance, 0.0)
+        varied = [
+            replace(probe, focus_mm=probe.focus_mm * (1.0 + side * sheet.focus_tolerance)),
+            replace(probe, aperture_mm=probe.aperture_mm * (1.0 + side * sheet.aperture_tolerance)),
+            replace(probe, attenuation_db_cm_mhz=attenuation),
+            replace(probe, low_hz=pitch * probe.low_hz, high_hz=pitch * probe.high_hz),
         ]
-    )
-    common = sensitivity(sheet.nominal, depth_mm, sheet.backscatter_exponent).mean(axis=0)
-    return float(np.sqrt(((common * sigma) ** 2).sum() + MODEL_SIGMA**2))
+        some = varied[:2] if spectrum_known else varied
+        return np.array([log_width(one, depth_mm, sheet.backscatter_exponent).mean() for one in some])
+
+    sigma = UNIFORM * (widths(1.0) - widths(-1.0)) / 2.0
+    return float(np.sqrt((sigma**2).sum() + MODEL_SIGMA**2))
 
 
 def _passed(frequency_hz: FloatArray, band_hz: tuple[float, float], edge_fraction: float) -> FloatArray:

@@ -21,8 +21,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy import fft
 from scipy.interpolate import CubicSpline
@@ -164,8 +162,6 @@ def _two_way_fields(
 
 
 _WIDEST = 1.2
-SMALL = 0.02
-"""Change of parameters over which distances are compared; they are straight over five times that."""
 
 
 def half_distance(distance_mm: FloatArray, correlation: FloatArray) -> float:
@@ -188,24 +184,3 @@ def log_width(
     distance: FloatArray = STEP_MM / 2 * np.arange(int(_WIDEST * probe.aperture_mm / STEP_MM), dtype=float)
     rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance)
     return np.log([half_distance(distance, row) for row in rho])
-
-
-def sensitivity(
-    probe: NominalProbe, depth_mm: FloatArray, backscatter_exponent: float = BACKSCATTER_EXPONENT
-) -> FloatArray:
-    """Derivatives of `log_width`, shape (r, 4).
-
-    By the logarithm of focus, of aperture, by attenuation in dB/cm/MHz, and by the logarithm of frequency.
-    """
-
-    def widths(step: float) -> FloatArray:
-        factor = float(np.exp(step))
-        varied = (
-            replace(probe, focus_mm=factor * probe.focus_mm),
-            replace(probe, aperture_mm=factor * probe.aperture_mm),
-            replace(probe, attenuation_db_cm_mhz=max(probe.attenuation_db_cm_mhz + step, 0.0)),
-            replace(probe, low_hz=factor * probe.low_hz, high_hz=factor * probe.high_hz),
-        )
-        return np.stack([log_width(one, depth_mm, backscatter_exponent) for one in varied], axis=1)
-
-    return (widths(SMALL) - widths(-SMALL)) / (2.0 * SMALL)
