@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,23 +13,13 @@ _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Of red, green and blue: ITU-R BT.601."""
 
 
-class Images(Protocol):
-    """Images in memory or in files: shape (n, row, column), with an axis of 3 or 4 colours more or not."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of all."""
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of their numbers."""
-
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        """Read one."""
-
-
 class ImageFrames:
     """Frames (column, row) of images; colours become grey by luminance.
+
+    Parameters
+    ----------
+    images : array, or what has its shape and dtype and gives one when indexed
+        Shape (n, row, column), with an axis of 3 or 4 colours more or not.
 
     Raises
     ------
@@ -37,8 +27,9 @@ class ImageFrames:
         If the images are of another shape or type.
     """
 
-    def __init__(self, images: Images) -> None:
-        shape, kind = images.shape, np.dtype(images.dtype)
+    def __init__(self, images: Any) -> None:
+        shape: tuple[int, ...] = images.shape
+        kind: np.dtype[Any] = np.dtype(images.dtype)
         is_colour = len(shape) == 4 and shape[3] in (3, 4) and kind == np.uint8
         if not (len(shape) == 3 or is_colour) or 0 in shape:
             raise InvalidInputError(

@@ -15,7 +15,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_increasing
-from speckle3d.core.images import ImageFrames, Images
+from speckle3d.core.images import ImageFrames
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
 
@@ -361,7 +361,7 @@ class Sweep:
     @classmethod
     def from_arrays(
         cls,
-        frames: Images | npt.ArrayLike,
+        frames: Any,
         *,
         pitch_mm: float | tuple[float, float] | None = None,
         frame_rate_hz: float | None = None,
@@ -402,7 +402,7 @@ class Sweep:
         >>> sweep.frames[0].shape, sweep.grid.vector_pitch_mm, float(sweep.frame_time_s[-1])
         ((8, 40), 0.2, 0.16)
         """
-        read = ImageFrames(frames if hasattr(frames, "shape") else np.asarray(frames))  # type: ignore[arg-type]
+        read = ImageFrames(frames if hasattr(frames, "shape") else np.asarray(frames))
         n, columns, rows = read.shape
         if frame_time_s is None and frame_rate_hz is not None:
             frame_time_s = np.arange(n) / frame_rate_hz

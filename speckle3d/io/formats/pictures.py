@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
-from speckle3d.core.images import ImageFrames, Images
+from speckle3d.core.images import ImageFrames
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
@@ -85,7 +85,7 @@ def _claims(path: Path, start: bytes) -> bool:
 
 def open_pictures(path: Path, settings: ImportSettings) -> Recording:
     """Read an array, a folder of pictures or a video."""
-    images: Images
+    images: Any
     if path.is_dir():
         images = PictureFolder(path)
     elif path.suffix.lower() in _VIDEOS:
