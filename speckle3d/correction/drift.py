@@ -10,13 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
 from speckle3d.core.shown import shown
 from speckle3d.correction.claims import curve_errors, length_sigma
@@ -105,8 +104,8 @@ class DriftCorrection:
 def correct_pose(
     world_from_image: RigidTransform,
     reference: RigidTransform,
-    covered: npt.ArrayLike,
-    corners_mm: npt.ArrayLike,
+    covered: BoolArray,
+    corners_mm: FloatArray,
     settings: DriftSettings | None = None,
 ) -> DriftCorrection:
     """Correct all six degrees of freedom by a position sensor (Housden et al. 2008, equations 1 to 4).
@@ -122,17 +121,15 @@ def correct_pose(
         Image-based poses, in any world, mm.
     reference : RigidTransform, as long as there are covered frames
         The sensor's ``world_from_image`` of each of them.
-    covered : array_like of bool, shape (n,)
+    covered : ndarray of bool, shape (n,)
         Which frames have a reading. The others are corrected by the same smooth curves and add no cost.
-    corners_mm : array_like, shape (4, 3)
+    corners_mm : ndarray, shape (4, 3)
         Image corners in the image frame.
 
     Raises
     ------
     InsufficientDataError
         If the sweep is too short, its coverage too small, or "distance" curves lack travel.
-    MismatchError
-        If the lengths do not belong together.
 
     References
     ----------
@@ -140,33 +137,30 @@ def correct_pose(
        use in a hybrid acquisition system", BioMedical Engineering OnLine 7:5, 2008.
     """
     settings = settings or DriftSettings()
-    corners = np.asarray(corners_mm, dtype=float)
-    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
-        raise InvalidInputError(f"corners_mm: expected shape (4, 3), got {corners.shape}")
-    used = _require_coverage(covered, len(world_from_image), len(reference), settings)
-    sensor_from_start = _register(_points(world_from_image[used], corners), _points(reference, corners))
-    target = _points(sensor_from_start.inv() * reference, corners)
-    centre = corners.mean(axis=0)
+    _require_coverage(covered, settings)
+    centre = corners_mm.mean(axis=0)
+    sensor_from_start = _registered(world_from_image[covered], reference, centre)
+    target = _points(sensor_from_start.inv() * reference, corners_mm)
     chain = _chain(world_from_image, centre, AXES, settings)
 
     def misfit(poses: FloatArray) -> FloatArray:
         """Equation (4): distances between corrected and measured corners of every covered frame."""
-        error = _points(RigidTransform.from_matrix(poses), corners) - target
+        error = _points(RigidTransform.from_matrix(poses), corners_mm) - target
         softened = (error**2).sum(axis=-1, keepdims=True) + settings.loss_epsilon_mm**2
         return np.asarray((error * softened**-0.25).reshape(len(poses), -1))
 
-    fit = _solve(misfit, chain, used, settings)
+    fit = _solve(misfit, chain, covered, settings)
     poses = sensor_from_start * RigidTransform.from_matrix(chain.poses(fit.x))
-    left = poses[used].inv() * reference
+    left = poses[covered].inv() * reference
     error = np.hstack([left.apply(centre) - centre, left.rotation.as_rotvec()])
-    return _correction(poses, fit, chain, used, settings, error, centre)
+    return _correction(poses, fit, chain, covered, settings, error, centre)
 
 
 def correct_orientation(
     world_from_image: RigidTransform,
     reference: Rotation,
-    covered: npt.ArrayLike,
-    centre_mm: npt.ArrayLike,
+    covered: BoolArray,
+    centre_mm: FloatArray,
     settings: DriftSettings | None = None,
 ) -> DriftCorrection:
     """Correct orientation by an orientation sensor (Housden et al. 2008, equation 5).
@@ -181,12 +175,12 @@ def correct_orientation(
         As for `correct_pose`.
     reference : Rotation, as long as there are covered frames
         The sensor's ``world_from_image`` of each of them.
-    centre_mm : array_like, shape (3,)
+    centre_mm : ndarray, shape (3,)
         Image centre in the image frame.
 
     Raises
     ------
-    InsufficientDataError, MismatchError
+    InsufficientDataError
         As for `correct_pose`.
 
     References
@@ -195,27 +189,24 @@ def correct_orientation(
        use in a hybrid acquisition system", BioMedical Engineering OnLine 7:5, 2008.
     """
     settings = settings or DriftSettings()
-    centre = np.asarray(centre_mm, dtype=float)
-    if centre.shape != (3,):
-        raise InvalidInputError(f"centre_mm: expected shape (3,), got {centre.shape}")
-    used = _require_coverage(covered, len(world_from_image), len(reference), settings)
-    sensor_from_start = (reference * world_from_image[used].rotation.inv()).mean()
+    _require_coverage(covered, settings)
+    sensor_from_start = (reference * world_from_image[covered].rotation.inv()).mean()
     target = sensor_from_start.inv() * reference
     # With the frame's origin moved to the centre, a turn about the centre has no translation.
-    image_from_centred = RigidTransform.from_translation(centre)
+    image_from_centred = RigidTransform.from_translation(centre_mm)
     chain = _chain(world_from_image * image_from_centred, np.zeros(3), AXES[3:], settings)
 
     def misfit(poses: FloatArray) -> FloatArray:
         """Equation (5): roll, yaw and tilt of the measured orientation seen from the corrected frame."""
         return roll_yaw_tilt(Rotation.from_matrix(poses[:, :3, :3]).inv() * target)
 
-    fit = _solve(misfit, chain, used, settings)
+    fit = _solve(misfit, chain, covered, settings)
     centred = RigidTransform.from_matrix(chain.poses(fit.x))
     turned = RigidTransform.from_rotation(sensor_from_start) * centred * image_from_centred.inv()
     poses = RigidTransform.from_translation(-turned[0].translation) * turned
     angles = fit.fun.reshape(-1, 3)[:, ::-1]
     error = np.hstack([np.zeros_like(angles), angles])
-    return _correction(poses, fit, chain, used, settings, error, centre)
+    return _correction(poses, fit, chain, covered, settings, error, centre_mm)
 
 
 def _solve(
@@ -286,37 +277,20 @@ def _points(poses: RigidTransform, corners: FloatArray) -> FloatArray:
     return np.asarray(corners @ rotation.as_matrix().transpose(0, 2, 1) + translation[:, None, :])
 
 
-def _register(moving: FloatArray, fixed: FloatArray) -> RigidTransform:
-    """Least-squares rigid transform ``fixed_from_moving`` of corresponding points, shape (f, c, 3)."""
-    a, b = moving.reshape(-1, 3), fixed.reshape(-1, 3)
-    a_mean, b_mean = a.mean(axis=0), b.mean(axis=0)
-    rotation, _ = Rotation.align_vectors(b - b_mean, a - a_mean)
-    return RigidTransform.from_components(b_mean - rotation.apply(a_mean), rotation)
+def _registered(moving: RigidTransform, fixed: RigidTransform, centre_mm: FloatArray) -> RigidTransform:
+    """Rigid transform ``fixed_from_moving`` of the mean turn and the mean place of the image's centre."""
+    turn = (fixed.rotation * moving.rotation.inv()).mean()
+    shift = (fixed.apply(centre_mm) - turn.apply(moving.apply(centre_mm))).mean(axis=0)
+    return RigidTransform.from_components(shift, turn)
 
 
-def _require_coverage(
-    covered: npt.ArrayLike, frames: int, readings: int, settings: DriftSettings
-) -> BoolArray:
-    used = np.asarray(covered, dtype=bool)
-    if used.shape != (frames,):
-        raise MismatchError(f"covered: expected shape ({frames},), got {used.shape}")
-    if frames < settings.minimum_frames:
+def _require_coverage(covered: BoolArray, settings: DriftSettings) -> None:
+    """Raise `InsufficientDataError` unless curves through the covered frames are determined everywhere."""
+    frames, count = covered.size, int(covered.sum())
+    least = max(settings.minimum_coverage * frames, settings.minimum_frames)
+    end = int(settings.maximum_end_gap * frames) + 1
+    if count < least or not (covered[:end].any() and covered[-end:].any()):
         raise InsufficientDataError(
-            f"drift correction: expected at least {settings.minimum_frames} frames, got {frames}"
+            f"drift correction: expected sensor readings for at least {least:.0f} of {frames} frames, among "
+            f"them the first {end} and the last {end}, got {count}"
         )
-    if used.mean() < settings.minimum_coverage or used.sum() < settings.minimum_frames:
-        least = max(settings.minimum_coverage * frames, settings.minimum_frames)
-        raise InsufficientDataError(
-            f"drift correction: expected sensor readings for at least {least:.0f} of {frames} frames, "
-            f"got {int(used.sum())}"
-        )
-    at = np.flatnonzero(used)
-    before, after = int(at[0]), frames - 1 - int(at[-1])
-    if max(before, after) > settings.maximum_end_gap * frames:
-        raise InsufficientDataError(
-            f"drift correction: expected at most {settings.maximum_end_gap:.0%} of {frames} frames without "
-            f"sensor readings at either end, got {before} at the start and {after} at the end"
-        )
-    if readings != used.sum():
-        raise MismatchError(f"reference: expected {used.sum()} for the covered frames, got {readings}")
-    return used

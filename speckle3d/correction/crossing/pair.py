@@ -14,8 +14,15 @@ from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.shown import shown
 from speckle3d.correction.crossing.fit import CrossingFit, Parts, Prior, covariance
-from speckle3d.correction.crossing.planes import BENDS, ORDERS, SPACING_MM, StraightSweep, straightened
-from speckle3d.correction.crossing.search import candidates, relative_turn
+from speckle3d.correction.crossing.planes import (
+    BENDS,
+    ORDERS,
+    SPACING_MM,
+    StraightSweep,
+    relative_turn,
+    straightened,
+)
+from speckle3d.correction.crossing.search import candidates
 from speckle3d.correction.crossing.similarity import PARAMETERS, RIGID, BlurredSweep, Placing
 from speckle3d.correction.crossing.sweep import CrossingSettings, CrossingSweep
 from speckle3d.correction.drift import correct_orientation
@@ -154,9 +161,8 @@ class _Crossing:
     def of(cls, first: CrossingSweep, second: CrossingSweep, settings: CrossingSettings) -> _Crossing:
         """Find the likeliest place."""
         given = first, second
-        sensed = first.sensed is not None and second.sensed is not None
         side = cache(lambda which, flipped: straightened(_turned(given[which], flipped), settings.nearest_mm))
-        starts = candidates(side, sensed, settings.depth_shift_mm, _STARTS)
+        starts = candidates(side, settings.depth_shift_mm, _STARTS)
         if not starts:
             raise MismatchError(
                 f"{first.name} and {second.name}: expected sweeps that cross over the same tissue, got none "
@@ -340,12 +346,11 @@ def _prior(
     spread[np.ix_([0, BENDS], [0, BENDS])] += given[0].scale_sigma * given[1].scale_sigma
     information = np.zeros((PARAMETERS, PARAMETERS))
     information[RIGID:, RIGID:] = np.linalg.inv(spread)
-    first, second = sides
-    if first.world is None or second.world is None:
-        return Prior(information)
-    up = first.world.inv().apply([0.0, 0.0, 1.0])
-    vertical = np.outer(up, up)
-    information[3:RIGID, 3:RIGID] = (
-        vertical / _BETWEEN_HEADING_RAD**2 + (np.eye(3) - vertical) / _BETWEEN_INCLINATION_RAD**2
-    )
-    return Prior(information, relative_turn(first, second))
+    turn, world = relative_turn(sides[0], sides[1]), sides[0].world
+    if turn is not None and world is not None:
+        up = world.inv().apply([0.0, 0.0, 1.0])
+        vertical = np.outer(up, up)
+        information[3:RIGID, 3:RIGID] = (
+            vertical / _BETWEEN_HEADING_RAD**2 + (np.eye(3) - vertical) / _BETWEEN_INCLINATION_RAD**2
+        )
+    return Prior(information, turn)

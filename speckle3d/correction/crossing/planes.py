@@ -81,6 +81,13 @@ class StraightSweep:
         return np.asarray(np.kron(np.eye(3), self.planes.basis[1:, 0].mean(axis=0) / SPACING_MM))
 
 
+def relative_turn(first: StraightSweep, second: StraightSweep) -> Rotation | None:
+    """Turn of the second path against the first by both sensors; None unless both have one."""
+    if first.world is None or second.world is None:
+        return None
+    return first.world.inv() * second.world
+
+
 def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep:
     """Put a sweep's frames on the planes of its smooth path.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import affine_transform, maximum_filter
@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.correction.crossing.planes import BENDS, StraightSweep
+from speckle3d.correction.crossing.planes import BENDS, StraightSweep, relative_turn
 from speckle3d.correction.crossing.similarity import Placing
 from speckle3d.correction.crossing.texture import blurred
 
@@ -28,8 +28,7 @@ _APART_MM = 5.0
 """Candidates of one turn nearer than this are one."""
 
 
-@dataclass(frozen=True)
-class Candidate:
+class Candidate(NamedTuple):
     """A start, and how much the coarse volumes speak for it.
 
     Attributes
@@ -46,17 +45,14 @@ class Candidate:
 
 
 def candidates(
-    sides: Callable[[int, bool], StraightSweep], sensed: bool, depth_shift_mm: float, keep: int
+    sides: Callable[[int, bool], StraightSweep], depth_shift_mm: float, keep: int
 ) -> list[Candidate]:
-    """Find the best starts, best first.
+    """Find the best starts, best first, at the turn that sensors tell or at many about the beam.
 
     Parameters
     ----------
     sides : callable
         First (0) or second (1) sweep, as its poses say or mirrored.
-    sensed : bool
-        Whether sensors tell the turn. Else turns about the beam are tried; mirrored both, the sweeps look the
-        same at the opposite turn.
     depth_shift_mm : float
         Furthest displacement along the beam.
     keep : int
@@ -64,6 +60,8 @@ def candidates(
     """
     turns = Rotation.from_rotvec(np.deg2rad(np.outer([*_TURNS_DEG, *-_TURNS_DEG], [0.0, 1.0, 0.0])))
     starts: list[Candidate] = []
+    sensed = relative_turn(sides(0, False), sides(1, False)) is not None
+    # Without sensors, two sweeps that are both mirrored look the same at the opposite turn.
     for one in (False, True)[: 1 + sensed]:
         for other in (False, True):
             pair = sides(0, one), sides(1, other)
@@ -71,9 +69,9 @@ def candidates(
             for scale in _SCALES:
                 bends = np.zeros((2, BENDS))
                 bends[:, 0] = scale
-                first = _Volume.of(pair[0], textures[0], Rotation.identity(), scale)
-                for turn in [relative_turn(*pair)] if sensed else turns:
-                    second = _Volume.of(pair[1], textures[1], turn, scale)
+                first = _turned(pair[0], textures[0], Rotation.identity(), scale)
+                for turn in [relative_turn(*pair) or Rotation.identity()] if sensed else turns:
+                    second = _turned(pair[1], textures[1], turn, scale)
                     for shift, score in _peaks(first, second, depth_shift_mm):
                         place = RigidTransform.from_components(shift, turn)
                         starts.append(Candidate(Placing(place, bends), (one, other), score))
@@ -88,43 +86,27 @@ def candidates(
     return chosen
 
 
-def relative_turn(first: StraightSweep, second: StraightSweep) -> Rotation:
-    """Turn of the second path against the first by both sensors."""
-    assert first.world is not None
-    assert second.world is not None
-    return first.world.inv() * second.world
-
-
-@dataclass(frozen=True)
-class _Volume:
+class _Volume(NamedTuple):
     """Texture on a regular grid along the first path's axes; zero where there is none."""
 
     low_mm: FloatArray
     values: Float32Array
     there: Float32Array
 
-    @classmethod
-    def of(cls, sweep: StraightSweep, texture: Float32Array, turn: Rotation, scale: float) -> _Volume:
-        """Take the planes for parallel: refinement starts from further away than paths bend."""
-        size, shape = np.array([1.0 + scale, 1.0, 1.0]) * sweep.spacing_mm, np.array(texture.shape)
-        first = np.array([-(shape[0] // 2) * size[0], *sweep.pixels[2:]])
-        # From (along, across, deep) to the path's axes (across, deep, along), turned.
-        axes = turn.as_matrix()[:, [2, 0, 1]]
-        corners = axes @ (
-            first[:, None] + size[:, None] * (shape[:, None] - 1) * np.indices((2, 2, 2)).reshape(3, 8)
-        )
-        low = np.floor(corners.min(axis=1) / VOXEL_MM) * VOXEL_MM
-        whole = (np.ceil((corners.max(axis=1) - low) / VOXEL_MM) + 1).astype(int)
-        values = affine_transform(
-            texture,
-            VOXEL_MM * axes.T / size[:, None],
-            (axes.T @ low - first) / size,
-            tuple(whole),
-            order=1,
-            cval=np.nan,
-        )
-        there = np.isfinite(values)
-        return cls(low, np.where(there, values, np.float32(0.0)), there.astype(np.float32))
+
+def _turned(sweep: StraightSweep, texture: Float32Array, turn: Rotation, scale: float) -> _Volume:
+    """Take the planes for parallel: refinement starts from further away than paths bend."""
+    size, shape = np.array([1.0 + scale, 1.0, 1.0]) * sweep.spacing_mm, np.array(texture.shape)
+    first = np.array([-(shape[0] // 2) * size[0], *sweep.pixels[2:]])
+    # From (along, across, deep) to the path's axes (across, deep, along), turned.
+    axes = turn.as_matrix()[:, [2, 0, 1]]
+    corners = axes @ (first[:, None] + (size * (shape - 1))[:, None] * np.indices((2, 2, 2)).reshape(3, 8))
+    low = np.floor(corners.min(axis=1) / VOXEL_MM) * VOXEL_MM
+    whole = (np.ceil((corners.max(axis=1) - low) / VOXEL_MM) + 1).astype(int)
+    matrix, offset = VOXEL_MM * axes.T / size[:, None], (axes.T @ low - first) / size
+    values = affine_transform(texture, matrix, offset, tuple(whole), order=1, cval=np.nan)
+    there = np.isfinite(values)
+    return _Volume(low, np.where(there, values, np.float32(0.0)), there.astype(np.float32))
 
 
 def _peaks(one: _Volume, other: _Volume, depth_shift_mm: float) -> list[tuple[FloatArray, float]]:
