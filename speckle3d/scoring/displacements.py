@@ -186,10 +186,8 @@ def challenge_score(
 
 def _mean_over_landmarks(differences: FloatArray, landmarks: Landmarks) -> float:
     at, points, last = landmarks.frame, landmarks.points_mm, len(differences)
-    if not at.size:
-        raise InvalidInputError("landmarks: expected at least one, got none")
-    if (wrong := np.flatnonzero((at < 1) | (at > last))).size:
-        raise InvalidInputError(f"landmark {wrong[0]}: expected a frame from 1 to {last}, got {at[wrong[0]]}")
+    if not at.size or at.min() < 1 or at.max() > last:
+        raise InvalidInputError(f"landmarks: expected some, all in frames 1 to {last}, got frames {at}")
     there = differences[at - 1]
     shifts = there[:, :, 3] + np.einsum("pij,pj->pi", there[:, :, :3], points)
     return float(np.linalg.norm(shifts, axis=1).mean())

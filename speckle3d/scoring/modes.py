@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.reconstruction import Reconstruction, Trust
+from speckle3d.correction.claims import length_sigma
 from speckle3d.examine.disagreements import differing_lengths
 from speckle3d.scoring.lengths import travelled_mm
 
@@ -18,10 +18,7 @@ def relative_claims(
     poses: Mapping[str, RigidTransform], trust: Trust, centre_mm: FloatArray
 ) -> dict[str, float]:
     """Relative standard deviation of the length that each mode claims, of those that do."""
-    z = poses["image"].apply(centre_mm)[:, 2]
-    farthest = int(np.argmax(np.abs(z - z[0])))
-    travelled = max(abs(float(z[farthest] - z[0])), 1e-9)
-    claims = {"image": float(np.sqrt(trust.covariance[farthest, 2, 2])) / travelled}
+    claims = {"image": length_sigma(poses["image"], trust.covariance, centre_mm)}
     claims |= {mode: errors.length_sigma for mode, errors in trust.modes.items()}
     return {mode: claim for mode, claim in claims.items() if mode in poses}
 

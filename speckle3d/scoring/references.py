@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.scoring.lengths import (
@@ -27,6 +27,8 @@ from speckle3d.scoring.lengths import (
 )
 
 REFERENCES = ("tracker", "truth")
+_UNITS = np.array([[1.0], *[[180.0 / np.pi]] * 3])
+"""mm per mm and degrees per radian, of length and three turns."""
 
 
 @shown
@@ -149,25 +151,16 @@ def sweep_curves(
     covariance : ndarray, shape (n, 6, 6), optional
         Of the poses of mode `image`: (x, y, z) in mm and (tilt, yaw, roll) in radians.
 
-    Raises
-    ------
-    MismatchError
-        If the reference is not of the same frames.
     """
     modes = {
         mode: _curves(each, centre_mm, END_FRAMES if mode == TRACKER else 1) for mode, each in poses.items()
     }
     half_width = None
     if covariance is not None and "image" in modes:
-        half_width = 1.96 * _in_degrees(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T[2:])
+        half_width = 1.96 * _UNITS * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).T[2:]
     if reference is None:
         return SweepCurves(modes, half_width=half_width)
     covered, frames = reference.covered, next(iter(modes.values())).shape[1]
-    if covered.shape != (frames,) or len(reference.world_from_image) != covered.sum():
-        raise MismatchError(
-            f"reference: expected {covered.sum()} poses for {frames} frames, "
-            f"got {len(reference.world_from_image)}"
-        )
     curves = np.full((4, frames), np.nan)
     curves[:, covered] = _curves(reference.world_from_image, centre_mm, reference.end_frames)
     return SweepCurves(modes, curves, reference.name, half_width)
@@ -204,11 +197,6 @@ def error_rows(
 
 def _curves(poses: RigidTransform, centre_mm: npt.ArrayLike, end_frames: int) -> FloatArray:
     """Length (mm), tilt, yaw and roll (degrees), shape (4, n), zero where the first end is read."""
-    curves = _in_degrees(np.stack(accumulated(poses, centre_mm)))
+    curves = _UNITS * np.stack(accumulated(poses, centre_mm))
     start = np.array([[read_end(each[::-1], end_frames)] for each in curves])
     return np.asarray(curves - start)
-
-
-def _in_degrees(values: FloatArray) -> FloatArray:
-    """Turn all rows but the first, which is a length, from radians to degrees."""
-    return np.concatenate([values[:1], np.rad2deg(values[1:])])

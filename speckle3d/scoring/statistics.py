@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy import stats
 
 from speckle3d.core.errors import InsufficientDataError
 
@@ -54,8 +55,6 @@ def mean_interval(values: npt.ArrayLike) -> MeanInterval:
         raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
     low = high = None
     if present.size >= FEWEST and np.ptp(present) > 0:
-        from scipy import stats  # takes 0.3 s to import, which a single reconstruction does without
-
         rng = np.random.default_rng(_SEED)
         bootstrap = stats.bootstrap((present,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=rng)
         low, high = map(float, bootstrap.confidence_interval)
@@ -82,8 +81,6 @@ def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[Mean
     mean = mean_interval(differences)
     if mean.low is None:
         return mean, None
-    from scipy import stats
-
     return mean, float(stats.wilcoxon(differences[np.isfinite(differences)]).pvalue)
 
 
@@ -96,9 +93,8 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     ----------
     .. [1] S. Holm, "A simple sequentially rejective multiple test procedure", Scand. J. Statist. 6, 1979.
     """
-    tests = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
-    corrected: list[float | None] = [None] * len(p_values)
-    least = 0.0
-    for rank, (p, i) in enumerate(tests):
-        least = corrected[i] = max(least, min(1.0, (len(tests) - rank) * p))
-    return corrected
+    tests = [p for p in p_values if p is not None]
+    order = np.argsort(tests)
+    grown = np.sort(tests) * np.arange(len(tests), 0, -1)
+    corrected = np.minimum(np.maximum.accumulate(grown), 1.0)[np.argsort(order)].tolist()
+    return [None if p is None else corrected.pop(0) for p in p_values]

@@ -60,16 +60,6 @@ def test_the_same_curves_as_the_published_powers_of_t():
         assert np.abs(left).max() < 1e-12
 
 
-def test_the_first_frame_has_its_own_offset_and_no_curve():
-    _, chain = chain_of(3)
-    offsets = np.zeros((6, 5))
-    offsets[:, 0] = [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]
-    values = chain.values(offsets.ravel())
-    np.testing.assert_array_equal(values[0], offsets[:, 0])
-    assert not values[1:].any()
-    assert not chain.basis[0, :, 1:].any()
-
-
 def test_distance_curves_turn_round_with_the_probe_and_leave_in_plane_motion_alone():
     poses, chain = chain_of(4, frames=100, curves="distance", turns=1)
     steps = elevational_steps(poses, CENTRE_MM)

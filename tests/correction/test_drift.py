@@ -96,14 +96,6 @@ def test_orientation_correction_removes_tilt_and_keeps_every_step_of_the_centre(
     assert np.abs(found.curves[:, :3]).max() == 0.0
 
 
-def test_orientation_result_is_in_the_sensors_world_with_the_first_image_origin_at_zero():
-    truth, estimate, _ = sweep(41)
-    settings = DriftSettings(curves="distance")
-    found = correct_orientation(estimate, truth.rotation, everywhere(truth), CENTRE_MM, settings)
-    np.testing.assert_allclose(found.poses[0].translation, 0.0, atol=1e-12)
-    assert np.rad2deg((found.poses[0].rotation.inv() * truth[0].rotation).magnitude()) < 0.1
-
-
 def test_neither_the_sensors_world_nor_the_images_matters():
     truth, estimate, reference = sweep(42)
     # At the singularity of the angles.

@@ -28,15 +28,6 @@ def moved(tracker, shift_mm=0.0, factor=1.0):
     return replace(tracker, readings=readings)
 
 
-def test_without_sensors_the_images_length_and_claim_remain():
-    made = scene(1, frames=16, length_mm=2.0)
-    found = fuse(*made.given())
-    assert path_mm(found.poses) == pytest.approx(path_mm(made.image), abs=1e-6)
-    own = np.sqrt(made.covariance[-1, 2, 2])
-    assert np.sqrt(found.covariance[-1, 2, 2]) == pytest.approx(own, rel=0.2)
-    assert found.used == ("images",)
-
-
 def test_evidence_of_the_scale_counts_by_its_information_against_the_images_claim():
     made = scene(2, frames=16, length_mm=2.0, scale_sigma=0.05)
     told = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))

@@ -1,7 +1,5 @@
 """Which mode is taken where nobody says: the one that claims the smallest error of length, or none."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
@@ -9,7 +7,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.scoring.modes import default_mode, length_claims
+from speckle3d.scoring.modes import default_mode
 
 GRID = ImageGrid(8, 40, 0.3, 0.1)
 N = 11
@@ -36,13 +34,6 @@ def test_the_smallest_claim_wins_and_its_length_is_told_with_95_percent():
     assert "--mode" in why
 
 
-def test_claims_are_standard_deviations_of_the_lengths():
-    found = made({"pose": (9.0, 0.02)})
-    claims = length_claims(found.poses, found.trust, GRID.centre_mm)
-    assert claims["image"] == pytest.approx((10.0, 0.5))
-    assert claims["pose"] == pytest.approx((9.0, 0.18))
-
-
 def test_beyond_three_joint_claims_there_is_none_and_both_numbers_are_told():
     within = made({"pose": (8.6, 0.01)})
     assert default_mode(within)[0] == "pose"
@@ -50,8 +41,3 @@ def test_beyond_three_joint_claims_there_is_none_and_both_numbers_are_told():
         default_mode(made({"pose": (8.0, 0.01)}))
     for words in ("10.00", "8.00", "image", "pose", "--mode"):
         assert words in str(refusal.value)
-
-
-def test_where_nothing_is_claimed_the_images_are_taken():
-    assert default_mode(replace(made({"pose": (8.0, 0.01)}), trust=None)) == ("image", "")
-    assert default_mode(made({})) == ("image", "")

@@ -139,7 +139,9 @@ class CrossingFit:
         gain = other.strain - self.strain
         for way, theirs in zip(self.ways, other.ways, strict=True):
             both = way.valid & theirs.valid
-            # Else less overlap could pass for more likeness.
+            # Less overlap could pass for more likeness.
+            if both.sum() < 0.5 * theirs.valid.sum():
+                return False
             gain += other.weight * (way.correlation(both) - theirs.correlation(both))
         return gain > 0.0
 

@@ -344,7 +344,8 @@ def _prior(
         spread[own, own] = np.diag(np.repeat([settings.tissue_sigma, *rates], ORDERS) ** 2)
     # Probe and curves are the same: so is the error of the scale.
     spread[np.ix_([0, BENDS], [0, BENDS])] += given[0].scale_sigma * given[1].scale_sigma
-    information = np.zeros((PARAMETERS, PARAMETERS))
+    # A kilometre and 1000 radians of place and turn: as good as nothing.
+    information = 1e-6 * np.eye(PARAMETERS)
     information[RIGID:, RIGID:] = np.linalg.inv(spread)
     turn, world = relative_turn(sides[0], sides[1]), sides[0].world
     if turn is not None and world is not None:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.ndimage import affine_transform, maximum_filter
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import Float32Array, FloatArray
@@ -112,11 +112,12 @@ def _turned(sweep: StraightSweep, texture: Float32Array, turn: Rotation, scale: 
 def _peaks(one: _Volume, other: _Volume, depth_shift_mm: float) -> list[tuple[FloatArray, float]]:
     """Shifts of the other volume at which the two correlate best, with score."""
     # Textures have no mean, so that sums of products are covariances.
-    count, power_a, power_b, product = fftconvolve(
-        np.stack([one.there, one.values**2, one.there, one.values]),
-        np.stack([other.there, other.there, other.values**2, other.values])[:, ::-1, ::-1, ::-1],
-        axes=(1, 2, 3),
-    )
+    a = np.stack([one.there, one.values**2, one.there, one.values])
+    b = np.stack([other.there, other.there, other.values**2, other.values])[:, ::-1, ::-1, ::-1]
+    whole = np.add(a.shape[1:], b.shape[1:]) - 1
+    size, axes = [next_fast_len(int(n), real=True) for n in whole], (1, 2, 3)
+    sums = irfftn(rfftn(a, size, axes) * rfftn(b, size, axes), size, axes)
+    count, power_a, power_b, product = sums[:, : whole[0], : whole[1], : whole[2]]
     power = power_a * power_b
     correlation = product / np.sqrt(np.maximum(power, 1e-3 * float(power.max())))
     score = np.arctanh(np.clip(correlation, -0.99, 0.99)) * np.sqrt(np.maximum(count, 0.0))

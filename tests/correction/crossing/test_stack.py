@@ -21,12 +21,6 @@ def test_pools_intensity_before_the_logarithm():
     assert stack.grid.first_sample_depth_mm == pytest.approx(0.5 + 14.5 * 0.0115)
 
 
-def test_pools_narrow_vectors():
-    stack = ImageStack(ImageGrid(9, 64, 0.15, 0.35))
-    assert (stack.grid.vectors, stack.grid.vector_pitch_mm) == (4, pytest.approx(0.3))
-    assert stack.left_mm == pytest.approx(0.075)
-
-
 def test_names_a_frame_that_was_not_kept():
     stack, other = ImageStack(GRID), ImageStack(GRID)
     for index in (0, 1, 3):
