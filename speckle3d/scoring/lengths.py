@@ -249,8 +249,8 @@ def read_end(values: FloatArray, end_frames: int = END_FRAMES) -> float:
     end = values[-_width(values.size, end_frames) :]
     if end.size < 3:
         return float(end[-1])
-    slope, first, *_ = theilslopes(end, method="joint")
-    return float(first + slope * (end.size - 1))
+    slope = float(theilslopes(end)[0])
+    return float(np.median(end - slope * np.arange(1 - end.size, 1)))
 
 
 def jitter_mm(length_mm: FloatArray) -> float:
