@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import signal
 import sys
@@ -98,6 +99,9 @@ def main() -> None:
     the end stop the command as Ctrl-C does, with exit code 128 and their number.
     """
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
+    for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding shows what it can
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     with stoppable() as heard, warnings.catch_warnings():
         warnings.showwarning = _warn
         _run(heard)

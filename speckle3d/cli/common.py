@@ -99,7 +99,7 @@ def shared() -> None:
 
 def note(text: str) -> None:
     """Print a remark of one line on stderr, apart from the results; what it quotes is shown escaped."""
-    sys.stderr.write(f"{_encodable(printable(text), sys.stderr.encoding)}\n")
+    sys.stderr.write(f"{printable(text)}\n")
 
 
 def notes(lines: Iterable[str]) -> None:
@@ -110,18 +110,12 @@ def notes(lines: Iterable[str]) -> None:
 
 def emit(text: str) -> None:
     """Print results on stdout; but for line breaks, characters that drive a terminal are shown escaped."""
-    shown = _encodable(printable(text, kept="\n"), sys.stdout.encoding)
+    shown = printable(text, kept="\n")
     try:
         sys.stdout.write(shown if shown.endswith("\n") else shown + "\n")
         sys.stdout.flush()
     except OSError as error:
         raise FileError(f"standard output: cannot be written: {error.strerror}") from error
-
-
-def _encodable(text: str, encoding: str | None) -> str:
-    """Escape what a terminal of another encoding than Unicode cannot show."""
-    name = encoding or "utf-8"
-    return text.encode(name, "backslashreplace").decode(name)
 
 
 def emit_json(values: Any) -> None:

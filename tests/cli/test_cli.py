@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import pytest
-from commands import SMALL
 
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volumes import read_volume
@@ -127,10 +126,3 @@ def test_an_unknown_setting(refused, bench, tmp_path):
     config = ("--config", tmp_path / "c.toml")
     message = refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *config)
     assert "trajectory.keyframes" in message
-
-
-def test_folders_that_cannot_be_written(refused, bench, tmp_path):
-    (tmp_path / "file").write_text("")
-    assert "file" in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "file" / "o")
-    assert "file" in refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "file")
-    assert "folder" in refused("simulate", tmp_path / "none" / "s.h5", *SMALL)

@@ -157,15 +157,3 @@ def test_images_get_the_fitted_pixels_unless_given(run, sequence, saved, tmp_pat
         got.tracker.sensor_from_image.as_matrix(), made().sensor_from_image.as_matrix(), atol=1e-12
     )
     assert ("found pixels of" in err) == bool(options)
-
-
-def test_calibrations_that_do_not_fit_are_refused(refused, bench, saved, sequence, tmp_path):
-    sweep, out = bench / "sweep.h5", tmp_path / "o"
-    turn, place, again = saved(made("orientation"), "turn.h5"), saved(made()), saved(made(), "again.h5")
-    message = refused("convert", sequence, out, "--dynamic-range-db", "60", "--column-pitch-mm", "0.1",
-                      "--row-spacing-mm", "0.1", "--calibration", turn)  # fmt: skip
-    assert "turn.h5" in message
-    assert "orientation" in message
-    reconstruct = "reconstruct", sweep, "-o", out
-    assert "again.h5" in refused(*reconstruct, "--calibration", place, "--calibration", again)
-    assert "'speckle3d.calibration'" in refused(*reconstruct, "--calibration", bench / "curves.h5")

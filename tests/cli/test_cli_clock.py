@@ -3,7 +3,7 @@
 import h5py
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.io.calibrations import read_calibration, write_calibration
@@ -49,12 +49,3 @@ def test_a_clock_is_found_from_images_and_its_calibration_goes_over_no_input(
     assert code == 0, err
     assert "s (95 %)" in out
     assert read_calibration(tmp_path / "c.h5").time_offset_s == pytest.approx(-0.04, abs=0.012)
-
-
-def test_a_calibration_of_another_sensor_is_refused(refused, back, tmp_path):
-    held = tmp_path / "imu.h5"
-    write_calibration(held, calibration(Rotation.identity(), None))
-    assert "expected --calibration" in refused("calibrate", "clock", back, *IMAGES, "-o", tmp_path / "c.h5")
-    line = refused("calibrate", "clock", back, "--calibration", held, "-o", tmp_path / "c.h5")
-    assert str(held) in line
-    assert "orientation" in line

@@ -88,6 +88,11 @@ def test_every_setting_is_printed_with_what_it_is_and_its_default(run):
             "--voxel-mm",
         ),
         (("imu", "orient", "{sweep}", "--into", "{sweep}"), "--replace replaces it"),
+        (
+            ("view", "{sweep}", "--calibrate", "plane", "--points", "{sweep}"),
+            "--points: is of another method",
+        ),
+        (("volume", "{sweep}", "-o", "v.nrrd", "--within-gb", "1", "--shape", "3", "3", "3"), "--within-gb"),
     ],
 )
 def test_what_is_refused_is_refused_before_work(refused, monkeypatch, tmp_path, shipped, arguments, expected):

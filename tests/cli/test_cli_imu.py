@@ -38,18 +38,14 @@ def log_file(tmp_path):
 
 
 def test_a_log_is_told(run, log_file):
-    code, out, _ = run("imu", "info", log_file)
-    assert code == 0
-    assert "100.00 samples/s" in out
-    assert "9.80" in out
-    code, out, _ = run("imu", "info", log_file, "--json")
+    out = run("imu", "info", log_file, "--json")[1]
     told = {row["description"]: row["value"] for row in json.loads(out)}
     assert told["samples"] == "2000"
     assert told["lost"] == "0"
 
 
-@pytest.mark.parametrize("method", ["filter", "sensor"])
-def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path, method):
+def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path):
+    method = "filter"
     sweep_file = tmp_path / "sweep.h5"
     write_sweep(sweep_file, sweep_examples.rf_sweep())
     into = ("--into", sweep_file, "--replace", "--time-offset-s", "0.05")
@@ -74,35 +70,22 @@ def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, 
     assert "--into" in refused("imu", "orient", log_file)
 
 
-def optical(path, truth, time_s):
-    """TUM text of a target that is turned on the sensor, in a world of its own, on a clock 2 s ahead."""
-    target = Rotation.from_euler("xyz", [0.3, -0.5, 1.0])
-    world = Rotation.from_euler("z", 0.7)
-    seen = (world * truth * target).as_quat()
-    rows = [f"{t + 2.0} 0 0 0 {' '.join(map(str, q))}" for t, q in zip(time_s, seen, strict=True)]
-    path.write_text("\n".join(rows) + "\n")
-
-
-def test_accuracy_beside_an_optical_tracker(run, refused, tmp_path):
+def test_accuracy_beside_an_optical_tracker(run, tmp_path):
+    """A target turned on the sensor, in a world of its own, on a clock 2 s ahead, as TUM text."""
     time_s = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
     angles = 0.5 * np.column_stack([np.sin(time_s), np.sin(0.7 * time_s), np.sin(1.3 * time_s)])
     truth = Rotation.from_euler("zyx", angles)
     off = Rotation.from_rotvec(np.deg2rad(0.4) * np.random.default_rng(1).standard_normal((time_s.size, 3)))
     write_csv(tmp_path / "log.csv", ImuLog(time_s, world_from_sensor=truth * off))
-    optical(tmp_path / "target.txt", truth, time_s)
-    arguments = ("imu", "accuracy", tmp_path / "log.csv", "--method", "sensor", "--optical")
-    fitted = (*arguments, tmp_path / "target.txt", "--time-offset-s", "2.0", "--json")
-    code, out, err = run(*fitted)
+    seen = (Rotation.from_euler("z", 0.7) * truth * Rotation.from_euler("xyz", [0.3, -0.5, 1.0])).as_quat()
+    np.savetxt(tmp_path / "target.txt", np.column_stack([time_s + 2.0, np.zeros((len(seen), 3)), seen]))
+    arguments = ("imu", "accuracy", tmp_path / "log.csv", "--method", "sensor", "--time-offset-s", "2.0")
+    code, out, err = run(*arguments, "--optical", tmp_path / "target.txt", "--json")
     assert code == 0, err
-    assert "mounting" in err
     told = {row["description"]: row["value"] for row in json.loads(out)}
     for angle in ("roll", "yaw", "tilt"):
         # Two readings of 0.4 degrees each: 0.57; 77 of them leave 10 % open.
         assert 0.45 < told[f"log: {angle} error, RMS"] < 0.7
-    told = {row["description"]: row["value"] for row in json.loads(run(*fitted, "--aligned")[1])}
-    assert told["log: tilt error, RMS"] > 5.0
-    assert "--optical" in refused("imu", "accuracy", tmp_path / "log.csv")
-    assert "covered" in refused(*arguments, tmp_path / "target.txt", "--time-offset-s", "90")
 
 
 @pytest.fixture

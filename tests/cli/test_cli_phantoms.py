@@ -44,11 +44,6 @@ def changed(scan, path, change):
     return path
 
 
-def clock_of(scan):
-    with h5py.File(scan) as file:
-        return float(file["tracker"].attrs["time_offset_s"])
-
-
 def error_of(path, scan):
     """Degrees, and millimetres at 20 mm depth in the middle of the image."""
     mounting = RigidTransform.from_matrix(truth(scan, "tracker_sensor_from_image"))
@@ -77,55 +72,28 @@ def test_a_plane_calibrates_a_tracker(run, scans, tmp_path):
     assert out.with_suffix(".png").stat().st_size > 20_000
 
 
-# Exact sensors; tilt is the weak one, as in the paper. Measured 0.1, 0.02 and 0.01 degrees.
-@pytest.mark.parametrize(
-    ("sensor", "limits_deg"), [("orientation", [1.0, 0.2, 0.1]), ("tracker", [1.0, 1.0, 1.0])]
-)
-def test_a_plane_calibrates_what_a_sensor_says_of_orientation(run, scans, tmp_path, sensor, limits_deg):
+def test_a_plane_calibrates_an_orientation_sensor(run, scans, tmp_path):
     out = tmp_path / "imu.h5"
-    code, table, err = run("calibrate", "orientation", scans / "bar.h5", "-o", out, "--sensor", sensor)
+    code, _, err = run("calibrate", "orientation", scans / "bar.h5", "-o", out)
     assert code == 0, err
-    if sensor == "tracker":
-        mounting = RigidTransform.from_matrix(truth(scans / "bar.h5", "tracker_sensor_from_image")).rotation
-    else:
-        wxyz = truth(scans / "bar.h5", "orientation_sensor_from_image_wxyz")
-        mounting = Rotation.from_quat(wxyz, scalar_first=True)
+    wxyz = truth(scans / "bar.h5", "orientation_sensor_from_image_wxyz")
+    mounting = Rotation.from_quat(wxyz, scalar_first=True)
     error = np.rad2deg((mounting.inv() * read_calibration(out).rotation).as_rotvec())
-    assert (np.abs(error) < limits_deg).all()
-    assert "orientation" in table
-
-
-@pytest.mark.slow
-def test_a_clock_that_is_off_is_found(run, scans, tmp_path):
-    out, true = tmp_path / "c.h5", clock_of(scans / "bar.h5")
-
-    def shift(file):
-        file["tracker"].attrs["time_offset_s"] = true + 0.11
-
-    shifted = changed(scans / "bar.h5", tmp_path / "shifted.h5", shift)
-    code, table, err = run("calibrate", "plane", shifted, "-o", out, "--time-offset-s", "estimate")
-    assert code == 0, err
-    # The hand moves by 10 mm/s here and the lines are exact to 0.02 mm: two milliseconds.
-    assert read_calibration(out).time_offset_s == pytest.approx(true, abs=0.004)
-    assert "estimated" in table
-    code, _, _ = run("calibrate", "plane", shifted, "-o", out, "--time-offset-s", true)
-    assert code == 0
-    assert error_of(out, scans / "bar.h5")[1] < 0.3
+    # Exact sensors; tilt is the weak one, as in the paper. Measured 0.1, 0.02 and 0.01 degrees.
+    assert (np.abs(error) < [1.0, 0.2, 0.1]).all()
 
 
 def test_a_missing_motion_is_refused_and_nothing_written(refused, scans, tmp_path):
     line = refused("calibrate", "plane", scans / "untilted.h5", "-o", tmp_path / "c.h5")
     assert "untilted.h5" in line
     assert "tilt" in line
-    line = refused("calibrate", "orientation", scans / "untilted.h5", "-o", tmp_path / "c.h5")
-    assert "untilted.h5" in line
 
 
-def scan_of_wires(folder, kind, seed, count=90):
+def scan_of_wires(folder, seed, count=90):
     """Blank images, the sensor's readings, and picks of a phantom that is where it was: sweep and CSV."""
     rng = np.random.default_rng(seed)
-    wire = np.repeat([0, 1, 2], count // 3) if kind == "three" else None
-    places = np.zeros((count, 3)) if wire is None else rng.uniform(-30, 30, (count, 1)) * np.eye(3)[wire]
+    wire = np.repeat([0, 1, 2], count // 3)
+    places = rng.uniform(-30, 30, (count, 1)) * np.eye(3)[wire]
     stand = RigidTransform.from_components([200.0, -50.0, 120.0], Rotation.from_rotvec([0.4, -0.3, 1.1]))
     pixels, readings = scan_wires(rng, places, world_from_phantom=stand, noise_mm=0.1)
     times = np.arange(count) / 10.0
@@ -138,22 +106,19 @@ def scan_of_wires(folder, kind, seed, count=90):
     return files
 
 
-@pytest.mark.parametrize("kind", ["cross", "three"])
-def test_picked_points_calibrate_with_wires(run, tmp_path, kind):
-    (sweep, picked), (other, others) = (scan_of_wires(tmp_path, kind, seed) for seed in (5, 6))
+def test_picked_points_calibrate_with_wires(run, tmp_path):
+    kind = "three"
+    (sweep, picked), (other, others) = (scan_of_wires(tmp_path, seed) for seed in (5, 6))
     out = tmp_path / "c.h5"
     options = ("--phantom", kind, "--points", picked, "--validation", other, "--validation-points", others)
     code, table, err = run("calibrate", "wires", sweep, "-o", out, *options)
     assert code == 0, err
     found = read_calibration(out)
-    assert found.method == {"cross": "cross-wire", "three": "three-wire"}[kind]
     step = (TRIAL_1.inv() * found.sensor_from_image).translation
     # Picks of 0.1 mm in 90 frames; the claimed standard errors are 0.05 mm.
     assert np.linalg.norm(step) < 0.3
     np.testing.assert_allclose(found.pixel_mm, PIXEL_MM, rtol=0.01)
     assert out.with_suffix(".csv").read_text().startswith("frame,column_px,row_px")
-    assert len(found.parameters) == {"cross": 11, "three": 14}[kind]
-    assert "condition number" in table
     # The noise of the picks, in the two directions of each equation's three that it has.
     validated = float(table.split("wires-6.h5, not used: RMS residual ")[1].split()[0])
     assert 0.05 < validated < 0.15

@@ -1,6 +1,5 @@
 """A sweep served by the command, received by a client."""
 
-import signal
 import subprocess
 import time
 from contextlib import contextmanager
@@ -71,19 +70,3 @@ def test_a_recorded_sweep_is_served_whole_and_at_its_own_rate(tmp_path):
     place = sweep.tracker.world_from_image(sweep.frame_time_s[9]).as_matrix()
     corner = place @ [*sweep.grid.corners_mm[2], 1.0]
     np.testing.assert_allclose(frames[9].image_to_world @ [39.0, 4.0, 0.0, 1.0], corner, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_bmode_stands_upright_and_a_loop_goes_on_in_time_until_it_is_stopped(tmp_path):
-    sweep = sweep_examples.bmode_sweep(frames=4)
-    write_sweep(tmp_path / "s.h5", sweep)
-    with served(tmp_path / "s.h5", "--loop", "--rate", 20, "--image", "Scan") as (process, port):
-        found, _ = received(port, 10)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(WAIT_S) == 130
-        assert process.stderr.read().splitlines()[-1] == "speckle3d: stopped"
-    frames = [each for each in found if isinstance(each, ImageReceived)]
-    for k in range(10):
-        np.testing.assert_array_equal(frames[k].pixels, sweep.frames[k % 4])
-    np.testing.assert_allclose(np.diff([each.time_s for each in frames]), 0.04, atol=1e-8)
-    assert {each.device for each in frames} == {"Scan"}

@@ -7,9 +7,7 @@ from speckle3d.core.volume import Volume
 from speckle3d.io.load import load_sweep
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.io.voxels.volumes import read_volume
-from speckle3d.study.reslices.cut_geometry import read_cuts, read_plane
-
-PNG = b"\x89PNG\r\n\x1a\n"
+from speckle3d.study.reslices.cut_geometry import read_plane
 
 
 @pytest.fixture
@@ -20,24 +18,6 @@ def curve(bench, tmp_path):
     path = tmp_path / "curve.csv"
     np.savetxt(path, points, delimiter=",", header="x_mm,y_mm,z_mm", comments="", fmt="%.6f")
     return path
-
-
-@pytest.mark.parametrize(
-    ("options", "axes"),
-    [
-        (("--lateral-mm", "2", "--mode", "image", "--mode", "pose"), ("along the sweep", "depth")),
-        (("--depth-mm", "10", "--mode", "image"), ("along the sweep", "lateral")),
-    ],
-)
-def test_pictures_say_what_they_show_and_where(run, reconstructed, tmp_path, options, axes):
-    out = tmp_path / "r.png"
-    code, _, err = run("reslice", reconstructed / "reconstruction.h5", "-o", out, *options)
-    assert code == 0, err
-    assert out.read_bytes().startswith(PNG)
-    cuts = read_cuts(out)
-    # Several modes are compared with the truth, which the sweep holds.
-    assert [each.mode for each in cuts] == (["image", "pose", "truth"] if "pose" in options else ["image"])
-    assert out.read_bytes().count(f'"axes": ["{axes[0]}", "{axes[1]}"]'.encode()) == 1
 
 
 def test_a_cut_in_a_frames_plane_lies_there_and_is_that_frame(run, bench, tmp_path):

@@ -71,19 +71,6 @@ def test_a_signal_that_asks_for_the_end_is_one_line_and_a_code(told, number):
     assert signal.getsignal(number) is before
 
 
-def test_a_signal_that_python_drops_is_raised_again(told):
-    class Finalised:
-        def __del__(self):
-            signal.raise_signal(signal.SIGTERM)
-
-    def work():
-        Finalised()
-        until_stopped()
-
-    assert told(work) == (143, "", "speckle3d: stopped\n")
-    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-
-
 def test_what_a_process_was_started_to_ignore_stays_ignored(told):
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
@@ -134,13 +121,3 @@ def test_two_runs_into_one_folder_and_one_that_is_killed(bench, reconstructed, r
     assert code == 0, err
     assert {path.name for path in out.iterdir()} == set(before)
     assert set(read_reconstruction(out / "reconstruction.h5").poses) == {"image"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [(), ("--workers", "2")])
-def test_a_study_told_to_end_before_its_first_sweep_is_done_leaves_no_folder(bench, tmp_path, options):
-    process = started(tmp_path, "compare", bench / "sweep.h5", "-o", tmp_path / "above" / "o", *options)
-    ended(process, signal.SIGTERM)
-    # A worker may end its sweep first: then that is whole.
-    left = {path.name for path in tmp_path.rglob("*") if path.is_file()}
-    assert not left or (options and {"reconstruction.h5", "summary.json", "table.txt"} <= left)

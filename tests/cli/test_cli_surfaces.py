@@ -111,23 +111,6 @@ def test_a_ball_has_its_volume_and_what_the_scale_does_to_it(run, ball, rec, tmp
     assert "1 part" in text
 
 
-def test_labels_and_empty_voxels_and_the_dark_side(run, ball, tmp_path):
-    index = np.moveaxis(np.indices((20, 20, 20)), 0, -1)
-    labels = np.where(np.abs(index - 10).max(axis=-1) < 4, 3, 0).astype(np.uint8)
-    write_volume(tmp_path / "labels.nrrd", Volume(labels, (0.5,) * 3, RigidTransform.identity()))
-    code, text, err = run("surface", tmp_path / "labels.nrrd", "-o", tmp_path / "of.stl", "--labels")
-    assert code == 0, err
-    assert (tmp_path / "of-3.stl").exists()
-    state = np.ones((41, 41, 41), np.uint8)
-    state[:, :, 20:] = 0
-    write_volume(tmp_path / "state.nrrd", Volume(state, (STEP_MM,) * 3, RigidTransform.identity()))
-    out = ("-o", tmp_path / "half.vtk", "--level", "128", "--state", tmp_path / "state.nrrd")
-    code, text, err = run("surface", ball, *out)
-    assert code == 0, err
-    assert "open along" in text
-    assert "volume" not in text
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

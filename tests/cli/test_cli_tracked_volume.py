@@ -73,6 +73,9 @@ def test_a_cut_takes_the_same_options_and_shows_levels_where_decibels_are_not_kn
     # As stored, but for one level that all frames are raised by; 0 where nothing was seen.
     seen = cut.voxels[cut.voxels > 0].astype(float)
     assert np.ptp(seen) == pytest.approx(np.ptp(pixels[2].astype(float)), abs=4)
+    part = "rectangle 0,0 3,9"
+    assert run("reslice", path, *options, "--region", part, "-o", tmp_path / "p.nrrd")[0] == 0
+    assert 0 < (read_volume(tmp_path / "p.nrrd").voxels > 0).sum() < 0.7 * (cut.voxels > 0).sum()
     other = tmp_path / "c.nrrd", "--plus-config", tmp_path / "set.xml", "-o", tmp_path / "d.png"
     code, _, told = run("reslice", *other)
     assert code == 2

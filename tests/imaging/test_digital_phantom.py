@@ -2,14 +2,10 @@
 
 import numpy as np
 import pytest
-from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Helix, Phantom, curved_path
+from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Phantom, curved_path
 
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.core.volume import Volume
-from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.measures.surface import largest_part, measures_of, surface_of
-from speckle3d.imaging.voxels.backward import look_up_voxels
-from speckle3d.imaging.voxels.grid import grid_around
 from speckle3d.imaging.voxels.volume import compound
 
 GRID = ImageGrid(120, 120, 0.1, 0.1)
@@ -24,14 +20,6 @@ def voxel_volume(volume, body):
     return np.nansum(share) * np.prod(volume.spacing_mm)
 
 
-def made(way, images, grid, poses):
-    if way != "backward":
-        return compound(images, grid, poses, STEP_MM, splat=way)
-    voxel_grid = grid_around(grid, poses, STEP_MM)
-    voxels, _ = look_up_voxels(PosedImages(images, grid, poses), voxel_grid, 0.5)
-    return Volume(voxels.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
-
-
 def test_a_sphere_swept_by_hand_has_its_size():
     body = Ball((6.0, 6.0, 6.0), 3.0)
     poses = curved_path(120, 12.0, seed=1)
@@ -41,31 +29,6 @@ def test_a_sphere_swept_by_hand_has_its_size():
     assert voxel_volume(voxels, body) == pytest.approx(body.volume_mm3, rel=0.005)
     assert surface.volume_mm3 == pytest.approx(body.volume_mm3, rel=0.01)
     assert np.abs(body.depth(surface.vertices_mm)).max() < STEP_MM / 2
-
-
-@pytest.fixture(scope="module")
-def shapes():
-    """Spheres and a helix, the images' grid, poses and images."""
-    balls = [Ball((5.0, 6.0, 6.0), 3.0), Ball((15.0, 17.0, 18.0), 2.0)]
-    bodies = (*balls, Helix((10.0, 12.0, 29.0), 4.0, 4.0, 2.0, 0.9))
-    phantom, poses = Phantom(bodies, ImageGrid(200, 230, 0.1, 0.1)), curved_path(380, 38.0, seed=2)
-    return bodies, phantom.grid, poses, phantom.images(poses)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", ["nearest", "linear", "backward"])
-def test_spheres_and_a_helix_have_their_sizes_whichever_way_they_are_compounded(shapes, way):
-    """To half a voxel, and voxels to a hundredth of the volume; `bench_surfaces` prints how near."""
-    bodies, grid, poses, images = shapes
-    volume = made(way, images, grid, poses)
-    surface = surface_of(volume, LEVEL)
-    part, middles = surface.parts(), surface.vertices_mm[surface.triangles].mean(axis=1)
-    for body in bodies:
-        own = surface.of_triangles(part == part[np.abs(body.depth(middles)).argmin()])
-        assert not len(own.open_edges())
-        assert np.abs(body.depth(own.vertices_mm)).max() < STEP_MM / 2
-    for ball in bodies[:2]:
-        assert voxel_volume(volume, ball) == pytest.approx(ball.volume_mm3, rel=0.01)
 
 
 @pytest.mark.slow

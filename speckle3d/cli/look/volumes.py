@@ -151,12 +151,11 @@ def volume(
     from speckle3d.study.scenes.voxels import GridRequest, VolumeRequest, write_voxels
 
     inputs = (input_file, sweep_file, grid.get("like"), *files_of(imported, calibration))
-    places: dict[Path, str] = {}
-    for flag, path in {"--output": out, "--state": state, "--deviation": deviation}.items():
-        if path is not None:
-            require_own_place(path, "volume", *inputs)
-            if (other := places.setdefault(path.resolve(), flag)) != flag:
-                raise InvalidInputError(f"{flag}: expected another file than {other}, got {path} for both")
+    outputs = [path.resolve() for path in (out, state, deviation) if path is not None]
+    for path in outputs:
+        require_own_place(path, "volume", *inputs)
+        if outputs.count(path) > 1:
+            raise InvalidInputError(f"{path}: expected a file for each of --output, --state and --deviation")
     checked = compounding_settings(config_file, settings)
     imports = given_settings(input_file, imported, transform)
     stated = sweep_file, imports, calibration or (), settings.get("dynamic_range_db")

@@ -31,16 +31,6 @@ def test_columns_are_even_along_an_arc_of_known_radius():
     )
 
 
-def test_a_helix_swept_along_its_axis_is_a_straight_line_of_its_own_length():
-    """A bright thread on a cylinder: laid flat it is straight, and as long as it is."""
-    radius, pitch_mm = 8.0, 12.0
-    angle = np.linspace(0, 1.5 * np.pi, 40)
-    helix = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), pitch_mm * angle / (2 * np.pi)])
-    sheet = curved_sheet(helix, [0, 0, 1], (0.0, 10.0), 0.2)
-    x = radius * angle
-    np.testing.assert_allclose(sheet.world_from_mm(x[:-1], helix[:-1, 2]), helix[:-1], atol=5e-3)
-
-
 def test_frames_and_their_field_agree_along_a_curve():
     grid = ImageGrid(41, 41, 0.5, 0.5)
     poses = RigidTransform.from_translation(np.outer(np.arange(0, 12, 0.4), [0, 0, 1]))

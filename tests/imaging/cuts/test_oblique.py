@@ -9,22 +9,11 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.cuts.oblique import (
     covering_box,
     covering_plane,
-    turned_frame_plane,
 )
 from speckle3d.imaging.cuts.planes import lateral_line, planes_from_first_frame
 
 GRID = ImageGrid(11, 21, 0.5, 0.5, 1.0)
 BOX = np.array([[x, y, z] for x in (0.0, 4.0) for y in (0.0, 6.0) for z in (0.0, 8.0)])
-
-
-@pytest.mark.parametrize("angle_deg", [30.0])
-def test_a_turned_frame_holds_its_depth_line(angle_deg):
-    pose = RigidTransform.from_components([3.0, 1.0, -2.0], Rotation.from_euler("ZYX", [0.2, 0.5, -0.4]))
-    placed = pose.inv() * turned_frame_plane(pose, 2.0, angle_deg)
-    np.testing.assert_allclose(placed.apply([[0, 0, 0], [0, 7.0, 0]]), [[2, 0, 0], [2, 7, 0]], atol=1e-12)
-    turned = np.deg2rad(angle_deg)
-    right = placed.rotation.apply([1.0, 0, 0])
-    np.testing.assert_allclose(right, [np.cos(turned), 0, np.sin(turned)], atol=1e-12)
 
 
 def test_a_covering_plane_is_as_large_as_what_frames_show():

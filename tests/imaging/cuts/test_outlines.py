@@ -1,7 +1,6 @@
 """Outlines of frames, and the lines in which frames cross a plane."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.sweep import ImageGrid
@@ -10,10 +9,9 @@ from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
 GRID = ImageGrid(11, 21, 0.4, 0.5, 1.0)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_crossings_are_on_the_plane_and_on_the_outline(seed):
+def test_crossings_are_on_the_plane_and_on_the_outline():
     """Against a dense walk along the line that a frame's and the cut's endless planes share."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     poses = RigidTransform.from_components(rng.normal(0, 3, (40, 3)), Rotation.random(40, rng=rng))
     plane = RigidTransform.from_components(rng.normal(0, 1, 3), Rotation.random(rng=rng))
     found = crossings(frame_outlines(GRID, poses), plane)

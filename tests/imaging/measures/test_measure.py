@@ -85,17 +85,3 @@ def test_belonging_is_found_as_by_looking_at_every_frame():
         assert near.weights[k, 1] == pytest.approx(max(shares, default=0.0))
         assert near.weights[k].sum() == pytest.approx(1.0)
         assert near.gap_mm[k] == pytest.approx(np.linalg.norm(beside[best]) if sides else away[best])
-
-
-def test_what_is_measured_is_what_the_formulas_give():
-    poses = swept()
-    points = inside(poses, [(5, 10, 2), (15, 30, 9), (8, 20, 18), (8, 30, 18)])
-    rows = measured(points, belonging_of(points, GRID, poses), some_errors(poses), 0.1)
-    assert [row.kind for row in rows] == ["distance"] * 3 + ["length"] + ["angle"] * 2
-    steps = np.diff(points, axis=0)
-    sizes = np.linalg.norm(steps, axis=1)
-    bend = np.arccos(-(steps[0] @ steps[1]) / sizes[0] / sizes[1])
-    np.testing.assert_allclose([row.value for row in rows[:5]], [*sizes, sizes.sum(), bend])
-    # Picked both ends of each distance to 0.1 mm per axis; both points of the last lie in one frame.
-    np.testing.assert_allclose([row.pick_sigma for row in rows[:3]], 0.1 * np.sqrt(2))
-    assert rows[2].pose_sigma == pytest.approx(0.0, abs=1e-9)

@@ -2,12 +2,10 @@
 
 import numpy as np
 import oracles
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core import threads
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
@@ -69,15 +67,3 @@ def test_a_linear_field_is_met_between_sparse_images():
     expected[[2, 6, 10, 14]] = MEASURED
     np.testing.assert_array_equal(state, np.broadcast_to(expected[:, None, None], state.shape))
     assert np.isnan(voxels[state == EMPTY]).all()
-
-
-def test_any_number_of_threads_gives_the_same(many_threads):
-    rng = np.random.default_rng(3)
-    poses, images = shaken(rng, 20, 0.5), rng.normal(size=(20, 9, 14)).astype(np.float32)
-    source, grid = PosedImages(images, GRID, poses), grid_around(GRID, poses, 0.25)
-    shared = look_up_voxels(source, grid, 2.0)
-    with pytest.MonkeyPatch.context() as one:
-        one.setattr(threads, "cores", lambda: 1)
-        alone = look_up_voxels(source, grid, 2.0)
-    for found, expected in zip(shared, alone, strict=True):
-        np.testing.assert_array_equal(found, expected)

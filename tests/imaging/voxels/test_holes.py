@@ -2,11 +2,9 @@
 
 import numpy as np
 import oracles
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from speckle3d.core import threads
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.imaging.voxels.holes import boxes_within, fill_holes
 
@@ -67,14 +65,3 @@ def test_boxes_in_mm_are_those_of_brute_force(seed, spacing, radius_mm):
     fill_holes(voxels, state, radius_mm, spacing)
     np.testing.assert_array_equal(state, expected[1])
     np.testing.assert_array_equal(voxels[state == FILLED], expected[0][state == FILLED])
-
-
-def test_any_number_of_threads_gives_the_same(many_threads):
-    shared = some_voxels(np.random.default_rng(7), (40, 30, 20), 0.1)
-    alone = [each.copy() for each in shared]
-    fill_holes(*shared, 3)
-    with pytest.MonkeyPatch.context() as one:
-        one.setattr(threads, "cores", lambda: 1)
-        fill_holes(*alone, 3)
-    for found, expected in zip(shared, alone, strict=True):
-        np.testing.assert_array_equal(found, expected)
