@@ -135,7 +135,7 @@ def command_of(name: str, function: Command) -> TyperCommand:
 
     run.__signature__ = inspect.Signature(list(options.values()))  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in options.values()}
-    builder = typer.Typer(add_completion=False)
+    builder = typer.Typer(add_completion=False, rich_markup_mode=None)
     builder.command(name, cls=PlainCommand, help=words.text, context_settings=_SETTINGS)(run)
     command = typer.main.get_command(builder)
     assert isinstance(command, PlainCommand)
@@ -196,46 +196,28 @@ def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
 
 
 class PlainCommand(TyperCommand):
-    """A command whose help is plain text: common options first, the others on request."""
+    """A command whose help is plain text: common options, the others on request, and examples."""
 
     words: Words
-    shows_all = False
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Take `-o FILE` where the output is an argument, as everywhere else; answer for removed words."""
         for word in args:
             if text := _REMOVED.get((str(self.name), word.partition("=")[0])):
                 raise InvalidInputError(f"{word} was removed: {text}")
-        self.shows_all = "--help-all" in args
+        shows_all = "--help-all" in args
+        for param in self.params:
+            param.hidden = not shows_all and param.name not in self.words.common  # type: ignore[attr-defined]
+        args = ["--help"] if shows_all else args
         if any(param.name == "out" and param.param_type_name == "argument" for param in self.params):
             args = _output_last(args)
-        return list(super().parse_args(ctx, ["--help"] if self.shows_all else args))
+        return list(super().parse_args(ctx, args))
 
-    def panels(self, ctx: Any) -> dict[str, list[Any]]:
-        """Parameters by heading."""
-        held: dict[str, list[Any]] = {"Arguments": [], "Options": [], "Other options": []}
-        for param in self.get_params(ctx):
-            title = "Options" if param.name in (*self.words.common, "help") else "Other options"
-            held["Arguments" if param.param_type_name == "argument" else title].append(param)
-        return held
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print usage, what it does, examples, arguments and options."""
-        self.format_usage(ctx, formatter)
-        self.format_help_text(ctx, formatter)
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Print examples, and how many options are not shown."""
         formatter.write("".join(["\nExample:\n", *(f"  {line}\n" for line in self.words.examples)]))
-        panels = self.panels(ctx)
-        others = [] if self.shows_all else panels.pop("Other options")
-        for title, params in panels.items():
-            if params:
-                _write_list(formatter, title, [param.get_help_record(ctx) for param in params])
-        if others:
-            formatter.write(f"\n{len(others)} other options: {ctx.command_path} --help-all\n")
-
-
-def _write_list(formatter: Any, title: str, records: Sequence[Any]) -> None:
-    with formatter.section(title):
-        formatter.write_dl(records)
+        if others := sum(param.hidden for param in self.params):
+            formatter.write(f"\n{others} other options: {ctx.command_path} --help-all\n")
 
 
 def _output_last(args: list[str]) -> list[str]:
@@ -263,13 +245,17 @@ class Group(TyperGroup):
         """Print usage, what the group is for, its options and its commands, each with its first sentence."""
         self.format_usage(ctx, formatter)
         self.format_help_text(ctx, formatter)
-        _write_list(formatter, "Options", [param.get_help_record(ctx) for param in self.get_params(ctx)])
         rows = []
         for name, entry in self.table.items():
             text = entry[0] if isinstance(entry, tuple) else inspect.getdoc(_function(entry)) or ""
             sentence = re.split(r"[.;](?:\s|$)", text, maxsplit=1)[0]
             rows.append((name, " ".join(sentence.split()) + "."))
-        _write_list(formatter, "Commands", rows)
+        for title, lines in (
+            ("Options", [p.get_help_record(ctx) for p in self.get_params(ctx)]),
+            ("Commands", rows),
+        ):
+            with formatter.section(title):
+                formatter.write_dl(lines)
 
 
 def _function(place: str) -> Command:

@@ -12,8 +12,8 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import image_corners, require_poses
 
-_LEAST_COMMON = 0.5
-"""Length of a mean of unit vectors that makes it a direction: as of a spread of 110 degrees either way."""
+_LEAST_ALIKE = 0.55
+"""Mean squared cosine to a direction in common: as of a spread of 80 degrees either way; all round 0.5."""
 
 _TURNS = Rotation.from_rotvec(np.stack(np.meshgrid(*[np.linspace(-0.7, 0.7, 7)] * 3), axis=-1).reshape(-1, 3))
 """Turns at which the smallest box is looked for: with quarter turns, near any orientation there is."""
@@ -40,25 +40,17 @@ def sweep_axes(world_from_image: RigidTransform) -> Rotation:
         through half a circle.
     InvalidInputError
         If there are no poses.
-
-    References
-    ----------
-    .. [1] F. L. Markley et al., "Averaging quaternions", J. Guidance, Control, and Dynamics, 2007.
     """
     require_poses(world_from_image)
-    images = world_from_image.rotation
-    matrices = images.as_matrix()
-    lateral, elevational = (matrices[:, :, axis] @ line_along(matrices[:, :, axis]) for axis in (0, 2))
-    half_turn = Rotation.from_rotvec([0.0, np.pi, 0.0])
-    turned = (lateral < 0) & (elevational < 0)
-    facing = Rotation.concatenate([images[~turned], images[turned] * half_turn])
-    common = np.linalg.norm(facing.as_matrix().mean(axis=0), axis=0)
-    if common.min() < _LEAST_COMMON:
-        which = ("lateral", "axial", "elevational")[int(common.argmin())]
+    images = world_from_image.rotation.as_matrix()
+    axes = np.stack([line_along(images[:, :, axis]) for axis in range(3)], axis=1)
+    alike = np.square(np.einsum("nia,ia->na", images, axes)).mean(axis=0)
+    if alike.min() < _LEAST_ALIKE:
+        which = ("lateral", "axial", "elevational")[int(alike.argmin())]
         raise InsufficientDataError(
             f"the images have no {which} direction in common: expected one sweep, or axes as asked for"
         )
-    return facing.mean()
+    return Rotation.from_matrix(axes)
 
 
 def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotation:
