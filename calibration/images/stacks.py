@@ -222,7 +222,9 @@ def read_stack(
     images = np.empty(shape, np.float32)
     for n, frame in enumerate(frames):
         # Whole blocks; a block is NaN where any of its pixels is.
-        whole = source.read(int(frame))[: shape[1] * bins[0], : shape[2] * bins[1]]
+        whole = np.array(source.read_as_stored(int(frame)), np.float32, order="C")[
+            : shape[1] * bins[0], : shape[2] * bins[1]
+        ]
         images[n] = transform.downscale_local_mean(whole, tuple(bins))
         if progress:
             progress(n + 1, len(frames))

@@ -216,7 +216,7 @@ class PlainCommand(TyperCommand):
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Print examples, and how many options are not shown."""
         formatter.write("".join(["\nExample:\n", *(f"  {line}\n" for line in self.words.examples)]))
-        if others := sum(param.hidden for param in self.params):
+        if others := sum(param.hidden for param in self.params):  # type: ignore[attr-defined]
             formatter.write(f"\n{others} other options: {ctx.command_path} --help-all\n")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.sweep import ImageGrid
 
@@ -65,11 +65,6 @@ class PosedImages:
     def any_thread(self) -> bool:
         """Whether images may be read by several threads at once."""
         return _any_thread(self.images)
-
-    def read(self, index: int) -> Float32Array:
-        """Image number `index`, shape (vector, sample), contiguous; raises what `read_as_stored` does."""
-        # Writeable, so that read-only sources do not compile the kernels a second time.
-        return np.require(self.read_as_stored(index), np.float32, ["C", "W"])
 
     def read_as_stored(self, index: int) -> npt.NDArray[Any]:
         """Image number `index` in the type and the order in memory that it has, shape (vector, sample).

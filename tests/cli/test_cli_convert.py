@@ -82,11 +82,7 @@ RESULT = "FreehandCalibration3NWires_fCal2.0.results.xml"
 SWEEPS = {
     "plus/BoneUltrasound_L14.igs.mha": ("BoneUltrasound_L14_config.xml", DB, (21, 820, 616), 21),
     "plus/SpinePhantomFreehand.igs.mha": (SPINE, DB, (21, 820, 616), 21),
-    "plus/NwirePhantomFreehand.igs.nrrd": (None, DB | SIZE, (97, 820, 616), 97),
-    "plus/fCal_Test_Calibration_3NWires_fCal2.0.igs.mha": (RESULT, DB, (190, 820, 616), 190),
-    "plus/fCal_Test_Validation_3NWires_fCal2.0.igs.mha": (WIRES, DB, (103, 820, 616), 103),
     "plus/WaterTankBottomTranslationVideoBuffer.igs.mha": (None, DB | SIZE, (201, 820, 616), None),
-    "plus/UltrasonixLinearScanConvertedData.igs.mha": (LINEAR, DB, (1, 260, 400), None),
     "plus/UltrasonixLinearRfData.igs.mha": (
         LINEAR,
         ECHOES | {"sampling_rate_hz": "40e6", "demodulation_frequency_hz": "0"},

@@ -219,10 +219,9 @@ def _sizes(place: Path, rough: Surface, surface: Surface, *errors: Any) -> dict[
     sizes = {"file": str(place), **asdict(measures), "parts": int(surface.parts().max()) + 1}
     sizes["size_mm"] = extent.tolist()
     if surface is not rough:
-        before = measures_of(rough)
-        sizes["smoothing_changed_area"] = surface.area_mm2 / before.area_mm2 - 1.0
-        if measures.volume_mm3 is not None and before.volume_mm3:
-            sizes["smoothing_changed_volume"] = measures.volume_mm3 / before.volume_mm3 - 1.0
+        before = measures_of(rough).volume_mm3
+        if measures.volume_mm3 is not None and before:
+            sizes["smoothing_changed_volume"] = measures.volume_mm3 / before - 1.0
     return sizes
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import (
     Json,
     MaybeNumber,
@@ -213,9 +214,7 @@ def orient(
 def record(
     port: str,
     out: OutArgument,
-    content: str = "orientation",
-    rate_hz: MaybeNumber = None,
-    baud: int | None = None,
+    settings: Annotated[dict[str, Any], Fields("xsens.live.device:DeviceSettings")],
     duration_s: MaybeNumber = None,
     append: bool = False,
 ) -> None:
@@ -252,12 +251,10 @@ def record(
     from xsens.live.device import DeviceSettings
     from xsens.live.recording import record as record_port
 
-    settings = DeviceSettings(content, rate_hz, baud)
-    console = Console(stderr=True)
-    state = None
+    console, device, state = Console(stderr=True), DeviceSettings(**settings), None
     try:
         with Live(Text("connecting"), console=console, refresh_per_second=8, transient=True) as live:
-            for state in record_port(port, out, settings, append, duration_s=duration_s or float("inf")):
+            for state in record_port(port, out, device, append, duration_s=duration_s or float("inf")):
                 live.update(Text(state.line()))
     except KeyboardInterrupt:
         note("stopped")

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray
@@ -26,6 +25,7 @@ from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
 from speckle3d.imaging.voxels.holes import fill_holes
 from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
 from speckle3d.imaging.voxels.splatting import splat_images
+from speckle3d.io.toml import validated
 
 _BYTES_PER_VOXEL = 25
 """Of work beside the voxels' own type: sum and weight, or two images beside it; tag, level and state."""
@@ -139,19 +139,10 @@ def compound(
     source = PosedImages(images, grid, world_from_image)
     if voxel_grid is None:
         voxel_grid = grid_around(grid, world_from_image, float(voxel_mm or 0.0), world_from_axes)
-    try:
-        settings = CompoundingSettings(
-            splat=splat,
-            rule=rule,
-            fill_radius=fill_radius,
-            backward_mm=backward_mm,
-            voxel_type=voxel_type,
-            max_memory_gb=max_memory_gb,
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InvalidInputError(f"{first['loc'][0]}: {first['msg']}, got {first['input']!r}") from None
-    return compound_onto(voxel_grid, source, settings, weights, region)
+    settings = {"splat": splat, "rule": rule, "fill_radius": fill_radius, "backward_mm": backward_mm,
+                "voxel_type": voxel_type, "max_memory_gb": max_memory_gb}  # fmt: skip
+    checked = validated(settings, "compound", CompoundingSettings)
+    return compound_onto(voxel_grid, source, checked, weights, region)
 
 
 def compound_onto(

@@ -6,12 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.labels import EMPTY, FILLED, MEASURED
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.backward import look_up_voxels
-from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
+from speckle3d.imaging.voxels.grid import grid_around
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
@@ -46,24 +45,3 @@ def test_matches_brute_force(seed, spacing, reach_mm):
     np.testing.assert_array_equal(state.T.ravel(), expected[1])
     # Single precision of levels of order one, of distances up to 5 mm and of their ratios.
     np.testing.assert_allclose(voxels.T.ravel(), expected[0], atol=2e-5)
-
-
-def test_a_linear_field_is_met_between_sparse_images():
-    poses = RigidTransform.from_translation(np.outer(np.arange(4) * 2.0, [0, 0, 1]))
-    x = np.arange(9)[:, None] * 0.5
-    y = 0.7 + np.arange(14) * 0.3
-    images = [(3.0 * x - 2.0 * y + 5.0 * z) for z in poses.translation[:, 2]]
-    grid = VoxelGrid((7, 6, 17), (0.5, 0.5, 0.5), RigidTransform.from_translation([0.25, 1.0, -1.0]))
-    voxels, state = look_up_voxels(PosedImages(images, GRID, poses), grid, 2.1)
-    z, y, x = np.meshgrid(
-        np.arange(17) * 0.5 - 1.0, 1.0 + np.arange(6) * 0.5, 0.25 + np.arange(7) * 0.5, indexing="ij"
-    )
-    inside = (z >= 0) & (z <= 6)
-    # Single precision of levels of some tens.
-    np.testing.assert_allclose(voxels[inside], (3.0 * x - 2.0 * y + 5.0 * z)[inside], atol=1e-5)
-    # Images lie on planes 2, 6, 10 and 14; half a voxel reaches no other, and nothing is extrapolated.
-    expected = np.full(17, EMPTY)
-    expected[2:15] = FILLED
-    expected[[2, 6, 10, 14]] = MEASURED
-    np.testing.assert_array_equal(state, np.broadcast_to(expected[:, None, None], state.shape))
-    assert np.isnan(voxels[state == EMPTY]).all()
