@@ -88,7 +88,7 @@ def reslice(
     outlines
         Draw where the frames are instead.
     volume
-        Cut this volume of the sweep, not its frames.
+        Cut this volume of the sweep, not its frames. Not with --difference-to.
     state
         What `volume --state` wrote: empty voxels are not shown.
     pixel_mm
