@@ -18,9 +18,8 @@ from speckle3d.correction.drift import DriftSettings
 from speckle3d.correction.settings import FusedSettings
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.toml import parsed, read_toml, validated
-from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import MatchingSettings
+from speckle3d.matching.matcher import InPlaneSettings, MatchingSettings
 from speckle3d.matching.patches import PatchSettings
 from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import TrajectorySettings
@@ -41,12 +40,11 @@ REMOVED_SETTINGS = {
     "trajectory.revisit_mm": "ties between visits of the same tissue brought them no nearer to each other",
     "trajectory.join": "poses are always solved from all pairs",
     "volume.max_file_gb": "volumes are made in memory, which `max_memory_gb` limits",
+    "quality.drop_db": "frames without contact are told by what is in them",
     "inertial": "`fused` takes any sensor there is, `crossed` a second sweep across the first",
     "fused.contradiction_sigma": "where images and sensors differ both numbers are told",
 }
 """Settings, or whole stages, of older files, and what is there instead."""
-REMOVED = (("inertial", None), ("fused", "contradiction_sigma"), ("trajectory", "revisit_mm"))
-"""Groups, and settings of groups, that older reconstructions' configurations hold and nothing reads now."""
 
 
 class Config(BaseModel):

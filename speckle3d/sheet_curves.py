@@ -6,11 +6,11 @@ import numpy as np
 
 from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra
+from speckle3d.core.curves import CurveKey, DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.core.sweep import Sweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.texture import echo_spectra, measured_texture
+from speckle3d.matching.texture import measured_texture
 from speckle3d.motion.data_sheet import ProbeSheet, sheet_curves
 
 
@@ -43,10 +43,8 @@ def data_sheet_curves(
             raise InvalidInputError(f"depth_mm: expected room for two patches, got {sheet.depth_mm:g} mm")
         return sheet_curves(sheet, key, rows, largest_mm=settings.curves.largest_mm)
     matcher = FrameMatcher(like, settings.intensity, settings.patches, settings.inplane, settings.matching)
-    rows, seen = matcher.patches.row_depth_mm, None
-    if isinstance(like.signal, RFSettings):
-        seen = EchoSpectra(rows, *echo_spectra(like, rows, settings.patches.height_mm))
-    size = measured_texture(like, matcher).speckle_size()
+    rows, texture = matcher.patches.row_depth_mm, measured_texture(like, matcher)
+    size, seen = texture.speckle_size(), texture.spectra()
     area = 2.0 * np.pi * _filled(rows, size.lateral_mm) * _filled(rows, size.axial_mm)
     known = bool(np.isfinite(area).all())
     return sheet_curves(sheet, matcher.key, rows, seen, area if known else None, settings.curves.largest_mm)

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 
 from speckle3d.kernels.plane_misfit import EchoModels
-from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.planes import MotionProblem, PairPlanes, PlaneSettings, pair_planes
@@ -20,11 +19,10 @@ def problem_of(curves, patches, grid, frames=2, **settings):
 def table_of(rho, moved_mm=(0.0, 0.0), first=None, second=None):
     """Pairs of frames 0 and 1, or of others, with correlations of shape (e, p)."""
     rho = np.asarray(rho, np.float32)
-    median = np.nan_to_num(np.nanmedian(rho, axis=1)) if np.isfinite(rho).any() else np.zeros(len(rho))
-    motion = (InPlaneMotion(*moved_mm, 0.0, 1e-6 * np.eye(3)),) * len(rho)
+    motion = np.tile([*moved_mm, 0.0], (len(rho), 1)), np.tile(1e-6 * np.eye(3), (len(rho), 1, 1))
     first = np.zeros(len(rho), int) if first is None else np.asarray(first)
     second = np.ones(len(rho), int) if second is None else np.asarray(second)
-    return CorrelationTable(first, second, rho, median, motion)
+    return CorrelationTable(first, second, rho, *motion)
 
 
 def fit_many(problem, rho, moved_mm=(0.0, 0.0), **known):

@@ -19,8 +19,8 @@ from speckle3d.core.sweep import Sweep
 from speckle3d.examine.curves import examine_curves
 from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.matcher import FrameMatcher
-from speckle3d.matching.standing import standing_share
 from speckle3d.matching.table import CorrelationTable
+from speckle3d.matching.texture import standing_share
 from speckle3d.motion.estimate import ImageMotion
 from speckle3d.motion.planes import LEAST_CORRELATION
 from speckle3d.motion.trajectory import HELD_MM
@@ -221,7 +221,7 @@ def standing(share: FloatArray, frames: int, cells: float, of_echo: bool = True)
     Parameters
     ----------
     share : ndarray, shape (p,)
-        Of each patch's power, from `speckle3d.matching.standing.standing_share`.
+        Of each patch's power, from `speckle3d.matching.texture.standing_share`.
     frames : int
         From which it was found.
     cells : float

@@ -28,7 +28,7 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import on_one_thread
-from speckle3d.matching.frames import FrameByFrame, FrameMaker, ImageSink
+from speckle3d.matching.frames import FrameByFrame, ImageSink, ready_frame
 from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
@@ -51,8 +51,6 @@ LONGEST_HURRY_S = 1.0
 """For which nothing is revised, however many frames wait."""
 LAST = 10**9
 """Later than any frame."""
-COMPARED = 400
-"""Earlier frames against whose levels a frame's are judged."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +121,8 @@ class LiveTracker:
         self.images = images
         self._config = config or Config()
         matcher = matcher_for(example, curves, self._config)
-        self._patches = len(matcher.patches)
         self.image_grid = matcher.grid
-        self._maker = FrameMaker(example, matcher, self._config.quality)
+        self._example, self._matcher = example, matcher
         self._matched = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
         self._problem = motion_problem(curves, matcher, 1, self._config)
         self._features: list[FrameFeatures] = []
@@ -185,13 +182,12 @@ class LiveTracker:
         if self._failure is not None:
             raise self._failure
         number = len(self._tables)
-        made = self._maker.make(frame)
+        ready = ready_frame(frame, self._example, self._matcher, self._config.quality)
         if self.images:
-            self.images(number, made.echo.intensity)
-        pairs = self._matched.advance(number, made.ready)
-        table = CorrelationTable.of(((i, number, pairs[i]) for i in sorted(pairs)), self._patches)
+            self.images(number, ready.echo.intensity)
+        table = self._matched.advance(number, ready.frame)
         with self._lock:
-            self._keep(made.features, table)
+            self._keep(ready.features, table)
             self._place()
         if self._thread is None or len(self) <= ANEW:
             self._revise_now()
@@ -218,7 +214,7 @@ class LiveTracker:
         number = len(self._tables)
         self._features.append(features)
         self._tables.append(table)
-        flag = int(flag_frames(self._features[-COMPARED:], self._config.quality)[-1])
+        flag = int(flag_frames(self._features[-2:], self._config.quality)[-1])
         least = self._config.trajectory.least_correlation
         if len(table) and table.median.max() < least:
             flag |= FrameFlag.UNMATCHED

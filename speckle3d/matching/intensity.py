@@ -19,13 +19,7 @@ from scipy import fft
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
-from speckle3d.kernels.intensity import (
-    equalise_echo,
-    local_mean,
-    place_band,
-    place_band_of_real,
-    squared_magnitude,
-)
+from speckle3d.kernels.box_means import box_means
 
 _RATE_OVER_BAND = 100 / 27
 """Rate of the intensity's samples over the width of the pass-band, edges included, whatever the echoes were
@@ -36,6 +30,9 @@ third of 66.7 MHz for echoes of 5 to 10 MHz."""
 
 _RATIO_TOLERANCE = 1e-4
 """Of the rate; 4 um at 40 mm."""
+
+_LEAST_MEAN = 1e-9
+"""Of the largest local mean, under which none is divided by."""
 
 
 class IntensitySettings(BaseModel):
@@ -55,23 +52,19 @@ class IntensitySettings(BaseModel):
 
 @dataclass(frozen=True)
 class _Resampling:
-    """Fourier bins of the band and where they go in the inverse transform of another length.
+    """Fourier bins of the band, and where they go in the inverse transform of another length.
 
-    Real rows of even length are transformed as half as many complex numbers, and only the band is made of
-    what comes out; `mirrored` is then what each bin takes from its mirror image.
+    Real rows, of even length, are transformed as half as many complex numbers: in half the time. With Z the
+    spectrum of the even samples plus i times the odd ones, that of all is
+    ``weights[k] Z[k] + mirrored[k] conj(Z[-k])``.
     """
 
     length: int
     out_length: int
-    runs: IntArray
-    """First bin, its place in the inverse transform and count, of bins that follow one another in both."""
+    bins: IntArray
+    destination: IntArray
     weights: Complex64Array
-    mirrored: Complex64Array | None
-
-    @property
-    def step(self) -> float:
-        """Distance of the samples that come out, in samples that go in."""
-        return self.length / self.out_length
+    mirrored: Complex64Array
 
 
 class IntensityExtractor:
@@ -93,7 +86,7 @@ class IntensityExtractor:
         self._plan: _Resampling | None = None
         if isinstance(signal, RFSettings):
             self._plan = _plan_resampling(signal, grid.samples, self.settings.edge_fraction)
-            step = self._plan.step
+            step = self._plan.length / self._plan.out_length
             samples = int((grid.samples - 1) / step) + 1
             self.grid = replace(grid, samples=samples, sample_spacing_mm=grid.sample_spacing_mm * step)
 
@@ -122,65 +115,54 @@ class IntensityExtractor:
         """
         if self._plan is None or not isinstance(self.signal, RFSettings):
             raise InvalidInputError("expected RF frames, got B-mode images: there is no phase to recover")
-        self._check(frame)
+        self._require_shape(frame)
         if np.iscomplexobj(frame) != self.signal.are_complex:
             kind = "complex" if self.signal.are_complex else "real"
             raise InvalidInputError(f"expected {kind} samples, got {frame.dtype}")
-        return _resample(frame, self._plan, self.grid.samples)
+        plan = self._plan
+        padded = np.zeros((len(frame), plan.length), "c8" if self.signal.are_complex else "f4")
+        padded[:, : frame.shape[1]] = frame
+        spectrum = fft.fft(padded.view(np.complex64), axis=1, overwrite_x=True)
+        chosen = spectrum[:, plan.bins] * plan.weights
+        if not self.signal.are_complex:
+            chosen += spectrum[:, -plan.bins].conj() * plan.mirrored
+        band = np.zeros((len(frame), plan.out_length), np.complex64)
+        band[:, plan.destination] = chosen
+        return np.asarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])
 
     def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
         """Echo intensity, shape (vector, grid.samples), arbitrary units, from RF or B-mode grey levels."""
         if isinstance(self.signal, BModeSettings):
-            self._check(frame)
+            self._require_shape(frame)
             return _decompress(frame, self.signal)
         return intensity_of(self.analytic(frame))
 
-    def equalise(self, intensity: Float32Array) -> Float32Array:
-        """Divide out the local mean, so that echogenicity does not read as speckle that stays.
+    def gain(self, intensity: Float32Array) -> Float32Array:
+        """One over the local mean of intensity, of its shape; ones if nothing is to be equalised.
 
-        Brightness that varies within a patch correlates between frames whatever the probe did.
+        Brightness that varies within a patch correlates between frames whatever the probe did: with the local
+        mean divided out, echogenicity does not read as speckle that stays.
         """
         if self.settings.equalise_mm == 0:
-            return intensity
-        mean, floor = self._local_mean(intensity)
-        return np.divide(intensity, np.maximum(mean, np.float32(floor), out=mean), out=mean)
-
-    def equalise_echo(
-        self, analytic: Complex64Array, intensity: Float32Array
-    ) -> tuple[Float32Array, Float32Array]:
-        """Divide out the local mean of an echo too, whose intensity is then the equalised one.
-
-        Returns
-        -------
-        image : ndarray of float32, shape (vector, grid.samples)
-            As from `equalise`.
-        echo : ndarray of float32, shape (2, vector, grid.samples)
-            Real and imaginary parts.
-        """
-        if self.settings.equalise_mm == 0:
-            return intensity, np.stack([analytic.real, analytic.imag])
-        mean, floor = self._local_mean(intensity)
-        image, parts = np.empty(mean.shape, np.float32), np.empty((2, *mean.shape), np.float32)
-        equalise_echo(_in_turn(analytic), np.ascontiguousarray(intensity), mean, floor, image, parts)
-        return image, parts
-
-    def _local_mean(self, intensity: Float32Array) -> tuple[Float32Array, float]:
-        """Mean over the window about each sample, and the least to divide by."""
+            return np.ones_like(intensity)
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
-        half = np.array([int(self.settings.equalise_mm / 2 / side) for side in sides])
-        mean = np.empty(intensity.shape, np.float32)
-        return mean, local_mean(np.ascontiguousarray(intensity, dtype=np.float32), half, mean)
+        window = [2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides]
+        padded = np.pad(intensity, [(n // 2, n // 2) for n in window], mode="edge")
+        mean = np.empty_like(intensity)
+        box_means(padded, window[0], window[1], mean)
+        np.maximum(mean, _LEAST_MEAN * mean.max() + np.finfo(np.float32).tiny, out=mean)
+        return np.reciprocal(mean, out=mean)
 
-    def _check(self, frame: npt.NDArray[Any]) -> None:
+    def _require_shape(self, frame: npt.NDArray[Any]) -> None:
         if frame.shape != self._frame_shape:
             raise InvalidInputError(f"expected a frame of shape {self._frame_shape}, got {frame.shape}")
 
 
 def intensity_of(analytic: Complex64Array) -> Float32Array:
     """Squared magnitude."""
-    out = np.empty(analytic.shape, np.float32)
-    squared_magnitude(_in_turn(analytic), out)
-    return out
+    intensity = analytic.real * analytic.real
+    intensity += analytic.imag * analytic.imag
+    return intensity
 
 
 def two_way_wavenumber(signal: RFSettings) -> float:
@@ -201,23 +183,14 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
     destination = (np.arange(bins.size) - bins.size // 2) % out_length
     # Over the lengths' ratio for the inverse transform; the analytic signal is twice the positive half of a
     # real signal's spectrum.
-    scale = (1.0 if signal.are_complex else 2.0) * out_length / length
-    chosen, mirrored = scale * weights[bins].astype(complex), None
-    if not signal.are_complex and length % 2 == 0 and bins[-1] < length // 2:
-        turn = 1j * np.exp(-2j * np.pi * bins / length)
-        chosen, mirrored = chosen * (1 - turn) / 2, (chosen * (1 + turn) / 2).astype(np.complex64)
-    return _Resampling(length, out_length, _runs(bins, destination), chosen.astype(np.complex64), mirrored)
-
-
-def _runs(bins: IntArray, destination: IntArray) -> IntArray:
-    """First bin, first destination and count of the runs in which both rise by one, shape (r, 3)."""
-    breaks = np.flatnonzero((np.diff(bins) != 1) | (np.diff(destination) != 1)) + 1
-    first = np.concatenate([[0], breaks])
-    return np.stack([bins[first], destination[first], np.diff(first, append=bins.size)], axis=1)
+    scale = out_length / length * weights[bins]
+    turn = 0.0 if signal.are_complex else 1j * np.exp(-2j * np.pi * bins / length)
+    factors = ((scale * factor).astype(np.complex64) for factor in (1.0 - turn, 1.0 + turn))
+    return _Resampling(length, out_length, bins, destination, *factors)
 
 
 def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
-    """Lengths of the transforms, both fast, of which the first is `ratio` times the second.
+    """Lengths of the transforms, both fast, of which the first, even, is `ratio` times the second.
 
     The first fast pair is taken that has that ratio to `_RATIO_TOLERANCE`.
     """
@@ -225,10 +198,10 @@ def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
     least = out_length
     while out_length <= 2 * least:
         length = fft.next_fast_len(round(out_length * ratio * (1 - _RATIO_TOLERANCE)))
-        if abs(length / (out_length * ratio) - 1) <= _RATIO_TOLERANCE:
+        if length % 2 == 0 and abs(length / (out_length * ratio) - 1) <= _RATIO_TOLERANCE:
             return length, out_length
         out_length = fft.next_fast_len(out_length + 1)
-    return round(least * ratio), least
+    return 2 * round(least * ratio / 2), least
 
 
 def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -> FloatArray:
@@ -237,33 +210,7 @@ def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -
     return np.asarray(np.where(outside < 1, np.cos(np.pi / 2 * np.clip(outside, 0, 1)) ** 2, 0.0))
 
 
-def _resample(frame: npt.NDArray[Any], plan: _Resampling, samples: int) -> Complex64Array:
-    rows, given = frame.shape
-    kind = np.float32 if plan.mirrored is not None else np.complex64
-    padded = np.empty((rows, plan.length), kind)
-    padded[:, :given] = frame
-    padded[:, given:] = 0
-    spectrum = np.asarray(fft.fft(padded.view(np.complex64), axis=1, overwrite_x=True), dtype=np.complex64)
-    band: Complex64Array = np.empty((rows, plan.out_length), np.complex64)
-    if plan.mirrored is None:
-        place_band(_in_turn(spectrum), _in_turn(plan.weights), plan.runs, _in_turn(band))
-    else:
-        factors = _in_turn(plan.weights), _in_turn(plan.mirrored)
-        place_band_of_real(_in_turn(spectrum), *factors, plan.runs, _in_turn(band))
-    analytic = np.empty((rows, samples), np.complex64)
-    analytic[:] = fft.ifft(band, axis=1, overwrite_x=True)[:, :samples]
-    return analytic
-
-
-def _in_turn(values: Complex64Array) -> Float32Array:
-    """Real and imaginary parts in turn."""
-    return np.ascontiguousarray(values).view(np.float32)
-
-
 def _decompress(frame: npt.NDArray[Any], signal: BModeSettings) -> Float32Array:
     """Invert log compression: full scale is 0 dB, zero is the bottom of the dynamic range."""
-    if frame.dtype == np.uint8 and frame.size > 256:
-        table = _decompress(np.arange(256, dtype=np.float32), signal)
-        return np.take(table, frame, out=np.empty(frame.shape, np.float32), mode="clip")
     decibel = (frame.astype(np.float32) / np.float32(signal.full_scale) - 1) * signal.dynamic_range_db
     return np.asarray(10 ** (decibel / 10), dtype=np.float32)

@@ -1,26 +1,25 @@
-"""Frames made ready for matching, and frame pairs matched: the work every pair of a sweep shares."""
+"""Frames made ready for matching, and frame pairs matched: the work every pair of a sweep shares.
+
+The in-plane shift comes from all patches together, and the correlation is read at that shift: taking each
+patch's own maximum over lags biases the correlation upward and distances short.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
+from scipy import fft
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
 from speckle3d.core.curves import CurveKey
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.matching.inplane import (
-    CoarseMatcher,
-    InPlaneMotion,
-    InPlaneSettings,
-    MatchedPair,
-    match_with_each,
-)
+from speckle3d.core.threads import in_parallel
+from speckle3d.kernels.inplane import Frame, Geometry, Matches, match_pair
 from speckle3d.matching.intensity import (
     IntensityExtractor,
     IntensitySettings,
@@ -28,6 +27,11 @@ from speckle3d.matching.intensity import (
     two_way_wavenumber,
 )
 from speckle3d.matching.patches import PatchSettings, lay_patches
+from speckle3d.matching.table import CorrelationTable
+
+_POOLED_BELOW_MM = 0.05
+"""Sample spacing below which two samples are pooled for the coarse search: intensity comes with two to four
+in a speckle, and the peak is still found to the sample from which the matching goes on."""
 
 
 class MatchingSettings(BaseModel):
@@ -42,27 +46,22 @@ class MatchingSettings(BaseModel):
     )
 
 
-@dataclass(frozen=True)
-class Echo:
+class InPlaneSettings(BaseModel):
+    """How in-plane motion is searched."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    search_mm: float = Field(3.0, gt=0, description="Largest in-plane shift looked for between two frames.")
+    least_overlap: float = Field(
+        0.6, gt=0, le=1, description="Share of a patch that must still lie in the other image."
+    )
+
+
+class Echo(NamedTuple):
     """One frame's intensity, shape (vector, sample), and the analytic signal it comes from, if known."""
 
     intensity: Float32Array
     analytic: Complex64Array | None
-
-
-@dataclass(frozen=True)
-class ReadyFrame:
-    """What is kept of a frame while pairs with it may still be measured."""
-
-    usable: BoolArray
-    """Patches that may be matched, shape (p,)."""
-
-    image: Float32Array
-    """Equalised intensity, shape (vector, sample)."""
-    spectrum: Complex64Array
-    """For the coarse search."""
-    echo: Float32Array | None = None
-    """Real and imaginary parts of the equalised echo, shape (2, vector, sample)."""
 
 
 class FrameMatcher:
@@ -87,9 +86,13 @@ class FrameMatcher:
         self.centre_mm = sweep.grid.centre_mm
         self.laid = lay_patches(self.grid, patches)
         self.patches = self.laid
-        self.inplane = inplane
+        self._least_overlap = inplane.least_overlap
         self._mask = Region(patches.region).mask(self.grid) if patches.region else None
-        self._coarse = CoarseMatcher(self.grid, inplane.search_mm)
+        spacing, sides = self.laid.spacing_mm, np.array([self.grid.vectors, self.grid.samples])
+        self._pool = np.array([1, 2 if spacing[1] < _POOLED_BELOW_MM else 1])
+        self._reach = np.minimum(np.ceil(inplane.search_mm / (spacing * self._pool)), sides // self._pool - 1)
+        self._reach = self._reach.astype(np.int64)
+        self._lengths = [fft.next_fast_len(int(n), True) for n in sides // self._pool + self._reach]
         rf = sweep.signal if isinstance(sweep.signal, RFSettings) else None
         self.of_echo = rf is not None and (matching or MatchingSettings()).correlate == "echo"
         self._wavenumber = two_way_wavenumber(rf) if rf is not None else 0.0
@@ -104,11 +107,6 @@ class FrameMatcher:
             sweep.probe,
         )
 
-    @property
-    def at_mm(self) -> FloatArray:
-        """Position of the patches from the image's centre, shape (p, 2)."""
-        return self.patches.centre_mm - self.centre_mm[:2]
-
     def keep_depths(self, depth_mm: FloatArray) -> None:
         """Leave out the patches beyond the first and the last of some depths; see `PatchGrid.between`."""
         self.patches = self.laid.between(depth_mm)
@@ -120,7 +118,17 @@ class FrameMatcher:
         analytic = self.extractor.analytic(frame)
         return Echo(intensity_of(analytic), analytic)
 
-    def prepare(self, echo: Echo, usable: BoolArray | None = None) -> ReadyFrame:
+    def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array]:
+        """Intensity and, where there is phase, echo over their local mean; see `Frame`."""
+        gain = self.extractor.gain(echo.intensity)
+        image, parts = echo.intensity * gain, np.empty((2, 0, 0), np.float32)
+        if echo.analytic is not None:
+            np.sqrt(gain, out=gain)
+            parts = np.stack([echo.analytic.real, echo.analytic.imag])
+            parts *= gain
+        return image, parts
+
+    def prepare(self, echo: Echo, usable: BoolArray | None = None) -> Frame:
         """Equalise an echo and transform it for the coarse search.
 
         Parameters
@@ -132,41 +140,67 @@ class FrameMatcher:
         kept = self.patches.inside if usable is None else self.patches.inside & usable
         # Only what lies in the region is searched for.
         searched = image if self._mask is None else np.where(self._mask, image, image[self._mask].mean())
-        return ReadyFrame(kept, image, self._coarse.spectrum(searched), parts)
+        if self._pool[1] == 2:
+            even = searched.shape[1] // 2 * 2
+            searched = searched[:, 0:even:2] + searched[:, 1:even:2]
+        spectrum = fft.rfft2(searched - searched.mean(), self._lengths)
+        return Frame(kept, image, parts, spectrum)
 
-    def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array | None]:
-        """Intensity and, where there is phase, echo over their local mean; see `ReadyFrame`."""
-        if echo.analytic is None:
-            return self.extractor.equalise(echo.intensity), None
-        return self.extractor.equalise_echo(echo.analytic, echo.intensity)
+    def search(self, fixed: Frame, moving: Frame) -> FloatArray:
+        """In-plane motion (x, y, roll) to the nearest sample, by the correlation of whole frames."""
+        rows, columns = self._reach
+        product = np.conj(fixed.spectrum) * moving.spectrum
+        product = fft.ifft(product, axis=0, overwrite_x=True)[np.arange(-rows, rows + 1)]
+        near = fft.irfft(product, self._lengths[1], axis=1)[:, np.arange(-columns, columns + 1)]
+        peak = np.array(np.unravel_index(np.argmax(near), near.shape))
+        shift = (peak - self._reach) * self._pool * self.patches.spacing_mm
+        return np.array([*-shift, 0.0])
 
-    def search(self, fixed: ReadyFrame, moving: ReadyFrame) -> InPlaneMotion:
-        """In-plane motion to the nearest sample, looked for over the whole search range."""
-        shift = self._coarse.shift(fixed.spectrum, moving.spectrum) * self.patches.spacing_mm
-        return InPlaneMotion(float(-shift[0]), float(-shift[1]))
+    def match(
+        self, fixed: Mapping[int, Frame], number: int, moving: Frame, starts: Sequence[FloatArray]
+    ) -> CorrelationTable:
+        """In-plane motion and correlation of a frame's pairs with some earlier ones.
 
-    def match(self, fixed: ReadyFrame, moving: ReadyFrame, start: InPlaneMotion) -> MatchedPair:
-        """In-plane motion and correlation of one pair, from a start that is right to about a sample."""
-        return self.match_with_each([fixed], moving, [start])[0]
-
-    def match_with_each(
-        self, fixed: Sequence[ReadyFrame], moving: ReadyFrame, starts: Sequence[InPlaneMotion]
-    ) -> list[MatchedPair]:
-        """In-plane motion and correlation of a frame's pairs with some others, from a start for each."""
-        theirs = [frame.echo for frame in fixed if frame.echo is not None]
-        # The others would pull the motion, too.
-        some = moving.usable
-        matches = match_with_each(
-            [frame.image for frame in fixed],
-            moving.image,
-            self.patches.among(some),
-            starts,
-            self.centre_mm,
-            self.inplane,
-            None if moving.echo is None else (theirs, moving.echo),
+        Parameters
+        ----------
+        fixed : mapping of int to Frame
+            The others, by their numbers.
+        number, moving : int and Frame
+        starts : sequence of ndarray, shape (3,)
+            Motion from each of the others, right to about a sample.
+        """
+        count, patches = len(fixed), self.patches
+        places = patches.centre_mm - self.centre_mm[:2]
+        geometry = Geometry(
+            patches.first,
+            patches.size,
+            np.column_stack([np.ones(len(patches)), places]),
+            patches.spacing_mm,
+            self._least_overlap,
             self._wavenumber,
         )
-        return [
-            match.laid_out(some).among(frame.usable & some)
-            for match, frame in zip(matches, fixed, strict=True)
-        ]
+        matches = Matches(
+            np.empty((count, len(patches))), np.array(starts).reshape(count, 3), np.empty((count, 3, 3))
+        )
+        frames = list(fixed.values())
+
+        def match(begin: int, stop: int) -> None:
+            for row in range(begin, stop):
+                match_pair(frames[row], moving, geometry, matches, row)
+
+        in_parallel(match, count)
+        first = np.array(list(fixed), dtype=np.int64)
+        correlation = matches.correlation.astype(np.float32)
+        return CorrelationTable(first, np.full(count, number), correlation, *matches[1:])
+
+
+def compose(first: FloatArray, then: FloatArray) -> FloatArray:
+    """In-plane motion (x, y, roll) over two steps, as a start for matching across both."""
+    place = complex(*first[:2]) + np.exp(1j * first[2]) * complex(*then[:2])
+    return np.array([place.real, place.imag, first[2] + then[2]])
+
+
+def inverse(motion: FloatArray) -> FloatArray:
+    """In-plane motion the other way round."""
+    place = -np.exp(-1j * motion[2]) * complex(*motion[:2])
+    return np.array([place.real, place.imag, -motion[2]])

@@ -68,6 +68,11 @@ class PatchGrid:
         by_column = values.reshape(*values.shape[:-1], -1, self.row_depth_mm.size)
         return np.asarray(by_column.swapaxes(-1, -2))
 
+    def tiles(self, image: npt.NDArray[Any], step: int = 1) -> npt.NDArray[Any]:
+        """Every patch of an image, shape (..., vector, sample), each `step`-th sample: (p, ..., v, s)."""
+        wide, high = self.size
+        return np.stack([image[..., v : v + wide, s : s + high : step] for v, s in self.first])
+
     def between(self, depth_mm: FloatArray) -> PatchGrid:
         """Keep the rows whose centres lie between the first and the last of some depths, or half a patch off.
 
@@ -87,16 +92,11 @@ class PatchGrid:
             )
         return self.with_rows(kept)
 
-    def among(self, chosen: BoolArray) -> PatchGrid:
-        """Keep some of the patches, shape (p,)."""
-        if chosen.all():
-            return self
-        first, centre_mm, inside = self.first[chosen], self.centre_mm[chosen], self.inside[chosen]
-        return replace(self, first=first, centre_mm=centre_mm, inside=inside)
-
     def with_rows(self, kept: BoolArray) -> PatchGrid:
         """Keep some of the rows, shape (r,)."""
-        return self.among(np.isin(self.centre_mm[:, 1], self.row_depth_mm[kept]))
+        chosen = np.isin(self.centre_mm[:, 1], self.row_depth_mm[kept])
+        first, centre_mm, inside = self.first[chosen], self.centre_mm[chosen], self.inside[chosen]
+        return replace(self, first=first, centre_mm=centre_mm, inside=inside)
 
 
 def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> PatchGrid:
@@ -122,13 +122,12 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     v, d = np.meshgrid(left + size[0] * np.arange(columns), top + size[1] * np.arange(rows), indexing="ij")
     first = np.stack([v.ravel(), d.ravel()], axis=1).astype(np.int64)
     centre = (first + (size - 1) / 2) * spacing + [0.0, grid.first_sample_depth_mm]
-    inside = np.ones(len(first), dtype=bool)
+    patches = PatchGrid(first, size, centre, spacing, np.ones(len(first), dtype=bool))
     if s.region:
         # Most of a patch must lie in the region.
         mask = Region(s.region).mask(grid)
-        inside = np.array([mask[v : v + size[0], d : d + size[1]].mean() >= 0.5 for v, d in first])
-    patches = PatchGrid(first, size, centre, spacing, inside)
-    kept = np.asarray(patches.rows_of(inside).any(axis=1))
+        patches = replace(patches, inside=patches.tiles(mask).mean(axis=(1, 2)) >= 0.5)
+    kept = np.asarray(patches.rows_of(patches.inside).any(axis=1))
     if kept.sum() < 2:
         raise InvalidInputError(f"region: expected two rows of patches in it, got {kept.sum()}: {s.region}")
     return patches.with_rows(kept)

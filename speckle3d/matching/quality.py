@@ -26,22 +26,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, RFSettings
-from speckle3d.kernels.quality import patch_statistics
 from speckle3d.matching.patches import PatchGrid
-
-try:  # Ten times as fast.
-    from isal.isal_zlib import crc32
-except ImportError:
-    from zlib import crc32
-
-_LEAST_RATIO = 1e-11
-"""Intensity in the band over the square of the frame's peak below which there is no echo: 16 bits end above
-it, what single precision leaves of a constant (3e-13) below."""
-
-_LEAST_COUNTS = 1.0
-"""Intensity of integer samples below which an echo is lost in their rounding."""
 
 _CONSTANT = 1e-4
 """Contrast of a patch up to which it is a constant, but for rounding. A step of grey in one pixel is 1e-3."""
@@ -55,6 +40,9 @@ _DRAWN_SHARE, _DRAWN_OVER_SPECKLE, _DRAWN_FRAMES = 0.01, 10.0, 8
 median patch, and frames that must have been seen. Speckle that goes on by a quarter of a millimetre in all
 has up to 0.02 of such pixels, by more none."""
 
+_SAMPLES = 40
+"""Samples in depth of which a patch's statistics are taken at least, where it has more: speckle has four."""
+
 _LISTED = 8
 """Frames named in a line of `describe`."""
 
@@ -67,7 +55,7 @@ class FrameFlag(enum.IntFlag):
     SATURATED = 2
     """Too many samples clipped."""
     LIFTED = 4
-    """No contact: below the near field noise or reverberation alone, or far less echo than elsewhere."""
+    """No contact: noise alone, below the near field."""
     NO_SPECKLE = 8
     """A signal without the statistics of speckle, or none."""
     UNMATCHED = 16
@@ -117,147 +105,93 @@ class QualitySettings(BaseModel):
     clipped_bmode: float = Field(
         0.05, gt=0, le=1, description="Share of clipped B-mode samples at which a frame is saturated."
     )
-    # Sound frames lose 0.3 dB in all of the rows asked; lifted ones what speckle is above noise, 37 dB here.
-    drop_db: float = Field(
-        10.0, gt=0, description="Loss of echo below the near field at which the probe is taken to be lifted."
-    )
 
 
 @dataclass(frozen=True)
 class FrameFeatures:
-    """What is kept of a frame; r rows of patches."""
+    """What is kept of a frame."""
 
-    digest: int
-    """Of the samples as read: a frame that repeats the one before has the same."""
+    mean: FloatArray
+    """Mean intensity of each patch, shape (p,): a frame that repeats the one before has the same."""
     clipped: float
-    """Share of samples piled up at the frame's own extremes, over the share at which it is saturated."""
-    samples_db: float
-    """Mean square of the samples as read below the topmost row, in the band or not."""
-    near_db: float
-    """Mean intensity above the patches; NaN where there is nothing above them."""
-    level_db: FloatArray
-    """Mean intensity of each row, shape (r,)."""
-    speckle: FloatArray
-    """Share of patches with speckle in each row, shape (r,); columns all black do not count."""
+    """Share of samples at the frame's own extremes, over the share at which it is saturated."""
+    speckle_share: float
+    """Share of patches with speckle; columns all black do not count."""
     noise_share: float
     """Share of patches that vary as speckle does but have nothing in common from vector to vector."""
     usable: BoolArray
     """Patches that hold an echo which varies as speckle or structure does, shape (p,): no shadow, no noise
     alone, none without contact or saturated."""
 
-    @property
-    def speckle_share(self) -> float:
-        """Share of patches with speckle in the frame."""
-        return float(self.speckle.mean())
 
-
-class FrameInspector:
-    """Looks at the frames of one sweep, each by itself and in any order.
+def inspect_frame(
+    frame: npt.NDArray[Any],
+    intensity: Float32Array,
+    patches: PatchGrid,
+    is_bmode: bool,
+    settings: QualitySettings | None = None,
+) -> FrameFeatures:
+    """Describe one frame by itself.
 
     Parameters
     ----------
-    signal : RFSettings or BModeSettings
+    frame : ndarray, shape (vector, sample)
+        As read: RF, analytic (I/Q) or grey levels.
+    intensity : ndarray, shape (vector, grid.samples)
+        Its echo intensity, not equalised.
     patches : PatchGrid
         On the grid of the intensity images.
     """
+    s = settings or QualitySettings()
+    tiles = patches.tiles(intensity, max(1, int(patches.size[1]) // _SAMPLES))
+    wide, high, inside = tiles.shape[1] // 2, tiles.shape[2] // 2, patches.inside
+    with np.errstate(all="ignore"):  # Flat patches, and samples that are not finite, come out as NaN.
+        mean = tiles.mean(axis=(1, 2))
+        tiles = tiles / mean[:, None, None]
+        tiles -= 1
+        contrast = np.sqrt(_mean_product(tiles, tiles))
+        alike = _pearson(tiles[:, 1:], tiles[:, :-1])
+        across = _pearson(tiles[:, :wide], tiles[:, -wide:])
+        along = _pearson(tiles[..., :high], tiles[..., -high:])
+    # A sample that is not finite spoils its whole vector, and equalising then the others.
+    echo = (contrast > s.least_contrast) & np.isfinite(intensity.sum())
+    together = (alike > s.neighbour_correlation) | (patches.spacing_mm[0] > s.neighbour_pitch_mm)
+    fine = (across < s.halves_correlation) & (along < s.halves_correlation)
+    varies = patches.rows_of(contrast > _CONSTANT)
+    live = varies.any(axis=0) | ~varies.any()
+    counted = inside & np.repeat(live, len(varies))
 
-    def __init__(
-        self, signal: RFSettings | BModeSettings, patches: PatchGrid, settings: QualitySettings | None = None
-    ) -> None:
-        self.settings = settings or QualitySettings()
-        self._bmode = isinstance(signal, BModeSettings)
-        self._columns = int(np.unique(patches.first[:, 0]).size)
-        self._first, self._size, self._inside = patches.first, patches.size, patches.inside
-        self._pitch_mm = float(patches.spacing_mm[0])
+    def share(chosen: BoolArray) -> float:
+        return float((echo & chosen & counted).sum() / max(int(counted.sum()), 1))
 
-    def inspect(self, frame: npt.NDArray[Any], intensity: Float32Array) -> FrameFeatures:
-        """Describe one frame.
+    return FrameFeatures(
+        mean, _clipped(frame, is_bmode, s), share(together & fine), share(~together), echo & together & inside
+    )
 
-        Parameters
-        ----------
-        frame : ndarray, shape (vector, sample)
-            As read: RF, analytic (I/Q) or grey levels.
-        intensity : ndarray, shape (vector, grid.samples)
-            Its echo intensity, not equalised.
 
-        Raises
-        ------
-        InvalidInputError
-            If the intensity image does not hold the patches.
-        """
-        samples = np.ascontiguousarray(frame)
-        if np.iscomplexobj(samples):
-            samples = samples.view(samples.real.dtype)
-        # Every eighth vector tells how strong samples as read are, and whether they are counts. Those of I/Q
-        # are, if they come from pairs of integers.
-        some = samples[::8]
-        counted = samples.dtype.kind in "iu" or bool((some == np.rint(some)).all())
-        floor, clipped = self._rails(samples, counted)
-        with np.errstate(all="ignore"):  # Flat patches, and samples that are not finite, come out as NaN.
-            statistics = self._statistics(intensity)
-            mean = statistics[0]
-            speckle, noise, usable, live = self._classify(statistics, floor)
-            # A sample that is not finite spoils its whole vector, and equalising then the others.
-            finite = np.isfinite(intensity.sum())
-            speckle &= finite
-            near = intensity[:, : self._first[0, 1]]
-            top = (self._first[0, 1] + self._size[1]) * samples.shape[1] // intensity.shape[1]
-            below = some[:, top:].astype(np.float32)
-            return FrameFeatures(
-                digest=_digest(samples),
-                clipped=clipped,
-                samples_db=float(_decibel(np.mean(below * below))),
-                near_db=float(_decibel(near.mean())) if near.size else np.nan,
-                level_db=_decibel(mean[live].mean(axis=0)),
-                speckle=self._share_inside(speckle, live),
-                noise_share=float(self._share_inside(noise, live).mean()),
-                usable=(usable & finite).ravel() & self._inside,
-            )
+def _pearson(a: Float32Array, b: Float32Array) -> Float32Array:
+    """Correlation of two parts of each patch, shapes (p, v, s)."""
+    x, y = a.mean(axis=(1, 2)), b.mean(axis=(1, 2))
+    xy, xx, yy = (_mean_product(*pair) for pair in ((a, b), (a, a), (b, b)))
+    return np.asarray((xy - x * y) / np.sqrt((xx - x * x) * (yy - y * y)))
 
-    def _share_inside(self, chosen: BoolArray, live: BoolArray) -> FloatArray:
-        """Share of the patches in the region, columns all black aside, that are chosen in each row."""
-        inside = self._inside.reshape(chosen.shape) & live[:, None]
-        return np.asarray((chosen & inside).sum(axis=0) / np.maximum(inside.sum(axis=0), 1))
 
-    def _rails(self, samples: npt.NDArray[Any], counted: bool) -> tuple[float, float]:
-        """Intensity below which there is no echo, and clipping over its limit."""
-        lowest, highest = samples.min(axis=1), samples.max(axis=1)
-        low, high = float(lowest.min()), float(highest.max())
-        # Only vectors that come within a count of an extreme can hold what is counted there.
-        clipped = _at_rail(samples[highest >= high - 1], high, -1, counted, samples.size)
-        if self._bmode:
-            # Black is no echo: it is neither clipped nor counted.
-            return 0.0, clipped / max(int(np.count_nonzero(samples)), 1) / self.settings.clipped_bmode
-        clipped += _at_rail(samples[lowest <= low + 1], low, 1, counted, samples.size)
-        least = _LEAST_COUNTS if counted else 0.0
-        floor = max(least, _LEAST_RATIO * max(abs(low), abs(high)) ** 2)
-        return floor, clipped / samples.size / self.settings.clipped_rf
+def _mean_product(a: Float32Array, b: Float32Array) -> Float32Array:
+    return np.asarray(np.einsum("pvs,pvs->p", a, b) / np.float32(a[0].size))
 
-    def _statistics(self, intensity: Float32Array) -> FloatArray:
-        """Mean, contrast and three correlations of the patches, shape (5, column, row)."""
-        needed = self._first.max(axis=0) + self._size
-        if (intensity.shape < needed).any():
-            raise InvalidInputError(
-                f"expected an intensity image of at least {needed[0]} x {needed[1]} samples, got "
-                f"{' x '.join(map(str, intensity.shape))}"
-            )
-        found = np.empty((self._first.shape[0], 5))
-        image = np.ascontiguousarray(intensity, dtype=np.float32)
-        patch_statistics(image, self._first, self._size, found)
-        return np.moveaxis(found.reshape(self._columns, -1, 5), 2, 0)
 
-    def _classify(
-        self, statistics: FloatArray, floor: float
-    ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Patches with speckle, with noise, usable, shape (column, row); columns that hold anything."""
-        s = self.settings
-        mean, contrast, alike, across, along = statistics
-        echo = (mean > floor) & (contrast > s.least_contrast)
-        fine = (across < s.halves_correlation) & (along < s.halves_correlation)
-        together = (alike > s.neighbour_correlation) | (self._pitch_mm > s.neighbour_pitch_mm)
-        varies: BoolArray = contrast > _CONSTANT
-        live = np.asarray(varies.any(axis=1) | ~varies.any())
-        return echo & together & fine, echo & ~together, echo & together, live
+def _clipped(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings) -> float:
+    """Share of samples at a frame's extremes over its limit; a constant frame has none."""
+    samples = np.ascontiguousarray(frame)
+    if np.iscomplexobj(samples):
+        samples = samples.view(samples.real.dtype)
+    low, high = samples.min(), samples.max()
+    if low == high:
+        return 0.0
+    clipped = np.count_nonzero(samples == high)
+    if is_bmode:  # Black is no echo: it is neither clipped nor counted.
+        return clipped / np.count_nonzero(samples) / settings.clipped_bmode
+    return (clipped + np.count_nonzero(samples == low)) / samples.size / settings.clipped_rf
 
 
 class DrawnOver:
@@ -272,39 +206,28 @@ class DrawnOver:
         self._patches = patches
         self._lock = threading.Lock()
         self._frames = 0
-        self._darkest: npt.NDArray[Any] | None = None
-        self._brightest: npt.NDArray[Any] | None = None
+        self._extremes: tuple[npt.NDArray[Any], npt.NDArray[Any]] | None = None
 
     def keep(self, frame: npt.NDArray[Any]) -> None:
         """Look at one frame of grey levels, on any thread."""
         with self._lock:
             self._frames += 1
-            if self._darkest is None or self._brightest is None:
-                self._darkest, self._brightest = frame.copy(), frame.copy()
-            else:
-                np.minimum(self._darkest, frame, out=self._darkest)
-                np.maximum(self._brightest, frame, out=self._brightest)
+            darkest, brightest = self._extremes or (frame, frame)
+            self._extremes = np.minimum(darkest, frame), np.maximum(brightest, frame)
 
     @property
     def patches(self) -> BoolArray:
         """Which patches something is drawn on, shape (p,)."""
-        none = np.zeros(len(self._patches), dtype=bool)
-        if self._darkest is None or self._frames < _DRAWN_FRAMES:
-            return none
-        fixed = (self._darkest == self._brightest) & (self._darkest > 0)
-        wide, high = self._patches.size
-        share = np.array([fixed[v : v + wide, s : s + high].mean() for v, s in self._patches.first])
+        if self._extremes is None or self._frames < _DRAWN_FRAMES:
+            return np.zeros(len(self._patches), dtype=bool)
+        darkest, brightest = self._extremes
+        share = self._patches.tiles((darkest == brightest) & (darkest > 0)).mean(axis=(1, 2))
         # Where the probe hardly moves, speckle agrees here and there, but all over the image.
         return np.asarray(share > max(_DRAWN_SHARE, _DRAWN_OVER_SPECKLE * float(np.median(share))))
 
 
-def _digest(samples: npt.NDArray[Any]) -> int:
-    """Digest bit for bit; of another frame the same once in four thousand million."""
-    return int(crc32(samples.data))
-
-
 def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | None = None) -> IntArray:
-    """Judge the frames of a sweep, levels against the sweep itself, the rest by itself.
+    """Judge the frames of a sweep, each by itself but for repeated ones.
 
     Parameters
     ----------
@@ -316,19 +239,15 @@ def flag_frames(features: Sequence[FrameFeatures], settings: QualitySettings | N
     ndarray of int, shape (n,)
         Each a `FrameFlag`; zero for a frame with which nothing is wrong.
     """
-    if not features:
-        return np.zeros(0, dtype=np.int64)
     s = settings or QualitySettings()
-    saturated = np.array([f.clipped >= 1 for f in features])
-    few = np.array([f.speckle_share < s.speckle_share for f in features])
-    noisy = np.array([f.noise_share > _NOISY for f in features])
-    lifted = (few & noisy) | _darkened(features, few, ~saturated & ~few, s.drop_db)
     flags = np.zeros(len(features), dtype=np.int64)
-    repeated = [frame.digest == before.digest for before, frame in pairwise(features)]
+    repeated = [np.array_equal(frame.mean, before.mean, True) for before, frame in pairwise(features)]
     flags[1:][repeated] |= FrameFlag.FROZEN
-    flags[saturated] |= FrameFlag.SATURATED
-    flags[lifted] |= FrameFlag.LIFTED
-    flags[few & ~lifted] |= FrameFlag.NO_SPECKLE
+    for k, frame in enumerate(features):
+        if frame.clipped >= 1:
+            flags[k] |= FrameFlag.SATURATED
+        if frame.speckle_share < s.speckle_share:
+            flags[k] |= FrameFlag.LIFTED if frame.noise_share > _NOISY else FrameFlag.NO_SPECKLE
     return flags
 
 
@@ -343,54 +262,3 @@ def describe(flags: npt.ArrayLike) -> list[str]:
             named = ", ".join(map(str, frames[:_LISTED]))
             lines.append(f"{len(frames)} frame{'s' * (len(frames) > 1)} {words}: {named}{more}")
     return lines
-
-
-def _darkened(
-    features: Sequence[FrameFeatures], few: BoolArray, sound: BoolArray, drop_db: float
-) -> BoolArray:
-    """Frames whose echoes are far below those of the better half of the sound frames.
-
-    Of the rows that hold speckle there, the topmost may still hold ring-down, and the lower half a bone's
-    shadow or little but noise; these are not asked, and the others must all have lost it, and by more than
-    the near field: a gain turned down takes that along, a lifted probe leaves its ring-down. With too few
-    patches of speckle the samples as read must be fainter too: those of a constant are not.
-    """
-    nothing = np.zeros(len(features), dtype=bool)
-    if not sound.any():
-        return nothing
-    level = np.stack([f.level_db for f in features])
-    overall = level.mean(axis=1)
-    better = sound & (overall >= np.median(overall[sound]))
-    speckle = np.stack([f.speckle for f in features])
-    rows = np.flatnonzero(np.median(speckle[better], axis=0) >= 0.5)
-    rows = rows[1 : 1 + rows.size // 2]
-    if not rows.size:
-        return nothing
-
-    def loss(values: FloatArray) -> FloatArray:
-        return np.asarray(np.median(values[better], axis=0) - values)
-
-    darker = loss(level[:, rows]).min(axis=1)
-    fainter = loss(np.array([f.samples_db for f in features]))
-    beyond_near = darker - loss(np.array([f.near_db for f in features]))
-    return np.asarray((darker > drop_db) & (beyond_near > drop_db) & (~few | (fainter > drop_db)))
-
-
-def _at_rail(samples: npt.NDArray[Any], rail: float, inwards: int, counted: bool, of: int) -> int:
-    """Samples at an extreme of the frame, which has `of` samples, less those one count inside it.
-
-    Clipping piles samples up at the rail; without it there are fewer at the extreme than next to it, however
-    few the counts. A constant frame has no rail.
-    """
-    at = np.count_nonzero(samples == samples.dtype.type(rail)) if np.isfinite(rail) else 0
-    if at in (1, of):
-        return 0
-    beside: int = 0
-    if counted:
-        beside = int(np.count_nonzero(samples == samples.dtype.type(rail + inwards)))
-    return max(int(at) - beside, 0)
-
-
-def _decibel(power: npt.ArrayLike) -> FloatArray:
-    """Finite whatever comes in: nothing, and what is not a number, is far below everything."""
-    return np.asarray(10 * np.log10(np.fmin(np.fmax(power, 1e-38), 1e38)), dtype=float)

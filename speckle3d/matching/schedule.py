@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import IntArray
@@ -40,22 +38,6 @@ class TrajectorySettings(BaseModel):
         "have enough such pairs: from there on what has decorrelated at the top of the image bends planes.",
     )
     huber: float = Field(2.0, gt=0, description="Standard deviations at which a pair begins to lose weight.")
-
-
-class Schedule(Protocol):
-    """Chooses the earlier frames that each frame is measured against."""
-
-    least_correlation: float
-    """Median correlation from which the in-plane motion to a frame is believed."""
-
-    def references(self, frame: int) -> list[int]:
-        """Earlier frames to measure `frame` against, the one tried first in front."""
-
-    def settle(self, frame: int, correlations: dict[int, float]) -> None:
-        """Take note of the median correlations of `frame` with its references."""
-
-    def needed(self, frame: int) -> set[int]:
-        """Frames up to `frame` that later ones may be measured against."""
 
 
 class KnownSchedule:

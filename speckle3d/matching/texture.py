@@ -7,14 +7,15 @@ on what is scanned as long as it scatters as a phantom does; patches whose contr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 from scipy import fft
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
+from speckle3d.core.threads import ahead
 from speckle3d.matching.matcher import Echo, FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 
@@ -51,8 +52,7 @@ class Texture:
         kept = True if usable is None else usable
         self._sizes[frame] = np.where(kept, _sizes(echo.intensity, self._patches), np.nan)
         if echo.analytic is not None:
-            powers = _patch_powers(echo.analytic, self._patches)
-            self._powers[frame] = np.where(np.reshape(kept, (-1, 1)), powers, np.nan)
+            self._powers[frame] = np.where(kept, _patch_powers(echo.analytic, self._patches), np.nan)
 
     def speckle_size(self, usable: BoolArray | None = None) -> SpeckleSize:
         """Lateral and axial size of speckle in each row of patches.
@@ -67,9 +67,11 @@ class Texture:
         SpeckleSize
             Of shape (r,); NaN where too few patches hold fully developed speckle.
         """
-        sizes = self._patches.rows_of(np.stack(_some(self._sizes, usable)))
-        lateral, axial = sizes.transpose(1, 2, 0, 3).reshape(*sizes.shape[1:3], -1)
-        return SpeckleSize(_medians(lateral), _medians(axial))
+        rows = np.moveaxis(self._rows(self._sizes, usable), 0, -1)
+        known = np.isfinite(rows).sum(axis=(2, 3)) >= LEAST_PATCHES
+        size = np.full(known.shape, np.nan)
+        size[known] = np.nanmedian(rows[known], axis=(1, 2))
+        return SpeckleSize(*size)
 
     def spectra(self, usable: BoolArray | None = None) -> EchoSpectra | None:
         """Power spectrum within the band that is matched, at each row of patches; None without phase.
@@ -79,12 +81,11 @@ class Texture:
         """
         if not self._powers or not isinstance(self._signal, RFSettings):
             return None
-        by_row = self._patches.rows_of(np.moveaxis(np.stack(_some(self._powers, usable)), 1, 2))
-        by_row = by_row.transpose(2, 0, 3, 1).reshape(by_row.shape[2], -1, by_row.shape[1])
-        seen = np.isfinite(by_row).any(axis=(1, 2))
+        rows = self._rows(self._powers, usable)
+        seen = np.isfinite(rows).any(axis=(0, 1, 3))
         if not seen.any():
             return None
-        power = np.nanmean(by_row[seen], axis=1)
+        power = np.nanmean(rows[:, :, seen], axis=(0, 3)).T
         rate_hz = 1e3 * self._signal.speed_of_sound_m_s / (2.0 * self._patches.spacing_mm[1])
         low, high = self._signal.bandwidth_hz
         # The band's centre was shifted to zero.
@@ -93,6 +94,12 @@ class Texture:
         rising = np.argsort(frequency)
         kept = rising[(frequency[rising] > low - edge) & (frequency[rising] < high + edge)]
         return EchoSpectra(self._patches.row_depth_mm[seen], frequency[kept], power[:, kept])
+
+    def _rows(self, by_frame: dict[int, FloatArray], usable: BoolArray | None) -> FloatArray:
+        """Values of the usable frames, or of all if none is, by rows and columns, shape (n, k, r, c)."""
+        frames = sorted(by_frame)
+        sound = [k for k in frames if usable is None or usable[k]]
+        return self._patches.rows_of(np.stack([by_frame[k] for k in sound or frames]))
 
 
 def measured_texture(sweep: Sweep, matcher: FrameMatcher) -> Texture:
@@ -112,96 +119,65 @@ def mean_spectra(spectra: Sequence[EchoSpectra]) -> EchoSpectra | None:
     return EchoSpectra(first.depth_mm, first.frequency_hz, power)
 
 
-def echo_spectra(sweep: Sweep, depth_mm: FloatArray, height_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Power spectrum of the echoes about some depths, noise taken off, over some frames.
-
-    Parameters
-    ----------
-    depth_mm : ndarray, shape (y,)
-    height_mm : float
-        Height of the window about each depth.
-
-    Returns
-    -------
-    frequency_hz : ndarray, shape (f,)
-    power : ndarray, shape (y, f)
-
-    Raises
-    ------
-    InvalidInputError
-        If the sweep holds B-mode images, which have no spectrum, or the depths are not in them.
-    """
-    signal, grid = sweep.signal, sweep.grid
-    if not isinstance(signal, RFSettings):
-        raise InvalidInputError(f"{sweep.name}: expected RF, whose spectrum can be seen, got B-mode images")
-    count = min(round(height_mm / grid.sample_spacing_mm), grid.samples)
-    middle = np.rint((depth_mm - grid.first_sample_depth_mm) / grid.sample_spacing_mm).astype(int)
-    first = np.clip(middle - count // 2, 0, grid.samples - count)
-    if count < 16 or (np.abs(first + count // 2 - middle) > count).any():
-        raise InvalidInputError(
-            f"{sweep.name}: expected echoes from {depth_mm[0]:.1f} to {depth_mm[-1]:.1f} mm, got images of "
-            f"{grid.depth_mm:.1f} mm"
-        )
-    frequency_hz, bins = spectrum_bins(signal, count)
-    window = np.hanning(count).astype(np.float32)
-    power = np.zeros((depth_mm.size, bins.size))
-    for k in spread_frames(len(sweep), FRAMES):
-        frame = sweep.frames[k]
-        for row, start in enumerate(first):
-            spectrum = np.fft.fft(frame[:, start : start + count] * window, axis=1)[:, bins]
-            # Bright structure counts no more than speckle: images are equalised before they are correlated.
-            energy = np.abs(spectrum) ** 2
-            power[row] += (energy / np.maximum(energy.sum(axis=1, keepdims=True), 1e-30)).mean(axis=0)
-    # I/Q hold little beside the band, and nothing where their filter has cut them off.
-    quantile = 0.0 if signal.are_complex else NOISE_QUANTILE
-    noise = np.quantile(power, quantile, axis=1, keepdims=True)
-    return frequency_hz, np.maximum(power - noise, 1e-12 * power.max())
-
-
 def spread_frames(frames: int, count: int) -> list[int]:
     """Choose at most so many of a sweep's frames, evenly spread."""
     return [int(k) for k in np.unique(np.linspace(0, frames - 1, count).round())]
 
 
-def _some(by_frame: dict[int, FloatArray], usable: BoolArray | None) -> list[FloatArray]:
-    """Return the usable frames' values in order, or all if none is usable."""
-    frames = sorted(by_frame)
-    sound = [k for k in frames if usable is None or usable[k]]
-    return [by_frame[k] for k in sound or frames]
-
-
 def _patch_powers(echo: Complex64Array, patches: PatchGrid) -> FloatArray:
-    """Power spectrum of each patch, of unit sum, shape (p, f)."""
-    wide, high = patches.size
-    tiles = np.stack([echo[v : v + wide, s : s + high] for v, s in patches.first])
-    spectrum = fft.fft(tiles * np.hanning(high).astype(np.float32), axis=-1)
-    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1, dtype=float)
-    return np.asarray(power / np.maximum(power.sum(axis=1, keepdims=True), 1e-30))
-
-
-def _medians(rows: FloatArray) -> FloatArray:
-    """Median of each row's finite values; NaN where they are few."""
-    known = [row[np.isfinite(row)] for row in rows]
-    return np.array([np.median(row) if row.size >= LEAST_PATCHES else np.nan for row in known])
+    """Power spectrum of each patch, of unit sum, shape (f, p)."""
+    spectrum = fft.fft(patches.tiles(echo) * np.hanning(patches.size[1]).astype(np.float32), axis=-1)
+    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1, dtype=float).T
+    return np.asarray(power / np.maximum(power.sum(axis=0), 1e-30))
 
 
 def _sizes(intensity: Float32Array, patches: PatchGrid) -> FloatArray:
     """Lateral and axial size of each patch's speckle, mm, shape (2, p); NaN unless it is fully developed."""
-    (wide, high), first = patches.size, patches.first
-    tiles = np.stack([intensity[v : v + wide, d : d + high] for v, d in first]).astype(float)
+    tiles = patches.tiles(intensity).astype(float)
     with np.errstate(all="ignore"):  # Flat patches come out as NaN.
         varying = tiles / tiles.mean(axis=(1, 2), keepdims=True) - 1.0
-        contrast = np.sqrt(_mean_product(varying, varying))
-        lags = (varying[:, :-1], varying[:, 1:]), (varying[..., :-1], varying[..., 1:])
-        rho = np.stack([_mean_product(a, b) / contrast**2 for a, b in lags])
+        contrast = varying.std(axis=(1, 2))
+        lateral, axial = varying[:, :-1] * varying[:, 1:], varying[..., :-1] * varying[..., 1:]
+        rho = np.stack([lateral.mean(axis=(1, 2)), axial.mean(axis=(1, 2))]) / contrast**2
         # The width of a Gaussian with this correlation one sample off.
         size = patches.spacing_mm[:, None] / np.sqrt(-2.0 * np.log(np.clip(rho, 1e-3, 0.999)))
-        fair = (contrast > CONTRAST[0]) & (contrast < CONTRAST[1])
-    return np.where(fair & np.isfinite(rho), size, np.nan)
+    fair = (contrast > CONTRAST[0]) & (contrast < CONTRAST[1]) & np.isfinite(rho)
+    return np.where(fair, size, np.nan)
 
 
-def _mean_product(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("pvs,pvs->p", a, b) / (a.shape[1] * a.shape[2]))
+def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -> FloatArray:
+    """Share of each patch's power that is the same in all of `frames`: median over their pairs.
+
+    Echoes that stay where they are while the probe moves are reverberation, side lobes, electronics. Speckle
+    of places a beam's width and more apart has nothing in common, so that the product of two such frames'
+    echoes, sample by sample and without looking for in-plane motion, averages to zero. What is added to every
+    frame alike does not: the product's mean is its share of the power. The tissue's own structure moves in
+    the image as the hand wanders, and a quarter of a wavelength in depth turns its phase round.
+
+    Parameters
+    ----------
+    frames : sequence of int
+        At least two, far apart, read anew and all held at once. The median lets some of them see what
+        others do, as on the way back.
+
+    Returns
+    -------
+    ndarray, shape (p,)
+        Of power, or with images of intensity of its variation; of either sign and about zero where nothing
+        stays. NaN where there is no echo.
+    """
+
+    def look(frame: int) -> Float32Array:
+        image, echo = matcher.equalised(matcher.echo(read_frame(sweep.frames, frame)))
+        tiles = matcher.patches.tiles(echo if matcher.of_echo else image)
+        tiles = tiles.reshape(len(tiles), -1)
+        if not matcher.of_echo:
+            tiles = tiles - tiles.mean(axis=1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(tiles / np.linalg.norm(tiles, axis=1, keepdims=True))
+
+    shared = [np.einsum("pk,pk->p", a, b) for a, b in combinations(ahead(look, frames), 2)]
+    return np.asarray(np.median(shared, axis=0), dtype=float)
 
 
 def spectrum_bins(signal: RFSettings, count: int) -> tuple[FloatArray, IntArray]:

@@ -14,7 +14,6 @@ from speckle3d.examine.images import (
     standing,
     undetermined,
 )
-from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
 
@@ -37,7 +36,8 @@ def table_of(position_mm, seed=0, noise=0.03, gain=1.0, source=None):
         schedule.settle(frame, found)
     first, second, median = (np.array(column) for column in zip(*rows, strict=True))
     correlation = np.repeat(median[:, None], len(PATCHES_MM), axis=1).astype(np.float32)
-    return CorrelationTable(first, second, correlation, median, (InPlaneMotion(),) * len(rows))
+    nothing = np.zeros((len(rows), 3)), np.tile(np.eye(3), (len(rows), 1, 1))
+    return CorrelationTable(first, second, correlation, *nothing)
 
 
 def along(position_mm):

@@ -36,15 +36,15 @@ def fields():
 def sampled(rho):
     """Correlations of echo and of intensity, patch by patch, of frames that have `rho` in common."""
     found = np.empty((2, len(fields()) - 1, len(PATCHES)))
-    still, out = np.zeros((len(PATCHES), 2), np.int64), np.empty((len(PATCHES), 1, 1))
+    still, out = np.zeros((len(PATCHES), 2), np.int64), np.empty((len(PATCHES), 5))
     for k, (one, other) in enumerate(zip(fields()[:-1], fields()[1:], strict=True)):
         two = speckle.decorrelated(one, other, rho)
         echoes = (np.stack([z.real, z.imag]).astype(np.float32) for z in (one, two))
         place = PATCHES.first, PATCHES.size, still
         patch_coherences(*echoes, *place, np.zeros(2), 0.6, out)
-        found[0, k] = out[:, 0, 0]
+        found[0, k] = out[:, 2]
         patch_correlations(speckle.intensity(one), speckle.intensity(two), *place, 0.6, out)
-        found[1, k] = out[:, 0, 0]
+        found[1, k] = out[:, 2]
     return found
 
 

@@ -46,8 +46,8 @@ def test_each_pose_is_what_the_frames_up_to_it_give(followed):
     sweep, curves, _, told = followed
     for k in (3, 14, 22):
         part = track(sweep.part(0, k + 1), curves).image
-        # 0.1 mm is asked for; 0.046 mm at frame 14.
-        assert apart_mm(sweep, told[k].world_from_image, part[k]) < 0.07
+        # As is asked for; 0.07 mm at frame 14, the last before poses are revised.
+        assert apart_mm(sweep, told[k].world_from_image, part[k]) < 0.1
 
 
 def test_at_the_end_poses_are_those_of_the_recording(followed):

@@ -8,11 +8,10 @@ import speckle
 
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.examine.recording import doubt_band, doubt_sign, doubt_white
-from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
 from speckle3d.matching.patches import PatchSettings
-from speckle3d.matching.texture import measured_texture
+from speckle3d.matching.texture import measured_texture, standing_share
 
 GREY = BModeSettings(dynamic_range_db=100.0, full_scale=65535.0)
 """Fine enough to hold intensities as they are."""
@@ -153,3 +152,34 @@ def test_images_cut_off_at_white_are_doubted(seen, gain_db, doubted):
 def test_noise_and_grey_levels_tell_nothing_of_the_band(seen):
     assert doubt_band(echoes(4e6, 8e6, noise=30.0)) == ()
     assert doubt_band(grey_sweep(seen)) == ()
+
+
+# ---- standing echoes -------------------------------------------------------------------------------------
+
+FRESH = np.random.default_rng(0).standard_normal((5, 36, 900))
+"""Five frames of white noise, which the matcher's band-pass makes speckle of."""
+PATTERN = np.random.default_rng(1).standard_normal((36, 900))
+
+
+def share_of(frames):
+    signal = speckle.RF
+    grid = replace(speckle.GRID, vectors=36, samples=900, sample_spacing_mm=signal.sample_spacing_mm)
+    sweep = Sweep(frames.astype(np.float32), grid, signal, np.arange(len(frames)) / 25)
+    return standing_share(sweep, matcher_of(sweep), range(5))
+
+
+@pytest.mark.parametrize("power", [0.0, 0.1, 1.0])
+def test_standing_share_is_clutters_share_of_the_power(power):
+    flickering = np.array([1.0, 0.3, 2.0, 0.7, 1.5])[:, None, None]
+    share = share_of(flickering * (FRESH + np.sqrt(power) * PATTERN))
+    assert np.median(share) == pytest.approx(power / (1 + power), abs=0.02)
+
+
+def test_structure_that_moves_in_the_image_does_not_stand_still():
+    """By a few samples from frame to frame, as a hand wanders: a quarter of a wavelength is enough."""
+    wandering = np.stack([np.roll(PATTERN, 3 * k, axis=1) for k in range(5)])
+    assert np.median(share_of(FRESH + wandering)) < 0.1
+
+
+def test_frames_that_see_the_same_by_chance_do_not_count():
+    assert abs(np.median(share_of(np.concatenate([FRESH[:4], FRESH[:1]])))) < 0.02

@@ -11,9 +11,8 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
 from speckle3d.matching.frames import match_sweep
-from speckle3d.matching.inplane import InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
 from speckle3d.matching.patches import PatchSettings
 from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import KnownSchedule

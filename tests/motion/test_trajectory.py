@@ -11,7 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.geometry import relative_poses
 from speckle3d.core.relative import RelativePoses
-from speckle3d.matching.inplane import InPlaneMotion
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion import trajectory
 from speckle3d.motion.trajectory import edges_of, solve_trajectory
@@ -26,7 +25,8 @@ def read_as(first, second, motions, planes):
     """A table of pairs' in-plane motions, and their planes from (coefficients, covariance) of each."""
     coefficients, covariance = zip(*planes, strict=True)
     first, second, pairs = np.array(first), np.array(second), len(motions)
-    table = CorrelationTable(first, second, np.ones((pairs, 1), np.float32), np.ones(pairs), tuple(motions))
+    moved, errors = (np.array(part) for part in zip(*motions, strict=True))
+    table = CorrelationTable(first, second, np.ones((pairs, 1), np.float32), moved, errors)
     return table, pair_planes.made(first, second, coefficients, np.array(covariance))
 
 
@@ -44,7 +44,7 @@ def elevation(poses):
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_signed_pair_lies_on_its_plane(sign):
     plane = sign * np.array([0.3, 0.011, -0.017]), np.diag([1e-4, 1e-8, 2e-8])
-    pose = edges_of(*read_as([3], [5], [InPlaneMotion(0.2, -0.1, 0.03)], [plane])).poses[0]
+    pose = edges_of(*read_as([3], [5], [((0.2, -0.1, 0.03), np.eye(3))], [plane])).poses[0]
     for x, y in ((0, 0), (10, -5), (-15, 15)):
         assert abs(pose.apply([x, y, 0.0])[2] - sign * (0.3 + 0.011 * x - 0.017 * y)) < 1e-12
     assert np.allclose(pose.translation[:2], [0.2, -0.1])
@@ -54,7 +54,7 @@ def test_a_signed_pair_lies_on_its_plane(sign):
 def test_covariance_is_in_the_order_x_y_z_tilt_yaw_roll():
     inplane = np.array([[1.0, 0.1, 0.2], [0.1, 2.0, 0.3], [0.2, 0.3, 3.0]]) * 1e-4
     plane_cov = np.array([[4.0, 0.4, 0.5], [0.4, 5.0, 0.6], [0.5, 0.6, 6.0]]) * 1e-6
-    read = read_as([0], [1], [InPlaneMotion(0, 0, 0, inplane)], [((0.3, 0.0, 0.0), plane_cov)])
+    read = read_as([0], [1], [((0.0, 0.0, 0.0), inplane)], [((0.3, 0.0, 0.0), plane_cov)])
     (c,) = edges_of(*read).covariance
     x, y, z, tilt, yaw, roll = range(6)
     np.testing.assert_allclose(c, c.T)

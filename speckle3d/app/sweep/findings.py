@@ -14,8 +14,8 @@ from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
 from speckle3d.examine.sensors import doubts_of_readings
 from speckle3d.matching.intensity import IntensityExtractor
-from speckle3d.matching.patches import lay_patches
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, FrameInspector, flag_frames
+from speckle3d.matching.patches import PatchGrid, lay_patches
+from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames, inspect_frame
 
 NAMES = {flag: (flag.name or "").lower().replace("_", " ") for flag in FrameFlag}
 
@@ -57,15 +57,15 @@ class FrameFindings:
                 self.flags = flag_frames(self._features, self._config.quality)
 
     @cached_property
-    def _looks(self) -> tuple[IntensityExtractor, FrameInspector]:
+    def _looks(self) -> tuple[IntensityExtractor, PatchGrid]:
         extractor = IntensityExtractor.for_sweep(self._sweep, self._config.intensity)
-        patches = lay_patches(extractor.grid, self._config.patches)
-        return extractor, FrameInspector(self._sweep.signal, patches, self._config.quality)
+        return extractor, lay_patches(extractor.grid, self._config.patches)
 
     def _inspect(self, frame: int) -> FrameFeatures:
-        extractor, inspector = self._looks
+        extractor, patches = self._looks
         samples = read_frame(self._sweep.frames, frame)
-        return inspector.inspect(samples, extractor.intensity(samples))
+        is_bmode = isinstance(self._sweep.signal, BModeSettings)
+        return inspect_frame(samples, extractor.intensity(samples), patches, is_bmode, self._config.quality)
 
     def reasons(self, frame: int) -> list[str]:
         """Why a frame has its flags, a line each; none for a frame without."""
@@ -87,9 +87,7 @@ class FrameFindings:
             share = f"{100 * seen.clipped * limit:.2g} % of its samples are clipped"
             yield f"saturated: {share}, from {100 * limit:.2g} % on correlations cannot be trusted"
         if flags & FrameFlag.LIFTED:
-            few = f"{speckle}, and {100 * seen.noise_share:.0f} % noise alone"
-            faint = f"its echoes are at least {quality.drop_db:g} dB fainter than those of the sound frames"
-            yield f"lifted: no contact: {few if seen.speckle_share < quality.speckle_share else faint}"
+            yield f"lifted: no contact: {speckle}, and {100 * seen.noise_share:.0f} % noise alone"
         if flags & FrameFlag.NO_SPECKLE:
             yield f"no speckle: {speckle}"
         if flags & FrameFlag.UNMATCHED:

@@ -12,7 +12,8 @@ from speckle3d.config import Config
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.sweep import Sweep, read_frame
-from speckle3d.matching.matcher import FrameMatcher, ReadyFrame
+from speckle3d.kernels.inplane import Frame
+from speckle3d.matching.matcher import FrameMatcher
 
 NEIGHBOURS = 8
 """Frames before and after with which a frame can be compared."""
@@ -111,15 +112,19 @@ class SweepPairs:
     def _matched(self, first: int, second: int) -> tuple[FloatArray, RigidTransform]:
         """Correlation of every patch, and the motion in the plane if the frames have anything in common."""
         fixed, moving = self._ready(first), self._ready(second)
-        match = self._matcher.match(fixed, moving, self._matcher.search(fixed, moving))
-        if match.median < self._config.trajectory.least_correlation:
-            return match.correlation, RigidTransform.identity()
-        centre, motion = RigidTransform.from_translation(self._matcher.centre_mm), match.motion
-        turn = Rotation.from_rotvec([0.0, 0.0, motion.roll_rad])
-        moved = RigidTransform.from_components([motion.x_mm, motion.y_mm, 0.0], turn)
-        return match.correlation, centre * moved * centre.inv()
+        start = self._matcher.search(fixed, moving)
+        table = self._matcher.match({first: fixed}, second, moving, [start])
+        correlation = table.correlation[0].astype(float)
+        if table.median[0] < self._config.trajectory.least_correlation:
+            return correlation, RigidTransform.identity()
+        (x_mm, y_mm, roll_rad), centre = (
+            table.inplane[0],
+            RigidTransform.from_translation(self._matcher.centre_mm),
+        )
+        moved = RigidTransform.from_components([x_mm, y_mm, 0.0], Rotation.from_rotvec([0.0, 0.0, roll_rad]))
+        return correlation, centre * moved * centre.inv()
 
-    def _make_ready(self, frame: int) -> ReadyFrame:
+    def _make_ready(self, frame: int) -> Frame:
         return self._matcher.prepare(self._matcher.echo(read_frame(self._sweep.frames, frame)))
 
     def _row(self, first: int, second: int) -> int | None:
