@@ -76,7 +76,7 @@ def test_scaled_distances_are_refused(part, curves, factor, why):
 def test_scaled_distances_of_curves_without_tilt_are_refused_where_no_beam_is_so_wide(part, curves):
     scaled = replace(curves, distance_mm=1000 * curves.distance_mm, tilt=None)
     with pytest.raises(
-        MismatchError, match=r"^phantom: curves: expected correlation to halve within 8 mm, got 394"
+        MismatchError, match=r"^phantom: curves: expected correlation to fall within 8 mm, got"
     ):
         track(part, scaled)
 

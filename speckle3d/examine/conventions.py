@@ -67,39 +67,21 @@ class GyroscopeTurns:
         angle = np.concatenate([np.zeros((1, 3)), angle])
         return cls(lag, lag * float(np.median(pause)), np.rad2deg(angle[lag:] - angle[:-lag]))
 
-    def difference(self, turned: Rotation) -> FloatArray:
-        """The gyroscope's turns less the readings', degrees, shape (m - lag, 3)."""
-        return np.asarray(
-            self.degrees - (turned[: -self.lag].inv() * turned[self.lag :]).as_rotvec(degrees=True)
-        )
+    def difference(self, turned: Rotation | None, sign: float = 1.0) -> FloatArray:
+        """The gyroscope's turns, or the opposite ones, less the readings', or none; degrees, (m - lag, 3)."""
+        if turned is None:
+            return self.degrees
+        return sign * self.degrees - (turned[: -self.lag].inv() * turned[self.lag :]).as_rotvec(degrees=True)
 
     @property
     def noise_deg(self) -> float:
         """By how much turns and readings honestly differ."""
         return LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
 
-    def agree(self, turned: Rotation) -> bool:
-        """Whether readings turn as the gyroscope, or neither turns, to their noise."""
-        return float(_spread(self.difference(turned)).max()) <= self.noise_deg
-
-    def misfit(self, difference: FloatArray) -> float:
-        """Negative log likelihood of a difference, but for a bias; overlapping turns count once."""
-        variance = _spread(difference) ** 2 + self.noise_deg**2
+    def misfit(self, turned: Rotation | None, sign: float = 1.0) -> float:
+        """Negative log likelihood of readings, but for a bias; overlapping turns count once."""
+        variance = _spread(self.difference(turned, sign)) ** 2 + self.noise_deg**2
         return float(len(self.degrees) / self.lag * np.log(variance).sum())
-
-    def gain(self, turned: Rotation, other: Rotation | None = None) -> float:
-        """Log likelihood of `other` readings, or of none that turn, over that of `turned`."""
-        against = self.degrees if other is None else self.difference(other)
-        return self.misfit(self.difference(turned)) - self.misfit(against)
-
-    def gain_reversed(self, turned: Rotation) -> float:
-        """Log likelihood of the readings, were the gyroscope of the other sign, over that as they are."""
-        difference = self.difference(turned)
-        return self.misfit(difference) - self.misfit(difference - 2.0 * self.degrees)
-
-    def bias_deg_s(self, turned: Rotation) -> float:
-        """Rate by which the gyroscope turns on the whole and the readings do not."""
-        return float(np.linalg.norm(np.median(self.difference(turned), axis=0))) / self.seconds
 
 
 def _spread(values: FloatArray) -> FloatArray:
@@ -112,29 +94,33 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     turns, readings = GyroscopeTurns.of(sensor), sensor.readings.world_from_sensor
     if turns is None:
         return
+    difference, misfit = turns.difference(readings), turns.misfit(readings)
     upright = [
-        (turns.gain(readings, other), name)
+        (misfit - turns.misfit(other), name)
         for name, other in conventions(readings)
         if not _gravity_from_vertical(sensor, other) > UPRIGHT_DEG
     ]
     gain, name = max(upright, default=(0.0, ""))
-    still, bias = turns.gain(readings), turns.bias_deg_s(readings)
-    contradicted = not turns.agree(readings)
-    if contradicted and gain > max(LEAST_GAIN, turns.gain_reversed(readings)):
+    still, bias = misfit - turns.misfit(None), float(np.linalg.norm(np.median(difference, axis=0)))
+    contradicted = float(_spread(difference).max()) > turns.noise_deg
+    # The gyroscope's sign may be the mistaken one.
+    if contradicted and gain > max(LEAST_GAIN, misfit - turns.misfit(readings, -1.0)):
         evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
     elif contradicted and still > LEAST_GAIN:
         evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
-    elif bias > MOST_BIAS_DEG_S:
-        evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"
+    elif bias > MOST_BIAS_DEG_S * turns.seconds:
+        evidence = f"expected turns as its gyroscope's, got {bias / turns.seconds:.1f} degrees/s more"
         yield Doubt(sensor.label, "heading drift, or a gyroscope's bias", evidence, False)
 
 
 def turns_confirmed(sensor: OrientationSensor) -> bool:
     """Whether the gyroscope turns enough to tell, and the readings with it."""
     turns = GyroscopeTurns.of(sensor)
-    return turns is not None and turns.gain(sensor.readings.world_from_sensor) < -LEAST_GAIN
+    return turns is not None and (
+        turns.misfit(sensor.readings.world_from_sensor) - turns.misfit(None) < -LEAST_GAIN
+    )
 
 
 def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:

@@ -12,18 +12,16 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
+from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.curves import DecorrelationCurves, EchoSpectra, SpeckleSize
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.texture import Texture
 from speckle3d.motion.coherence import NOISY_GAIN, RowScales
 from speckle3d.motion.estimate import Motion
 
-FASTEST_MM_S = 300.0
-"""Mean speed above which no hand sweeps a probe: scans take 1 to 50 mm/s, a fast one some 100."""
 BENT, REFUTED_BEND = 0.12, 0.25
 """Standard deviation over depth of the logarithm of distances. Simulated: right curves up to 0.06 in phantom,
 tissue and noise; of a lens whose focus is 10 % off 0.11; shipped ones 10 mm too high 0.20, reversed 0.53."""
@@ -34,16 +32,9 @@ to 0.03 in phantom, 0.10 in tissue, 0.19 to 0.31 at depths wrong by 10 mm; axial
 by 0.3 dB/cm/MHz 0.17, with a sampling rate wrong by a factor of two 0.69."""
 LEAST_ROWS, ENOUGH_ROWS = 3, 4
 """Rows of patches from which doubts arise, and from which sizes refute."""
-UNSEEN_NOISE, REFUTED_NOISE = 1.8, 2.5
-"""Correlation of neighbouring vectors over what the noise taken from distances would leave of it. Simulated:
-up to 1.1 in nearly all of 64 good sweeps, 1.5 in the worst."""
-UNEVEN = 0.32
-"""Median logarithm of two steps' sum over the one step that spans both, either sign. Simulated: below 0.02 in
-half of 64 good sweeps, 0.24 in the worst; with a fifth of the curves' correlation missing 0.38. Noise moves
-it in images of few patches: alone, it refutes nothing."""
-LEAST_TRIPLES = 12
-FLAT = 0.3
-"""Part of the distance that halves the correlation, below which it is too flat for distances to be summed."""
+_LEAST_RISE = 0.04
+"""Of the mean frequency over the depth, over the bandwidth: over simulated tissue of 0.5 dB/cm/MHz it falls
+by 0.14 in 4 cm."""
 _ROW_ERROR = 0.03
 """Of a row's factor, from the curves and tissue."""
 
@@ -56,12 +47,12 @@ def examine_curves(sweep: Sweep, texture: Texture, motion: Motion, usable: BoolA
     MismatchError
         If they are refuted.
     """
-    problem, pairs = motion.problem, motion.pairs
-    size = texture.speckle_size(usable)
-    least = FLAT * float(problem.typical_distance(np.sqrt(0.5)))
-    ratios = sum_ratios(pairs.first, pairs.second, pairs.offset_mm, least)
-    doubts = doubt_curves(size, rows_without_tilt(motion), ratios, problem.curves, problem.patches)
-    return unrefuted([*doubt_speed(motion.path, sweep.frame_time_s), *doubts], sweep.name, MismatchError)
+    problem, size = motion.problem, texture.speckle_size(usable)
+    doubts = (
+        *doubt_curves(size, rows_without_tilt(motion), problem.curves, problem.patches),
+        doubt_sign(texture.spectra(usable), sweep),
+    )
+    return unrefuted(doubts, sweep.name, MismatchError)
 
 
 def rows_without_tilt(motion: Motion) -> RowScales | None:
@@ -77,45 +68,17 @@ def rows_without_tilt(motion: Motion) -> RowScales | None:
 
 
 def doubt_curves(
-    seen: SpeckleSize,
-    rows: RowScales | None,
-    ratios: FloatArray,
-    curves: DecorrelationCurves,
-    patches: PatchGrid,
+    seen: SpeckleSize, rows: RowScales | None, curves: DecorrelationCurves, patches: PatchGrid
 ) -> tuple[Doubt, ...]:
-    """Doubts that a sweep's own speckle raises: by its size, noise, depths that disagree, and steps' sums.
+    """Doubts that a sweep's own speckle raises: by its size, and by depths that disagree.
 
-    Size, depths and sums say so independently of each other: two of them at once refute the curves.
+    They say so independently of each other: both at once refute the curves.
     """
     gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain, nan=1.0)
-    kinds = doubt_size(seen, curves, patches, gain), doubt_bend(rows), doubt_sums(ratios)
-    found = tuple(doubt for kind in kinds for doubt in kind)
-    if sum(map(bool, kinds)) > 1:
-        found = tuple(replace(doubt, refuted=True) for doubt in found)
-    return (*found, *doubt_noise(seen, curves, patches, gain))
-
-
-def doubt_speed(path: FloatArray, time_s: FloatArray) -> tuple[Doubt, ...]:
-    """Doubt distances that no hand travels in the time.
-
-    Parameters
-    ----------
-    path : ndarray, shape (n, 2)
-        Elevational position of each frame's centre, mm, and its slope along x.
-    time_s : ndarray, shape (n,)
-    """
-    speed = float(np.abs(np.diff(path[:, 0])).sum() / (time_s[-1] - time_s[0]))
-    if speed <= FASTEST_MM_S:
-        return ()
-    return (
-        Doubt(
-            "curves",
-            "units",
-            f"expected a hand's speed of at most {FASTEST_MM_S:g} mm/s, got {speed:.0f} mm/s by the curves "
-            "and the frame times",
-            refuted=True,
-        ),
-    )
+    sizes, depths = doubt_size(seen, curves, patches, gain), doubt_bend(rows)
+    if depths is None:
+        return sizes
+    return tuple(replace(each, refuted=each.refuted or bool(sizes)) for each in (*sizes, depths))
 
 
 def bend(rows: RowScales) -> float:
@@ -136,66 +99,18 @@ def bend(rows: RowScales) -> float:
     return float(np.std(design @ fit.x))
 
 
-def doubt_bend(rows: RowScales | None) -> tuple[Doubt, ...]:
+def doubt_bend(rows: RowScales | None) -> Doubt | None:
     """Doubt curves by which depths of one image are not as far from the next."""
     size = 0.0 if rows is None else bend(rows)
     if rows is None or size < BENT:
-        return ()
+        return None
     ratio = np.exp(np.nanmax(rows.logarithm) - np.nanmin(rows.logarithm))
-    return (
-        Doubt(
-            "curves",
-            "curves of another probe, lens or depth",
-            f"expected all depths to tell the same distance, got distances at {rows.depth_mm[0]:.0f} to "
-            f"{rows.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} "
-            f"({100 * size:.0f} % rms, at most {100 * BENT:.0f} expected)",
-            refuted=size > REFUTED_BEND,
-        ),
+    evidence = (
+        f"expected all depths to tell the same distance, got distances at {rows.depth_mm[0]:.0f} to "
+        f"{rows.depth_mm[-1]:.0f} mm that differ by a factor of {ratio:.2f} ({100 * size:.0f} % rms, at most "
+        f"{100 * BENT:.0f} expected)"
     )
-
-
-def sum_ratios(first: IntArray, second: IntArray, distance_mm: FloatArray, least_mm: float) -> FloatArray:
-    """Sums of two distances over the one that spans both, of all three frames that go one way.
-
-    Parameters
-    ----------
-    first, second : ndarray, shape (e,)
-        Frames of each pair.
-    distance_mm : ndarray, shape (e,)
-        Signed, at the image's centre.
-    least_mm : float
-        Distances below are passed over.
-    """
-    to: dict[int, dict[int, float]] = {}
-    for i, j, d in zip(first.tolist(), second.tolist(), distance_mm.tolist(), strict=True):
-        if abs(d) > least_mm:
-            to.setdefault(j, {})[i] = d
-    ratios = [
-        (before + after) / whole
-        for spans in to.values()
-        for j, after in spans.items()
-        for i, before in to.get(j, {}).items()
-        if (whole := spans.get(i, 0.0)) * after > 0 and before * after > 0
-    ]
-    return np.array(ratios)
-
-
-def doubt_sums(ratios: FloatArray) -> tuple[Doubt, ...]:
-    """Doubt curves by which two steps are not as long as the one that spans both."""
-    if ratios.size < LEAST_TRIPLES:
-        return ()
-    middle = float(np.median(ratios))
-    if abs(np.log(middle)) <= UNEVEN:
-        return ()
-    return (
-        Doubt(
-            "curves",
-            "curves of another signal or with noise",
-            f"expected two steps to be as long as the one that spans both, got {middle:.2f} times its length "
-            f"(median of {ratios.size})",
-            refuted=False,
-        ),
-    )
+    return Doubt("curves", "curves of another probe, lens or depth", evidence, size > REFUTED_BEND)
 
 
 def doubt_size(
@@ -213,7 +128,6 @@ def doubt_size(
     if curves.speckle is None:
         return ()
     known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
-    excused = (left < NOISY_GAIN) & (_unseen_noise(seen, known, left, patches) < UNSEEN_NOISE)
     found = []
     for name in ("lateral_mm", "axial_mm"):
         here, there = getattr(seen, name), getattr(known, name)
@@ -222,55 +136,35 @@ def doubt_size(
             continue
         ratio = np.log(here[fair] / there[fair])
         # Noise differs from sample to sample, so that speckle under it looks finer.
-        off = float(np.median(np.where(excused[fair], np.maximum(ratio, 0.0), np.abs(ratio))))
+        off = float(np.median(np.where(left[fair] < NOISY_GAIN, np.maximum(ratio, 0.0), np.abs(ratio))))
         if off > RESIZED[name]:
-            found.append(
-                Doubt(
-                    "curves",
-                    "another probe, depth or sampling rate",
-                    f"expected {name.removesuffix('_mm')} speckle of {np.median(there[fair]):.3f} mm, as in "
-                    f"the curves' phantom, got {np.median(here[fair]):.3f} mm ({100 * off:.0f} % off at the "
-                    "median depth)",
-                    refuted=bool(off > REFUTED_SIZE[name] and fair.sum() >= ENOUGH_ROWS),
-                )
+            evidence = (
+                f"expected {name.removesuffix('_mm')} speckle of {np.median(there[fair]):.3f} mm, as in the "
+                f"curves' phantom, got {np.median(here[fair]):.3f} mm ({100 * off:.0f} % off at "
+                "the median depth)"
             )
+            refuted = bool(off > REFUTED_SIZE[name] and fair.sum() >= ENOUGH_ROWS)
+            found.append(Doubt("curves", "another probe, depth or sampling rate", evidence, refuted))
     return tuple(found)
 
 
-def doubt_noise(
-    seen: SpeckleSize, curves: DecorrelationCurves, patches: PatchGrid, left: FloatArray
-) -> tuple[Doubt, ...]:
-    """Doubt distances read with noise that the images do not show.
+def doubt_sign(spectra: EchoSpectra | None, sweep: Sweep) -> Doubt | None:
+    """Doubt the sign of Q where the echoes' frequency seems to rise with depth.
 
-    Noise takes as much from the correlation of neighbouring vectors as from that of frames. Where frames lack
-    correlation that vectors have, it was not noise that took it, and the curves are read at wrong distances.
-
-    Parameters
-    ----------
-    seen, gain
-        As for `doubt_size`.
+    Tissue takes more of high frequencies, so it falls; with the other sign it is mirrored at the demodulation
+    frequency. Noise, too, draws it to the band's middle, so it is doubted only where it goes away from it.
     """
-    if curves.speckle is None:
-        return ()
-    known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
-    excess = _unseen_noise(seen, known, left, patches)
-    if excess < UNSEEN_NOISE:
-        return ()
-    return (
-        Doubt(
-            "curves",
-            "curves of another probe, lens or depth",
-            f"expected the noise that distances were read with, {100 * (1 - np.median(left)):.0f} % of the "
-            f"correlation, between vectors too, got {excess:.1f} times the correlation that it leaves there",
-            refuted=excess > REFUTED_NOISE,
-        ),
+    signal = sweep.signal
+    if spectra is None or not isinstance(signal, RFSettings) or not signal.demodulation_frequency_hz:
+        return None
+    low, high = signal.bandwidth_hz
+    frequency = spectra.power @ spectra.frequency_hz / spectra.power.sum(axis=1)
+    slope, start = np.polyfit(np.arange(frequency.size), frequency - (low + high) / 2, 1)
+    end = start + slope * (frequency.size - 1)
+    if end - start <= _LEAST_RISE * (high - low) or abs(end) <= abs(start):
+        return None
+    evidence = (
+        "expected echoes whose frequency falls with depth, as tissue attenuates it, got "
+        f"{frequency[0] / 1e6:.2f} to {frequency[-1] / 1e6:.2f} MHz"
     )
-
-
-def _unseen_noise(seen: SpeckleSize, known: SpeckleSize, left: FloatArray, patches: PatchGrid) -> float:
-    """Median over depth of neighbouring vectors' correlation over what noise would leave of the phantom's."""
-    fair = np.isfinite(seen.lateral_mm)
-    if fair.sum() < LEAST_ROWS:
-        return 1.0
-    here, there = (np.exp(-0.5 * (patches.spacing_mm[0] / s.lateral_mm[fair]) ** 2) for s in (seen, known))
-    return float(np.median(here / (there * left[fair])))
+    return Doubt("images", "sign of Q", evidence, False)

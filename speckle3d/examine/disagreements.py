@@ -12,8 +12,8 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.geometry import relative_poses
-from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.examine.readings import jitter, rigid
 
 JOINT_CLAIMS = 3.0
 """Joint standard deviations beyond which two numbers disagree (DESIGN, Disagreement)."""
@@ -67,11 +67,10 @@ def _compared(
     length_sigma: float,
 ) -> Iterator[Doubt]:
     centre, about = sweep.grid.centre_mm, f"images and {sensor.label}"
-    measured = sensor.world_from_image(sweep.frame_time_s[covered])
-    poses = measured if isinstance(measured, RigidTransform) else RigidTransform.from_rotation(measured)
+    poses = rigid(sensor.world_from_image(sweep.frame_time_s[covered]))
     by_images, by_sensor = _motion(image, centre), _motion(poses, centre)
     travel = np.abs(by_images[:, 2])
-    noise = jitter_of(poses, centre)
+    noise = jitter(poses, centre)
     unit = unit_of_length(image, sensor, poses) if isinstance(sensor, Tracker) else ""
     for axis, name in (2, "length"), (0, "x"), (1, "y"), (5, "roll"):
         if axis < 3 and not isinstance(sensor, Tracker):
@@ -106,14 +105,6 @@ def _motion(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     return np.asarray(path - path[0])
 
 
-def jitter_of(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    """Standard deviation of the place of an image's centre, mm, and of its turn, rad, but for slow motion."""
-    turns = (poses.rotation.mean().inv() * poses.rotation).as_rotvec()
-    values = (poses.apply(centre_mm), turns)
-    second = ((each[2:] - 2.0 * each[1:-1] + each[:-2]) / np.sqrt(6.0) for each in values)
-    return np.array([max(robust_sigma(column) for column in each.T) for each in second])
-
-
 def apart(numbers: tuple[float, float], sigmas: tuple[float, float]) -> bool:
     """Whether two numbers differ by more than their joint claims allow."""
     return abs(numbers[0] - numbers[1]) > JOINT_CLAIMS * float(np.hypot(*sigmas))
@@ -134,9 +125,10 @@ def unit_of_length(image: RigidTransform, tracker: Tracker, poses: RigidTransfor
     )
     ratio = float((images * measured).sum() / max((images**2).sum(), LEAST_SIGMA_MM**2))
     for factor, name in UNITS.items():
-        for multiple, unit in (1.0 / factor, name), (factor, f"1/{factor:g} of a millimetre"):
-            if multiple / UNIT_FACTOR < ratio < multiple * UNIT_FACTOR:
-                return unit
+        if 1.0 / UNIT_FACTOR < ratio * factor < UNIT_FACTOR:
+            return name
+        if 1.0 / UNIT_FACTOR < ratio / factor < UNIT_FACTOR:
+            return f"1/{factor:g} of a millimetre"
     return ""
 
 

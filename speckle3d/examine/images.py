@@ -30,9 +30,9 @@ IMAGES = "images"
 
 SHADOW_TOLD = 0.02
 """Share of patches without an echo that is told."""
-OPEN_SHARE, LOOSE_SHARE = 0.5, 0.25
-"""Standard error over length from which a length is refused and flagged. Good sweeps claim up to 0.06, those
-with noise of half the signal's power 0.15."""
+OPEN_SHARE = 0.5
+"""Standard error over length from which a length is refused; from half of it, it is flagged. Good sweeps
+claim up to 0.06, those with noise of half the signal's power 0.15."""
 
 MOST_FRAMES = 10
 """Frames in which standing echoes are looked for: 45 pairs, held at once."""
@@ -63,8 +63,6 @@ ALIKE = (0.2, 0.9)
 WINDOW = 8
 """Frames over which distances are compared with what pairs as alike have elsewhere: a fold of the path takes
 no more. A quarter of a window on comes the next."""
-LISTED = 4
-"""Cuts that are named."""
 LEAST_COMPARED = 6
 """Pairs that a window needs."""
 FOLD_TOLD, FOLD_PATCHES = 8, 24
@@ -99,12 +97,15 @@ def examine_images(
         If so much stands still that distances mean nothing, the images do not determine the length, or they
         cannot be those of one probe that moves.
     """
-    pairs, path_mm = motion.motion.pairs, motion.motion.path[:, 0]
+    pairs, inside = motion.motion.pairs, matcher.patches.inside
+    frames = far_apart(motion.motion.path[:, 0], usable, curves).tolist()
+    share = standing_share(sweep, matcher, frames) if len(frames) > 1 else np.full(inside.size, np.nan)
+    share[~inside | (matches.left_out > 0.5)] = np.nan
     doubts = unrefuted(
         [
-            shadowed(matches.left_out[matcher.patches.inside]),
+            shadowed(matches.left_out[inside]),
             interleaved(matches.table, len(sweep), motion.motion.problem.trajectory.least_correlation),
-            _standing_echoes(sweep, matcher, matches, far_apart(path_mm, usable, curves), curves),
+            standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo),
         ],
         sweep.name,
         InsufficientDataError,
@@ -117,20 +118,6 @@ def examine_images(
         folded(matches.table, motion.poses, matcher.patches.centre_mm, usable),
     )
     return doubts + unrefuted(path, sweep.name, InsufficientDataError)
-
-
-def _standing_echoes(
-    sweep: Sweep,
-    matcher: FrameMatcher,
-    matches: MatchedSweep,
-    frames: IntArray,
-    curves: DecorrelationCurves,
-) -> Doubt | None:
-    if len(frames) < 2:
-        return None
-    share = standing_share(sweep, matcher, frames.tolist())
-    share[~matcher.patches.inside | (matches.left_out > 0.5)] = np.nan
-    return standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo)
 
 
 def shadowed(left_out: FloatArray) -> Doubt | None:
@@ -163,12 +150,10 @@ def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float)
     """
     length, sigma = float(np.ptp(position_mm)), float(np.max(sigma_mm))
     allowed = max(OPEN_SHARE * length, reach_mm)
-    loose = max(LOOSE_SHARE * length, reach_mm / 2)
-    if sigma <= loose:
+    if sigma <= allowed / 2:
         return None
-    limit = allowed if sigma > allowed else loose
     evidence = (
-        f"expected a length known to {limit:.3g} mm, got {length:.3g} mm with a standard error of "
+        f"expected a length known to {allowed / 2:.3g} mm, got {length:.3g} mm with a standard error of "
         f"{sigma:.3g} mm: the correlations do not determine it"
     )
     return Doubt(IMAGES, "too little speckle in common", evidence, sigma > allowed)
@@ -176,13 +161,11 @@ def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float)
 
 def interleaved(table: CorrelationTable, frames: int, least_correlation: float) -> Doubt | None:
     """Doubt a sweep whose frames resemble earlier ones more than the last: not recorded in this order."""
-    last, before, best = (np.full(frames, np.nan) for _ in range(3))
-    lag = table.second - table.first
-    last[table.second[lag == 1]] = table.median[lag == 1]
-    before[table.second[lag == 2]] = table.median[lag == 2]
-    best[table.second] = -np.inf
-    np.maximum.at(best, table.second, table.median)
-    known = np.isfinite(last) & np.isfinite(before) & (best >= least_correlation)
+    last, before = np.full((2, frames), np.nan)
+    for lag, median in (1, last), (2, before):
+        rows = table.second - table.first == lag
+        median[table.second[rows]] = table.median[rows]
+    known = np.isfinite(last) & np.isfinite(before) & ~table.unmatched(frames, least_correlation)
     if known.sum() < 4:
         return None
     swapped = float(np.mean(before[known] > last[known] + OUT_OF_TURN))
@@ -230,7 +213,7 @@ def standing(share: FloatArray, frames: int, cells: float, of_echo: bool = True)
         Whether the images have phase.
     """
     known = share[np.isfinite(share)]
-    if not known.size or frames < 2:
+    if not known.size:
         return None
     # Each pair's coherence scatters by one over the root of twice its cells; pairs that share a frame are
     # nearly independent, and a median scatters by a quarter more than a mean.
@@ -314,10 +297,9 @@ def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | Non
     cuts = [k for k in cuts if k - 1 not in cuts]
     if not cuts:
         return None
-    more = f" and {len(cuts) - LISTED} more" if len(cuts) > LISTED else ""
     evidence = (
-        f"expected speckle that joins all frames, got none across frame {', '.join(map(str, cuts[:LISTED]))}"
-        f"{more}: what was travelled there is a guess within {HELD_MM:g} mm"
+        f"expected speckle that joins all frames, got none at {len(cuts)} places, the first across frame "
+        f"{cuts[0]}: what was travelled there is a guess within {HELD_MM:g} mm"
     )
     where = tuple((k, k) for k in cuts)
     return Doubt(IMAGES, "too fast, lifted, or frames lost", evidence, False, where)

@@ -1,4 +1,4 @@
-"""A sensor's readings against themselves: spikes, standstills, and its own gyroscope and gravity."""
+"""A sensor's readings against themselves: spikes, slips, jitter and standstills."""
 
 from __future__ import annotations
 
@@ -20,46 +20,47 @@ Sensor = TypeVar("Sensor", OrientationSensor, Tracker)
 _WINDOW = 9
 """Readings of which the median is taken: up to four spikes in a row do not move it."""
 _SPIKE_SIGMA = 10.0
-_SPIKE_MM, _SPIKE_RAD = 3.0, float(np.deg2rad(5.0))
-"""No hand goes so far and back between readings: at 50 Hz it would take 7 m/s^2 and 220 rad/s^2."""
-_SLIP_MM_S, _SLIP_RAD_S = 250.0, float(np.deg2rad(300.0))
-"""No scan is so fast, from one reading to the next."""
+_SPIKE = float(np.deg2rad(5.0)), 3.0
+"""Turn, rad, and distance, mm, that no hand goes and comes back between readings: at 50 Hz it would take 220
+rad/s^2 and 7 m/s^2."""
+_SLIP = float(np.deg2rad(300.0)), 250.0
+"""Rates, rad/s and mm/s, of no scan, from one reading to the next."""
 _STILL = 1e-9
 """Readings closer than this are the same: noise moves the last digits of any sensor that is read."""
 
 
+def rigid(samples: RigidTransform | Rotation) -> RigidTransform:
+    """Readings as rigid transforms; an orientation sensor's are all at the origin."""
+    return samples if isinstance(samples, RigidTransform) else RigidTransform.from_rotation(samples)
+
+
+def _steps(poses: RigidTransform, others: RigidTransform) -> FloatArray:
+    """Turn, rad, and distance, mm, from poses to others, shape (2, n)."""
+    moved = np.linalg.norm(others.translation - poses.translation, axis=1)
+    return np.stack([(poses.rotation.inv() * others.rotation).magnitude(), moved])
+
+
 def spikes(sensor: OrientationSensor | Tracker) -> BoolArray:
     """Which readings lie far off the median of those around them, shape (m,)."""
-    samples = sensor.readings.world_from_sensor
-    if len(samples) < _WINDOW:
-        return np.zeros(len(samples), dtype=bool)
-    rotation = samples.rotation if isinstance(samples, RigidTransform) else samples
-    around = Rotation.from_matrix(nearest_rotation(_medians(rotation.as_matrix())))
-    turned = np.atleast_1d((around.inv() * rotation).magnitude())
-    found = turned > max(_SPIKE_RAD, _SPIKE_SIGMA * robust_sigma(turned))
-    if isinstance(samples, RigidTransform):
-        moved = np.linalg.norm(samples.translation - _medians(samples.translation), axis=1)
-        found |= moved > max(_SPIKE_MM, _SPIKE_SIGMA * robust_sigma(moved))
-    return np.asarray(found)
-
-
-def _medians(values: FloatArray) -> FloatArray:
-    """Running medians along the first axis."""
-    return np.asarray(median_filter(values, (_WINDOW, *[1] * (values.ndim - 1)), mode="mirror"))
+    poses = rigid(sensor.readings.world_from_sensor)
+    if len(poses) < _WINDOW:
+        return np.zeros(len(poses), dtype=bool)
+    place = median_filter(poses.translation, (_WINDOW, 1), mode="mirror")
+    matrix = median_filter(poses.rotation.as_matrix(), (_WINDOW, 1, 1), mode="mirror")
+    turn = Rotation.from_matrix(nearest_rotation(matrix))
+    off = _steps(RigidTransform.from_components(place, turn), poses)
+    limits = [max(most, _SPIKE_SIGMA * robust_sigma(size)) for most, size in zip(_SPIKE, off, strict=True)]
+    return np.asarray((off > np.array(limits)[:, None]).any(axis=0))
 
 
 def slips(sensor: OrientationSensor | Tracker) -> IntArray:
     """Readings that go on elsewhere than those before them were, faster than any hand, shape (places,)."""
-    samples, pause = sensor.readings.world_from_sensor, np.diff(sensor.readings.time_s)
-    if len(samples) < _WINDOW:
+    poses = rigid(sensor.readings.world_from_sensor)
+    if len(poses) < _WINDOW:
         return np.zeros(0, dtype=np.int64)
-    rotation = samples.rotation if isinstance(samples, RigidTransform) else samples
-    rate = (rotation[:-1].inv() * rotation[1:]).magnitude() / pause
-    found = rate > max(_SLIP_RAD_S, _SPIKE_SIGMA * float(np.median(rate)))
-    if isinstance(samples, RigidTransform):
-        speed = np.linalg.norm(np.diff(samples.translation, axis=0), axis=1) / pause
-        found |= speed > max(_SLIP_MM_S, _SPIKE_SIGMA * float(np.median(speed)))
-    return np.flatnonzero(found) + 1
+    rate = _steps(poses[:-1], poses[1:]) / np.diff(sensor.readings.time_s)
+    limit = np.maximum(_SLIP, _SPIKE_SIGMA * np.median(rate, axis=1))
+    return np.flatnonzero((rate > limit[:, None]).any(axis=0)) + 1
 
 
 def frames_at(
@@ -85,37 +86,21 @@ def without(sensor: Sensor, left_out: BoolArray) -> Sensor:
     return replace(sensor, readings=less, **kept)
 
 
-def jitter(sensor: OrientationSensor | Tracker) -> tuple[float, float]:
-    """Standard deviation of a step between readings but for the motion itself, mm and degrees."""
-    samples = sensor.readings.world_from_sensor
-    rotation = samples.rotation if isinstance(samples, RigidTransform) else samples
-    turns = (rotation.mean().inv() * rotation).as_rotvec(degrees=True)
-    places = samples.translation if isinstance(samples, RigidTransform) else np.zeros((len(turns), 3))
-    if len(turns) < 3:
+def jitter(poses: RigidTransform, at_mm: FloatArray) -> tuple[float, float]:
+    """Standard deviation of the place of a point, mm, and of the turn, rad, of poses but for slow motion."""
+    if len(poses) < 3:
         return 0.0, 0.0
-    # A second difference of white noise varies six times as much, a step twice.
-    second = (np.sqrt(1.0 / 3.0) * (each[2:] - 2.0 * each[1:-1] + each[:-2]) for each in (places, turns))
-    size = [max(robust_sigma(column) for column in each.T) for each in second]
-    return size[0], size[1]
+    turns = (poses.rotation.mean().inv() * poses.rotation).as_rotvec()
+    # A second difference of white noise varies six times as much.
+    second = (np.diff(values, 2, axis=0) / np.sqrt(6.0) for values in (poses.apply(at_mm), turns))
+    place, turn = (max(robust_sigma(column) for column in each.T) for each in second)
+    return place, turn
 
 
 def standstill(sensor: OrientationSensor | Tracker) -> tuple[float, float]:
     """Begin and end of the longest time over which the readings are all the same, s; empty without one."""
-    samples, time_s = sensor.readings.world_from_sensor, sensor.readings.time_s
-    if len(samples) < 2:
-        return float(time_s[0]), float(time_s[0])
-    still = _unchanged(samples)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    begin, end = edges[::2], edges[1::2]
-    if not begin.size:
-        return float(time_s[0]), float(time_s[0])
-    longest = int(np.argmax(time_s[end] - time_s[begin]))
-    return float(time_s[begin[longest]]), float(time_s[end[longest]])
-
-
-def _unchanged(samples: RigidTransform | Rotation) -> BoolArray:
-    if isinstance(samples, RigidTransform):
-        step = samples[:-1].inv() * samples[1:]
-        moved = np.linalg.norm(step.translation, axis=1)
-        return np.asarray((step.rotation.magnitude() < _STILL) & (moved < _STILL))
-    return np.asarray((samples[:-1].inv() * samples[1:]).magnitude() < _STILL)
+    poses, time_s = rigid(sensor.readings.world_from_sensor), sensor.readings.time_s
+    still = (_steps(poses[:-1], poses[1:]) < _STILL).all(axis=0) if len(poses) > 1 else np.zeros(0, bool)
+    runs = runs_of(np.flatnonzero(still))
+    spans = [(float(time_s[first]), float(time_s[last + 1])) for first, last in runs]
+    return max(spans, key=lambda span: span[1] - span[0], default=(float(time_s[0]),) * 2)

@@ -16,7 +16,16 @@ from speckle3d.core.doubts import Doubt, runs_of
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.examine.conventions import doubts_of_gravity, doubts_of_gyroscope, turns_confirmed
-from speckle3d.examine.readings import Sensor, frames_at, jitter, slips, spikes, standstill, without
+from speckle3d.examine.readings import (
+    Sensor,
+    frames_at,
+    jitter,
+    rigid,
+    slips,
+    spikes,
+    standstill,
+    without,
+)
 
 REPEATED_S, LONGEST_STILL_S = 0.15, 0.5
 """Loggers repeat a reading until the next; beyond the second time, unchanged readings are told."""
@@ -124,7 +133,9 @@ def require_believed(doubts: Iterable[Doubt], sensor: OrientationSensor | Tracke
 
 
 def _shaking(sensor: OrientationSensor | Tracker) -> Iterator[Doubt]:
-    size = jitter(sensor)
+    place, turn = jitter(rigid(sensor.readings.world_from_sensor), np.zeros(3))
+    # A step varies twice as much as a reading.
+    size = np.sqrt(2.0) * place, np.sqrt(2.0) * np.rad2deg(turn)
     if max(size) > SHAKING:
         evidence = f"expected a steady path, got a jitter of {size[0]:.2g} mm and {size[1]:.2g} degrees"
         yield Doubt(sensor.label, "noise or scrambled values", evidence, max(size) > SCRAMBLED)

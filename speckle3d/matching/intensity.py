@@ -123,9 +123,9 @@ class IntensityExtractor:
         padded = np.zeros((len(frame), plan.length), "c8" if self.signal.are_complex else "f4")
         padded[:, : frame.shape[1]] = frame
         spectrum = fft.fft(padded.view(np.complex64), axis=1, overwrite_x=True)
-        chosen = spectrum[:, plan.bins] * plan.weights
+        chosen = spectrum.take(plan.bins, axis=1, mode="wrap") * plan.weights
         if not self.signal.are_complex:
-            chosen += spectrum[:, -plan.bins].conj() * plan.mirrored
+            chosen += spectrum.take(-plan.bins, axis=1, mode="wrap").conj() * plan.mirrored
         band = np.zeros((len(frame), plan.out_length), np.complex64)
         band[:, plan.destination] = chosen
         return np.asarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from scipy import fft
 
-from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead
@@ -29,7 +29,6 @@ CONTRAST = (0.75, 1.15)
 cells. Coherent structure is above; its patches look coarser than speckle."""
 LEAST_PATCHES = 8
 """Patches, over all frames, that a row's size is taken from at least."""
-NOISE_QUANTILE = 0.2
 
 
 class Texture:
@@ -178,11 +177,3 @@ def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -
 
     shared = [np.einsum("pk,pk->p", a, b) for a, b in combinations(ahead(look, frames), 2)]
     return np.asarray(np.median(shared, axis=0), dtype=float)
-
-
-def spectrum_bins(signal: RFSettings, count: int) -> tuple[FloatArray, IntArray]:
-    """Frequencies above zero that `count` samples hold, increasing, and their bins in ``fft``."""
-    frequency_hz = signal.bin_frequency_hz(count)[: None if signal.are_complex else count // 2]
-    rising = np.argsort(frequency_hz)
-    rising = rising[frequency_hz[rising] >= 0]
-    return frequency_hz[rising], rising

@@ -14,11 +14,7 @@ from speckle3d.examine.curves import (
     bend,
     doubt_bend,
     doubt_curves,
-    doubt_noise,
     doubt_size,
-    doubt_speed,
-    doubt_sums,
-    sum_ratios,
 )
 from speckle3d.examine.recording import doubt_depths, doubt_widths
 from speckle3d.matching.intensity import two_way_wavenumber
@@ -41,11 +37,11 @@ def test_the_first_refuted_doubt_is_raised_and_the_others_are_returned():
 
 def test_rows_left_out_are_told_with_the_depths_expected_and_got():
     used = PATCHES.between(ROWS[:-2])
-    (doubt,) = doubt_depths(replace(CURVES, depth_mm=ROWS), PATCHES, used)
+    doubt = doubt_depths(replace(CURVES, depth_mm=ROWS), PATCHES, used)
     assert not doubt.refuted
     assert f"{ROWS[0]:.1f} to {ROWS[-1]:.1f} mm" in doubt.evidence
     assert f"2 of {ROWS.size} rows" in doubt.evidence
-    assert doubt_depths(CURVES, PATCHES, PATCHES) == ()
+    assert doubt_depths(CURVES, PATCHES, PATCHES) is None
 
 
 @pytest.mark.parametrize(("factor", "refuted"), [(1.0, False), (5.0, False), (1000.0, True)])
@@ -63,16 +59,6 @@ def test_distances_scaled_after_the_measurement_contradict_the_tilt(factor, refu
     assert [d.refuted for d in found] == [True] * refuted
 
 
-@pytest.mark.parametrize(("mm_s", "doubted"), [(3.0, False), (100.0, False), (290.0, False), (3000.0, True)])
-def test_no_hand_is_faster_than_a_hand(mm_s, doubted):
-    time_s = 7.0 + np.arange(50) / 25
-    # Forward and back, ending where it began.
-    path = np.column_stack([mm_s * np.abs(time_s - 8.0), np.zeros(50)])
-    found = doubt_speed(path, time_s)
-    assert [d.refuted for d in found] == [True] * doubted
-    assert all(f"{mm_s:.0f} mm/s" in d.evidence for d in found)
-
-
 def bent(by, rows=9, gain=1.0):
     """Scales that rise by so much from the first row to the middle."""
     line = by * np.linspace(-1, 1, rows)
@@ -88,52 +74,12 @@ def test_rows_that_stand_out_alone_are_no_bend():
 
 @pytest.mark.parametrize(
     ("rows", "refuted"),
-    [(bent(0.08), []), (bent(0.25), [False]), (bent(0.6), [True]), (bent(0.6, gain=0.5), []), (None, [])],
+    [(bent(0.08), None), (bent(0.25), False), (bent(0.6), True), (bent(0.6, gain=0.5), None), (None, None)],
     ids=["right", "doubtful", "reversed", "noisy", "not adapted to"],
 )
 def test_depths_that_disagree_doubt_the_curves(rows, refuted):
-    assert [d.refuted for d in doubt_bend(rows)] == refuted
-
-
-def pairs_of(path, reach, read=lambda d: d):
-    """All pairs of frames within reach, and the signed distances read between them."""
-    first, second = np.triu_indices(len(path), 1)
-    near = np.abs(path[second] - path[first]) < reach
-    apart = (path[second] - path[first])[near]
-    return first[near], second[near], np.sign(apart) * read(np.abs(apart))
-
-
-THERE_AND_BACK = np.concatenate([np.linspace(0, 2, 21), np.linspace(1.93, 0, 21)])
-
-
-@pytest.mark.parametrize("path", [THERE_AND_BACK, -THERE_AND_BACK, np.cumsum(np.tile([0.05, 0.15], 20))])
-def test_two_steps_are_as_long_as_the_one_that_spans_them(path):
-    ratios = sum_ratios(*pairs_of(path, 0.6), 0.08)
-    assert ratios.size > 50
-    np.testing.assert_allclose(ratios, 1.0)
-    assert doubt_sums(ratios) == ()
-
-
-def test_no_sums_over_a_turn_and_none_of_hardly_any_distance():
-    first, second = np.array([0, 0, 1, 0, 2]), np.array([1, 2, 2, 3, 3])
-    # Forward, back past the start, and a last step too short to be told.
-    assert sum_ratios(first, second, np.array([0.3, -0.2, -0.5, -0.21, -0.01]), 0.05).size == 0
-    assert sum_ratios(first, second, np.array([0.3, 0.5, 0.2, 0.51, 0.01]), 0.05).tolist() == [1.0]
-
-
-@pytest.mark.parametrize(
-    ("read", "doubted"),
-    [
-        (lambda d: 1.5 * d, 0),
-        (lambda d: np.maximum(d - 0.15, 1e-3), 1),
-        (lambda d: np.hypot(d, 0.25), 1),
-    ],
-    ids=["scaled: cannot be told", "noise taken away", "noise left"],
-)
-def test_sums_tell_curves_of_another_shape(read, doubted):
-    ratios = sum_ratios(*pairs_of(THERE_AND_BACK, 0.5, read), 0.01)
-    assert len(doubt_sums(ratios)) == doubted
-    assert doubt_sums(ratios[:5]) == ()
+    doubt = doubt_bend(rows)
+    assert (doubt and doubt.refuted) == refuted
 
 
 def scaled(lateral=1.0, axial=1.0):
@@ -166,43 +112,12 @@ def test_few_rows_with_speckle_do_not_refute():
     assert [d.refuted for d in doubt_size(few, CURVES, PATCHES, CLEAR)] == [False]
     fewer = SpeckleSize(np.where(np.arange(ROWS.size) < 2, 0.5 * SIZE.lateral_mm, np.nan), SIZE.axial_mm)
     assert doubt_size(fewer, CURVES, PATCHES, CLEAR) == ()
-    assert doubt_noise(fewer, CURVES, PATCHES, 0.2 * CLEAR) == ()
-
-
-def test_curves_of_earlier_versions_tell_nothing_of_size():
-    older = replace(CURVES, speckle=None)
-    assert doubt_size(scaled(0.5), older, PATCHES, CLEAR) == ()
-    assert doubt_noise(scaled(), older, PATCHES, 0.2 * CLEAR) == ()
-
-
-def noisy(gain):
-    """Size that speckle seems to have where noise leaves `gain` of its correlation."""
-    rho = gain * np.exp(-0.5 * (0.3 / SIZE.lateral_mm) ** 2)
-    return SpeckleSize(0.3 / np.sqrt(-2 * np.log(rho)), SIZE.axial_mm)
-
-
-@pytest.mark.parametrize("gain", [0.2, 0.5, 0.75, 1.0])
-def test_noise_that_the_images_show_is_believed(gain):
-    assert doubt_noise(noisy(gain), CURVES, PATCHES, gain * CLEAR) == ()
-
-
-@pytest.mark.parametrize(("gain", "refuted"), [(0.75, []), (0.5, [False]), (0.25, [True])])
-def test_noise_that_the_images_do_not_show_is_not(gain, refuted):
-    assert [d.refuted for d in doubt_noise(noisy(1.0), CURVES, PATCHES, gain * CLEAR)] == refuted
 
 
 @pytest.mark.parametrize(
-    ("lateral", "by", "ratio", "refuted"),
-    [
-        (1.0, 0.0, 1.0, []),
-        (1.16, 0.0, 1.0, [False]),
-        (1.0, 0.25, 1.0, [False]),
-        (1.0, 0.0, 1.5, [False]),
-        (1.16, 0.25, 1.0, [True, True]),
-        (1.16, 0.0, 0.7, [True, True]),
-        (1.0, 0.25, 1.5, [True, True]),
-    ],
+    ("lateral", "by", "refuted"),
+    [(1.0, 0.0, []), (1.16, 0.0, [False]), (1.0, 0.25, [False]), (1.16, 0.25, [True, True])],
 )
-def test_two_independent_doubts_at_once_refute(lateral, by, ratio, refuted):
-    found = doubt_curves(scaled(lateral), bent(by), np.full(20, ratio), CURVES, PATCHES)
+def test_two_independent_doubts_at_once_refute(lateral, by, refuted):
+    found = doubt_curves(scaled(lateral), bent(by), CURVES, PATCHES)
     assert [d.refuted for d in found] == refuted
