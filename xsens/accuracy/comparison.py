@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedRotations
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def compare_orientations(
     >>> round(found.heading_rms_rad, 6), round(found.inclination_rms_rad, 6)
     (0.1, 0.0)
     """
-    first, second = _stream(one), _stream(other)
+    first, second = (s if isinstance(s, TimedRotations) else s.rotations for s in (one, other))
     common = second.covers(first.time_s)
     if not common.any():
         raise InsufficientDataError(
@@ -91,16 +91,6 @@ def compare_orientations(
         float(np.angle(offset)),
         _rms(np.angle(turn / offset)),
     )
-
-
-def _stream(given: object) -> TimedRotations:
-    stream = getattr(given, "rotations", given)
-    if not isinstance(stream, TimedRotations):
-        raise InvalidInputError(
-            f"expected TimedRotations or an Orientation, as orient(log) gives, got {type(given).__name__}: "
-            "a log's own orientation is log.rotations()"
-        )
-    return stream
 
 
 def _rms(values: npt.ArrayLike) -> float:

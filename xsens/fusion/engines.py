@@ -53,17 +53,15 @@ class Filter:
         self._rows, north = rows[whole:], self._north
         if settings.use_magnetometer and whole:
             rows = rows[:whole]
-            found = self._heading.follow(
-                averaged_bins(rows, rows["start"], rows["bias"], rows["sd"], settings)
-            )
-            north = np.concatenate([north, np.column_stack(list(vars(found).values()))])
+            bins = averaged_bins(rows, rows["start"], rows["bias"], rows["sd"], settings)
+            north = np.concatenate([north, self._heading.follow(bins)])
         done = np.searchsorted(steps.last, np.arange(1, len(samples) + 1), side="right")
-        bins = (before + done) // per_bin + len(self._north) - 1
+        of_bin = (before + done) // per_bin + len(self._north) - 1
         known = np.concatenate([self._steps, steps.rows])
         of_step = np.maximum(done + len(self._steps) - 1, 0)
         self._steps, self._north = known[-1:], north[-1:]
         north = north if len(north) else np.array([_UNKNOWN])
-        turn, heading_sd, disturbed, stray, iron = north[np.clip(bins, 0, len(north) - 1)].T
+        turn, heading_sd, disturbed, stray, iron = north[np.clip(of_bin, 0, len(north) - 1)].T
         known = known if len(known) else np.zeros(1, STEP)
         sd = known["sd"][of_step, :3] * CLAIMED
         if settings.use_magnetometer:
@@ -86,25 +84,24 @@ class Filter:
 
 def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     """Orientation of a stretch by all its samples; it must be longer than a second."""
-    steps, level = smooth(samples, settings)
-    rows, nodes, sd = steps.rows, level.levels, level.sd[:, :3].copy()
-    count = len(rows)
-    disturbed, stray, iron = np.zeros(count, dtype=bool), np.full(count, np.nan), np.full(count, np.nan)
+    steps, nodes, biases, deviations = smooth(samples, settings)
+    rows, sd, count = steps.rows, deviations[:, :3].copy(), len(steps.rows)
+    north = np.tile(_UNKNOWN, (count, 1))
     if settings.use_magnetometer and np.isfinite(rows["field"][:, 0]).any():
-        bins = averaged_bins(rows, nodes[:-1], level.bias_rad_s[1:], level.sd[1:], settings)
-        found = HeadingFilter(settings, online=False).smooth(bins)
+        bins = averaged_bins(rows, nodes[:-1], biases[1:], deviations[1:], settings)
+        of_bins = HeadingFilter(settings, online=False).smooth(bins)
         time_s = np.append(0.0, np.cumsum(rows["duration_s"]))
         ends_s = time_s[1:][lasts_of_bins(count, settings)]
-        nodes = _turned(np.interp(time_s, ends_s, np.unwrap(found.turn_rad)), nodes)
-        sd[:, 2] = np.interp(time_s, ends_s, found.sd_rad)
-        of_bin = np.arange(count) // steps_per_bin(settings)
-        disturbed, stray, iron = (each[of_bin] for each in (found.disturbed, found.stray, found.iron))
+        nodes = _turned(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
+        sd[:, 2] = np.interp(time_s, ends_s, of_bins[:, 1])
+        north = of_bins[np.arange(count) // steps_per_bin(settings)]
     elif settings.use_magnetometer:
         sd[:, 2] = np.pi
-    xyzw = within_steps(samples, steps, nodes, level.bias_rad_s)
+    xyzw = within_steps(samples, steps, nodes, biases)
     of_step = np.repeat(np.arange(count), np.diff(steps.last, prepend=0))
-    of_steps: tuple[Any, ...] = (sd[1:], level.bias_rad_s[1:], disturbed, rows["resting"], stray, iron)
-    return Estimate(xyzw, *(values[of_step] for values in of_steps))
+    _, _, disturbed, stray, iron = north[of_step].T
+    resting = rows["resting"][of_step]
+    return Estimate(xyzw, sd[1:][of_step], biases[1:][of_step], disturbed > 0.0, resting, stray, iron)
 
 
 def _turned(angles_rad: FloatArray, xyzw: FloatArray) -> FloatArray:

@@ -86,32 +86,27 @@ class InclinationFilter:
         return FilterSteps(last[:n], rows[:n], covariance[:n], transition[:n], xyzw)
 
 
-@dataclass(frozen=True)
-class Smoothed:
-    """Smoothed orientation at the start of a stretch and at the end of each step.
+def smooth(
+    samples: Samples, settings: FusionSettings
+) -> tuple[FilterSteps, FloatArray, FloatArray, FloatArray]:
+    """Smooth one stretch, which must be longer than the filter's start, one second.
 
-    Attributes
-    ----------
-    levels : ndarray, shape (steps + 1, 4)
-        World from sensor; the heading starts at zero.
-    bias_rad_s : ndarray, shape (steps + 1, 3)
-    sd : ndarray, shape (steps + 1, 6)
+    Returns
+    -------
+    FilterSteps
+    ndarray, shape (n + 1, 4)
+        World from sensor at the start and at the end of each step; the heading starts at zero.
+    ndarray, shape (n + 1, 3)
+        Bias of the gyroscope, rad/s.
+    ndarray, shape (n + 1, 6)
         Standard deviation about the world's axes, rad, and of the bias.
     """
-
-    levels: FloatArray
-    bias_rad_s: FloatArray
-    sd: FloatArray
-
-
-def smooth(samples: Samples, settings: FusionSettings) -> tuple[FilterSteps, Smoothed]:
-    """Smooth one stretch, which must be longer than the filter's start, one second."""
     steps = InclinationFilter(settings).run(samples, to_end=True, covariances=True)
     n, first = len(steps.last), int(np.argmax(steps.rows["started"]))
     levels, biases = np.empty((n + 1, 4)), np.empty((n + 1, 3))
     kernel.smooth_steps(steps.rows, steps.covariance, steps.transition, first, levels, biases)
     variance = np.diagonal(steps.covariance, axis1=1, axis2=2)[np.maximum(np.arange(-1, n), first), :6]
-    return steps, Smoothed(levels, biases, np.sqrt(np.maximum(variance, 0.0)))
+    return steps, levels, biases, np.sqrt(np.maximum(variance, 0.0))
 
 
 def within_steps(samples: Samples, steps: FilterSteps, nodes: FloatArray, biases: FloatArray) -> FloatArray:

@@ -105,42 +105,44 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         If times, accelerometer or gyroscope are in other units.
     """
     source = log.source or "log"
-    if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {_lacking(log)}")
     before, log = len(log.notes), measured(log)
-    notes = list(log.notes[before:])
-    if log.gyroscope_rad_s is None or log.accelerometer_m_s2 is None:
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got none: {notes[-1]}")
-    turns, told = (
-        np.asarray(np.isfinite(rows).all(axis=1)) for rows in (log.gyroscope_rad_s, log.accelerometer_m_s2)
-    )
+    notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
+    if rate is None or force is None:
+        why = [
+            note for note in (*log.notes[:before], *notes) if note.startswith(("columns", "gyro", "accel"))
+        ]
+        missing = " and ".join(
+            name for name, rows in (("gyroscope", rate), ("accelerometer", force)) if rows is None
+        )
+        got = "; ".join([f"no {missing}", *why])
+        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {got}")
+    turns, told = (np.asarray(np.isfinite(rows).all(axis=1)) for rows in (rate, force))
     used = np.flatnonzero(_near(log.time_s, turns) & _near(log.time_s, told))
     if turns[used].sum() < 2 or told[used].sum() < 2:
         raise InsufficientDataError(
             f"{source}: expected two samples of gyroscope and accelerometer or more, got {told[used].sum()}"
         )
-    part = slice(None) if used.size == len(log) else used
-    time_s, turns, told = log.time_s[part], turns[part], told[part]
-    rate, force = _plain(log.gyroscope_rad_s[part]), _plain(log.accelerometer_m_s2[part])
     _require_seconds(np.diff(log.time_s), source)
-    require_metres(force if told.all() else force[told], source)
-    _require_radians(rate if turns.all() else rate[turns], source)
+    require_metres(force[told], source)
+    _require_radians(rate[turns], source)
     notes += _agreement(log, source)
     if left_out := len(log) - used.size:
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
-    if not turns.all():
-        notes.append(f"{int((~turns).sum())} gyroscope readings missing: interpolated")
-    if not told.all():
-        notes.append(f"{int((~told).sum())} accelerometer readings missing: interpolated")
-    field = np.full((used.size, 3), np.nan)
+    for name, there in (("gyroscope", turns), ("accelerometer", told)):
+        if count := int((~there[used]).sum()):
+            notes.append(f"{count} {name} readings missing: interpolated")
+    time_s, field = log.time_s[used], np.full((used.size, 3), np.nan)
     if log.magnetometer_au is not None:
-        field = _plain(log.magnetometer_au[part])
+        field = log.magnetometer_au[used]
     step_s = np.diff(time_s, prepend=time_s[0] - np.median(np.diff(time_s)))
-    lost = lost_variance(time_s[turns], rate[turns], float(np.median(step_s)))
     lost_rad2 = np.zeros(used.size)
-    lost_rad2[np.flatnonzero(turns)[1:]] = lost
-    rate, force = _filled(time_s, rate, turns), _filled(time_s, force, told)
-    return used, Samples(step_s, _bridging(rate, step_s), _bridging(force, step_s), field, lost_rad2), notes
+    known = np.flatnonzero(turns[used])
+    lost_rad2[known[1:]] = lost_variance(time_s[known], rate[used][known], float(np.median(step_s)))
+    rate, force = (
+        _bridging(_filled(time_s, rows[used], there[used]), step_s)
+        for rows, there in ((rate, turns), (force, told))
+    )
+    return used, Samples(step_s, rate, force, field, lost_rad2), notes
 
 
 def _filled(time_s: FloatArray, readings: FloatArray, there: BoolArray) -> FloatArray:
@@ -187,18 +189,6 @@ def _bridging(readings: FloatArray, step_s: FloatArray) -> FloatArray:
     means = readings.copy()
     means[late] = 0.5 * ((1.0 + told) * readings[late] + (1.0 - told) * readings[late - 1])
     return means
-
-
-def _plain(values: FloatArray) -> FloatArray:
-    """Values as kernels are compiled for, without a copy if they are so."""
-    return np.require(values, dtype=float, requirements=["C", "W"])
-
-
-def _lacking(log: ImuLog) -> str:
-    """Names of the missing sensors, and the note on columns that may have been meant for them."""
-    vectors = {"gyroscope": log.gyroscope_rad_s, "accelerometer": log.accelerometer_m_s2}
-    missing = [f"no {name}" for name, values in vectors.items() if values is None]
-    return "; ".join([*missing, *(note for note in log.notes if note.startswith("columns"))])
 
 
 def _require_seconds(steps_s: FloatArray, source: str) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.extras import extra_module
-from xsens.messages.control import BASE_RATE_HZ, Configuration, MessageId, error_of
+from xsens.messages.control import BASE_RATE_HZ, Configuration, MessageId
 from xsens.messages.framing import Framer, Message, encode
 from xsens.messages.mtdata import OutputMode, OutputSettings
 
@@ -136,8 +136,10 @@ class Device:
                     if message.mid == mid + 1:
                         return message
                     if message.mid == MessageId.ERROR:
-                        said = error_of(message)
-                        raise DeviceError(f"{self._port.name}: message {mid:#04x} was answered by {said}")
+                        code = message.payload[:1].hex() or "none"
+                        raise DeviceError(
+                            f"{self._port.name}: message {mid:#04x}: error {code} of the sensor"
+                        )
                     if message.mid == MessageId.WAKE_UP and mid != MessageId.GO_TO_CONFIG:
                         self.send(Message(MessageId.WAKE_UP_ACK))  # not to begin measuring
         raise DeviceError(

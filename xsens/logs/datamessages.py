@@ -46,14 +46,10 @@ def _stretches(frames: Frames, which: IntArray) -> Stamps:
 # -- legacy MTData
 
 _RAW = OutputMode.RAW | OutputMode.MT9
-_RAW_WITH_COUNTER = 22
 _RAW_VECTORS = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
 _NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
 _SOME = 1 << 12
 """Messages decoded at a time: as numbers they take several times their memory."""
-
-_ENOUGH = 10_000
-"""Messages that show where the counter is."""
 
 
 def legacy_samples(frames: Frames, which: IntArray) -> Parts:
@@ -121,25 +117,18 @@ def _last(frames: Frames, which: BoolArray, read: Callable[[Message], _Read]) ->
 
 
 def _layout(data: Frames, configuration: Configuration | None) -> DataLayout:
-    """Layout as configured, or of raw counts; their counter is first or last, whichever rises by one."""
+    """Layout as configured, or else that of the MT9-B, which sends raw counts after its counter."""
     units = configuration.units if configuration is not None else ()
     if len(units) > 1:
         raise InvalidInputError(f"expected the log of one unit, got that of a master of {len(units)}")
-    if units and not units[0].output_mode & _RAW:
+    if units:
         return DataLayout(units[0].output_mode, units[0].output_settings)
-    start = data.payload_start[data.payload_size == _RAW_WITH_COUNTER]
-    if 2 * start.size <= len(data):
+    layout = DataLayout(OutputMode.MT9)
+    if 2 * (data.payload_size == layout.size).sum() <= len(data):
         raise InvalidInputError(
-            "expected a configuration before data messages that are not raw counts with a counter, got none"
+            "expected a configuration before data messages that are not an MT9-B's raw counts, got none"
         )
-    first, last = (_share_counting(data, start[:_ENOUGH] + at) for at in (0, _RAW_WITH_COUNTER - 2))
-    return DataLayout(OutputMode.MT9 if first >= last else OutputMode.RAW)
-
-
-def _share_counting(frames: Frames, at: IntArray) -> float:
-    """How often a 16-bit number, found at `at`, rises by one from each message to the next."""
-    steps = np.diff(256 * frames.data[at].astype(np.int64) + frames.data[at + 1])
-    return float(np.mean(steps % (1 << 16) == 1)) if steps.size else 0.0
+    return layout
 
 
 # -- MTData2

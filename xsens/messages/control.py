@@ -45,26 +45,9 @@ class MessageId(IntEnum):
     SKIP_FACTOR = 0xD4
 
 
-_ERRORS = {
-    3: "the period is not within the valid range",
-    4: "the message is not valid, or not in this state",
-    24: "the period is too short to collect all data",
-    30: "timer overflow: the sensor cannot keep up with its settings",
-    32: "the baud rate is not valid",
-    33: "a parameter is not valid",
-    40: "the device failed",
-}
-
-
 def rate_of(period: int) -> float:
     """Rate in Hz by a period in ticks; NaN if it is zero."""
     return BASE_RATE_HZ / period if period else float("nan")
-
-
-def error_of(message: Message) -> str:
-    """Text of an error message of the sensor."""
-    code = message.payload[0] if message.payload else -1
-    return f"error {code}: {_ERRORS.get(code, 'not documented')}"
 
 
 class UnitConfiguration(NamedTuple):
