@@ -25,8 +25,8 @@ Measured on twelve trials of BROAD (Laidig et al. 2021)."""
 @lru_cache(maxsize=8)
 def _limits(settings: FusionSettings) -> Any:
     """Settings that the filter uses, as its kernel takes them."""
-    values = tuple(getattr(settings, name) for name in kernel.LIMITS.names or ())
-    return np.array([values], kernel.LIMITS)
+    numbers = {name: float(value) for name, value in vars(settings).items()}
+    return np.array([tuple(numbers.values())], [(name, "f8") for name in numbers])
 
 
 @dataclass(frozen=True)

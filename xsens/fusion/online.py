@@ -196,16 +196,16 @@ def _checked(
     step = np.atleast_1d(np.asarray(step_s, dtype=float))
     if not (np.isfinite(step) & (step > 0.0)).all():
         raise InvalidInputError("step_s: expected positive numbers, got one that is not")
-    field = np.full((step.size, 3), np.nan) if magnetometer_au is None else magnetometer_au
-    vectors = {
-        "gyroscope_rad_s": np.atleast_2d(np.asarray(gyroscope_rad_s, dtype=float)),
-        "accelerometer_m_s2": np.atleast_2d(np.asarray(accelerometer_m_s2, dtype=float)),
-        "magnetometer_au": np.atleast_2d(np.asarray(field, dtype=float)),
-    }
-    for name, rows in vectors.items():
-        if rows.shape != (step.size, 3):
-            raise MismatchError(f"{name}: expected shape {(step.size, 3)}, got {rows.shape}")
-    rate, force, field = vectors.values()
+    vectors = (
+        gyroscope_rad_s,
+        accelerometer_m_s2,
+        np.full((step.size, 3), np.nan) if magnetometer_au is None else magnetometer_au,
+    )
+    rate, force, field = (np.atleast_2d(np.asarray(rows, dtype=float)) for rows in vectors)
+    if not rate.shape == force.shape == field.shape == (step.size, 3):
+        raise MismatchError(
+            f"expected readings of shape {(step.size, 3)}, got {rate.shape}, {force.shape} and {field.shape}"
+        )
     fast = np.linalg.norm(np.where(np.isfinite(rate), rate, 0.0), axis=1).max(initial=0.0)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,8 +21,6 @@ from xsens.messages.framing import Frames, Message
 from xsens.messages.mtdata import DataLayout, OutputMode, Values
 from xsens.messages.mtdata2 import ORIENTATIONS, STAMPS, read_items
 from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
-
-_Read = TypeVar("_Read")
 
 _STARTS = (MessageId.WAKE_UP, MessageId.GO_TO_MEASUREMENT_ACK, MessageId.UTC_TIME)
 """Messages after which the sensor's counter may have begun anew."""
@@ -108,7 +106,7 @@ def _decoded(layout: DataLayout, frames: Frames, calibration: RawCalibration | N
     return values
 
 
-def _last(frames: Frames, which: BoolArray, read: Callable[[Message], _Read]) -> _Read | None:
+def _last(frames: Frames, which: BoolArray, read: Callable[[Message], Any]) -> Any:
     """The last of some messages that can be read."""
     for i in np.flatnonzero(which)[::-1].tolist():
         with suppress(InvalidInputError):

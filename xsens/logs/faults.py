@@ -185,17 +185,20 @@ def _turning(rate: FloatArray | None, runs: _Runs) -> BoolArray:
 
 def _clipped(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
-    bad, whole = np.zeros(len(rows), dtype=bool), _Runs.of(rows)
-    of_run = np.repeat(np.arange(len(whole.start)), whole.length)
+    bad = np.zeros(len(rows), dtype=bool)
     for axis in rows.T:
+        ends = (np.fmax.reduce(axis), np.fmin.reduce(axis))
+        if max(np.count_nonzero(axis == end) for end in ends) < 3:
+            continue
         steps = np.abs(np.diff(axis))
         digit = np.min(steps[steps > 0.0], initial=np.inf)
         runs = _Runs.of(axis[:, None])
         slopes = np.pad(steps, 2)  # into each sample from the second before it, and out of it
         slope = np.minimum(slopes[runs.start], slopes[runs.start + runs.length + 2])
         value = axis[runs.start]
-        top = ((value == np.fmax.reduce(axis)) | (value == np.fmin.reduce(axis))) & (value != 0.0)
-        others_go_on = of_run[runs.start + runs.length - 1] - of_run[runs.start] > 1
+        top = ((value == ends[0]) | (value == ends[1])) & (value != 0.0)
+        changes = np.append(0, np.cumsum((rows[1:] != rows[:-1]).any(axis=1)))
+        others_go_on = changes[runs.start + runs.length - 1] - changes[runs.start] > 1
         bad |= runs.marked(top & others_go_on & (slope > 3.0 * digit))
     return bad
 

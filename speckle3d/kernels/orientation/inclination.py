@@ -43,27 +43,6 @@ from speckle3d.kernels.orientation.rotations import (
 ATTITUDE, BIAS, SPEED, SIZE = 0, 3, 6, 9
 """Places in the error state: attitude (world axes), gyroscope bias (sensor axes), velocity (world axes)."""
 
-LIMITS = np.dtype(
-    [
-        (name, "f8")
-        for name in (
-            "block_s",
-            "gravity_m_s2",
-            "gyro_noise_rad_sqrt_s",
-            "gyro_scale_noise_sqrt_s",
-            "bias_walk_rad_s_sqrt_s",
-            "speed_m_s",
-            "speed_time_s",
-            "force_noise_m_s_sqrt_s",
-            "rest_rate_rad_s",
-            "rest_force_m_s2",
-            "rest_after_s",
-            "rest_bias_rad_s",
-        )
-    ]
-)
-"""Settings of the filter, as `xsens.fusion.settings` explains them."""
-
 FILTER = np.dtype(
     [
         ("pause_s", "f8"),  # before the next sample, after which up is found anew; negative if it goes on
@@ -169,8 +148,10 @@ def run_filter(
         Variance of the turn over lost readings before each sample.
     to_end : bool
         The last sample completes an increment, however short.
-    filters, limits : structured ndarray, shape (1,), of `FILTER` and `LIMITS`
-        The filter is changed in place.
+    filters : structured ndarray, shape (1,), of `FILTER`
+        Changed in place.
+    limits : structured ndarray, shape (1,)
+        Numbers of `xsens.fusion.settings.FusionSettings` by name.
     unfinished : structured ndarray, shape (1,), of `STEP`
         The increment that is not complete, from one call to the next.
     steps : structured ndarray, shape (n,), of `STEP`
@@ -214,12 +195,14 @@ def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: Float
     """Add a sample to an increment, with the increment's bias."""
     half = _turn(rate, step.start_bias, 0.5 * dt)
     q = product(quaternion(step.turn), half)
-    step.force += dt * np.array(rotated(q, _three(force)))
+    for i, part in enumerate(rotated(q, _three(force))):
+        step.force[i] += dt * part
+        step.rate[i] += dt * rate[i]
     q = product(q, half)
     if math.isfinite(field[0] + field[1] + field[2]):
-        step.field += np.array(rotated(q, _three(field)))
+        for i, part in enumerate(rotated(q, _three(field))):
+            step.field[i] += part
         step.fields += 1.0
-    step.rate += dt * rate
     step.turn[:] = q
     step.duration_s += dt
 
