@@ -3,7 +3,6 @@ from contextlib import closing
 
 import pytest
 
-from speckle3d.core.errors import FileError
 from xsens.live.device import DeviceSettings, connect, prepare
 from xsens.messages.control import Configuration, MessageId
 
@@ -49,8 +48,3 @@ class TestDevice:
         items = dict(sensor.outputs)
         assert {0x1020, 0x1060, 0xE020} == {each for each, rate in items.items() if rate == 0xFFFF}
         assert {0x2010, 0x4020, 0x8020, 0xC020} == {each for each, rate in items.items() if rate == 80}
-
-    def test_a_missing_port_is_a_file_error_in_one_line(self, tmp_path):
-        with pytest.raises(FileError, match="none") as caught:
-            connect(str(tmp_path / "none"))
-        assert "\n" not in str(caught.value)

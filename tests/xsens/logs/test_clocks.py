@@ -3,7 +3,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps, timeline
 from xsens.logs.samples import ImuLog
 
@@ -32,13 +31,6 @@ def test_a_new_start_is_as_long_as_the_computers_clock_says():
     np.testing.assert_allclose(line.time_s[[0, 50, 100]], [0.0, 10.0, 20.5])
     assert [(g.after_index, g.lost) for g in line.gaps] == [(49, 0), (99, 0)]
     assert (np.diff(line.time_s) > 0).all()
-
-
-def test_a_time_needs_a_clock_or_a_counter_and_a_rate():
-    with pytest.raises(InvalidInputError):
-        timeline(Stamps())
-    with pytest.raises(InvalidInputError, match="rate"):
-        timeline(Stamps(counter=np.arange(3)))
 
 
 def test_a_message_that_was_overtaken_is_put_in_its_place():

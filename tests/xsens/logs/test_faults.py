@@ -157,17 +157,6 @@ def test_two_sensors_in_one_table_are_refused(whose):
         parse_text(text)
 
 
-def test_rows_out_of_order_are_sorted():
-    log, _ = swinging(4.0)
-    rows = rows_of(log)
-    rows[10:13] = rows[12:9:-1]
-    rows.insert(50, rows[50])
-    found = parse_text("\n".join([NAMES, *rows]))
-    np.testing.assert_allclose(found.gyroscope_rad_s, log.gyroscope_rad_s, atol=1e-6)
-    assert any("out of order" in note for note in found.notes)
-    assert any("1 samples at the time of another" in note for note in found.notes)
-
-
 def test_a_rate_that_the_times_contradict_is_refused():
     names = "PacketCounter\tSampleTimeFine\tAcc_X\tAcc_Y\tAcc_Z"
     rows = [f"{i}\t{100 * i}\t0\t{0.01 * i}\t9.8" for i in range(50)]

@@ -23,16 +23,6 @@ def mt9b(realdata):
     return realdata / "mt9b" / "MT9_data.bin"
 
 
-def test_every_record_of_the_mt9_after_the_truncated_one(mt9b):
-    data = mt9b.read_bytes()
-    log = read_log(mt9b)
-    # What is left of the file after the block (173 bytes) and the truncated record (15), in records of 27.
-    assert len(log) == (len(data) - 173 - 15) / 27 == 21162
-    np.testing.assert_array_equal(np.diff(log.counter), 1)
-    assert (log.rate_hz, log.gaps) == (256.0, ())
-    assert re.findall(r"\d+", log.notes[0]) == ["15", "1", "173"]  # bytes, places, the first byte
-
-
 def test_the_mt9_at_rest_feels_gravity(mt9b):
     """Within what is not compensated, 1.2 % of standard gravity here, and steady to a twelfth of that."""
     log = read_log(mt9b)
