@@ -37,9 +37,8 @@ from speckle3d.corrections import correct
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.measures.measure import measured
 from speckle3d.imaging.measures.surface import surface_of
-from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import grid_around
-from speckle3d.imaging.voxels.volume import compound
+from speckle3d.imaging.voxels.volume import compound, look_up_voxels
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction

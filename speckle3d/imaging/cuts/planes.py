@@ -129,8 +129,9 @@ class ReslicePlane(Cut):
     def world_from_mm(self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike) -> FloatArray:
         """Points of the world by what the picture's axes say, shape (..., 3), mm."""
         x, y = np.broadcast_arrays(np.asarray(x_mm, dtype=float), np.asarray(y_mm, dtype=float))
-        local = np.stack([x - self.first_mm[0], y - self.first_mm[1], np.zeros(x.shape)], axis=-1)
-        return np.asarray(self.world_from_plane.apply(local.reshape(-1, 3)).reshape(local.shape))
+        right = self.world_from_plane.rotation.apply([1.0, 0.0, 0.0])
+        along = (x - self.first_mm[0])[..., None] * right + (y - self.first_mm[1])[..., None] * self.down
+        return np.asarray(self.world_from_plane.translation + along)
 
 
 def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:

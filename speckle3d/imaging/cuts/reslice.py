@@ -20,7 +20,6 @@ from speckle3d.core.labels import EMPTY
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.planes import Cut, image_plane
-from speckle3d.imaging.cuts.planes import ReslicePlane as ReslicePlane
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.nearest import NearestImages, look_up
 

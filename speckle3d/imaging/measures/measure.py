@@ -129,13 +129,7 @@ def angle(points_mm: FloatArray) -> tuple[float, FloatArray]:
     normal = np.cross(one, other)
     sine, cosine = float(np.linalg.norm(normal)), float(one @ other)
     # Along a straight line every turn opens or closes the angle alike, to first order of its size.
-    across = normal / sine if sine > 1e-9 else _perpendicular(one)
+    across = normal / sine if sine > 1e-9 else np.linalg.svd(one[None])[2][2]
     ends = np.array([np.cross(one, across), -np.cross(other, across)]) / sizes
     gradient = np.array([ends[0], -ends.sum(axis=0), ends[1]])
     return float(np.arctan2(sine, cosine)), gradient
-
-
-def _perpendicular(direction: FloatArray) -> FloatArray:
-    """Any unit vector at a right angle to `direction`."""
-    across = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
-    return np.asarray(across / np.linalg.norm(across))

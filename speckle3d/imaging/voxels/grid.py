@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import image_corners
 from speckle3d.imaging.voxels.settings import VoxelType
 
@@ -41,7 +39,7 @@ class VoxelGrid:
 
     def size_gb(self, voxel_type: str) -> float:
         """Size of the voxels alone, GB."""
-        return math.prod(float(n) for n in self.shape) * np.dtype(voxel_type).itemsize / 1e9
+        return float(np.prod(self.shape, dtype=float)) * np.dtype(voxel_type).itemsize / 1e9
 
     def __str__(self) -> str:
         voxels = " x ".join(str(n) for n in self.shape)
@@ -103,11 +101,6 @@ def grid_around(
     n_i, n_j, n_k = counts.astype(int).tolist()
     origin = axes.apply(low) if origin_mm is None else np.asarray(origin_mm, dtype=float)
     return VoxelGrid((n_i, n_j, n_k), spacing, RigidTransform.from_components(origin, axes))
-
-
-def grid_like(volume: Volume) -> VoxelGrid:
-    """Grid of a volume, to make another one with the same voxels."""
-    return VoxelGrid(volume.shape, volume.spacing_mm, volume.world_from_grid)
 
 
 def spacing_within(

@@ -21,7 +21,7 @@ from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.measures.uncertainty import deviation_volume
-from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, grid_like, spacing_within
+from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around, spacing_within
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.volume import compound_onto
 from speckle3d.io.voxels.volume_writer import write_volume
@@ -79,7 +79,8 @@ class GridRequest:
         if self.like is not None:
             if self != GridRequest(like=self.like):
                 raise InvalidInputError("--like: expected no other option of the grid beside it")
-            return grid_like(read_volume(self.like))
+            like = read_volume(self.like)
+            return VoxelGrid(like.shape, like.spacing_mm, like.world_from_grid)
         if self.within_gb is not None and (self.spacing_mm or self.shape):
             raise InvalidInputError("--within-gb: expected no --spacing-mm and no --shape beside it")
         axes = Rotation.identity()

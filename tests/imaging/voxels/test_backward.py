@@ -9,8 +9,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
-from speckle3d.imaging.voxels.backward import look_up_voxels
 from speckle3d.imaging.voxels.grid import grid_around
+from speckle3d.imaging.voxels.volume import look_up_voxels
 
 GRID = ImageGrid(vectors=9, samples=14, vector_pitch_mm=0.5, sample_spacing_mm=0.3, first_sample_depth_mm=0.7)
 
