@@ -29,10 +29,7 @@ but slopes that lead there start much farther out."""
 _MORE_GLANCES = 4096
 """Places compared if none of those led to an answer: the right one may lie in a corner of the box."""
 
-_BESIDE = 256
-"""Places compared around each of the `_HOPPED` best, at a blur whose slopes reach a quarter of the box."""
-
-_FOLLOWED, _COMPARED, _HOPPED, _DECIDED = 20, 5, 3, 3
+_FOLLOWED, _COMPARED, _DECIDED = 20, 5, 3
 
 _STEPS = 12
 
@@ -55,14 +52,14 @@ def search(
     """
     centre_mm = crossing.centre_mm
 
-    def best_of(level: Level, about: Estimate, part: float, count: int, most: int) -> list[Estimate]:
-        """The best of many places in part of the box about one: those from which an increment leads to it."""
+    def best_of(count: int, most: int) -> list[Estimate]:
+        """The best of many places in the box: those from which an increment leads to the start."""
         places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
         places[0] = 0.0
-        turn = Rotation.from_euler("xyz", part * capture_rad * places[:, :3])
-        away = RigidTransform.from_components(part * capture_mm * places[:, 3:], turn)
-        tried = [Estimate(place, about.scales) for place in about.sensor_from_image * away.inv()]
-        comparison, scores = crossing.level(level, about.sensor_from_image), np.empty(count)
+        turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
+        away = RigidTransform.from_components(capture_mm * places[:, 3:], turn)
+        tried = [Estimate(place, start.scales) for place in start.sensor_from_image * away.inv()]
+        comparison, scores = crossing.level(GLANCE, start.sensor_from_image), np.empty(count)
         for n, score in enumerate(ahead(lambda place: comparison.at(place).score, tried)):
             scores[n] = score
             if progress is not None:
@@ -91,7 +88,7 @@ def search(
     followed: list[Refined] = []
     for count, most in ((_GLANCES, _FOLLOWED), (_MORE_GLANCES, 2 * _FOLLOWED)):
         if not followed:
-            best = best_of(GLANCE, start, 1.0, count, most)
+            best = best_of(count, most)
             followed = inside(refined(FOLLOWED, best))
     if not followed:
         got = "none but farther off" if best else "no overlap anywhere"
@@ -99,16 +96,8 @@ def search(
             f"expected sweeps that agree within {capture_mm:g} mm and {np.rad2deg(capture_rad):g} degrees "
             f"of the start, got {got}"
         )
-    compared = refined(COMPARED, _distinct(followed, centre_mm)[:_COMPARED])
-    # In layered or repetitive tissue the best place so far is often a neighbour of the right one.
-    hops = [
-        place
-        for one in compared[:_HOPPED]
-        for place in best_of(FOLLOWED, one.estimate, 0.5, _BESIDE, _FOLLOWED // len(compared[:_HOPPED]))
-    ]
-    again = refined(COMPARED, _distinct(inside(refined(FOLLOWED, hops)), centre_mm)[:_COMPARED])
-    best_first = sorted(compared + again, key=lambda one: -one.similarity.score)
-    return _distinct(refined(DECIDED, _distinct(best_first, centre_mm)[:_DECIDED]), centre_mm)
+    compared = _distinct(refined(COMPARED, _distinct(followed, centre_mm)[:_COMPARED]), centre_mm)
+    return _distinct(refined(DECIDED, compared[:_DECIDED]), centre_mm)
 
 
 def _distinct(ends: list[Refined], centre_mm: FloatArray) -> list[Estimate]:
