@@ -29,7 +29,7 @@ _ANGLES = 24
 _LINE_REACH = 2.5
 """Distance from a peak, in `_SURROUND_MM`, at which it is tested for a line; the 24 directions are then less
 than half a millimetre apart."""
-_SHIFTS, _NEAR_MM = 8, 1.0
+_SHIFTS, _NEAR_MM = 5, 1.0
 """Steps of the mean shift that centres a dot, and the standard deviation of its window; a bead is then placed
 to 0.02 mm."""
 
