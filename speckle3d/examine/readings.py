@@ -78,10 +78,8 @@ def without(sensor: Sensor, left_out: BoolArray) -> Sensor:
     keep = ~left_out
     readings = sensor.readings
     less = replace(readings, time_s=readings.time_s[keep], world_from_sensor=readings.world_from_sensor[keep])
-    if isinstance(sensor, Tracker):
-        return replace(sensor, readings=less)
     names = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
-    vectors = {name: getattr(sensor, name) for name in names}
+    vectors = {name: getattr(sensor, name, None) for name in names}
     kept = {name: value[keep] for name, value in vectors.items() if value is not None}
     return replace(sensor, readings=less, **kept)
 

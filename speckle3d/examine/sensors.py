@@ -83,26 +83,33 @@ def _doubts_of(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTr
     found = [*_frozen(sensor, sweep, image), *_shaking(sensor)]
     if not found and isinstance(sensor, OrientationSensor):
         found += [*doubts_of_gyroscope(sensor), *doubts_of_gravity(sensor)]
-    return [*found, *_slips(sensor, sweep.frame_time_s)]
+    return found
 
 
 def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
-    """Leave out single wild readings, and count them."""
-    tracker, about_tracker = _cleaned(sweep.tracker, sweep.frame_time_s)
-    orientation, about_orientation = _cleaned(sweep.orientation, sweep.frame_time_s)
-    doubts = (*about_tracker, *about_orientation)
-    return (replace(sweep, tracker=tracker, orientation=orientation) if doubts else sweep), doubts
+    """Leave out single wild readings, and count them and jumps."""
+    doubts: list[Doubt] = []
+    if sweep.tracker is not None:
+        sweep = replace(sweep, tracker=_cleaned(sweep.tracker, sweep.frame_time_s, doubts))
+    if sweep.orientation is not None:
+        sweep = replace(sweep, orientation=_cleaned(sweep.orientation, sweep.frame_time_s, doubts))
+    return sweep, tuple(doubts)
 
 
-def _cleaned(sensor: Sensor | None, frame_time_s: FloatArray) -> tuple[Sensor | None, list[Doubt]]:
-    wild = np.zeros(0, dtype=bool) if sensor is None else spikes(sensor)
-    if sensor is None or not wild.any():
-        return sensor, []
+def _cleaned(sensor: Sensor, frame_time_s: FloatArray, doubts: list[Doubt]) -> Sensor:
+    wild = spikes(sensor)
+    if not wild.any():
+        doubts += _slips(sensor, frame_time_s)
+        return sensor
     share = f"{int(wild.sum())} of {wild.size} readings jump away from those around them and back"
     if wild.mean() > MOST_SPIKES:
-        return sensor, [Doubt(sensor.label, "scrambled values", f"expected a path, but {share}", True)]
+        doubts.append(Doubt(sensor.label, "scrambled values", f"expected a path, but {share}", True))
+        return sensor
     where = frames_at(sensor, np.flatnonzero(wild), frame_time_s)
-    return without(sensor, wild), [Doubt(sensor.label, "spikes", f"{share}, and are left out", False, where)]
+    steady = without(sensor, wild)
+    doubts.append(Doubt(sensor.label, "spikes", f"{share}, and are left out", False, where))
+    doubts += _slips(steady, frame_time_s)
+    return steady
 
 
 def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
@@ -115,14 +122,6 @@ def believed(sweep: Sweep, doubts: Iterable[Doubt]) -> Sweep:
         tracker=None if Tracker.label in refuted else sweep.tracker,
         orientation=None if OrientationSensor.label in refuted else sweep.orientation,
     )
-
-
-def doubts_of_readings(sweep: Sweep) -> tuple[Doubt, ...]:
-    """Spikes and jumps of a sweep's sensors, without any image."""
-    cleaned, doubts = cleaned_readings(sweep)
-    left = believed(cleaned, doubts)
-    sensors = [sensor for sensor in (left.tracker, left.orientation) if sensor is not None]
-    return (*doubts, *(each for sensor in sensors for each in _slips(sensor, sweep.frame_time_s)))
 
 
 def require_believed(doubts: Iterable[Doubt], sensor: OrientationSensor | Tracker | None, where: str) -> None:
@@ -178,8 +177,6 @@ def _turn_confirmed(sensor: OrientationSensor, sweep: Sweep, image: RigidTransfo
     covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
     if sensor.sensor_from_image is None or covered.size < FEWEST_FRAMES:
         return False
-    measured = sensor.world_from_image(sweep.frame_time_s[covered])
-    sensed = (measured[0].inv() * measured).as_rotvec()[:, 2]
-    turned = image[covered].rotation
-    seen = (turned[0].inv() * turned).as_rotvec()[:, 2]
+    turned = sensor.world_from_image(sweep.frame_time_s[covered]), image[covered].rotation
+    sensed, seen = ((turns[0].inv() * turns).as_rotvec()[:, 2] for turns in turned)
     return bool(np.var(sensed - seen) < (1.0 - ROLL_EXPLAINED) * np.var(seen))

@@ -11,7 +11,6 @@ from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.examine.curves import (
-    bend,
     doubt_bend,
     doubt_curves,
     doubt_size,
@@ -65,13 +64,6 @@ def bent(by, rows=9, gain=1.0):
     return RowScales(np.linspace(3, 30, rows), line, np.full(rows, gain))
 
 
-def test_rows_that_stand_out_alone_are_no_bend():
-    # Sheets along the motion hold two rows back.
-    sheets = np.where(np.isin(np.arange(9), [2, 6]), -1.2, 0.0)
-    assert bend(replace(bent(0.0), logarithm=sheets)) < 0.1
-    assert bend(replace(bent(0.3), logarithm=bent(0.3).logarithm + sheets)) == pytest.approx(0.2, abs=0.07)
-
-
 @pytest.mark.parametrize(
     ("rows", "refuted"),
     [(bent(0.08), None), (bent(0.25), False), (bent(0.6), True), (bent(0.6, gain=0.5), None), (None, None)],
@@ -105,13 +97,6 @@ def test_speckle_of_another_size_doubts_the_curves(seen, refuted):
 def test_noise_excuses_finer_speckle_but_not_coarser():
     assert doubt_size(scaled(0.7, 0.5), CURVES, PATCHES, 0.5 * CLEAR) == ()
     assert len(doubt_size(scaled(1.4, 1.6), CURVES, PATCHES, 0.5 * CLEAR)) == 2
-
-
-def test_few_rows_with_speckle_do_not_refute():
-    few = SpeckleSize(np.where(np.arange(ROWS.size) < 3, 0.5 * SIZE.lateral_mm, np.nan), SIZE.axial_mm)
-    assert [d.refuted for d in doubt_size(few, CURVES, PATCHES, CLEAR)] == [False]
-    fewer = SpeckleSize(np.where(np.arange(ROWS.size) < 2, 0.5 * SIZE.lateral_mm, np.nan), SIZE.axial_mm)
-    assert doubt_size(fewer, CURVES, PATCHES, CLEAR) == ()
 
 
 @pytest.mark.parametrize(

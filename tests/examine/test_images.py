@@ -76,14 +76,6 @@ def test_sweeps_recorded_in_turn_are_refused(sweeps):
     assert "interleaved" in doubt.suspect
 
 
-def test_the_same_tissue_seen_in_turn_from_two_sides_is_refused():
-    there = np.linspace(0.0, 8.0, 60)
-    position = np.column_stack([there, there[::-1]]).ravel()
-    doubt = interleaved(table_of(position), position.size, 0.2)
-    assert doubt is not None
-    assert doubt.refuted
-
-
 def test_a_path_that_turns_where_the_images_do_not_is_doubted():
     # Pairs across a turn are as alike as others and on this path nearer to each other.
     once, often = np.where(SWEEP < 6.0, SWEEP, 12.0 - SWEEP), np.abs((SWEEP + 0.5) % 1.0 - 0.5)
@@ -104,11 +96,6 @@ def test_motion_read_from_noise_on_a_probe_at_rest_is_refused():
     doubt = folded(table, along(wander), PATCHES_MM, np.ones(80, dtype=bool))
     assert doubt is not None
     assert doubt.refuted
-
-
-def test_frames_not_to_be_used_do_not_speak():
-    turned = np.where(SWEEP < 6.0, SWEEP, 12.0 - SWEEP)
-    assert folded(table_of(SWEEP), along(turned), PATCHES_MM, SWEEP < 5.8) is None
 
 
 def test_a_turning_probe_is_judged_by_all_of_its_image():
@@ -133,16 +120,6 @@ def test_a_length_that_is_left_open_is_doubted(length_mm, sigma_mm, refused):
     assert doubt is not None
     assert doubt.refuted == refused
     assert f"{sigma_mm:.3g} mm" in doubt.evidence
-
-
-@pytest.mark.parametrize(("length_mm", "sigma_mm"), [(12.0, 0.1), (12.0, 2.9), (0.0, 1.2), (100.0, 20.0)])
-def test_a_length_that_is_known_is_not(length_mm, sigma_mm):
-    assert undetermined(np.linspace(0.0, length_mm, 20), np.full(20, sigma_mm), 2.5) is None
-
-
-def test_the_farthest_point_of_a_sweep_that_comes_back_is_its_length():
-    there_and_back = np.concatenate([SWEEP, SWEEP[::-1]])
-    assert undetermined(there_and_back, np.full(160, 2.4), 2.0) is None
 
 
 def test_frames_far_apart_are_beyond_the_reach_of_speckle():
@@ -172,15 +149,6 @@ def test_echoes_that_stand_still_are_doubted(share, refuted):
     doubt = standing(share, MOST_FRAMES, CELLS)
     assert doubt is not None
     assert doubt.refuted == refuted
-
-
-def test_what_chance_leaves_in_common_is_not():
-    rng = np.random.default_rng(0)
-    for patches, frames in ((6, 2), (6, 10), (50, 2), (400, 10)):
-        scatter = 1.25 / np.sqrt(2 * CELLS * frames * (frames - 1) / 2)
-        for _ in range(200):
-            assert standing(scatter * rng.standard_normal(patches), frames, CELLS) is None
-    assert standing(np.full(5, np.nan), 4, CELLS) is None
 
 
 def test_without_phase_layers_along_the_sweep_are_not_clutter():

@@ -55,7 +55,8 @@ def test_good_sensors_are_not_doubted(sweep, tracked):
     examined, found = doubts_of(sweep, tracked)
     assert examined.doubts == found == ()
     assert examined.turn_confirmed
-    assert examined.trusted is sweep
+    assert examined.trusted.tracker is sweep.tracker
+    assert examined.trusted.orientation is sweep.orientation
 
 
 @pytest.mark.parametrize("name", AGAINST_THEMSELVES)

@@ -51,16 +51,6 @@ ROWS = ImageGrid(40, 700, 0.3, 0.05)
 """Eleven rows of patches, from 3.5 mm down."""
 
 
-def test_patches_between_depths_and_half_a_patch_beyond_are_kept():
-    patches = lay_patches(ROWS)
-    depths = patches.row_depth_mm
-    assert len(patches.between(np.array([4.9, 32.2]))) == len(patches)
-    fewer = patches.between(np.array([5.1, 28.0]))
-    np.testing.assert_array_equal(fewer.row_depth_mm, depths[1:-2])
-    assert len(fewer) == 3 * 8
-    np.testing.assert_array_equal(fewer.first[:8], patches.first[1:9])
-
-
 @pytest.mark.parametrize("depths", [(64.0, 100.0), (-30.0, 1.0), (3.5, 16.0), (20.0, 20.0)])
 def test_depths_that_hold_less_than_half_of_the_rows_are_refused(depths):
     with pytest.raises(MismatchError):

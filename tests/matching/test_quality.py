@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import hilbert
 from speckle import GRID, Speckle, intensity
 
 from speckle3d.core.sweep import BModeSettings, ImageGrid
@@ -142,21 +141,6 @@ def test_a_turned_down_gain_is_not_a_lifted_probe(good):
     assert not any(flags_of(mixed, signal, grid))
 
 
-def test_what_lies_above_a_bones_shadow_is_enough(phantom):
-    frames, signal, grid = phantom
-    shadowed = lifted(frames[2], grid, 14.0)
-    features = inspected([*frames[:2], shadowed, *frames[3:]], signal, grid)
-    # Four of 13 rows are left, twice what is asked.
-    assert 0.25 < features[2].speckle_share < 0.35
-    assert not flag_frames(features).any()
-
-
-def test_noise_is_told_from_speckle_under_it(phantom):
-    frames, signal, grid = phantom
-    # 10 dB below: neighbouring vectors still agree by 0.65 / 1.1^2, twice the threshold.
-    assert not any(flags_of([counts(f + noise(f, 110.0).astype(float)) for f in frames], signal, grid))
-
-
 def test_only_the_repeat_of_the_frame_before_is_frozen(phantom):
     frames, signal, grid = phantom
     a, b = frames[:2]
@@ -173,26 +157,6 @@ def test_clipping_is_saturation_from_where_distances_are_wrong(phantom, gain, sa
     frames, signal, grid = phantom
     spoilt = [counts(gain * frame) for frame in frames]
     assert flags_of(spoilt, signal, grid) == [SATURATED if saturated else 0] * len(frames)
-
-
-@pytest.mark.parametrize("kind", ["float32", "analytic"])
-def test_samples_of_other_types_are_judged_alike(tissue, kind):
-    frames, signal, grid = tissue
-    mixed = [lifted(frames[0], grid, 3.0), counts(30.0 * frames[1].astype(float)), *frames[2:], frames[-1]]
-    expected = [LIFTED, SATURATED, 0, 0, 0, 0, FROZEN]
-    other = {
-        "float32": lambda f: f.astype(np.float32) / 8192,
-        "analytic": lambda f: hilbert(f.astype(np.float32)).astype(np.complex64),
-    }[kind]
-    turned = [other(frame) for frame in mixed]
-    if kind == "analytic":
-        # The machine's rail is that of I and Q.
-        i_and_q = turned[1].view(np.float32)
-        np.clip(i_and_q, -RAIL, RAIL, out=i_and_q)
-    assert flags_of(mixed, signal, grid) == expected
-    if kind == "analytic":
-        signal = replace(signal, demodulation_frequency_hz=0.0)
-    assert flags_of(turned, signal, grid) == expected
 
 
 @pytest.mark.parametrize(("value", "where"), [(np.nan, (5, 1700)), (np.inf, slice(None))])
@@ -245,14 +209,6 @@ def speckle_and_noise(image, grid=GRID):
     """Shares of patches with speckle and with noise alone in an image of intensity."""
     features = inspect_frame(image, image.astype(np.float32), lay_patches(grid), False)
     return features.speckle_share, features.noise_share
-
-
-def test_contrast_below_a_half_is_no_speckle():
-    # The mean of n independent speckle images has contrast 1 / sqrt(n): 0.71 for two, 0.33 for nine.
-    rng = np.random.default_rng(2)
-    images = [intensity(Speckle(rng).seen()) for _ in range(9)]
-    assert speckle_and_noise(np.mean(images[:2], axis=0))[0] > 0.9
-    assert speckle_and_noise(np.mean(images, axis=0))[0] < 0.05
 
 
 def test_vectors_that_agree_nowhere_are_noise_unless_they_are_far_apart():

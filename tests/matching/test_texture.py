@@ -88,12 +88,6 @@ def test_echoes_above_the_band_refute_the_sampling_rate(complex_too):
     assert doubt.suspect == "sampling rate or band"
 
 
-def test_echoes_below_the_band_are_doubted_but_used():
-    # Fundamental echoes beside a band at their harmonic.
-    doubt = doubt_band(echoes(2e6, 3.5e6, band=(6e6, 8e6)))
-    assert not doubt.refuted
-
-
 def attenuated(sign=1, middle_hz=6e6, rate_hz=8e6, noise=0.0):
     """I/Q, demodulated at `middle_hz`, of echoes whose frequency falls from 6.2 to 5.2 MHz; `sign` of Q."""
     rng = np.random.default_rng(4)
@@ -123,20 +117,6 @@ def test_the_other_sign_of_q_is_doubted(middle_hz):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_noise_tells_nothing_of_the_sign(sign):
     assert sign_of(attenuated(sign, noise=30.0)) is None
-
-
-@pytest.mark.parametrize(("low", "high"), [(4e6, 8e6), (5e6, 6e6)])
-def test_i_and_q_in_the_band_are_believed_and_above_it_refuted(low, high):
-    """The bins of I/Q stand for frequencies about that of the demodulation."""
-    analytic = echoes(low, high, complex_too=True)
-    turns = np.exp(-2j * np.pi * 6e6 * np.arange(SAMPLES) / RATE)
-    lowered = [analytic.frames[k] * turns for k in range(3)]
-    baseband = replace(analytic.signal, demodulation_frequency_hz=6e6)
-    sweep = replace(analytic, frames=np.asarray(lowered, np.complex64), signal=baseband)
-    assert doubt_band(sweep) is None
-    wrong = replace(sweep, signal=replace(baseband, demodulation_frequency_hz=12e6))
-    doubt = doubt_band(wrong)
-    assert doubt.refuted
 
 
 @pytest.mark.parametrize(("gain_db", "doubted"), [(-30.0, False), (-12.0, False), (0.0, True)])
@@ -178,7 +158,3 @@ def test_structure_that_moves_in_the_image_does_not_stand_still():
     """By a few samples from frame to frame, as a hand wanders: a quarter of a wavelength is enough."""
     wandering = np.stack([np.roll(PATTERN, 3 * k, axis=1) for k in range(5)])
     assert np.median(share_of(FRESH + wandering)) < 0.1
-
-
-def test_frames_that_see_the_same_by_chance_do_not_count():
-    assert abs(np.median(share_of(np.concatenate([FRESH[:4], FRESH[:1]])))) < 0.02
