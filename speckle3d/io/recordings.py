@@ -20,7 +20,13 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
-from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings, settings_file, settings_for
+from speckle3d.io.import_settings import (
+    SPEED_OF_SOUND_M_S,
+    ImportSettings,
+    MissingSettingsError,
+    settings_file,
+    settings_for,
+)
 from speckle3d.io.pose_paths import checked_path, usable
 
 Row = tuple[str, str, str]
@@ -228,13 +234,10 @@ class Recording:
         if frames is None or 0 in frames.shape:
             shape = None if frames is None else frames.shape
             raise InvalidInputError(f"{self.path}: expected frames, got shape {shape}")
-        wanted = {name: one.value for name, one in self.needed.items()}
-        lacking = {
-            self.asked.get(name, name): value if getattr(self.settings, name) is None else 0
-            for name, value in wanted.items()
-        }
-        self.settings.over(self.path, **lacking)  # asks for what is missing by the easiest name
-        values = self.settings.over(self.path, **wanted)
+        values = {name: getattr(self.settings, name) for name in self.needed}
+        values = {name: self.needed[name].value if one is None else one for name, one in values.items()}
+        if lacking := [self.asked.get(name, name) for name, one in values.items() if one is None]:
+            raise MissingSettingsError(self.path, tuple(lacking))
         if (rate_hz := values.get("frame_rate_hz")) is not None:
             times = np.arange(frames.shape[0]) / float(rate_hz)
         signal: RFSettings | BModeSettings

@@ -160,6 +160,10 @@ class VolumeWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
+            if self._planes != self._volume.shape[2]:
+                raise MismatchError(
+                    f"{self._path}: expected {self._volume.shape[2]} planes, got {self._planes}"
+                )
             write_volume(self._path, self._volume, self._compress)
 
     def append(self, planes: npt.NDArray[Any]) -> None:

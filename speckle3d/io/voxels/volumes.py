@@ -12,11 +12,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.files import PathLike, open_regular
+from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
-from speckle3d.io.hdf5 import reading
 from speckle3d.io.headers import (
     SequenceHeader,
     axes_mm,
@@ -25,12 +24,11 @@ from speckle3d.io.headers import (
     read_header,
     space_unit_mm,
 )
+from speckle3d.io.readers import first_bytes
 from speckle3d.io.text import numbers
 from speckle3d.io.voxels.nifti import is_nifti, read_nifti
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
 from speckle3d.io.voxels.volume_writer import own_fields
-
-_SNIFFED_BYTES = 4096
 
 _SAME_PLACE_MM = 1e-3
 """Two grids are one if they differ by less: NIfTI keeps places to single precision."""
@@ -44,7 +42,7 @@ def is_volume(path: PathLike) -> bool:
     FileError, InvalidInputError
         If it cannot be read, or its header does not make sense.
     """
-    start = _start(path)
+    start = first_bytes(path)
     if is_metaimage(start) or is_nrrd(start):
         return read_header(path).is_volume
     return is_nifti(Path(path), start)
@@ -60,15 +58,10 @@ def may_be_volume(path: PathLike) -> bool:
     FileError
         If it cannot be read.
     """
-    start = _start(path)
+    start = first_bytes(path)
     if is_metaimage(start) or is_nrrd(start):
         return b"Seq_Frame" not in start
     return is_nifti(Path(path), start)
-
-
-def _start(path: PathLike) -> bytes:
-    with reading(path), open_regular(path) as stream:
-        return stream.read(_SNIFFED_BYTES)
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -93,7 +86,7 @@ def read_volume(path: PathLike) -> Volume:
     InvalidInputError
         If it is not a grey three-dimensional image.
     """
-    start = _start(path)
+    start = first_bytes(path)
     if is_nifti(Path(path), start):
         voxels, matrix, fields, is_labels = read_nifti(Path(path))
         own = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
