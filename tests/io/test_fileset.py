@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from speckle3d.core.errors import FileError
+from speckle3d.io import fileset
 from speckle3d.io.fileset import FileSet
 
 FILES = FileSet("main.h5", ("a.txt", "b.txt"), ("made/page.html",))
@@ -57,6 +58,7 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path, error):
 HOLDER = """
 import sys, time
 from pathlib import Path
+from speckle3d.io import fileset
 from speckle3d.io.fileset import FileSet
 with FileSet("main.h5", ("a.txt", "b.txt")).replaced(Path(sys.argv[1])) as part:
     (part / "a.txt").write_text("half")
@@ -84,6 +86,7 @@ def test_a_second_run_is_refused_until_the_first_is_gone_however_it_went(tmp_pat
 KILLED = """
 import json, os, signal, sys
 from pathlib import Path
+from speckle3d.io import fileset
 from speckle3d.io.fileset import FileSet
 
 files = FileSet("main.h5", ("a.txt", "b.txt"), ("made/page.html",))
@@ -132,3 +135,11 @@ for there in (False, True):
             break
 print(json.dumps(found))
 """
+
+
+def test_broken_off_between_two_files_nothing_is_of_both_results(tmp_path, monkeypatch):
+    write(tmp_path, "old")
+    monkeypatch.setattr(fileset.shutil, "move", lambda *_: (_ for _ in ()).throw(OSError("broken off")))
+    with pytest.raises(FileError):
+        write(tmp_path, "new")
+    assert held(tmp_path) == {"main.h5": "old"}

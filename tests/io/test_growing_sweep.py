@@ -11,7 +11,7 @@ import pytest
 import sweep_examples
 from disks import FULL, limited
 
-from speckle3d.core.errors import FileError, NoSpaceError
+from speckle3d.core.errors import FileError, InvalidInputError, NoSpaceError
 from speckle3d.core.parts import locks
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io import records
@@ -145,3 +145,19 @@ def test_killed_at_some_moments_all_that_was_appended_is_read():
     script = Path(__file__).parents[1] / "benchmarks" / "bench_growing.py"
     done = subprocess.run([sys.executable, script, "15", "7"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_what_is_refused_is_not_in_the_file_and_the_recording_goes_on(tmp_path):
+    sweep, path = SWEEPS["rf"], tmp_path / "s.h5"
+    with growing(path, sweep) as target:
+        target.append(sweep.frames[0], 10.0)
+        target.append_pose(9.0, np.eye(4))
+        for refused in (
+            lambda: target.append_pose(9.0, np.eye(4)),
+            lambda: target.append(sweep.frames[1], 10.0),
+        ):
+            with pytest.raises(InvalidInputError):
+                refused()
+        target.append(sweep.frames[1], 12.0)
+    found = load_sweep(path)
+    assert (found.frame_time_s.tolist(), len(found.tracker.readings)) == ([10.0, 12.0], 1)
