@@ -169,9 +169,8 @@ class SensorReadings:
 
     def _hats(self) -> FloatArray:
         """Weights of the wander's knots at each reading, shape (m, k)."""
-        knots = self.knots_s
-        rows = [np.interp(self.time_s, knots, row) for row in np.eye(knots.size)]
-        return np.stack(rows, axis=1) if rows else np.zeros((self.time_s.size, 0))
+        away = np.abs(self.time_s[:, None] - self.knots_s)
+        return np.maximum(1.0 - away / np.diff(self.knots_s)[:1], 0.0)
 
     def errors(self, path: FloatArray, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Expected less measured turns, rad, and places, mm, along the world's axes, shape (m, 3) each."""
@@ -246,12 +245,11 @@ class SensorReadings:
         k = self.knots_s.size
         matrix = np.zeros((self.size, self.size))
         matrix[range(RIGID), range(RIGID)] = rigid
-        if k:
-            size = np.array([s.inclination_sigma_rad, s.inclination_sigma_rad, s.heading_sigma_rad])
-            kept = float(np.exp(-(self.knots_s[1] - self.knots_s[0]) / s.wander_s))
-            change = np.eye(k) - kept * np.eye(k, k=-1)
-            change[1:] /= np.sqrt(1.0 - kept**2)
-            matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / size))
+        size = np.array([s.inclination_sigma_rad, s.inclination_sigma_rad, s.heading_sigma_rad])
+        kept = np.exp(-np.diff(self.knots_s)[:1] / s.wander_s)
+        change = np.eye(k) - kept * np.eye(k, k=-1)
+        change[1:] /= np.sqrt(1.0 - kept**2)
+        matrix[RIGID:, RIGID:] = np.kron(change, np.diag(1.0 / size))
         return matrix @ unknowns, matrix
 
     def strain(self, unknowns: FloatArray) -> float:

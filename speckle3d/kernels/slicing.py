@@ -153,13 +153,7 @@ def compare_patches(
         out.alike[p] = a @ b
         out.energy[p, 0], out.energy[p, 1] = norm_a / math.sqrt(n), norm_b / math.sqrt(n)
         if derivatives:
-            # Neither brightness nor contrast counts.
-            fixed = np.full((2, n), 1.0 / math.sqrt(n))
-            fixed[1] = b
-            slopes = rows[:, :n] / norm_b
-            lost = slopes @ fixed.T
-            out.normal[p] = slopes @ slopes.T - lost @ lost.T
-            out.gradient[p] = slopes @ a - lost[:, 1] * out.alike[p]
+            _differentiate(a, b, norm_b, rows, out.normal[p], out.gradient[p])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
@@ -323,3 +317,35 @@ def _fill_rows(
         row[5] += bz - az
         row[6] += x * bx - px * ax
         row[7] += y * by - py * ay
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)
+def _differentiate(
+    f: FloatArray,
+    g: FloatArray,
+    norm_g: float,
+    rows: FloatArray,
+    normal: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Gauss-Newton matrix and gradient of one patch, from normalised levels and the length `g` had."""
+    n = f.shape[0]
+    for c in range(PARAMETERS):
+        mean = along = 0.0
+        for i in range(n):
+            mean += rows[c, i]
+        mean /= n
+        for i in range(n):
+            rows[c, i] = (rows[c, i] - mean) / norm_g
+            along += rows[c, i] * g[i]
+        change = 0.0
+        for i in range(n):
+            rows[c, i] -= along * g[i]
+            change += rows[c, i] * f[i]
+        gradient[c] = change
+    for c in range(PARAMETERS):
+        for d in range(c + 1):
+            total = 0.0
+            for i in range(n):
+                total += rows[c, i] * rows[d, i]
+            normal[c, d] = normal[d, c] = total
