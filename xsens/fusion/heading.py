@@ -44,7 +44,7 @@ _ODDS = np.array([0.0, 3.0, 100.0])
 trials, six have less than 25 of evidence for iron that is not there, one 240; a magnet of a tenth of the
 field has 170 in a minute of turning."""
 
-_ALIKE = 20.0
+_ALIKE = 18.0
 """Bins that tell as much of iron as one: an uneven field lasts some seconds of movement. So what is claimed
 covers both headings until the evidence is plain. Simulated iron of 30 uT: errors of 4.5 claims become 2.5."""
 
@@ -63,7 +63,7 @@ _DISTRUSTED = 0.5
 _ROUNDING = 1e-12
 """Variance that keeps covariances invertible: (1 microradian)^2, a millionth of the field, 1 microsecond."""
 
-_NEGLIGIBLE = 0.01
+_NEGLIGIBLE = 0.005
 """Filters of less weight are not smoothed."""
 
 

@@ -82,6 +82,7 @@ class OnlineFilter:
         self._filter = Filter(self._settings)
         self._live = LiveFaults()
         self._state: OnlineState | None = None
+        self._pending: list[tuple[Any, ...]] = []  # since the filter ran: once in an increment is enough
         self._rate: FloatArray | None = None
         self._force = np.full(3, np.nan)
         self._skipped_s = self._forceless_s = self._judged_s = 0.0
@@ -117,26 +118,27 @@ class OnlineFilter:
             first second, the accelerometer is not in m/s^2.
         """
         steps, rates, forces, fields = _checked(step_s, gyroscope_rad_s, accelerometer_m_s2, magnetometer_au)
-        pending: list[tuple[Any, ...]] = []
         for step_s, rate, force, field in zip(map(float, steps), rates, forces, fields, strict=True):
             self._judge(step_s, force)
             reading = self._measured(step_s, rate, force, field)
             if reading is None:
                 continue
             if reading[0] > PAUSE_S:
-                self._run(pending)
-                pending = []
+                self._run()
                 # The turn in a pause is not known, nor is the first sample's own step.
                 self._filter.begin(0.0 if self._rate is None else reading[0])
                 reading = (self._settings.block_s, *reading[1:])
             self._rate = reading[1]
-            pending.append(reading)
-        self._run(pending)
+            self._pending.append(reading)
+        if sum(step_s for step_s, *_ in self._pending) >= self._settings.block_s:
+            self._run()
 
-    def _run(self, pending: list[tuple[Any, ...]]) -> None:
-        if not pending:
+    def _run(self) -> None:
+        """Filter what is pending."""
+        if not self._pending:
             return
-        found = self._filter.run(Samples(*map(np.array, zip(*pending, strict=True))))
+        found = self._filter.run(Samples(*map(np.array, zip(*self._pending, strict=True))))
+        self._pending = []
         if len(last := self._filter.last):
             self._state = OnlineState(
                 Rotation.from_quat(found.xyzw[-1]),
@@ -152,6 +154,7 @@ class OnlineFilter:
     @property
     def state(self) -> OnlineState | None:
         """Estimate after the last sample; None before the first whole increment."""
+        self._run()
         return self._state
 
     def _judge(self, step_s: float, force: FloatArray) -> None:

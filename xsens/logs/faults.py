@@ -257,15 +257,14 @@ class LiveFaults:
     """Readings that are no measurements, as they arrive: zeros, repeats in movement, values out of range."""
 
     def __init__(self) -> None:
-        self._last = np.full((3, 3), np.nan)
+        self._last = b""
         self._run = 0
 
     def measured(self, *readings: FloatArray) -> list[FloatArray]:
         """Rate, force and field of a sample, each NaN if it is no measurement."""
         rate, force, field = readings
-        row = np.array(readings)
-        self._run = self._run + 1 if np.array_equal(row, self._last, equal_nan=True) else 1
-        self._last = row
+        row = b"".join(values.tobytes() for values in readings)
+        self._run, self._last = self._run + 1 if row == self._last else 1, row
         stuck = self._run > 2 and float(np.linalg.norm(rate)) > _SLOW_RAD_S
         dead = not (np.isfinite(force).all() and force.any())
         bad = [dead and not rate.any(), dead, not field.any()]
