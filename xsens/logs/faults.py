@@ -187,29 +187,29 @@ def _clipped(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
     bad = np.zeros(len(rows), dtype=bool)
     for axis in rows.T:
-        ends = (np.fmax.reduce(axis), np.fmin.reduce(axis))
-        if max(np.count_nonzero(axis == end) for end in ends) < 3:
-            continue
-        steps = np.abs(np.diff(axis))
-        digit = np.min(steps[steps > 0.0], initial=np.inf)
-        runs = _Runs.of(axis[:, None])
-        slopes = np.pad(steps, 2)  # into each sample from the second before it, and out of it
-        slope = np.minimum(slopes[runs.start], slopes[runs.start + runs.length + 2])
-        value = axis[runs.start]
-        top = ((value == ends[0]) | (value == ends[1])) & (value != 0.0)
-        changes = np.append(0, np.cumsum((rows[1:] != rows[:-1]).any(axis=1)))
-        others_go_on = changes[runs.start + runs.length - 1] - changes[runs.start] > 1
-        bad |= runs.marked(top & others_go_on & (slope > 3.0 * digit))
+        for end in {float(np.fmax.reduce(axis)), float(np.fmin.reduce(axis))} - {0.0}:
+            at = np.flatnonzero(axis == end)
+            if at.size < 3:
+                continue
+            steps = np.pad(np.abs(np.diff(axis)), 2)  # into each sample from the second before it, and out
+            digit = np.min(steps[steps > 0.0], initial=np.inf)
+            first, last = at[np.diff(at, prepend=-2) > 1], at[np.diff(at, append=len(axis) + 1) > 1]
+            steep = np.minimum(steps[first], steps[last + 3]) > 3.0 * digit
+            for i, k in zip(first[steep], last[steep], strict=True):
+                others_go_on = (rows[i + 1 : k + 1] != rows[i:k]).any(axis=1).sum() > 1
+                bad[i : k + 1] |= others_go_on
     return bad
 
 
 def _spikes(rows: FloatArray, height: float) -> BoolArray:
     """Single rows far from both neighbours, which are near each other."""
-    if len(rows) < 3 or not np.isfinite(height):
-        return np.zeros(len(rows), dtype=bool)
-    padded = np.concatenate([rows[1:2], rows, rows[-2:-1]])
-    away = _norm(rows - 0.5 * (padded[:-2] + padded[2:]))
-    return np.asarray((away > height) & (_norm(padded[2:] - padded[:-2]) < 0.2 * away))
+    bad = np.zeros(len(rows), dtype=bool)
+    if np.isfinite(height) and len(rows) > 2:
+        padded = np.concatenate([rows[1:2], rows, rows[-2:-1]])
+        away = 0.5 * _norm(np.diff(padded, n=2, axis=0))
+        at = np.flatnonzero(away > height)
+        bad[at[_norm(padded[at + 2] - padded[at]) < 0.2 * away[at]]] = True
+    return bad
 
 
 def _stuck(log: ImuLog) -> BoolArray:
