@@ -147,6 +147,7 @@ def _bad(
         beyond = size >= _ABSURD
     if beyond.any() or not finite.all():
         rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
+    clipped, spikes = _clipped(rows), _spikes(rows, limits.spike * unit)  # before there is more in memory
     runs = _Runs.of(rows)
     step = np.pad(_norm(np.diff(rows, axis=0)), 1, constant_values=np.nan)
     before, after = step[runs.start], step[runs.start + runs.length]
@@ -163,8 +164,8 @@ def _bad(
         "readings of zero": zero,
         "out of range": beyond,
         "repeated": repeated,
-        "at the end of the range": _clipped(rows) & ~repeated & ~zero,
-        "single spikes": _spikes(rows, limits.spike * unit) & ~zero,
+        "at the end of the range": clipped & ~repeated & ~zero,
+        "single spikes": spikes & ~zero,
     }
 
 
