@@ -38,8 +38,7 @@ UNKNOWN_SIGMA = 0.3 / np.sqrt(3.0)
 """Standard deviation of the difference where no spectrum tells it: soft tissues and phantoms lie within 0.3
 dB/cm/MHz of each other, taken as evenly spread."""
 LENGTH_PER_UNIT = 0.18
-"""Change of the logarithm of length per dB/cm/MHz where it cannot be calculated: 1.6 to 2 % for 0.1 on
-simulated sweeps."""
+"""Change of the logarithm of length per dB/cm/MHz: 1.6 to 2 % for 0.1 on simulated sweeps."""
 MODEL_SIGMA = 0.025
 """Error of the difference beside its posterior's, dB/cm/MHz: of seventeen sweeps of two simulators."""
 ROW_SIGMA = 0.1
@@ -60,11 +59,9 @@ OTHER_BAND = 6.0
 """Gain in the log-likelihood by one exponent in all rows, from skin to bottom, from which another transmit
 band or filter is told. Twenty-one sweeps of two simulators gain 0.3 to 4.3; with the band 0.3 MHz off they
 gain 8.5 to 34."""
-_SHALLOW = 5
-"""Rows near the probe whose spectrum, without the first, noise hardly reaches."""
 _NOISES = np.append(0.0, np.exp(np.arange(-8.0, 2.1, 0.25)))
 """Noise over the mean power of a row, tried one after another."""
-_ROUNDS, _BINS_PER_SAMPLE = 10, 1.5
+_ROUNDS, _BINS_PER_SAMPLE = 5, 1.5
 """Gauss-Newton steps; bins over which a Hann window correlates neighbouring ones."""
 
 
@@ -78,8 +75,6 @@ class Attenuation:
         One way, and its standard deviation; zero and `UNKNOWN_SIGMA` where no spectrum tells.
     depth_mm, log_stretch : ndarray, shape (r,)
         Logarithm of the factor on the curves' distances at each depth.
-    log_length_sigma : float
-        Standard deviation of all distances together that the difference's leaves.
     doubts : tuple of Doubt
         Of the spectrum.
     """
@@ -88,8 +83,12 @@ class Attenuation:
     sigma_db_cm_mhz: float
     depth_mm: FloatArray
     log_stretch: FloatArray
-    log_length_sigma: float
     doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def log_length_sigma(self) -> float:
+        """Standard deviation of all distances together that the difference's leaves."""
+        return float(LENGTH_PER_UNIT * self.sigma_db_cm_mhz)
 
     def applied(self, curves: DecorrelationCurves) -> DecorrelationCurves:
         """Curves of the phantom, stretched for the tissue, and its spectrum with the tissue's attenuation."""
@@ -110,9 +109,7 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     spectra : EchoSpectra or None
         Of the sweep's rows of patches; see `speckle3d.matching.texture`.
     """
-    unknown = Attenuation(
-        0.0, UNKNOWN_SIGMA, curves.depth_mm, np.zeros(curves.depth_mm.size), LENGTH_PER_UNIT * UNKNOWN_SIGMA
-    )
+    unknown = Attenuation(0.0, UNKNOWN_SIGMA, curves.depth_mm, np.zeros(curves.depth_mm.size))
     signal = curves.key.signal
     if curves.spectrum is None or spectra is None or not isinstance(signal, RFSettings):
         return unknown
@@ -121,8 +118,8 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     if inside.sum() < LEAST_FREQUENCIES:
         return unknown
     frequency_mhz = 1e-6 * spectra.frequency_hz[inside]
-    phantom = _without_noise(frequency_mhz, curves.spectrum.at(spectra.depth_mm, 1e6 * frequency_mhz))
-    fall, sigma, _ = _fit_rows(frequency_mhz, spectra.power[:, inside], phantom)
+    phantom = curves.spectrum.at(spectra.depth_mm, 1e6 * frequency_mhz)
+    fall, sigma = _fit_rows(frequency_mhz, spectra.power[:, inside], phantom)
     middle = float(frequency_mhz.mean())
     exponent, sigma = middle * fall, np.hypot(middle * sigma, ROW_SIGMA)
     per_unit = middle * _loss(spectra.depth_mm)
@@ -132,9 +129,7 @@ def estimate_attenuation(curves: DecorrelationCurves, spectra: EchoSpectra | Non
     error = float(np.hypot(error, MODEL_SIGMA))
     attenuated = _attenuated(phantom, spectra.depth_mm, frequency_mhz, beta)
     square = [(each @ frequency_mhz**2) / each.sum(axis=1) for each in (phantom, attenuated)]
-    stretch = WIDENING / 2.0 * np.log(square[0] / square[1])
-    by_unit = abs(float(stretch.mean())) / abs(beta) if abs(beta) > 0.01 else LENGTH_PER_UNIT
-    return Attenuation(beta, error, spectra.depth_mm, stretch, by_unit * error)
+    return Attenuation(beta, error, spectra.depth_mm, WIDENING / 2.0 * np.log(square[0] / square[1]))
 
 
 def _loss(depth_mm: FloatArray) -> FloatArray:
@@ -150,22 +145,9 @@ def _attenuated(
     return np.asarray(power * np.exp(-lost))
 
 
-def _without_noise(frequency_mhz: FloatArray, power: FloatArray) -> FloatArray:
-    """The phantom's spectrum less its noise, which shows against the rows near the probe, above all noise."""
-    shape = _of_unit_mean(power)
-    near = np.exp(np.log(np.maximum(shape[1:_SHALLOW], 1e-9)).mean(axis=0))
-    noise = _fit_rows(frequency_mhz, shape, np.tile(near, (len(shape), 1)))[2]
-    return np.asarray(np.maximum(shape - noise[:, None], 1e-3 * shape))
-
-
-def _of_unit_mean(power: FloatArray) -> FloatArray:
-    """Spectra over their means; zero where there is no echo."""
-    return np.asarray(power / np.maximum(power.mean(axis=1, keepdims=True), 1e-30))
-
-
 def _fit_rows(
     frequency_mhz: FloatArray, power: FloatArray, reference: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray]:
     """Fit power = a reference exp(-k f) + noise at each depth.
 
     Least squares of logarithms, whose error is the same at each frequency, for each of some noises.
@@ -174,11 +156,9 @@ def _fit_rows(
     -------
     k, sigma : ndarray, shape (r,)
         Per MHz, and its standard deviation.
-    noise : ndarray, shape (r,)
-        Over the mean power.
     """
     f = frequency_mhz - frequency_mhz.mean()
-    shape, known = (_of_unit_mean(values) for values in (power, reference))
+    shape, known = (v / np.maximum(v.mean(axis=1, keepdims=True), 1e-30) for v in (power, reference))
     log_shape = np.log(np.maximum(shape, 1e-9))[:, None]
     weight = (shape / np.maximum(shape.max(axis=1, keepdims=True), 1e-9))[:, None]
     weight = weight / (weight + NOISE_WEIGHT)
@@ -199,7 +179,7 @@ def _fit_rows(
     covariance = np.linalg.inv(normal + np.diag([1e-6, 1e-6, 0.05]))
     variance = cost[row, best] / (f.size - 3)
     variance = _BINS_PER_SAMPLE * np.maximum(variance, np.median(variance))
-    return values[row, best, 1], np.sqrt(variance * covariance[:, 1, 1]), _NOISES[best]
+    return values[row, best, 1], np.sqrt(variance * covariance[:, 1, 1])
 
 
 def _difference(
