@@ -60,16 +60,6 @@ def test_exact_samples_of_any_curve_give_its_distances_back(law, distances):
         assert np.abs(found / d[useful] - 1).max() < 0.02
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_many_noisy_pairs_give_the_distances_back(law):
-    curves = fit_curves(speckle.KEY, [samples(law, STEPPED, cells=60, repeats=80)])
-    d = np.array([0.15, 0.3, 0.45])
-    for depth, width in enumerate(WIDTHS_MM):
-        asked = np.broadcast_to(law(d, width), (len(DEPTHS_MM), d.size))
-        # A distance is known to 0.02 mm from 80 samples, and a polynomial is fitted through a dozen.
-        np.testing.assert_allclose(read_distance(curves, asked)[depth], d, atol=0.015)
-
-
 def test_what_noise_costs_is_no_distance():
     """Electronic noise at 14 dB takes 4 % of every coefficient; the curve begins there."""
     curves = fit_curves(speckle.KEY, [samples(speckle.gaussian_correlation, STEPPED, noise_floor=0.96)])

@@ -70,19 +70,6 @@ def test_the_curve_comes_back(phantom):
     assert np.abs(np.array(widths) / SIGMA_MM - 1).max() < 0.15
 
 
-def test_pairs_are_within_reach_and_about_as_many_as_asked(phantom):
-    samples = samples_of(phantom, CurveSettings(largest_mm=0.5, pairs=60))
-    assert samples.pairs == 60
-    assert np.abs(samples.offset_mm).max() <= 0.5 + 1e-9
-    every = samples_of(phantom, CurveSettings(largest_mm=0.5, pairs=3000))
-    # Thinned, they are spread over separation as all of them are, to half a step.
-    quantiles = [0.1, 0.3, 0.5, 0.7, 0.9]
-    spread = [np.quantile(np.abs(one.offset_mm), quantiles) for one in (samples, every)]
-    np.testing.assert_allclose(*spread, atol=0.05)
-    assert every.pairs > 60
-    assert set(samples.depth_mm) == set(matcher_of(phantom).patches.centre_mm[:, 1])
-
-
 def stepped_and_tipped(phantom, step_mm, tilt):
     """The phantom's first two frames, the second moved and turned about the middle of its depth."""
     about = RigidTransform.from_translation(GRID.centre_mm)

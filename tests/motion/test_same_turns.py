@@ -36,10 +36,3 @@ def test_the_same_motion_is_recognised(frames, duration_s, hz):
     found = told(200, frames, duration_s, hz, 1.0, 0.2)
     assert found.count(-1) == 0
     assert found.count(1) >= 160
-
-
-def test_the_other_sign_is_told_as_well():
-    rng = np.random.default_rng(5)
-    hand = slow(rng, 200, 8.0, 1.0)
-    assert same_turns(hand, -hand) == -1
-    assert same_turns(hand, 0.0 * hand) is None

@@ -72,10 +72,6 @@ def yaw_in_place(rng, seed):
     return z, b
 
 
-def yaw_alone(rng, seed):
-    return tremor(70, rng), 0.05 * np.sin(np.linspace(0, 4 * np.pi, 70))
-
-
 SWEEPS = [one_way, reversal, pause, reversal_in_a_pause, there_and_back_twice, yaw_in_place]
 
 
@@ -173,30 +169,6 @@ def test_signs_hold_where_all_distances_are_a_quarter_short(sweep):
 @pytest.mark.parametrize("sweep", [one_way, reversal_in_a_pause, yaw_in_place])
 def test_signs_hold_where_a_tenth_of_the_pairs_is_wrong(sweep):
     assert failures(sweep, wrong=0.1) == []
-
-
-def test_a_probe_that_only_turns_gets_its_signs_from_slopes():
-    """Offsets are noise. The first frames' are taken for the first motion, and their signs are not asked."""
-    assert failures(yaw_alone, after=2) == []
-
-
-def test_what_comes_later_settles_what_was_open():
-    """After a stop two paths lie open; the frame that sees one from before the stop decides, backwards."""
-    z = np.array([0.0, 0.2, 0.4, 0.42, 0.3, 0.1])
-    # Frame 4 is measured against the last two alone, which a turn and going on suit nearly alike.
-    seen = {1: [0], 2: [0, 1], 3: [1, 2], 4: [3], 5: [0, 1, 4]}
-    first, second = np.array([(i, frame) for frame, earlier in seen.items() for i in earlier]).T
-    moved = np.column_stack([np.abs(z[second] - z[first]), np.zeros(first.size)])
-    covariance = np.tile(np.diag([0.02**2, 1e-8]), (first.size, 1, 1))
-
-    def path(frames):
-        some = second < frames
-        planes = planes_of(first[some], second[some], moved[some], covariance[some])
-        return likeliest_path(planes, frames, ADAPTED, NONE)
-
-    # Hands turn back rarely: at frame 4 going on is the better guess, at frame 5 it no longer is.
-    assert path(5)[4, 0] > 0.42
-    np.testing.assert_allclose(path(6)[:, 0], z, atol=0.02)
 
 
 def test_a_pair_has_the_sign_with_which_offset_and_slope_together_agree():

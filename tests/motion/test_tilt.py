@@ -7,7 +7,7 @@ import pytest
 import speckle
 from pair_planes import fit_many, problem_of
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid
+from speckle3d.core.sweep import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import lay_patches
@@ -96,27 +96,8 @@ def test_the_curves_are_those_of_frames_that_do_not_turn(learnt):
         np.testing.assert_allclose(read, d[useful], rtol=0.03)
 
 
-def test_the_pivots_sign_is_told():
-    """Mirrored tilt angles are another probe: the pivot that explains them is not the same."""
-    sweeps = [stepped(seed=0), *(stepped(wander_deg=1.0, seed=s) for s in (2, 3))]
-    mirrored = [replace(s, offset_mm=-s.offset_mm, tilt_rad=-s.tilt_rad) for s in sweeps]
-    for one in (sweeps, mirrored):
-        np.testing.assert_allclose(learn(one).tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
-
-
 def test_phantoms_that_do_not_turn_tell_nothing_of_it():
     assert learn([stepped(seed=seed) for seed in range(2)]).tilt is None
-
-
-def test_bmode_images_of_unknown_frequency_have_a_pivot_without_spread():
-    key = replace(speckle.KEY, signal=BModeSettings(60.0))
-
-    def no_spread(depth, offset, tilt):
-        return np.exp(-((offset - pivots(depth) * tilt) ** 2) / (2 * widths(depth) ** 2))
-
-    made = learn([stepped(wander_deg=1.0, seed=s, law=no_spread) for s in range(3)], key)
-    np.testing.assert_allclose(made.tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
-    assert (made.tilt.spread_mm == 0).all()
 
 
 # ---- what it is worth -------------------------------------------------------------------------------------
