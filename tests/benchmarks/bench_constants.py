@@ -24,16 +24,8 @@ from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import track
 
 STAGES = ("coherence", "planes", "trajectory")
-NOT_OF_THE_PATH = (
-    "data_sheet",
-    "decorrelation",
-    "diffraction",
-    "lens",
-    "phantom",
-    "curve_doubts",
-    "plausibility",
-)
-"""Modules of curves, and of findings, which change no estimate."""
+NOT_OF_THE_PATH = ("data_sheet", "diffraction", "lens", "phantom")
+"""Modules of curves, which change no estimate."""
 
 
 def module_constants() -> Iterator[tuple[object, str, object]]:
