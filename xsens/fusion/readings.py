@@ -73,7 +73,7 @@ class Estimate:
     bias_rad_s : ndarray, shape (m, 3)
     disturbed, resting : ndarray of bool, shape (m,)
     field_stray, field_iron : ndarray, shape (m,)
-        As `xsens.fusion.heading.Headings` has them; NaN where no field tells the heading.
+        As `xsens.fusion.heading.NORTH` says; NaN where no field tells the heading.
     """
 
     xyzw: FloatArray
