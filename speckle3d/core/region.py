@@ -82,7 +82,7 @@ class Region:
         """
         inside = self.mask(grid)
         vector, sample = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-        moved_mm = grid.image_from_sample[:3, :2] @ [vector[0], sample[0]]
+        moved_mm = np.append(grid.mm(vector[0], sample[0]) - grid.mm(0, 0), 0.0)
         sides = int(vector[-1] - vector[0] + 1), int(sample[-1] - sample[0] + 1)
         within = replace(grid, vectors=sides[0], samples=sides[1])
         return within, world_from_image * RigidTransform.from_translation(moved_mm)
@@ -161,11 +161,15 @@ def _fan(grid: ImageGrid, apex: Pair, angles_deg: Pair, radii: Pair) -> BoolArra
 
 
 def _polygon(grid: ImageGrid, *corners: Pair) -> BoolArray:
-    image_from_sample = grid.image_from_sample[:2]
-    offset = np.reshape(corners, (-1, 2)) - image_from_sample[:, 2]
+    outline = np.reshape(corners, (-1, 2))
+    if grid.fan is not None:
+        # Its sides are not straight from sample to sample.
+        measure = extra_module("skimage.measure", "calibrate", "a region")
+        places = np.stack(_positions_mm(grid)[:2], axis=-1)
+        inside = measure.points_in_poly(places.reshape(-1, 2), outline)
+        return np.asarray(inside.reshape(places.shape[:2]))
     # Rounded, so that a sample on a side counts whatever the size of a pixel.
-    outline = np.round(np.linalg.solve(image_from_sample[:, :2], offset.T).T, 6)
-    return polygon_mask((grid.vectors, grid.samples), outline)
+    return polygon_mask((grid.vectors, grid.samples), np.round(grid.sample_at(outline), 6))
 
 
 _SHAPES: dict[str, Callable[..., BoolArray]] = {"rectangle": _rectangle, "fan": _fan, "polygon": _polygon}
@@ -173,9 +177,5 @@ _SHAPES: dict[str, Callable[..., BoolArray]] = {"rectangle": _rectangle, "fan": 
 
 def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray, float]:
     """Where the samples lie, x and y of shape (vector, sample), and the rounding of such places."""
-    sample = np.arange(float(grid.samples))
-    x, y = (
-        along * np.arange(float(grid.vectors))[:, None] + (down * sample + first)
-        for along, down, first in grid.image_from_sample[:2].tolist()
-    )
+    x, y = np.moveaxis(grid.mm(np.arange(grid.vectors)[:, None], np.arange(grid.samples)), -1, 0)
     return x, y, _HAIR * min(grid.vector_pitch_mm, grid.sample_spacing_mm)

@@ -15,7 +15,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
 from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
-from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
+from speckle3d.core.sweep import ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.import_settings import settings_for
@@ -74,12 +74,25 @@ def sweep_rows(sweep: Sweep) -> list[Row]:
         ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
         ("width", f"{grid.width_mm:.2f}", "mm"),
         ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
+        *_fan_rows(grid),
         ("signal", kind, ""),
         *(number_row(name, value) for name, value in vars(signal).items() if value and name != "full_scale"),
         *_sensor_rows("orientation sensor", sweep.orientation, sweep),
         *_sensor_rows("tracker", sweep.tracker, sweep),
         *([("image axes off square", f"{np.rad2deg(skew_rad):.3g}", "deg")] if skew_rad else []),
         ("truth", "no" if sweep.truth is None else "yes", ""),
+    ]
+
+
+def _fan_rows(grid: ImageGrid) -> list[Row]:
+    """Tell where the vectors of a curved or phased array lie."""
+    if grid.fan is None:
+        return []
+    first, last = np.rad2deg(grid.angle_rad([0, grid.vectors - 1]))
+    return [
+        ("array", "phased" if grid.fan.radius_mm == 0 else "curved", ""),
+        ("array radius", f"{grid.fan.radius_mm:.4g}", "mm"),
+        ("vectors from straight down", f"{first:.4g} to {last:.4g}", "deg"),
     ]
 
 

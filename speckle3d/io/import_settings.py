@@ -53,6 +53,13 @@ class ImportSettings(BaseModel):
         description="distance between elements of the array, in the probe's data sheet, where the file "
         "places its lines in elements",
     )
+    array_radius_mm: float | None = Field(
+        None, ge=0, description="radius of a curved array's face, in the probe's data sheet; 0: phased array"
+    )
+    line_angles_deg: tuple[float, float] | None = Field(
+        None,
+        description="angles of the first and the last line of a curved or phased array, from straight down",
+    )
     speed_of_sound_m_s: float | None = Field(
         None, gt=0, description="assumed by the scanner; 1540 unless its manual says otherwise"
     )

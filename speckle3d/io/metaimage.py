@@ -239,20 +239,26 @@ class _Sequence:
         if self.stamps is not None and (rate := rate_of(self.stamps[np.isfinite(self.stamps)])):
             values["frame_rate_hz"] = Value(rate, "of its time stamps")
         across, down = (replace(sizes, value=size) for size in sizes.value or (None, None))
+        if device.is_curved and (self.layout.is_rf or self.layout.has_lines_in_rows):
+            return values | self._spreading_lines() | own
         if not self.layout.is_rf:
             return values | {"column_pitch_mm": across, "row_spacing_mm": down} | own
-        if device.is_curved and self.settings.vector_pitch_mm is None and "vector_pitch_mm" not in own:
-            raise InvalidInputError(
-                f"{self.header.path}: expected lines of a linear transducer, got a {device.geometry.lower()} "
-                "one, whose lines spread, by the device set: give its scan-converted B-mode, or parallel "
-                "lines with --vector-pitch-mm"
-            )
         if down.value is not None:
             values["row_spacing_mm"] = down
         elif device.width_mm is not None:
             vectors, _ = self.layout.shape(self.header.size)
             across = Value(device.width_mm / vectors, "ScanConversion of the device set", _DEVICE)
         return values | {"vector_pitch_mm": across} | own
+
+    def _spreading_lines(self) -> dict[str, Value]:
+        """Where the device set has the lines of a curved array, and the samples on them."""
+        device, (_, samples) = self.device, self.layout.shape(self.header.size)
+        angles = Value(device.angles_deg, "ScanConversion of the device set", _DEVICE)
+        radii = device.radii_mm or (None, None)
+        values = {"line_angles_deg": angles, "array_radius_mm": replace(angles, value=radii[0])}
+        if device.radii_mm is not None and samples > 1:
+            values["row_spacing_mm"] = replace(angles, value=np.ptp(device.radii_mm) / (samples - 1))
+        return values
 
     def _pixel_mm(self) -> Value:
         """Lateral and axial distance of samples, mm: calibrated, spaced, or of the device set."""
@@ -346,8 +352,8 @@ class _Sequence:
         if len(header.frames) not in (0, count):
             notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")
         if device.is_curved:
-            lines = "its lines spread and are taken for parallel"
-            what = lines if self.layout.is_rf else "images are taken for scan-converted"
+            is_picture = not (self.layout.is_rf or self.layout.has_lines_in_rows)
+            what = "images are taken for scan-converted" if is_picture else "its lines spread"
             notes.append(f"the device set calls the transducer {device.geometry}: {what}")
         if device.clip is not None and device.clip.is_part_of(header.size):
             notes.append(

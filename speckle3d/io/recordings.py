@@ -38,8 +38,17 @@ SPREAD = 1e-3
 CONTRADICTION = 0.01
 """Difference, as a share, above which a number that is given contradicts what a file says."""
 
+_SPREADING = ("array_radius_mm", "line_angles_deg")
+"""What places lines that are not parallel."""
 _RATES = ("sampling_rate_hz", "centre_frequency_hz", "bandwidth_hz")
-_UNITS = {"hz": (1e6, "MHz"), "frame": (1.0, "Hz"), "mm": (1.0, "mm"), "db": (1.0, "dB"), "s": (1.0, "m/s")}
+_UNITS = {
+    "hz": (1e6, "MHz"),
+    "frame": (1.0, "Hz"),
+    "mm": (1.0, "mm"),
+    "db": (1.0, "dB"),
+    "deg": (1.0, "deg"),
+    "s": (1.0, "m/s"),
+}
 """What numbers are divided by where they are shown, and the unit then."""
 _ASSUMED = "assumed"
 
@@ -193,6 +202,9 @@ class Recording:
             names += ["column_pitch_mm", "row_spacing_mm", "dynamic_range_db"]
         else:
             names += ["vector_pitch_mm", "speed_of_sound_m_s", *_RATES]
+        if any(name in self.values or getattr(self.settings, name) is not None for name in _SPREADING):
+            names = [name for name in names if name not in ("vector_pitch_mm", "column_pitch_mm")]
+            names += _SPREADING
         if dtype.kind == "c":
             names.append("demodulation_frequency_hz")
         times, given_rate = self._timed[0], self.settings.frame_rate_hz is not None
@@ -243,14 +255,22 @@ class Recording:
         signal: RFSettings | BModeSettings
         if "dynamic_range_db" in values:
             signal = BModeSettings(values["dynamic_range_db"], self.full_scale)
-            pitch, spacing = values["column_pitch_mm"], values["row_spacing_mm"]
+            pitch, spacing = values.get("column_pitch_mm"), values["row_spacing_mm"]
         else:
             names = ("speed_of_sound_m_s", *_RATES, "demodulation_frequency_hz")
             signal = RFSettings(**{name: values[name] for name in names if name in values})
-            pitch, spacing = values["vector_pitch_mm"], signal.sample_spacing_mm
+            pitch, spacing = values.get("vector_pitch_mm"), signal.sample_spacing_mm
+        _, vectors, samples = frames.shape
+        first_mm = values["first_sample_depth_mm"]
+        if pitch is None:
+            first, last = np.deg2rad(values["line_angles_deg"]).tolist()
+            radius_mm = values["array_radius_mm"]
+            grid = ImageGrid.of_fan(vectors, samples, spacing, radius_mm, (first, last), first_mm)
+        else:
+            grid = ImageGrid(vectors, samples, pitch, spacing, first_mm)
         return Sweep(
             frames=frames,
-            grid=ImageGrid(frames.shape[1], frames.shape[2], pitch, spacing, values["first_sample_depth_mm"]),
+            grid=grid,
             signal=signal,
             frame_time_s=np.zeros(1) if times is None else times,
             tracker=self.tracker,

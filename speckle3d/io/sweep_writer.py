@@ -49,6 +49,7 @@ from speckle3d.io.hdf5 import (
 from speckle3d.io.meanings import label
 from speckle3d.io.records import put, reserve, trim, written
 from speckle3d.io.sweeps import (
+    FAN_VERSION,
     FORMAT,
     GROWING,
     IQ_VERSION,
@@ -96,6 +97,7 @@ class FrameSet:
         if isinstance(signal, RFSettings):
             self.name = "iq" if signal.are_complex else "rf"
         self.version = IQ_VERSION if self.name == "iq" else VERSION
+        self.version = self.version if grid.fan is None else FAN_VERSION
         self._where, self._grid, self._signal = f"{path}: /{self.name}", grid, signal
         self._dtype: np.dtype[Any] = SAMPLE_TYPES[self.name][0] if dtype is None else np.dtype(dtype)
         require_sample_type(self.name, self._dtype, self._where)
@@ -122,6 +124,8 @@ class FrameSet:
             sizes = {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
         values = {**vars(self._signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
         node.attrs.update({name: value for name, value in values.items() if value is not None})
+        if grid.fan is not None:
+            file.create_group("fan").attrs.update(vars(grid.fan))
         # h5py frees a handle in a callback, where Python drops a Ctrl-C: none is freed from frame to frame.
         self._file, self._node, self._memory = file.id, node.id, h5py.h5s.create_simple(shape)
         self._kind = h5py.h5t.py_create(self._dtype)
@@ -255,7 +259,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     InvalidInputError
         If it is no sweep file.
     """
-    with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
+    with opened(path, FORMAT, (VERSION, IQ_VERSION, FAN_VERSION)) as file:
         has_one = has_member(file, "orientation")
     with atomic_path(path) as part:
         shutil.copyfile(path, part)

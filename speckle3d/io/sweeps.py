@@ -22,6 +22,7 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import (
     INERTIAL,
     BModeSettings,
+    FanLines,
     ImageGrid,
     OrientationSensor,
     RFSettings,
@@ -48,13 +49,13 @@ from speckle3d.io.recordings import Recording
 from speckle3d.io.records import read_record
 
 FORMAT = "speckle3d.sweep"
-VERSION, IQ_VERSION = 1, 2
-"""Of files without and with I/Q, so that older readers still read what they can make sense of."""
+VERSION, IQ_VERSION, FAN_VERSION = 1, 2, 3
+"""Of files of parallel vectors without and with I/Q, and of a fan of vectors."""
 
 GROWING = "unfinished"
 """Data set of files that grow as they are recorded: 0 once the recording has been closed."""
 
-KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth", GROWING})
+KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth", "fan", GROWING})
 """Members of the root that these versions of the format give a meaning to."""
 
 SAMPLE_TYPES: dict[str, tuple[np.dtype[Any], ...]] = {
@@ -83,7 +84,7 @@ def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
 
 def _open(path: Path, _: ImportSettings) -> Recording:
     """Read a sweep file; its frames stay on disk until they are asked for."""
-    with opened(path, FORMAT, (VERSION, IQ_VERSION)) as file:
+    with opened(path, FORMAT, (VERSION, IQ_VERSION, FAN_VERSION)) as file:
         times = _read_times(file, "frame_time_s")
         if not times.size:
             raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
@@ -157,7 +158,8 @@ def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFS
             sizes = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
         else:
             sizes = read_attribute(node, "column_pitch_mm"), read_attribute(node, "row_spacing_mm")
-        return frames, ImageGrid(vectors, samples, *sizes, first_mm), signal
+        fan = read_record(require_group(file, "fan"), FanLines) if has_member(file, "fan") else None
+        return frames, ImageGrid(vectors, samples, *sizes, first_mm, fan=fan), signal
 
 
 def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:

@@ -56,7 +56,12 @@ class Geometry(NamedTuple):
         Vectors and samples.
     design : float64, shape (p, 3)
         One, and the place of the patches' centres from the image's, mm.
-    spacing_mm : float64, shape (2,)
+    spacing_mm : float64, shape (p, 2)
+        Of vectors and samples at each patch.
+    turn : float64, shape (p, 2)
+        Sine and cosine of the angle of each patch's vectors from the image's y axis.
+    step_rad : float
+        Between neighbouring vectors; 0 if they are parallel.
     least_overlap : float
         Share of a patch that must still lie in the other image.
     wavenumber_per_mm : float
@@ -67,6 +72,8 @@ class Geometry(NamedTuple):
     size: IntArray
     design: FloatArray
     spacing_mm: FloatArray
+    turn: FloatArray
+    step_rad: float
     least_overlap: float
     wavenumber_per_mm: float
 
@@ -151,16 +158,75 @@ def _robust_fit(
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _fit_fan(
+    design: FloatArray,
+    turn: FloatArray,
+    shift: FloatArray,
+    weight: FloatArray,
+    field: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Improve a field fitted to shifts across and along vectors that are not parallel, as if they were.
+
+    Each of the two has its own robust standard deviation: along vectors it is far smaller.
+    """
+    sine, cosine = turn[:, :1].copy(), turn[:, 1:].copy()
+    rows = (np.hstack((cosine * design, -sine * design)), np.hstack((sine * design, cosine * design)))
+    total = (weight.copy(), weight.copy())
+    for _ in range(_ROUNDS):
+        normal, right = np.zeros((6, 6)), np.zeros(6)
+        for i in range(2):
+            weighted = rows[i] * total[i].reshape(-1, 1)
+            normal += weighted.T @ rows[i]
+            right += weighted.T @ shift[i]
+        inverse = np.linalg.inv(normal)
+        solution = inverse @ right
+        for i in range(2):
+            size = np.abs(shift[i] - rows[i] @ solution) * np.sqrt(weight)
+            scale = MAD_TO_SIGMA * np.median(size) + 1e-12
+            total[i][:] = weight * (_HUBER / np.maximum(size / scale, _HUBER)) / scale**2
+    for i in range(2):
+        field[i], covariance[i] = solution[3 * i : 3 * i + 3], inverse[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _places(geometry: Geometry, field: FloatArray) -> FloatArray:
+    """Shift of each patch across and along its vectors, in vectors and samples."""
+    shift, sine, cosine = geometry.design @ field.T, geometry.turn[:, 0], geometry.turn[:, 1]
+    across, along = cosine * shift[:, 0] - sine * shift[:, 1], sine * shift[:, 0] + cosine * shift[:, 1]
+    return np.column_stack((across, along)) / geometry.spacing_mm
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
+def _ramp(geometry: Geometry, field: FloatArray, p: int, across: float) -> tuple[float, float]:
+    """Phase that a field adds from vector to vector and from sample to sample of a patch.
+
+    `across` is its shift in vectors. The next vector of a fan has another direction, in which that counts.
+    """
+    sine, cosine = geometry.turn[p, 0], geometry.turn[p, 1]
+    by_x = sine * field[0, 1] + cosine * field[1, 1]
+    by_y = sine * field[0, 2] + cosine * field[1, 2]
+    pitch, spacing, k = geometry.spacing_mm[p, 0], geometry.spacing_mm[p, 1], geometry.wavenumber_per_mm
+    turned = geometry.step_rad * across
+    return k * pitch * (cosine * by_x - sine * by_y + turned), k * spacing * (sine * by_x + cosine * by_y)
+
+
+@njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
 def _fit(
-    design: FloatArray, shift: FloatArray, weight: FloatArray, field: FloatArray, covariance: FloatArray
+    geometry: Geometry, shift: FloatArray, weight: FloatArray, field: FloatArray, covariance: FloatArray
 ) -> bool:
-    """Fit an affine field, shape (2, 3), to the patches' shifts, shape (2, p); false if they are too few."""
+    """Fit an affine field, shape (2, 3), to the patches' shifts across and along their vectors, shape (2, p).
+
+    False if they are too few.
+    """
     rows = np.flatnonzero(weight > 0.0)
     if rows.size < _LEAST_PATCHES:
         return False
-    fitted = True
+    design, fitted = geometry.design, True
     for axis in range(2):
         fitted &= _robust_fit(design[rows], shift[axis][rows], weight[rows], field[axis], covariance[axis])
+    if fitted and geometry.step_rad > 0.0:
+        _fit_fan(design[rows], geometry.turn[rows], shift[:, rows], weight[rows], field, covariance)
     return fitted
 
 
@@ -178,9 +244,9 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
     .. [1] Housden et al., "Subsample interpolation strategies for sensorless freehand 3D ultrasound",
        Ultrasound Med. Biol. 32(12), 2006: sub-sample lateral motion must not read as elevation.
     """
-    design, spacing, size = geometry.design, geometry.spacing_mm, (geometry.size[0], geometry.size[1])
+    spacing, size = geometry.spacing_mm, (geometry.size[0], geometry.size[1])
     motion, correlation = matches.motion[row], matches.correlation[row]
-    patches, usable = len(design), fixed.usable & moving.usable
+    patches, usable = len(spacing), fixed.usable & moving.usable
     c, s = np.cos(motion[2]), np.sin(motion[2])
     # Offset and slopes of the lateral and the axial shift.
     field = np.array(
@@ -190,15 +256,17 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
         ]
     )
     start, covariance, fitted = field.copy(), np.empty((2, 3, 3)), False
+    turn = phase_ramp(size, 0.0, 0.0)
     lag, rho = np.full((2, patches), _NOWHERE), np.full((patches, len(LAGS)), np.nan)
     shift, weight, logarithmic = np.zeros((2, patches)), np.zeros(patches), np.zeros(patches, np.bool_)
     of_echo = moving.echo.size > 0
     for turned in range(PASSES + of_echo):
-        places = design @ field.T / spacing
+        places = _places(geometry, field)
         by_echo = turned == PASSES
-        ramp = geometry.wavenumber_per_mm * field[1, 1:] * spacing
-        turn = phase_ramp(size, ramp[0], ramp[1])
         for p in range(patches):
+            if by_echo and (p == 0 or geometry.step_rad > 0.0):
+                ramp = _ramp(geometry, field, p, places[p, 0])
+                turn = phase_ramp(size, ramp[0], ramp[1])
             at = int(np.rint(places[p, 0])), int(np.rint(places[p, 1]))
             if usable[p] and (by_echo or at[0] != lag[0, p] or at[1] != lag[1, p]):
                 lag[0, p], lag[1, p] = at
@@ -210,12 +278,12 @@ def match_pair(fixed: Frame, moving: Frame, geometry: Geometry, matches: Matches
                     correlate_patch(fixed.image, moving.image, window, at, z)
                 logarithmic[p] = _take_logarithms(z)
                 lateral, axial, weight[p] = _peak(z, logarithmic[p])
-                shift[0, p], shift[1, p] = (at[0] + lateral) * spacing[0], (at[1] + axial) * spacing[1]
+                shift[0, p], shift[1, p] = (at[0] + lateral) * spacing[p, 0], (at[1] + axial) * spacing[p, 1]
         if not by_echo:
-            fitted = _fit(design, shift, weight, field, covariance)
+            fitted = _fit(geometry, shift, weight, field, covariance)
             if not fitted:
                 field[:] = start
-    places = design @ field.T / spacing
+    places = _places(geometry, field)
     for p in range(patches):
         away = places[p, 0] - lag[0, p], places[p, 1] - lag[1, p]
         correlation[p] = _read(rho[p], logarithmic[p], away[0], away[1])

@@ -194,3 +194,87 @@ def scatter_echoes(
                     line[sample, 2 * k + 1] += early * im
                     line[sample + 1, 2 * k] += late * re
                     line[sample + 1, 2 * k + 1] += late * im
+
+
+class Fan(NamedTuple):
+    """Vectors that spread from a point: where it is, the face's radius, sines and cosines of their angles."""
+
+    apex_mm: tuple[float, float]
+    radius_mm: float
+    sine: FloatArray
+    cosine: FloatArray
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS)
+def scatter_fan_echoes(
+    position_mm: FloatArray,
+    strength: Float32Array,
+    fan: Fan,
+    far_mm: float,
+    table: FieldTable,
+    echoes: EchoGrid,
+    out: Float32Array,
+) -> None:
+    """Add each scatterer's echo to ``out[vector, sample]`` of every vector of a fan that it lies near.
+
+    Parameters
+    ----------
+    position_mm, strength : ndarray, shape (n, 3) and (n,)
+        Scatterers in the image.
+    far_mm : float
+        How far a vector's beam reaches to the side.
+    out : float32, shape (vector, sample, nodes * 2)
+        Real and imaginary parts in turn.
+    """
+    rows, reach, reached_vectors, curvature_per_mm, grid = table
+    first_depth_mm, sample_mm, cycles_per_mm = echoes
+    ny, nz, per_pitch = reached_vectors.shape[0], reached_vectors.shape[1], reach.shape[1]
+    vectors, samples, width = out.shape
+    value = np.empty(width, dtype=np.float32)
+    one = np.float32(1.0)
+    for j in range(position_mm.shape[0]):
+        x, y = position_mm[j, 0] - fan.apex_mm[0], position_mm[j, 1] - fan.apex_mm[1]
+        z = position_mm[j, 2]
+        fz = abs(z) / grid[3]
+        iz = int(fz)
+        if iz >= nz - 1:
+            continue
+        wz = np.float32(fz - iz)
+        for n in range(vectors):
+            across_mm = abs(x * fan.cosine[n] - y * fan.sine[n])
+            if across_mm >= far_mm:
+                continue
+            depth_mm = x * fan.sine[n] + y * fan.cosine[n] - fan.radius_mm
+            fy = (depth_mm - grid[0]) / grid[1]
+            iy = int(np.floor(fy))
+            steps = across_mm / grid[2]
+            whole = int(steps)
+            m, r = whole // per_pitch, whole % per_pitch
+            if iy < 0 or iy >= ny - 1 or m >= reach.shape[2] or iz >= reach[iy, r, m]:
+                continue
+            part = fy - iy
+            kx = (1.0 - part) * curvature_per_mm[iy, 0] + part * curvature_per_mm[iy + 1, 0]
+            kz = (1.0 - part) * curvature_per_mm[iy, 1] + part * curvature_per_mm[iy + 1, 1]
+            echo_mm = depth_mm + kz * z * z + kx * across_mm * across_mm
+            at = (echo_mm - first_depth_mm) / sample_mm
+            sample = int(np.floor(at))
+            if sample < 0 or sample >= samples - 1:
+                continue
+            wy, wx = np.float32(part), np.float32(steps - whole)
+            for q in range(width):
+                value[q] = 0.0
+            for k in range(8):
+                dy, dz, dx = k >> 2, (k >> 1) & 1, k & 1
+                share = strength[j] * (wy if dy else one - wy) * (wz if dz else one - wz)
+                share *= wx if dx else one - wx
+                for q in range(width):
+                    value[q] += share * rows[iy + dy, iz + dz, r + dx, m * width + q]
+            late = np.float32(at - sample)
+            carrier = _unit_phasor(cycles_per_mm * echo_mm)
+            for k in range(width // 2):
+                re = carrier.real * value[2 * k] - carrier.imag * value[2 * k + 1]
+                im = carrier.real * value[2 * k + 1] + carrier.imag * value[2 * k]
+                out[n, sample, 2 * k] += (one - late) * re
+                out[n, sample, 2 * k + 1] += (one - late) * im
+                out[n, sample + 1, 2 * k] += late * re
+                out[n, sample + 1, 2 * k + 1] += late * im

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import ByteArray, Float16Array, Float32Array, IntArray
+from speckle3d.core.arrays import Float16Array, Float32Array, IntArray
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.imaging.voxels.grid import spacing_within
@@ -80,8 +80,8 @@ class GrowingVolume:
         return compound(grey_levels(images), self.grid, world_from_small, voxel_mm, voxel_type="uint8")
 
 
-def grey_levels(images: Float16Array) -> ByteArray:
-    """Grey levels of images in dB, those of the last one deciding what is white."""
-    bright = float(np.percentile(images[-1].astype(np.float32), _BRIGHT_PERCENTILE))
-    levels = 1.0 + (images.astype(np.float32) - bright) / RANGE_DB
-    return np.asarray(np.rint(255.0 * np.clip(levels, 0.0, 1.0)), dtype=np.uint8)
+def grey_levels(images: Float16Array) -> Float32Array:
+    """Grey levels of images in dB, those of the last one deciding what is white; NaN stays."""
+    bright = np.float32(np.nanpercentile(images[-1].astype(np.float32), _BRIGHT_PERCENTILE))
+    levels = 1.0 + (images.astype(np.float32) - bright) / np.float32(RANGE_DB)
+    return np.asarray(np.float32(255.0) * np.clip(levels, 0.0, 1.0))

@@ -175,7 +175,9 @@ class FrameMatcher:
             patches.first,
             patches.size,
             np.column_stack([np.ones(len(patches)), places]),
-            patches.spacing_mm,
+            np.column_stack([patches.pitch_mm, np.full(len(patches), patches.spacing_mm[1])]),
+            np.column_stack([np.sin(patches.angle_rad), np.cos(patches.angle_rad)]),
+            patches.step_rad,
             self._least_overlap,
             self._wavenumber,
         )

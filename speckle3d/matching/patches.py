@@ -43,17 +43,29 @@ class PatchGrid:
         Vectors and samples in a patch.
     centre_mm : ndarray, shape (p, 2)
         Lateral and axial position of each patch's centre.
+    depth_mm : ndarray, shape (p,)
+        Of each patch's centre along its vector, from the array's face.
+    angle_rad : ndarray, shape (p,)
+        Of the vector there, from straight down and towards growing x: 0 but in a fan.
+    pitch_mm : ndarray, shape (p,)
+        Distance of neighbouring vectors there.
     spacing_mm : ndarray, shape (2,)
-        Vector pitch and sample spacing.
+        Vector pitch, of a fan at its middle depth, and sample spacing.
     inside : ndarray of bool, shape (p,)
         Patches in the region that counts.
+    step_rad : float
+        Angle between neighbouring vectors.
     """
 
     first: IntArray
     size: IntArray
     centre_mm: FloatArray
+    depth_mm: FloatArray
+    angle_rad: FloatArray
+    pitch_mm: FloatArray
     spacing_mm: FloatArray
     inside: BoolArray
+    step_rad: float = 0.0
 
     def __len__(self) -> int:
         return int(self.first.shape[0])
@@ -61,7 +73,7 @@ class PatchGrid:
     @property
     def row_depth_mm(self) -> FloatArray:
         """Depth of the centres of each row of patches, shape (r,), increasing."""
-        return np.unique(self.centre_mm[:, 1])
+        return np.unique(self.depth_mm)
 
     def rows_of(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values of patches, shape (..., p), as rows and columns, shape (..., r, c)."""
@@ -94,9 +106,9 @@ class PatchGrid:
 
     def with_rows(self, kept: BoolArray) -> PatchGrid:
         """Keep some of the rows, shape (r,)."""
-        chosen = np.isin(self.centre_mm[:, 1], self.row_depth_mm[kept])
-        first, centre_mm, inside = self.first[chosen], self.centre_mm[chosen], self.inside[chosen]
-        return replace(self, first=first, centre_mm=centre_mm, inside=inside)
+        chosen = np.isin(self.depth_mm, self.row_depth_mm[kept])
+        names = ("first", "centre_mm", "depth_mm", "angle_rad", "pitch_mm", "inside")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
 
 def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> PatchGrid:
@@ -121,8 +133,13 @@ def lay_patches(grid: ImageGrid, settings: PatchSettings | None = None) -> Patch
     left = (grid.vectors - columns * size[0]) // 2
     v, d = np.meshgrid(left + size[0] * np.arange(columns), top + size[1] * np.arange(rows), indexing="ij")
     first = np.stack([v.ravel(), d.ravel()], axis=1).astype(np.int64)
-    centre = (first + (size - 1) / 2) * spacing + [0.0, grid.first_sample_depth_mm]
-    patches = PatchGrid(first, size, centre, spacing, np.ones(len(first), dtype=bool))
+    vector, sample = (first + (size - 1) / 2).T
+    depth, angle = grid.first_sample_depth_mm + sample * spacing[1], grid.angle_rad(vector)
+    pitch, step, inside = np.full(len(first), spacing[0]), 0.0, np.ones(len(first), dtype=bool)
+    if grid.fan is not None:
+        step = grid.fan.step_rad
+        pitch = (grid.fan.radius_mm + depth) * step
+    patches = PatchGrid(first, size, grid.mm(vector, sample), depth, angle, pitch, spacing, inside, step)
     if s.region:
         # Most of a patch must lie in the region.
         mask = Region(s.region).mask(grid)

@@ -159,7 +159,8 @@ def phantom_samples(
     normal = (poses[first].inv() * poses[second]).as_matrix()[:, 2]
     at = patches.centre_mm - table.inplane[counted, None, :2]
     offset = (at * normal[:, None, :2]).sum(axis=2) + normal[:, 3:]
-    depth, tilt = np.broadcast_arrays(patches.centre_mm[:, 1], normal[:, 1:2])
+    tilt = normal[:, :1] * np.sin(patches.angle_rad) + normal[:, 1:2] * np.cos(patches.angle_rad)
+    depth = np.broadcast_to(patches.depth_mm, tilt.shape)
     return PhantomSamples(
         depth.ravel(), offset.ravel(), tilt.ravel(), correlation.ravel().astype(float), len(first)
     )

@@ -104,7 +104,7 @@ class MotionProblem:
     @cached_property
     def at_patches(self) -> PatchCurves:
         """Fully developed curves at the patches."""
-        at = self.curves.at(self.patches.centre_mm[:, 1])
+        at = self.curves.at(self.patches.depth_mm)
         amplitude = np.ascontiguousarray(np.sqrt(at.correlation))
         of_echo = self.curves.key.correlation_of == "echo"
         return PatchCurves(amplitude, float(self.curves.distance_mm[1]), at.cells, of_echo)
@@ -117,8 +117,10 @@ class MotionProblem:
             # Unknown, it is taken to turn about the focus, and the focus to be at the image's centre: all
             # depths then see the centre's distance.
             return Levers(np.ascontiguousarray(x), np.zeros(x.size), np.zeros(x.size))
-        at = tilt.at(self.patches.centre_mm[:, 1], self.curves.depth_mm)
-        return Levers(np.ascontiguousarray(x), y - at.pivot_mm, np.ascontiguousarray(at.spread_mm))
+        at = tilt.at(self.patches.depth_mm, self.curves.depth_mm)
+        # A vector of a fan turns about a point on itself, and by the part of the turn that is across it.
+        sine, cosine = np.sin(self.patches.angle_rad), np.cos(self.patches.angle_rad)
+        return Levers(x - sine * at.pivot_mm, y - cosine * at.pivot_mm, cosine * at.spread_mm)
 
     @cached_property
     def end_amplitude(self) -> FloatArray:

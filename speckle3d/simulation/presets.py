@@ -139,7 +139,7 @@ def _sweep(
 ) -> SimulatedSweep:
     """Sweep `number` of a preset: images and sensors along a trajectory of its own."""
     probe, in_water = beam.probe, settings.preset not in _MEDIA
-    image = ImageGrid(settings.vectors, settings.samples, probe.pitch_mm, probe.signal.sample_spacing_mm)
+    image = _image_grid(settings, probe)
     tracker: Tracker | None = None
     orientation: OrientationSensor | None = None
     if settings.preset == "stepped":
@@ -173,6 +173,16 @@ def _sweep(
         tracker=replace(tracker, sensor_from_image=None),
     )
     return SimulatedSweep(bare, settings, tracker.sensor_from_image, orientation.sensor_from_image)
+
+
+def _image_grid(settings: SimulationSettings, probe: Probe) -> ImageGrid:
+    """Grid of parallel vectors, one at each element, or of a fan of vectors."""
+    spacing_mm = probe.signal.sample_spacing_mm
+    if settings.array == "linear":
+        return ImageGrid(settings.vectors, settings.samples, probe.pitch_mm, spacing_mm)
+    half = float(np.deg2rad(settings.sector_deg)) / 2
+    radius_mm = settings.radius_mm if settings.array == "curved" else 0.0
+    return ImageGrid.of_fan(settings.vectors, settings.samples, spacing_mm, radius_mm, (-half, half))
 
 
 def _comes_back(settings: SimulationSettings) -> bool:

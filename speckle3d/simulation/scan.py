@@ -13,7 +13,14 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.sweep import ImageGrid
-from speckle3d.kernels.scatter import EchoGrid, FieldTable, field_table, scatter_echoes
+from speckle3d.kernels.scatter import (
+    EchoGrid,
+    Fan,
+    FieldTable,
+    field_table,
+    scatter_echoes,
+    scatter_fan_echoes,
+)
 from speckle3d.simulation.beam import PER_PITCH, BeamTable
 from speckle3d.simulation.medium import Box, Medium
 
@@ -89,12 +96,24 @@ class SimulatedFrames:
         carrier = 2e-3 * float(self._frequency_hz[self._carrier_bin]) / probe.speed_of_sound_m_s
         grid = EchoGrid(image.first_sample_depth_mm, image.sample_spacing_mm, carrier)
         medium_from_image = self.medium_from_image[index]
-        matrix = medium_from_image.inv().as_matrix()
+        image_from_medium = medium_from_image.inv()
+        field = self._field, grid, out.view(np.float32)
         for position, strength in self.medium.seen(medium_from_image, self._box):
-            scatter_echoes(
-                position, strength, matrix, image.vector_pitch_mm, self._field, grid, out.view(np.float32)
-            )
+            if self._fan is None:
+                matrix = image_from_medium.as_matrix()
+                scatter_echoes(position, strength, matrix, image.vector_pitch_mm, *field)
+                continue
+            place = image_from_medium.apply(position)
+            inside = ((place > self._box[0]) & (place < self._box[1])).all(axis=1)
+            far_mm = self.beam.lateral_extent_mm
+            scatter_fan_echoes(place[inside], strength[inside], self._fan, far_mm, *field)
         return out
+
+    @cached_property
+    def _fan(self) -> Fan | None:
+        """Vectors that are not parallel."""
+        fan, angle = self.image.fan, self.image.angle_rad(np.arange(self.image.vectors))
+        return None if fan is None else Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
 
     @cached_property
     def _field(self) -> FieldTable:
@@ -107,9 +126,12 @@ class SimulatedFrames:
     def _box(self) -> Box:
         """Opposite corners of what the beam reaches, in the image."""
         margin, thick = self.beam.lateral_extent_mm, self.beam.elevation_extent_mm.max()
-        depth = self.beam.depth_mm
+        depth, fan = self.beam.depth_mm, self.image.fan
         low = np.array([-margin, depth[0], -thick])
-        return low, np.array([self.image.width_mm + margin, depth[-1], thick])
+        high = np.array([self.image.width_mm + margin, depth[-1], thick])
+        if fan is not None:
+            low[1], high[1] = -margin, fan.apex_mm[1] + fan.radius_mm + depth[-1]
+        return low, high
 
     @cached_property
     def _length(self) -> int:

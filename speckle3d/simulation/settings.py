@@ -27,6 +27,13 @@ class SimulationSettings(BaseModel):
     seed: int = Field(0, ge=0, description="Same seed and settings, same sweep.")
     vectors: int = Field(127, ge=1, le=1024, description="Vectors in a frame.")
     samples: int = Field(3818, ge=256, le=3818, description="Samples in a vector.")
+    array: Literal["linear", "curved", "phased"] = Field(
+        "linear", description="Whether vectors are parallel, or spread from a curved or a phased array."
+    )
+    radius_mm: float = Field(60.0, gt=0, le=200, description="curved: radius of the array's face.")
+    sector_deg: float = Field(
+        60.0, gt=0, le=120, description="curved, phased: angle between the first vector and the last."
+    )
     length_mm: float = Field(20.0, gt=0, le=200, description="Length of the sweep.")
     frames: int | None = Field(
         None,

@@ -14,6 +14,7 @@ from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.reconstruction import Reconstruction
+from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.imaging.voxels.settings import Levels
@@ -32,6 +33,8 @@ _GLANCES = 24
 
 class GreyImages:
     """Grey images of a sweep by frame number, made one at a time as they are asked for.
+
+    Those of a curved or phased array are scan converted, and NaN outside the fan.
 
     Parameters
     ----------
@@ -75,7 +78,9 @@ class GreyImages:
         bmode = sweep.signal if isinstance(sweep.signal, BModeSettings) else None
         self._sweep, self._progress, self._levels = sweep, progress, levels
         self._extractor = IntensityExtractor.for_sweep(sweep, settings)
-        self.grid: ImageGrid = self._extractor.grid
+        source = sweep.grid if levels == "stored" else self._extractor.grid
+        self._convert = ScanConversion(source) if source.fan is not None else None
+        self.grid: ImageGrid = self._convert.grid if self._convert else source
         self.dtype: np.dtype[Any] = np.dtype(np.float32)
         self.meaning = f"log-compressed, 0 to 255 over {dynamic_range_db:g} dB"
         if levels == "stored":
@@ -83,7 +88,8 @@ class GreyImages:
                 raise InvalidInputError(
                     f"{sweep.name}: expected B-mode for levels as stored, got RF or I/Q: take log or linear"
                 )
-            self.grid, self.dtype = sweep.grid, np.dtype(sweep.frames.dtype)
+            if self._convert is None:
+                self.dtype = np.dtype(sweep.frames.dtype)
             self.meaning = f"B-mode as stored, 0 to {bmode.full_scale:g}"
         elif levels == "linear":
             self.meaning = "echo amplitude, linear, " + (
@@ -112,7 +118,10 @@ class GreyImages:
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         if self._progress:
             self._progress(index + 1, len(self._sweep))
-        frame = read_frame(self._sweep.frames, index)
+        levels = self._levels_of(read_frame(self._sweep.frames, index))
+        return levels if self._convert is None else self._convert(levels)
+
+    def _levels_of(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if self._levels == "stored":
             return frame
         intensity = self._extractor.intensity(frame)

@@ -82,7 +82,7 @@ class SweepPage:
         parts: Float32Array = grey[:, : pool * grid.samples].reshape(grid.vectors, grid.samples, pool)
         # NumPy's mean takes more than twice as long over so short an axis.
         mean = np.einsum("vrp->rv", parts) / np.float32(pool)
-        return np.asarray(np.rint(np.clip(mean, 0, 255)), dtype=np.uint8, order="C")
+        return np.asarray(np.rint(np.clip(np.nan_to_num(mean), 0, 255)), dtype=np.uint8, order="C")
 
 
 class _Player(param.Parameterized):  # type: ignore[misc]

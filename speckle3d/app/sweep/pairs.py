@@ -27,8 +27,8 @@ class PatchValues:
     ----------
     centre_mm : ndarray, shape (p, 2)
         Where the patches lie in this frame.
-    turn_rad : float
-        By which they are turned there.
+    turn_rad : ndarray, shape (p,)
+        By which they are turned there, a fan's vectors included.
     correlation, distance_mm, sigma_mm : ndarray, shape (p,)
         NaN where there is none.
     used : ndarray of bool, shape (p,), or None
@@ -38,7 +38,7 @@ class PatchValues:
     """
 
     centre_mm: FloatArray
-    turn_rad: float
+    turn_rad: FloatArray
     correlation: FloatArray
     distance_mm: FloatArray
     sigma_mm: FloatArray
@@ -133,19 +133,20 @@ class SweepPairs:
         rows = np.flatnonzero((self._pairs.first == first) & (self._pairs.second == second))
         return int(rows[0]) if rows.size else None
 
-    def _placed(self, first_from_second: RigidTransform, in_second: bool) -> tuple[FloatArray, float]:
+    def _placed(self, first_from_second: RigidTransform, in_second: bool) -> tuple[FloatArray, FloatArray]:
         """Centres of the patches, which tile the earlier frame, in it or in the later one, and their turn."""
-        at = self._matcher.patches.centre_mm
+        at, angle = self._matcher.patches.centre_mm, self._matcher.patches.angle_rad
         if not in_second:
-            return at, 0.0
+            return at, -angle
         there = first_from_second.inv()
         inside = there.apply(np.column_stack([at, np.zeros(len(at))]))[:, :2]
-        return inside, float(there.rotation.as_euler("zyx")[0])
+        return inside, float(there.rotation.as_euler("zyx")[0]) - angle
 
     @cached_property
     def _matcher(self) -> FrameMatcher:
         c = self._config
         matcher = FrameMatcher(self._sweep, c.intensity, c.patches, c.inplane, c.matching)
         if self._pairs is not None:
-            matcher.keep_depths(np.unique(self._pairs.patch_centre_mm[:, 1]))
+            grid, (_, sample) = matcher.grid, matcher.grid.sample_at(self._pairs.patch_centre_mm).T
+            matcher.keep_depths(np.unique(grid.first_sample_depth_mm + sample * grid.sample_spacing_mm))
         return matcher

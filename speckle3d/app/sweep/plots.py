@@ -115,7 +115,7 @@ class ImagePlot:
         self._patches.data = columns | {
             "x": patches.centre_mm[:, 0],
             "y": patches.centre_mm[:, 1],
-            "angle": np.full(len(known), patches.turn_rad),
+            "angle": patches.turn_rad,
             "value": columns[by],
             "alpha": np.where(np.isfinite(columns[by]), _OPACITY, 0.0),
             "line": np.where(rejected, _REJECTED, "#ffffff"),

@@ -6,6 +6,7 @@ import numpy as np
 
 from speckle3d.core.arrays import Float16Array, Float32Array
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.sweep import ImageGrid
 
 PIXEL_MM = 0.35
@@ -17,6 +18,8 @@ class ImageStack:
     """Log-compressed images of a sweep, pooled to pixels of about a third of a millimetre.
 
     An image sink of `speckle3d.track`: pass `keep` as ``images``.
+
+    Those of a fan are scan converted, and NaN outside it.
 
     Parameters
     ----------
@@ -34,6 +37,12 @@ class ImageStack:
     """
 
     def __init__(self, grid: ImageGrid, pixel_mm: float = PIXEL_MM) -> None:
+        self._convert = None
+        if grid.fan is not None:
+            low, high = grid.corners_mm[0, :2], grid.corners_mm[2, :2]
+            columns, rows = (int(count) + 1 for count in (high - low) / pixel_mm)
+            self._convert = ScanConversion(grid, ImageGrid(columns, rows, pixel_mm, pixel_mm, float(low[1])))
+            grid = self._convert.grid
         across = max(1, min(grid.vectors, round(pixel_mm / grid.vector_pitch_mm)))
         deep = max(1, min(grid.samples, round(pixel_mm / grid.sample_spacing_mm)))
         self._pool = across, deep
@@ -49,6 +58,8 @@ class ImageStack:
 
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep one frame of speckle intensity, shape (vector, sample)."""
+        if self._convert is not None:
+            intensity = self._convert(intensity)
         across, deep = self._pool
         wide, high = self.grid.vectors, self.grid.samples
         part = intensity[: wide * across, : high * deep]

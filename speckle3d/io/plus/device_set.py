@@ -151,6 +151,9 @@ class DeviceSet:
         Of the transducer, as LINEAR; empty where the set does not say.
     width_mm : float, optional
         Of the transducer.
+    radii_mm, angles_deg : tuple of float, optional
+        First and last sample's distance from where the lines of a curved array meet, and its first and last
+        line's angle from straight down.
     output_size, output_mm : tuple, optional
         Pixels along x and y of the image that PLUS makes of lines, and their distances.
     clip : Clip, optional
@@ -164,6 +167,8 @@ class DeviceSet:
     probe: str = ""
     geometry: str = ""
     width_mm: float | None = None
+    radii_mm: tuple[float, float] | None = None
+    angles_deg: tuple[float, float] | None = None
     output_size: tuple[float, ...] | None = None
     output_mm: tuple[float, ...] | None = None
     clip: Clip | None = None
@@ -239,10 +244,18 @@ def device_set(path: str, root: Element) -> DeviceSet:
         scan.get("TransducerName", ""),
         scan.get("TransducerGeometry", "").upper(),
         None if width is None else width[0],
+        _both(scan, "RadiusStartMm", "RadiusStopMm"),
+        _both(scan, "ThetaStartDeg", "ThetaStopDeg"),
         _values(scan, 2, "OutputImageSizePixel"),
         _values(scan, 2, "OutputImageSpacingMmPerPixel"),
         _clip(root.find(".//VolumeReconstruction")),
     )
+
+
+def _both(element: Element, *names: str) -> tuple[float, float] | None:
+    """Two numbers, if both are there."""
+    first, last = (_values(element, 1, name) for name in names)
+    return None if first is None or last is None else (first[0], last[0])
 
 
 def _clip(element: Element | None) -> Clip | None:
