@@ -45,7 +45,7 @@ class ImportSettings(BaseModel):
         None,
         gt=0,
         description="distance between lines; a linear probe's element pitch, in its data sheet, where each "
-        "element has one line",
+        "element has one line; of lines that spread: array_radius_mm and line_angles_deg",
     )
     element_pitch_mm: float | None = Field(
         None,

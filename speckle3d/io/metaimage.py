@@ -257,7 +257,8 @@ class _Sequence:
         radii = device.radii_mm or (None, None)
         values = {"line_angles_deg": angles, "array_radius_mm": replace(angles, value=radii[0])}
         if device.radii_mm is not None and samples > 1:
-            values["row_spacing_mm"] = replace(angles, value=np.ptp(device.radii_mm) / (samples - 1))
+            near, far = device.radii_mm
+            values["row_spacing_mm"] = replace(angles, value=(far - near) / (samples - 1))
         return values
 
     def _pixel_mm(self) -> Value:

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.region import Region
+from speckle3d.core.scan_conversion import ScanConversion
+from speckle3d.core.sweep import ImageGrid
+
+CURVED = ImageGrid.of_fan(97, 401, 0.1, 60.0, tuple(np.deg2rad((-30.0, 30.0))))
+PHASED = ImageGrid.of_fan(65, 301, 0.2, 0.0, tuple(np.deg2rad((-45.0, 45.0))), 2.0)
+
+
+@pytest.mark.parametrize("grid", [CURVED, PHASED, ImageGrid(20, 30, 0.3, 0.1, 2.0, 0.03)])
+def test_places_and_samples_are_inverse(grid):
+    samples = np.random.default_rng(0).uniform(1, 19, (50, 2))
+    np.testing.assert_allclose(grid.sample_at(grid.mm(*samples.T)), samples, atol=1e-9)
+
+
+def test_image_of_a_curved_array_begins_at_its_top_left():
+    # The outermost lines begin highest, the middle one ends lowest.
+    top, left = 60.0 * np.cos(np.deg2rad(30.0)), -100.0 * np.sin(np.deg2rad(30.0))
+    np.testing.assert_allclose(CURVED.mm(48, 0), [-left, 60.0 - top], atol=1e-9)
+    np.testing.assert_allclose(CURVED.corners_mm[2, :2], [-2 * left, 100.0 - top], atol=1e-9)
+    np.testing.assert_allclose(CURVED.centre_mm, [-left, 80.0 - top, 0.0], atol=1e-9)
+    assert CURVED.vector_pitch_mm == pytest.approx(80.0 * np.deg2rad(60.0) / 96)
+
+
+def test_lines_of_a_phased_array_begin_at_one_point():
+    first, last = PHASED.mm([0, 64], -10)  # 2 mm before the first sample
+    np.testing.assert_allclose(first, last, atol=1e-9)
+
+
+def test_lines_beyond_the_horizon_are_refused():
+    with pytest.raises(InvalidInputError, match="90 degrees"):
+        ImageGrid.of_fan(10, 100, 0.1, 10.0, (-1.6, 1.6))
+
+
+@pytest.mark.parametrize("grid", [CURVED, PHASED])
+def test_a_disc_is_drawn_where_it_is(grid):
+    v, s = np.indices((grid.vectors, grid.samples))
+    place = grid.mm(v, s)
+    centre = grid.mm(0.7 * grid.vectors, 0.5 * grid.samples)
+    convert = ScanConversion(grid)
+    picture = convert(np.exp(-0.5 * ((place - centre) ** 2).sum(axis=2) / 2.0**2))
+    pixels = convert.grid.mm(*np.indices(picture.shape))
+    inside = np.isfinite(picture)
+    found = (picture[inside][:, None] * pixels[inside]).sum(axis=0) / picture[inside].sum()
+    np.testing.assert_allclose(found, centre, atol=0.02)
+    # The share of the box that a fan fills, by its area.
+    fan = 0.5 * np.ptp(grid.angle_rad([0, grid.vectors - 1]))
+    fan *= np.diff(np.square(grid.fan.radius_mm + np.array([grid.first_sample_depth_mm, grid.depth_mm])))[0]
+    low, high = grid.corners_mm[0], grid.corners_mm[2]
+    assert inside.mean() == pytest.approx(fan / np.prod((high - low)[:2]), rel=0.02)
+
+
+def test_a_region_in_millimetres_chooses_samples_of_a_fan():
+    low, high = CURVED.centre_mm[:2] - 5.0, CURVED.centre_mm[:2] + 5.0
+    square = Region(f"rectangle {low[0]},{low[1]} {high[0]},{high[1]}").mask(CURVED)
+    corners = f"{low[0]},{low[1]} {high[0]},{low[1]} {high[0]},{high[1]} {low[0]},{high[1]}"
+    assert (Region(f"polygon {corners}").mask(CURVED) != square).mean() < 1e-3
+    place = CURVED.mm(*np.nonzero(square))
+    assert (place >= low - 1e-6).all() and (place <= high + 1e-6).all()
+    radius_mm = np.linalg.norm(place - CURVED.fan.apex_mm, axis=1)
+    per_mm2 = 1.0 / (radius_mm * CURVED.fan.step_rad * CURVED.sample_spacing_mm)
+    assert (1.0 / per_mm2).sum() == pytest.approx(100.0, rel=0.03)

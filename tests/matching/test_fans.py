@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.matching.inplane import InPlaneMotion, InPlaneSettings
+from speckle3d.matching.intensity import IntensitySettings
+from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.patches import PatchSettings
+
+PIXEL_MM = 0.05
+CURVED = ImageGrid.of_fan(193, 401, 0.08, 60.0, tuple(np.deg2rad((-25.0, 25.0))))
+PHASED = ImageGrid.of_fan(129, 401, 0.08, 0.0, tuple(np.deg2rad((-35.0, 35.0))), 12.0)
+
+
+def speckle(grid, seed=0):
+    """A picture of speckle with room around the fan, and its margin, mm."""
+    rng, margin = np.random.default_rng(seed), 4.0
+    size = np.ceil((grid.corners_mm[2, :2] - grid.corners_mm[0, :2] + 2 * margin) / PIXEL_MM).astype(int)
+    parts = [gaussian_filter(rng.standard_normal(size), 0.3 / PIXEL_MM) for _ in range(2)]
+    return sum(part**2 for part in parts), margin
+
+
+def frame(grid, field, margin, motion):
+    """Grey levels of the image moved in its plane over the picture."""
+    at = grid.mm(*np.indices((grid.vectors, grid.samples))) - grid.centre_mm[:2]
+    c, s = np.cos(motion.roll_rad), np.sin(motion.roll_rad)
+    x = c * at[..., 0] - s * at[..., 1] + motion.x_mm + grid.centre_mm[0] + margin
+    y = s * at[..., 0] + c * at[..., 1] + motion.y_mm + grid.centre_mm[1] + margin
+    intensity = np.maximum(map_coordinates(field, np.stack([x, y]) / PIXEL_MM, order=3), 1e-12)
+    level = 255 + 255 / 60 * 10 * np.log10(intensity / field.max())
+    return np.rint(np.clip(level, 0, 255)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("grid", [CURVED, PHASED], ids=["curved", "phased"])
+@pytest.mark.parametrize("motion", [(0.3, 0.0, 0.0), (0.0, 0.25, 0.0), (-0.4, 0.2, 0.008)])
+def test_motion_in_the_plane_of_a_fan(grid, motion):
+    field, margin = speckle(grid)
+    moved = InPlaneMotion(*motion)
+    frames = np.stack([frame(grid, field, margin, each) for each in (InPlaneMotion(), moved)])
+    sweep = Sweep(frames, grid, BModeSettings(60.0), np.arange(2.0))
+    matcher = FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
+    first, second = (matcher.prepare(matcher.echo(each)) for each in frames)
+    match = matcher.match(first, second, matcher.search(first, second))
+    found = match.motion
+    # The same field is seen again: within a fifth of a sample, and no elevational motion to read.
+    np.testing.assert_allclose([found.x_mm, found.y_mm], motion[:2], atol=0.016)
+    assert found.roll_rad == pytest.approx(motion[2], abs=5e-4)
+    assert np.nanmedian(match.correlation) > 0.97
+    assert np.linalg.eigvalsh(found.covariance).min() > 0
