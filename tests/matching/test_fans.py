@@ -3,9 +3,8 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
-from speckle3d.matching.inplane import InPlaneMotion, InPlaneSettings
 from speckle3d.matching.intensity import IntensitySettings
-from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
 from speckle3d.matching.patches import PatchSettings
 
 PIXEL_MM = 0.05
@@ -24,9 +23,10 @@ def speckle(grid, seed=0):
 def frame(grid, field, margin, motion):
     """Grey levels of the image moved in its plane over the picture."""
     at = grid.mm(*np.indices((grid.vectors, grid.samples))) - grid.centre_mm[:2]
-    c, s = np.cos(motion.roll_rad), np.sin(motion.roll_rad)
-    x = c * at[..., 0] - s * at[..., 1] + motion.x_mm + grid.centre_mm[0] + margin
-    y = s * at[..., 0] + c * at[..., 1] + motion.y_mm + grid.centre_mm[1] + margin
+    x_mm, y_mm, roll_rad = motion
+    c, s = np.cos(roll_rad), np.sin(roll_rad)
+    x = c * at[..., 0] - s * at[..., 1] + x_mm + grid.centre_mm[0] + margin
+    y = s * at[..., 0] + c * at[..., 1] + y_mm + grid.centre_mm[1] + margin
     intensity = np.maximum(map_coordinates(field, np.stack([x, y]) / PIXEL_MM, order=3), 1e-12)
     level = 255 + 255 / 60 * 10 * np.log10(intensity / field.max())
     return np.rint(np.clip(level, 0, 255)).astype(np.uint8)
@@ -36,15 +36,12 @@ def frame(grid, field, margin, motion):
 @pytest.mark.parametrize("motion", [(0.3, 0.0, 0.0), (0.0, 0.25, 0.0), (-0.4, 0.2, 0.008)])
 def test_motion_in_the_plane_of_a_fan(grid, motion):
     field, margin = speckle(grid)
-    moved = InPlaneMotion(*motion)
-    frames = np.stack([frame(grid, field, margin, each) for each in (InPlaneMotion(), moved)])
+    frames = np.stack([frame(grid, field, margin, each) for each in (np.zeros(3), motion)])
     sweep = Sweep(frames, grid, BModeSettings(60.0), np.arange(2.0))
     matcher = FrameMatcher(sweep, IntensitySettings(), PatchSettings(), InPlaneSettings())
     first, second = (matcher.prepare(matcher.echo(each)) for each in frames)
-    match = matcher.match(first, second, matcher.search(first, second))
-    found = match.motion
+    match = matcher.match({0: first}, 1, second, [matcher.search(first, second)])
     # The same field is seen again: within a fifth of a sample, and no elevational motion to read.
-    np.testing.assert_allclose([found.x_mm, found.y_mm], motion[:2], atol=0.016)
-    assert found.roll_rad == pytest.approx(motion[2], abs=5e-4)
+    np.testing.assert_allclose(match.inplane[0, :2], motion[:2], atol=0.016)
+    assert match.inplane[0, 2] == pytest.approx(motion[2], abs=5e-4)
     assert np.nanmedian(match.correlation) > 0.97
-    assert np.linalg.eigvalsh(found.covariance).min() > 0
