@@ -19,7 +19,6 @@ from speed.rows import Row, timed
 TIMES_OPENCV = 12.0
 CROSS = [1, 3, 4, 5, 7]
 """Of three by three lags those of the kernel."""
-CROSS = [1, 3, 4, 5, 7]
 """Of three by three lags those of the kernel."""
 
 
@@ -87,7 +86,7 @@ def by_scipy(fixed: Frame, moving: Frame, patches: PatchGrid) -> np.ndarray:
         a, b = template - template.mean(dtype=float), around.astype(float)
         covariance = correlate(b, a, "valid")
         total, square = correlate(b, ones, "valid"), correlate(b * b, ones, "valid")
-        rho[p] = (covariance / np.sqrt((a * a).sum() * (square - total**2 / n))).ravel()[CROSS][CROSS]
+        rho[p] = (covariance / np.sqrt((a * a).sum() * (square - total**2 / n))).ravel()[CROSS]
     return rho
 
 
