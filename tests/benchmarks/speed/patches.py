@@ -19,7 +19,6 @@ from speed.rows import Row, timed
 TIMES_OPENCV = 12.0
 CROSS = [1, 3, 4, 5, 7]
 """Of three by three lags those of the kernel."""
-"""Of three by three lags those of the kernel."""
 
 
 def rows(path: Path, runs: int) -> list[Row]:
