@@ -11,7 +11,7 @@ import pytest
 import sweep_examples
 
 from speckle3d.core.errors import FileError
-from speckle3d.core.sweep import stored_dtype
+from speckle3d.core.sweep import ImageGrid, stored_dtype
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
@@ -136,3 +136,13 @@ def test_control_c_is_not_lost_while_frames_are_read_or_written(tmp_path, target
     assert trace.strip().endswith(b"KeyboardInterrupt")
     assert b"Exception ignored" not in trace
     assert [p.name for p in tmp_path.iterdir()] == ["whole.h5"]
+
+
+def test_a_fan_of_vectors_is_stored_whole(tmp_path):
+    flat = sweep_examples.rf_sweep()
+    spacing = flat.grid.sample_spacing_mm
+    fan = ImageGrid.of_fan(flat.grid.vectors, flat.grid.samples, spacing, 60.0, (-0.05, 0.1), 1.0)
+    write_sweep(tmp_path / "s.h5", replace(flat, grid=fan))
+    assert load_sweep(tmp_path / "s.h5").grid == fan
+    with h5py.File(tmp_path / "s.h5") as file:
+        assert file.attrs["version"] == 3

@@ -151,13 +151,11 @@ class Package:
         Raises
         ------
         InvalidInputError
-            Naming the line that is steered, unevenly spaced or repeated, or a curved array.
+            Naming the line that is steered, unevenly spaced or repeated.
         """
         said = self.said
         others = [member.name for kind, member in self.raw.items() if kind != self.chosen]
         advice = f"; or give another of its raw files: {', '.join(others)}" if others else ""
-        if radius_mm := said.of_probe("radius"):
-            raise InvalidInputError(self._polar(f"a curved array of {radius_mm:g} mm radius") + advice)
         elements, angle_deg = said.places.T
         if (steered := np.flatnonzero(angle_deg)).size:
             i = int(steered[0])
@@ -172,25 +170,10 @@ class Package:
         except InvalidInputError as error:
             raise InvalidInputError(f"{error}: packets of a Doppler mode are no image{advice}") from error
 
-    def _polar(self, what: str) -> str:
-        return (
-            f"{self.said.where}: expected parallel lines, got {what}: its lines fan out, and a sweep has one "
-            "distance between them. Needed would be the radius of the array, the angle between its lines, "
-            "and resampling"
-        )
-
     @cached_property
     def pitch(self) -> Value:
-        """Distance between lines, mm: of the elements' as given, by the yml, or by the maker's table.
-
-        Raises
-        ------
-        InvalidInputError
-            If the model's lines are not parallel.
-        """
-        per_line, model = self.place[1], _model(named := self.settings.probe or self.said.probe)
-        if model.startswith(CONVEX):
-            raise InvalidInputError(self._polar(f"the probe {named}"))
+        """Distance between lines at the array, mm: of the elements' as given, by the yml, or a table's."""
+        per_line, model = self.place[1], _model(self.settings.probe or self.said.probe)
         pitches = {
             "as given": self.settings.element_pitch_mm,
             _OWN: self.said.of_probe("pitch"),
@@ -201,6 +184,24 @@ class Package:
                 words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
                 return Value(element_mm * per_line, words, _OWN)
         return Value(self.settings.vector_pitch_mm, "--vector-pitch-mm")
+
+    @cached_property
+    def spreading(self) -> dict[str, Value]:
+        """Where the lines of a curved array lie; of a curved model without its radius, that it is lacking."""
+        radius_mm, named = self.said.of_probe("radius"), self.settings.probe or self.said.probe
+        if not radius_mm and not _model(named).startswith(CONVEX):
+            return {}
+        step_mm, lines = self.pitch.value, self.kept[0]
+        values = {"array_radius_mm": Value(radius_mm, "", _OWN), "line_angles_deg": Value()}
+        if radius_mm and step_mm is not None:
+            elements = self.said.below("probe").optional("elements")
+            first = -(len(self.said.places[lines]) - 1) / 2 * step_mm
+            if elements:
+                first = (self.place[0] - (elements - 1) / 2) * step_mm / self.place[1]
+            last = first + (len(self.said.places[lines]) - 1) * step_mm
+            angles = tuple(np.rad2deg([first / radius_mm, last / radius_mm]).tolist())
+            values["line_angles_deg"] = Value(angles, f"of lines {self.pitch.source}", _OWN)
+        return values
 
     @cached_property
     def file(self) -> ClariusFile:
@@ -301,6 +302,7 @@ class Package:
             "centre_frequency_hz": Value(centre_hz, "transmit frequency", _OWN),
             "demodulation_frequency_hz": Value(self.shift_hz, "of the lines' middle", _OWN),
         }
+        values |= self.spreading
         if self.speed_m_s is not None:
             values["speed_of_sound_m_s"] = Value(self.speed_m_s, "", _OWN)
         remarks = self._remarks()
@@ -323,7 +325,7 @@ class Package:
             probe=_probe_name(self.settings.probe or said.probe),
             name=self.files.name or self.files.path.stem,
             asked=dict.fromkeys(("vector_pitch_mm", "column_pitch_mm"), asked),
-            assumptions=("parallel lines of a linear array",),
+            assumptions=() if self.spreading else ("parallel lines of a linear array",),
             remarks=tuple(remarks),
         )
 

@@ -21,7 +21,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
@@ -37,11 +36,12 @@ from speckle3d.io.hdf5 import (
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing
+from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing, step_of
 
 FORMAT = "USTB .uff"
 
-_BEAMFORMED, _CHANNELS, _LINEAR = "uff.beamformed_data", "uff.channel_data", "uff.linear_scan"
+_BEAMFORMED, _CHANNELS = "uff.beamformed_data", "uff.channel_data"
+_LINEAR, _SECTOR = "uff.linear_scan", "uff.sector_scan"
 
 
 def is_uff(file: h5py.File) -> bool:
@@ -50,7 +50,7 @@ def is_uff(file: h5py.File) -> bool:
 
 
 def open_uff(path: Path, settings: ImportSettings) -> Recording:
-    """Read beamformed RF or I/Q on a linear scan; real data of one sign become grey levels."""
+    """Read beamformed RF or I/Q on a linear or a sector scan; real data of one sign become grey levels."""
     with open_hdf5(path) as file:
         rows: list[Row] = [("object", f"{name}: {kind}", "") for name, kind in _objects(file).items()]
         return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
@@ -59,21 +59,20 @@ def open_uff(path: Path, settings: ImportSettings) -> Recording:
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
     name = _chosen(file, path, settings)
     group = require_group(file, name)
-    x_mm, z_mm = _axes(group)
+    lines, samples, values = _scan(group, f"in {name}/scan")
     data = f"{name}/data"
     is_complex = isinstance(find_member(file, data), h5py.Group)
     parts = (f"{data}/real", f"{data}/imag") if is_complex else (data,)
-    axis, count = _frame_axis(require_dataset(file, parts[0]), x_mm.size * z_mm.size)
+    axis, count = _frame_axis(require_dataset(file, parts[0]), lines * samples)
     if (video := single(group, "frame_rate")) is not None:
         rows.append(("frame rate of videos made of it, not used", f"{video:g}", "frames/s"))
     modulation_hz = single(group, "modulation_frequency") or 0.0
-    values = grid_values(x_mm, z_mm, locate(group, "scan"), f"in {name}/scan")
     values["demodulation_frequency_hz"] = Value(modulation_hz, f"in {name}/modulation_frequency")
     values |= _pulse(group, f"in {name}", modulation_hz)
     for other, kind in _objects(file).items():
         if kind == _CHANNELS and (speed := single(file, f"{other}/sound_speed")):
             values["speed_of_sound_m_s"] = Value(speed, f"{other}/sound_speed")
-    shape = count, x_mm.size, z_mm.size
+    shape = count, lines, samples
     source = HDF5Slices(path, parts, Grid(shape[1:], (0, 1)), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
     if is_complex and count and settings.demodulation_frequency_hz is None:
@@ -133,16 +132,28 @@ def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> str:
     raise InvalidInputError(f"{path}: expected {_BEAMFORMED}, got {got}{advice}")
 
 
-def _axes(group: h5py.Group) -> tuple[FloatArray, FloatArray]:
-    """Lateral positions and depths, mm."""
+def _scan(group: h5py.Group, said: str) -> tuple[int, int, dict[str, Value]]:
+    """Lines and samples of a scan, and where they lie."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
     kind = text_of(scan.attrs.get("class"))
-    if kind != _LINEAR:
+    if kind not in (_LINEAR, _SECTOR):
         raise InvalidInputError(
-            f"{where}: expected a {_LINEAR}, got {kind or 'none'}: beamform onto a {_LINEAR}, whose lines "
-            "are parallel"
+            f"{where}: expected a {_LINEAR} or {_SECTOR}, got {kind or 'none'}: beamform onto one of them"
         )
-    return 1e3 * flat(scan, "x_axis"), 1e3 * flat(scan, "z_axis")
+    if kind == _LINEAR:
+        x_mm, z_mm = 1e3 * flat(scan, "x_axis"), 1e3 * flat(scan, "z_axis")
+        return x_mm.size, z_mm.size, grid_values(x_mm, z_mm, where, said)
+    angle, radius_mm = flat(scan, "azimuth_axis"), 1e3 * flat(scan, "depth_axis")
+    step_of(angle, f"{where}, azimuth_axis")
+    # Depths are from where the lines meet, which is above the array's face if it is curved.
+    above_mm = radius_mm[0] * np.cos(angle[0]) - 1e3 * flat(scan, "z")[0]
+    numbers = {
+        "array_radius_mm": max(0.0, round(float(above_mm), 6)),
+        "line_angles_deg": tuple(np.rad2deg(angle[[0, -1]]).tolist()),
+        "row_spacing_mm": step_of(radius_mm, f"{where}, depth_axis"),
+    }
+    numbers["first_sample_depth_mm"] = float(radius_mm[0]) - numbers["array_radius_mm"]
+    return angle.size, radius_mm.size, {name: Value(value, said) for name, value in numbers.items()}
 
 
 def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:

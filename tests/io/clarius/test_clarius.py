@@ -1,7 +1,7 @@
 """Packages of any sweep, written as the scanner writes them, are read back; what contradicts is named."""
 
 import pickle
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import clarius_examples as examples
 import numpy as np
@@ -14,7 +14,7 @@ from speckle3d.io.clarius.imu import read_samples
 from speckle3d.io.clarius.package import Member
 from speckle3d.io.clarius.reader import sensor_of
 from speckle3d.io.describe import describe
-from speckle3d.io.import_settings import ImportSettings
+from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, recording_files
 from speckle3d.io.readers import find_reader
 
@@ -29,7 +29,7 @@ def require_equal(got, expected):
     assert got.frames.dtype == expected.frames.dtype
     np.testing.assert_array_equal(got.frame_time_s, expected.frame_time_s)
     # Places are printed in elements and samples, and come back to rounding.
-    assert list(vars(got.grid).values()) == pytest.approx(list(vars(expected.grid).values()), rel=1e-12)
+    assert astuple(got.grid)[:-1] == pytest.approx(astuple(expected.grid)[:-1], rel=1e-12)
     assert got.signal == expected.signal
     ours, theirs = got.orientation, expected.orientation
     np.testing.assert_array_equal(ours.readings.time_s, theirs.readings.time_s)
@@ -191,3 +191,25 @@ def test_real_packages(realdata):
     assert envelope.frame_time_s[0] == pytest.approx(272.547324170, abs=1e-9)
     # 592 samples of 0.0513 mm; the depth is counted from the first but for one of its 16 delay samples.
     assert envelope.grid.depth_mm == pytest.approx(0.051 + 591 * 0.051333, abs=0.01)
+
+
+def test_lines_of_a_curved_array_spread_by_its_radius(tmp_path):
+    sweep = sweep_of("rf")
+    yml = examples.yml_text(sweep) + "probe: {radius: 45 mm, pitch: 0.35 mm, elements: 192}\n"
+    path = examples.write_package(tmp_path / "folder", sweep, yml=yml)
+    grid = load_sweep(path, GIVEN.model_copy(update={"probe": None})).grid
+    assert grid.fan.radius_mm == 45.0
+    # Lines lie where their elements do; the middle of 192 elements looks straight down.
+    elements = np.arange(grid.vectors) * sweep.grid.vector_pitch_mm / examples.ELEMENT_MM
+    np.testing.assert_allclose(grid.angle_rad(np.arange(grid.vectors)), (elements - 95.5) * 0.35 / 45.0)
+
+
+def test_a_curved_model_without_its_radius_is_asked_for_it(tmp_path):
+    path = examples.write_package(tmp_path / "folder", sweep_of("rf"))
+    curved = GIVEN.model_copy(update={"probe": "Clarius C3 HD3", "element_pitch_mm": 0.35})
+    with pytest.raises(MissingSettingsError) as caught:
+        load_sweep(path, curved)
+    assert set(caught.value.settings) == {"array_radius_mm", "line_angles_deg"}
+    given = {"array_radius_mm": 45.0, "line_angles_deg": (-3.0, 3.0)}
+    grid = load_sweep(path, curved.model_copy(update=given)).grid
+    np.testing.assert_allclose(np.rad2deg(grid.angle_rad([0, grid.vectors - 1])), [-3.0, 3.0])

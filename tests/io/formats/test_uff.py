@@ -1,5 +1,6 @@
 import pickle
 
+import h5py
 import numpy as np
 import pytest
 from format_examples import FIRST_MM, PITCH_MM, SPACING_MM, axes, carrying, iq, rf, write_uff
@@ -72,3 +73,23 @@ def test_a_modulation_frequency_that_the_phase_contradicts_is_refused(tmp_path, 
         load_sweep(path, RATE)
     given = RATE.model_copy(update={"demodulation_frequency_hz": right})
     assert load_sweep(path, given).signal.demodulation_frequency_hz == right
+
+
+def test_a_sector_scan_of_a_curved_array(tmp_path):
+    frames = rf()
+    path = write_uff(tmp_path / "a.uff", frames, scan="uff.sector_scan")
+    angle = np.linspace(-0.2, 0.3, frames.shape[1])
+    depth = 0.04 + 1e-3 * SPACING_MM * np.arange(frames.shape[2])
+    # The array's face is 38 mm from where the lines meet, and its middle at z = 0.
+    z = np.outer(np.cos(angle), depth).ravel() - 0.038
+    with h5py.File(path, "r+") as file:
+        scan = file["b_data/scan"]
+        for name, values in {"azimuth_axis": angle, "depth_axis": depth, "z": z}.items():
+            if name in scan:
+                del scan[name]
+            scan[name] = values[None]
+    sweep = load_sweep(path, RATE)
+    np.testing.assert_array_equal(read(sweep), frames)
+    assert sweep.grid.fan.radius_mm == pytest.approx(38.0, abs=1e-3)
+    assert sweep.grid.first_sample_depth_mm == pytest.approx(2.0, abs=1e-3)
+    np.testing.assert_allclose(sweep.grid.angle_rad([0, len(angle) - 1]), [-0.2, 0.3], atol=1e-6)

@@ -1,13 +1,15 @@
 """A device set gives what headers lack: pixels, the image on the probe, names of frames, pitch of lines."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from igsio_twin import Clip
 from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.region import Region
+from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep
@@ -99,8 +101,43 @@ def test_the_pitch_of_rf_lines_but_not_the_image_of_them(tmp_path):
     assert sweep.grid.vector_pitch_mm == pytest.approx(38.4 / 12)
     assert sweep.tracker.sensor_from_image is None  # of the B-mode image's pixels
     config = written(tmp_path / "set.xml", scan=scan.format("CURVILINEAR"))
-    with pytest.raises(InvalidInputError, match=r"rf\.mha: .*curvilinear.*parallel"):
+    with pytest.raises(MissingSettingsError) as caught:
         load_sweep(rf, given(config, sampling_rate_hz=40e6, **more))
+    assert set(caught.value.settings) == {"array_radius_mm", "line_angles_deg"}
+
+
+def test_lines_of_a_curved_transducer(tmp_path):
+    places = 'RadiusStartMm="50" RadiusStopMm="65" ThetaStartDeg="-10" ThetaStopDeg="5"'
+    scan = f'<ScanConversion TransducerGeometry="CURVILINEAR" {places}/>'
+    config = written(tmp_path / "set.xml", scan=scan)
+    rf = write_mha(tmp_path / "rf.mha", np.ones((2, 12, 301), np.int16), frames=tracked(2)[2])
+    sweep = load_sweep(rf, given(config, centre_frequency_hz=3e6, bandwidth_hz=(2e6, 3.8e6)))
+    assert sweep.grid.sample_spacing_mm == pytest.approx(15.0 / 300)
+    assert sweep.grid.fan.radius_mm == 50.0
+    np.testing.assert_allclose(np.rad2deg(sweep.grid.angle_rad([0, 11])), [-10, 5])
+
+
+def test_picture_of_curved_lines_is_that_of_plus(realdata):
+    """Other frames of the same scene, mirrored and of other grey levels: alike, and not 3 mm off."""
+    config = realdata / "plus" / "PlusDeviceSet_RfProcessingAlgoCurvilinearTest.xml"
+    made = given(str(config))
+    lines = load_sweep(realdata / "plus" / "UltrasonixCurvilinearBrightnessData.igs.mha", made)
+    picture = realdata / "plus" / "UltrasonixCurvilinearScanConvertedDataGroundTruth.igs.mha"
+    pixels = ImportSettings(
+        column_pitch_mm=0.15, row_spacing_mm=0.15, dynamic_range_db=60.0, frame_rate_hz=3.0
+    )
+    theirs = load_sweep(picture, pixels).frames[0].astype(float)
+
+    def alike(off_mm):
+        # The set has the middle of the array's face at pixel 410, 87.
+        apex = 410 * 0.15, 87 * 0.15 - 10.0 + off_mm
+        fan = replace(lines.grid, fan=replace(lines.grid.fan, apex_mm=apex))
+        ours = ScanConversion(fan, ImageGrid(*theirs.shape, 0.15, 0.15))(lines.frames[0][::-1])
+        inside = np.isfinite(ours)
+        return np.corrcoef(ours[inside], theirs[inside])[0, 1]
+
+    assert alike(0.0) > 0.8
+    assert alike(0.0) > max(alike(-3.0), alike(3.0)) + 0.1
 
 
 def test_the_clip_of_volumes_is_that_of_plus(tmp_path):
