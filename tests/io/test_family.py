@@ -62,7 +62,7 @@ WRONG = {
         (entry("orientation/gyroscope_rad_s", (3, 1), np.nan), "/gyroscope_rad_s"),
         (entry("tracker/world_from_sensor", 2, np.diag([1, 1, -1, 1])), r"/world_from_sensor\[2\]"),
         (attribute("rf", "sampling_rate_hz", "fast"), "/rf.*sampling_rate_hz"),
-        (attribute("/", "version", 3), "version"),
+        (attribute("/", "version", 4), "version"),
         (replaced("frame_time_s", h5py.ExternalLink("/etc/passwd", "/x")), "/frame_time_s"),
     ],
     "calibration": [

@@ -17,6 +17,7 @@ References
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -147,12 +148,13 @@ def _scan(group: h5py.Group, said: str) -> tuple[int, int, dict[str, Value]]:
     step_of(angle, f"{where}, azimuth_axis")
     # Depths are from where the lines meet, which is above the array's face if it is curved.
     above_mm = radius_mm[0] * np.cos(angle[0]) - 1e3 * flat(scan, "z")[0]
-    numbers = {
-        "array_radius_mm": max(0.0, round(float(above_mm), 6)),
+    array_mm = max(0.0, round(float(above_mm), 6))
+    numbers: dict[str, Any] = {
+        "array_radius_mm": array_mm,
         "line_angles_deg": tuple(np.rad2deg(angle[[0, -1]]).tolist()),
         "row_spacing_mm": step_of(radius_mm, f"{where}, depth_axis"),
+        "first_sample_depth_mm": float(radius_mm[0]) - array_mm,
     }
-    numbers["first_sample_depth_mm"] = float(radius_mm[0]) - numbers["array_radius_mm"]
     return angle.size, radius_mm.size, {name: Value(value, said) for name, value in numbers.items()}
 
 
