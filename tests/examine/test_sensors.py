@@ -2,8 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from faults import FAULTS_BY_NAME, ORIENTATION, TRACKER
-from rare_faults import RARE
+from faults import spoil
 
 from speckle3d.config import Config
 from speckle3d.core.errors import MismatchError
@@ -41,7 +40,11 @@ BESIDE_THE_IMAGES = {
     "tracker of another sweep": "",
 }
 """Faults that only the images contradict: both numbers are told."""
-EVERY = {fault.name: fault for fault in (*TRACKER, *ORIENTATION, *RARE)}
+REFUTED = (
+    *("tracker frozen", "tracker frozen from halfway", "tracker random", "orientation stored xyzw"),
+    *("orientation inverted", "orientation random", "orientation mirrored"),
+)
+"""Faults that leave nothing of a sensor to rely on."""
 
 
 def doubts_of(sweep, tracked):
@@ -61,17 +64,17 @@ def test_good_sensors_are_not_doubted(sweep, tracked):
 
 @pytest.mark.parametrize("name", AGAINST_THEMSELVES)
 def test_a_sensor_that_contradicts_itself_is_named(name, sweep, tracked):
-    fault = EVERY[name]
-    examined, _ = doubts_of(fault.into(sweep), tracked)
-    assert {doubt.about for doubt in examined.doubts} == {fault.about}
+    examined, _ = doubts_of(spoil(sweep, name), tracked)
+    about = "tracker" if name.startswith("tracker") else "orientation sensor"
+    assert {doubt.about for doubt in examined.doubts} == {about}
     assert any(AGAINST_THEMSELVES[name] in doubt.suspect for doubt in examined.doubts)
-    if fault.honest == "refuse" and "x of" not in name:
+    if name in REFUTED:
         assert any(doubt.refuted for doubt in examined.doubts)
 
 
 @pytest.mark.parametrize("name", BESIDE_THE_IMAGES)
 def test_images_and_a_sensor_that_differ_are_told_side_by_side_and_nobody_is_left_out(name, sweep, tracked):
-    bad = EVERY[name].into(sweep)
+    bad = spoil(sweep, name)
     examined, found = doubts_of(bad, tracked)
     assert examined.trusted.tracker is not None
     assert found
@@ -90,7 +93,7 @@ def test_lengths_of_modes_beyond_three_joint_claims_are_told_with_both_numbers()
 
 @pytest.mark.parametrize("name", ["orientation stored xyzw", "orientation inverted", "orientation random"])
 def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracked):
-    bad = FAULTS_BY_NAME[name].into(replace(sweep, tracker=None, truth=None))
+    bad = spoil(replace(sweep, tracker=None, truth=None), name)
     # Without what it measures beside its orientation, only the images are left to say so.
     bare = replace(bad, orientation=replace(bad.orientation, gyroscope_rad_s=None, accelerometer_m_s2=None))
     for recorded in (bad, bare):
@@ -100,7 +103,7 @@ def test_no_sign_is_taken_from_turns_that_nothing_confirms(name, sweep, tracked)
 
 
 def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tracked):
-    bad = FAULTS_BY_NAME["tracker frozen"].into(sweep)
+    bad = spoil(sweep, "tracker frozen")
     doubts = examined_sensors(bad, tracked.image).doubts
     with pytest.raises(MismatchError, match=r"pose.*tracker.*frozen"):
         correct(replace(tracked, doubts=doubts), bad, ["pose"])
@@ -109,7 +112,7 @@ def test_a_sensor_that_contradicts_itself_gives_no_mode_unless_told_to(sweep, tr
 
 
 def test_spikes_are_left_out_and_counted(sweep, tracked):
-    bad = FAULTS_BY_NAME["tracker spikes of 30 mm"].into(sweep)
+    bad = spoil(sweep, "tracker spikes of 30 mm")
     cleaned, (doubt,) = cleaned_readings(bad)
     places = [each.tracker.readings.world_from_sensor.translation for each in (bad, sweep)]
     spiked = np.linalg.norm(places[0] - places[1], axis=1) > 10.0
