@@ -42,13 +42,3 @@ def test_it_is_shown_judged_and_recorded_until_the_end(browser, sensor, tmp_path
     assert log.lost == 0
     assert log.oriented.all()
     assert scratch_folders() == before
-
-
-def test_without_a_name_its_bytes_are_not_kept(browser, sensor):
-    before = scratch_folders()
-    with viewing(sensor.path) as address:
-        page = opened(browser, address)
-        page.wait_for_selector("text=nowhere: named with --record they are kept")
-        assert len(scratch_folders() - before) == 1
-        page.close()
-    assert scratch_folders() == before

@@ -6,8 +6,7 @@ from field_scenes import simulated, with_readings
 from scipy.spatial.transform import Rotation
 
 from speckle3d.app.sensor.log import LogReadings
-from speckle3d.app.sensor.page import SensorPage, _Viewer
-from speckle3d.app.sensor.probe import figure_probe, turn_probe
+from speckle3d.app.sensor.page import SensorPage
 from speckle3d.app.sensor.source import thinned
 from speckle3d.app.sensor.watch import SensorWatch
 from xsens.fusion.field import Trust
@@ -65,19 +64,6 @@ def test_a_log_without_readings_shows_the_sensors_own_and_says_why_nothing_is_ju
     assert "expected gyroscope" in lone.judgement()[1]
 
 
-def test_a_step_moves_the_probe_and_the_cursor(motion, readings):
-    viewer = _Viewer(readings, None)
-    viewer.layout()
-    viewer._go(3.04)
-    assert (viewer.step, viewer._cursor.location) == (30, pytest.approx(3.0))
-    figure = figure_probe()
-    turn_probe(figure, readings.orientation_at(3.0))
-    np.testing.assert_allclose(viewer._probe.object.data[0].x, figure.data[0].x)
-    viewer._draw(2.0, 4.0)
-    shown = viewer._data.data["t"]
-    assert (shown[0], shown[-1]) == (pytest.approx(2.0, abs=0.02), pytest.approx(4.0, abs=0.02))
-
-
 def test_thinning_keeps_every_extreme():
     rng = np.random.default_rng(1)
     values = rng.normal(size=100_000)
@@ -87,14 +73,6 @@ def test_thinning_keeps_every_extreme():
     assert len(kept["x"]) <= 2100
     assert (np.nanmax(kept["x"]), np.nanmin(kept["x"])) == (50.0, -50.0)
     assert (np.diff(kept["t"]) > 0).all()
-
-
-def test_the_probe_points_where_it_is_held():
-    figure = figure_probe()
-    # Depth down: nothing is drawn below the far end of the image.
-    turn_probe(figure, Rotation.from_euler("x", -90.0, degrees=True))
-    lowest = [min(trace.z) for trace in figure.data[:4]]
-    assert lowest[2] == min(lowest) == pytest.approx(-0.95)
 
 
 def live(elapsed_s, heading_deg=0.0, started=True, stray=0.01, disturbed=False, **more):

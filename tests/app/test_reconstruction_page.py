@@ -105,17 +105,6 @@ def test_a_click_in_one_cut_moves_the_others_and_beside_the_tissue_nothing(viewe
     assert (viewer.frame, viewer.lateral_mm, viewer.depth_mm) == (20, 13.0, 6.0)
 
 
-def test_in_space_the_cuts_are_rectangles_where_the_cross_hair_is(viewer):
-    viewer.param.update(frame=10, lateral_mm=9.0, depth_mm=11.0)
-    cuts = viewer._space.object.data[-1]
-    along, frame, depth = np.column_stack([cuts.y, cuts.z, cuts.x]).reshape(3, 6, 3)
-    for corners, axis, place in ((along, 0, 9.0), (frame, 2, 4.0), (depth, 1, 11.0)):
-        np.testing.assert_allclose(corners[:5, axis], place, atol=1e-6)
-        assert (np.delete(np.ptp(corners[:5], axis=0), axis) > 8.0).all()
-        sides = np.linalg.norm(np.diff(corners[:5], axis=0), axis=1)
-        np.testing.assert_allclose(sides[:2], sides[2:])
-
-
 def test_points_are_measured_as_their_command_measures(viewer, page):
     for frame, lateral, depth in ((2, 3.0, 4.0), (18, 9.0, 15.0), (20, 2.0, 8.0)):
         viewer.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)

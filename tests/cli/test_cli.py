@@ -1,13 +1,11 @@
 """The command line from end to end, on a sweep of 24 small frames."""
 
 import json
-import re
 import subprocess
 import sys
 
 import pytest
 
-from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volumes import read_volume
 
 
@@ -28,16 +26,6 @@ def test_the_errors_against_truth_are_in_every_table(reconstructed):
     # a wrong sign, unit or axis still breaks.
     assert all(abs(row["length_error_percent"]) < 30 for row in rows.values())
     assert abs(rows["orientation"]["tilt_error_deg"]) < 1
-
-
-def test_settings_are_used_and_saved(run, bench, tmp_path):
-    (tmp_path / "c.toml").write_text("[trajectory]\nkey_frames = 2\n")
-    options = ("--config", tmp_path / "c.toml", "--drift", "orientation", "--drift-curves", "distance")
-    code, out, _ = run("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *options, "--json")
-    saved = read_reconstruction(tmp_path / "o" / "reconstruction.h5").config_toml
-    assert code == 0
-    assert "key_frames = 2" in saved
-    assert json.loads(out)["sweeps"][0]["details"]["corrections"]["orientation"]["curves"] == "distance"
 
 
 def test_without_a_sensor_the_sign_is_said_to_be_assumed(run, changed, tmp_path):
@@ -95,12 +83,6 @@ def test_help_is_no_error_and_needs_nothing_heavy(arguments):
     assert "Traceback" not in done.stderr
 
 
-def test_usage_errors_are_one_line(refused):
-    assert "--no-such" in refused("info", "x.h5", "--no-such")
-    assert "No such command" in refused("reconstuct")
-    assert "--preset" not in refused("simulate")
-
-
 def test_files_that_are_not_there_or_not_sweeps(refused, bench, tmp_path):
     out = tmp_path / "o"
     assert "none.h5" in refused("reconstruct", bench / "none.h5", "-o", out)
@@ -113,16 +95,3 @@ def test_files_that_are_not_there_or_not_sweeps(refused, bench, tmp_path):
     assert "half.h5" in refused("reconstruct", tmp_path / "half.h5", "--curves", curves, "-o", out)
     (tmp_path / "alone.h5").write_bytes(whole)
     assert "--curves" in refused("reconstruct", tmp_path / "alone.h5", "-o", out)
-
-
-def test_curves_of_another_probe(refused, changed, bench, tmp_path):
-    other = changed(lambda file: file.attrs.modify("vector_pitch_mm", 0.2), "curves.h5")
-    message = refused("reconstruct", bench / "sweep.h5", "--curves", other, "-o", tmp_path / "o")
-    assert re.search(r"vector_pitch_mm.*0\.2.*0\.3", message)
-
-
-def test_an_unknown_setting(refused, bench, tmp_path):
-    (tmp_path / "c.toml").write_text("[trajectory]\nkeyframes = 2\n")
-    config = ("--config", tmp_path / "c.toml")
-    message = refused("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *config)
-    assert "trajectory.keyframes" in message

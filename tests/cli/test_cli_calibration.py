@@ -1,24 +1,15 @@
 """Calibration files on the command line: told, put on sensors, written into sweeps."""
 
-import sys
-from contextlib import redirect_stderr, redirect_stdout
-from io import StringIO
-
-import h5py
 import numpy as np
 import pytest
 from calibration_files import made
 from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
 
-from speckle3d import cli
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.study.images import GreyImages
-
-FOUND = made().parameters
-MODES = ("--drift", "orientation", "--drift", "pose")
 
 
 def pixels_of(sweep):
@@ -57,47 +48,29 @@ def saved(tmp_path):
     return write
 
 
-@pytest.fixture(scope="session")
-def uncalibrated(bench):
+@pytest.fixture
+def uncalibrated(changed):
     """The small sweep without calibrations and with other clock offsets."""
 
-    def forget(path):
-        with h5py.File(path, "r+") as file:
-            del file["orientation"].attrs["sensor_from_image_wxyz"]
-            del file["tracker"].attrs["sensor_from_image"]
-            for name in ("orientation", "tracker"):
-                file[name].attrs["time_offset_s"] = 0.04
+    def forget(file):
+        del file["orientation"].attrs["sensor_from_image_wxyz"]
+        del file["tracker"].attrs["sensor_from_image"]
+        for name in ("orientation", "tracker"):
+            file[name].attrs["time_offset_s"] = 0.04
 
-    path = bench / "uncalibrated.h5"
-    path.write_bytes((bench / "sweep.h5").read_bytes())
-    forget(path)
-    return path
+    return changed(forget)
 
 
-@pytest.fixture(scope="session")
-def calibrated_run(bench, sweep, uncalibrated):
-    """A reconstruction whose calibrations all come from files; its folder and what was said on stderr."""
-    options = []
+def test_calibrations_from_files_do_what_those_in_the_sweep_do(
+    run, sweep, uncalibrated, saved, reconstructed, tmp_path
+):
+    options = ["--drift", "orientation", "--drift", "pose"]
     for sensor in ("tracker", "orientation"):
-        write_calibration(bench / f"{sensor}-cal.h5", of_sweep(sweep, sensor))
-        options += ["--calibration", bench / f"{sensor}-cal.h5"]
-    arguments = ("reconstruct", uncalibrated, "-o", bench / "calibrated", *MODES, *options)
-    with (
-        pytest.MonkeyPatch.context() as patch,
-        redirect_stdout(StringIO()),
-        redirect_stderr(StringIO()) as said,
-    ):
-        patch.setattr(sys, "argv", ["speckle3d", *map(str, arguments)])
-        with pytest.raises(SystemExit) as leave:
-            cli.main()
-    assert leave.value.code == 0, said.getvalue()
-    return bench / "calibrated", said.getvalue()
-
-
-def test_calibrations_from_files_do_what_those_in_the_sweep_do(calibrated_run, reconstructed):
+        options += ["--calibration", saved(of_sweep(sweep, sensor), f"{sensor}.h5")]
+    code, _, err = run("reconstruct", uncalibrated, "-o", tmp_path / "o", *options)
+    assert code == 0, err
     got, before = (
-        read_reconstruction(folder / "reconstruction.h5").poses
-        for folder in (calibrated_run[0], reconstructed)
+        read_reconstruction(folder / "reconstruction.h5").poses for folder in (tmp_path / "o", reconstructed)
     )
     assert set(got) == {"image", "orientation", "pose"}
     for mode, poses in before.items():
@@ -121,39 +94,26 @@ def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_
 
 
 def test_convert_puts_a_calibration_into_a_sweep(run, uncalibrated, saved, tmp_path):
-    sensor = "tracker"
-    path = saved(made(sensor))
+    path = saved(made())
     code, _, err = run("convert", uncalibrated, tmp_path / "out.h5", "--calibration", path)
     assert code == 0, err
     before, got = load_sweep(uncalibrated), load_sweep(tmp_path / "out.h5")
-    mounting = getattr(got, sensor).sensor_from_image
+    mounting = got.tracker.sensor_from_image
     assert (mounting.rotation.inv() * made().rotation).magnitude() < 1e-9
-    assert getattr(got, sensor).time_offset_s == -0.0125
+    assert got.tracker.time_offset_s == -0.0125
     assert got.orientation.sensor_from_image is None
     # RF says itself how far apart its samples are.
     assert got.grid == before.grid
 
 
-@pytest.fixture
-def sequence(tmp_path):
-    """B-mode images as PLUS writes them: poses of the probe, no pixel size."""
-    return write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2])
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ((), (0.137, 0.138)),
-        (("--column-pitch-mm", "0.2"), (0.2, 0.138)),
-    ],
-)
-def test_images_get_the_fitted_pixels_unless_given(run, sequence, saved, tmp_path, options, expected):
-    arguments = (sequence, tmp_path / "out.h5", "--dynamic-range-db", "60", *options)
-    code, _, err = run("convert", *arguments, "--calibration", saved(made()))
-    assert code == 0, err
-    got = load_sweep(tmp_path / "out.h5")
-    assert (got.grid.vector_pitch_mm, got.grid.sample_spacing_mm) == expected
-    np.testing.assert_allclose(
-        got.tracker.sensor_from_image.as_matrix(), made().sensor_from_image.as_matrix(), atol=1e-12
-    )
-    assert ("found pixels of" in err) == bool(options)
+def test_images_get_the_fitted_pixels_unless_given(run, saved, tmp_path):
+    sequence = write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2])
+    arguments = ("convert", sequence, tmp_path / "out.h5", "--dynamic-range-db", "60")
+    arguments = (*arguments, "--calibration", saved(made()))
+    for options, expected in (((), (0.137, 0.138)), (("--column-pitch-mm", "0.2"), (0.2, 0.138))):
+        code, _, err = run(*arguments, *options)
+        assert code == 0, err
+        got = load_sweep(tmp_path / "out.h5")
+        assert (got.grid.vector_pitch_mm, got.grid.sample_spacing_mm) == expected
+        mounting, own = got.tracker.sensor_from_image, made().sensor_from_image
+        np.testing.assert_allclose(mounting.as_matrix(), own.as_matrix(), atol=1e-12)

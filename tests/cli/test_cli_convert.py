@@ -5,11 +5,9 @@ import re
 
 import numpy as np
 import pytest
-import sweep_examples
 from image_examples import grey, tracked, write_mha
 
 from speckle3d.io.load import load_sweep
-from speckle3d.io.sweep_writer import write_sweep
 
 PIXELS = ("--column-pitch-mm", "0.1", "--row-spacing-mm", "0.2", "--dynamic-range-db", "60")
 
@@ -59,15 +57,6 @@ def test_options_reach_the_sweep(done, tmp_path):
     np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
     expected = tracked(3)[0].as_matrix()
     np.testing.assert_allclose(sweep.tracker.readings.world_from_sensor.as_matrix(), expected, atol=1e-3)
-
-
-def test_a_sweep_file_has_settings_of_its_own(refused, tmp_path):
-    write_sweep(tmp_path / "a.h5", sweep_examples.bmode_sweep())
-    names = tmp_path / "a.h5", tmp_path / "b.mha"
-    line = refused("convert", *names, "--row-spacing-mm", "0.2", "--probe", "x")
-    assert "--probe, --row-spacing-mm: expected none with" in line
-    for option in ("--transform", "--reference-transform", "--plus-config"):
-        assert f"{option}: expected an image sequence" in refused("convert", *names, option, "x")
 
 
 CONFIG = "PlusDeviceSet_"

@@ -25,14 +25,3 @@ def test_a_data_sheet_makes_curves(run, sheet, tmp_path):
     assert (found.origin, found.key.vector_pitch_mm, found.nominal.focus_mm) == ("data sheet", 0.3, 20.0)
     assert shown.startswith("calculated, not measured; correlation falls to one half at")
     assert f"+- {196 * found.scale_sigma:.1f} % (95 %)" in shown
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        (SHEET, "probe.toml: vector_pitch_mm: expected in the probe's settings, or a sweep, got none"),
-        (LENS + "band_mhz = [10.0, 5.0]", "probe.toml: band_mhz"),
-    ],
-)
-def test_a_faulty_sheet_is_named_with_its_setting(refused, sheet, tmp_path, text, told):
-    assert told in refused("calibrate", "curves", "--probe", sheet(text), "-o", tmp_path / "c.h5")

@@ -62,14 +62,6 @@ def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_pa
     assert np.rad2deg(error.max()) < 2.0
 
 
-def test_a_stream_that_is_there_is_not_replaced_unasked(run, refused, log_file, tmp_path):
-    sweep_file = tmp_path / "sweep.h5"
-    write_sweep(sweep_file, sweep_examples.rf_sweep())
-    assert run("imu", "orient", log_file, "--into", sweep_file, "--replace")[0] == 0
-    assert "--replace" in refused("imu", "orient", log_file, "--into", sweep_file)
-    assert "--into" in refused("imu", "orient", log_file)
-
-
 def test_accuracy_beside_an_optical_tracker(run, tmp_path):
     """A target turned on the sensor, in a world of its own, on a clock 2 s ahead, as TUM text."""
     time_s = np.arange(0.0, 20.0, 1.0 / RATE_HZ)

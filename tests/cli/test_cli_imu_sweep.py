@@ -26,11 +26,3 @@ def test_a_sweeps_own_sensor_is_oriented_anew(run, shipped, tmp_path):
         for name, value in attributes.items():
             np.testing.assert_array_equal(file["orientation"].attrs[name], value)
     assert not np.array_equal(found, held["quaternion_wxyz"])
-
-
-def test_a_sweep_without_a_sensor_says_so(refused, shipped, tmp_path):
-    path = tmp_path / "a.h5"
-    shutil.copy(shipped / "phantom.h5", path)
-    with h5py.File(path, "r+") as file:
-        del file["orientation"]
-    assert "expected an orientation sensor's stream" in refused("imu", "info", path)

@@ -28,8 +28,6 @@ def calls(bench, reconstructed, log):
         "convert": lambda out: ("convert", bench / "sweep.h5", out),
         "volume": lambda out: ("volume", made, "-o", out, "--voxel-mm", 1),
         "reslice": lambda out: ("reslice", made, "-o", out),
-        "export": lambda out: ("trajectory", "export", made, "-o", out),
-        "curves": lambda out: ("calibrate", "curves", bench / "stepped.h5", "-o", out),
         "imu convert": lambda out: ("imu", "convert", log, out),
         "imu orient": lambda out: ("imu", "orient", log, "-o", out),
     }
@@ -40,8 +38,6 @@ OUT = {
     "convert": "c.h5",
     "volume": "v.nrrd",
     "reslice": "r.png",
-    "export": "t.tum",
-    "curves": "k.h5",
     "imu convert": "l.csv",
     "imu orient": "o.csv",
 }
@@ -55,15 +51,7 @@ def test_a_file_of_another_kind_stays_as_it_is(refused, calls, tmp_path, name):
     assert place.read_text(encoding="utf-8") == "precious, 1, 2\n"
 
 
-def test_two_outputs_are_two_files(refused, reconstructed, tmp_path):
-    place = tmp_path / "v.nrrd"
-    command = ("volume", reconstructed / "reconstruction.h5", "-o", place, "--voxel-mm", 1)
-    told = refused(*command, "--state", tmp_path / "s.nrrd", "--deviation", tmp_path / "." / "v.nrrd")
-    assert "v.nrrd: expected a file for each" in told
-    assert not place.exists()
-
-
-@pytest.mark.parametrize("name", ["convert", "imu convert", "volume"])
+@pytest.mark.parametrize("name", ["convert", "imu convert"])
 def test_an_input_stays_as_it_is(refused, calls, name):
     arguments = calls[name]("there")
     given = next(path for path in arguments[1:] if hasattr(path, "read_bytes"))
@@ -72,7 +60,7 @@ def test_an_input_stays_as_it_is(refused, calls, name):
     assert given.read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["convert", "volume", "reslice", "export", "imu orient"])
+@pytest.mark.parametrize("name", ["convert", "volume", "imu orient"])
 def test_what_the_command_wrote_before_is_replaced(run, calls, tmp_path, name):
     place = tmp_path / OUT[name]
     for _ in range(2):
@@ -89,11 +77,3 @@ def test_a_recorded_sweep_is_not_replaced_by_a_simulated_one(refused, bench, cal
     assert "recorded.h5" in refused(*calls["simulate"](recorded))
     with h5py.File(recorded) as file:
         np.testing.assert_array_equal(file["rf"], before)
-
-
-def test_a_sequence_of_frames_is_no_volume_to_replace(refused, calls, tmp_path):
-    sequence = tmp_path / "sequence.mha"
-    sequence.write_bytes(
-        b"ObjectType = Image\nNDims = 3\nSeq_Frame0000_Timestamp = 1\nElementDataFile = LOCAL\n"
-    )
-    assert "sequence.mha" in refused(*calls["volume"](sequence))

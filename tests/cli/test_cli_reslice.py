@@ -84,21 +84,3 @@ def test_a_volume_is_cut_in_the_world_of_its_own_poses(run, refused, reconstruct
     assert read_plane(tmp_path / "c.png").mode == "orientation"
     told = refused("reslice", path, "-o", tmp_path / "d.png", "--volume", made, "--mode", "image")
     assert "--mode: expected orientation, at whose poses" in told
-
-
-def test_places_that_are_none_are_refused_in_one_line(refused, bench, curve, tmp_path):
-    sweep, out = bench / "sweep.h5", tmp_path / "r.png"
-
-    def told(*options, source=sweep, to=out):
-        return refused("reslice", source, "-o", to, *options)
-
-    assert "--depth-mm" in told("--lateral-mm", "2", "--depth-mm", "3")
-    assert "between (" in told("--points", "500,0,0 500,1,0 500,0,1")
-    assert "0 to 23, got 24" in told("--frame", "24")
-    assert "--right" in told("--origin", "0", "0", "0")
-    assert "curved" in told("--curve", curve, to=tmp_path / "r.nrrd")
-    write_volume(
-        tmp_path / "v.nrrd", Volume(np.zeros((3, 4, 5), np.uint8), (1, 1, 1), load_sweep(sweep).truth[0])
-    )
-    assert "--mode" in told("--mode", "image", source=tmp_path / "v.nrrd")
-    assert not out.exists()

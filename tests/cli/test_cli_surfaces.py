@@ -84,17 +84,6 @@ def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
     assert told["measurements"][0]["by_poses"] == pytest.approx(0.05 * 6.0, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--point", "5,5,1", "--point", "5,5,30"), "point 2 (5, 5, 30)"),
-        (("--point", "5,5,1", "--point", "5,5,2", "--mode", "pose"), "--mode"),
-    ],
-)
-def test_what_cannot_be_measured_is_said_in_a_line(refused, rec, arguments, words):
-    assert words in refused("measure", rec, *arguments)
-
-
 def test_a_ball_has_its_volume_and_what_the_scale_does_to_it(run, ball, rec, tmp_path):
     out = tmp_path / "ball.ply"
     code, text, err = run("surface", ball, "-o", out, "--level", "128", "--reconstruction", rec, "--json")
@@ -109,15 +98,3 @@ def test_a_ball_has_its_volume_and_what_the_scale_does_to_it(run, ball, rec, tmp
     code, text, err = run("surface", ball, "-o", out, "--level", "128", "--smooth", "5", "--largest")
     assert "smoothing changed the volume by" in text
     assert "1 part" in text
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("-o", "a.stl"), "--level or --labels"),
-        (("-o", "a.stl", "--labels", "--below"), "--below: expected --level"),
-    ],
-)
-def test_what_has_no_surface_is_said_in_a_line(refused, ball, tmp_path, monkeypatch, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    assert words in refused("surface", ball, *arguments)

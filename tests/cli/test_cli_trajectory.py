@@ -2,10 +2,9 @@ import json
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.tum import read_tum, write_tum
+from speckle3d.io.tum import read_tum
 
 
 def test_what_is_exported_is_read_back(run, reconstructed, tmp_path):
@@ -33,22 +32,3 @@ def test_a_reconstruction_is_scored_as_its_exported_text_is(run, bench, reconstr
     assert found[0]["APE"] == pytest.approx(found[1]["APE"], abs=1e-9)
     assert found[0]["reference"] == "sweep.h5, truth"
     assert (found[0]["poses"], found[0]["GLE_mm"]) == (24, None)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("export", "RECONSTRUCTION", "-o", "OUT", "--mode", "sideways"), "--mode"),
-        (("score", "TEXT", "TEXT", "--reference", "truth"), "--reference truth"),
-        (("score", "RECONSTRUCTION", "SWEEP", "--length-unit", "mm"), "--length-unit mm"),
-    ],
-)
-def test_a_wrong_option_is_one_line(refused, bench, reconstructed, tmp_path, arguments, message):
-    places = {
-        "RECONSTRUCTION": reconstructed / "reconstruction.h5",
-        "SWEEP": bench / "sweep.h5",
-        "OUT": tmp_path / "out.tum",
-        "TEXT": tmp_path / "text.tum",
-    }
-    write_tum(places["TEXT"], [0.0, 1.0], RigidTransform.identity(2))
-    assert message in refused("trajectory", *(places.get(each, each) for each in arguments))

@@ -55,15 +55,14 @@ def coherence_of_cells(rho, count, draws=8000):
     return cross / ((np.abs(a) ** 2).sum(axis=1) * (np.abs(b) ** 2).sum(axis=1))
 
 
-@pytest.mark.parametrize("count", [25, 80])
-@pytest.mark.parametrize("rho", [0.0, 0.05, 0.2, 0.5, 0.8, 0.95])
+@pytest.mark.parametrize(("rho", "count"), [(0.0, 25), (0.2, 80), (0.8, 25)])
 def test_variance_of_the_echos_correlation_over_independent_cells(rho, count):
     """8000 draws know a variance to 3 %; terms of second order in 1 / N, kept at rho = 0 alone, make 17 %."""
     claimed = correlation_variance(rho, count, True)
     assert coherence_of_cells(rho, count).var() == pytest.approx(claimed, rel=0.2 if count < 50 else 0.1)
 
 
-@pytest.mark.parametrize("rho", [0.0, *REACH, 0.95])
+@pytest.mark.parametrize("rho", [0.0, 0.4, 0.9])
 def test_variance_of_the_echos_correlation_over_speckle(rho):
     """With cells from the field's own autocorrelation, nothing fitted: 10 % of the deviation."""
     claimed = np.sqrt(correlation_variance(rho, cells(2), True))
@@ -89,18 +88,3 @@ def test_variance_of_intensitys_correlation_follows_its_law_with_cells_calibrate
     np.testing.assert_allclose(np.sqrt(seen), np.sqrt(shape / calibrated), rtol=0.17)
     # Fewer than are there: what exponential tails cost.
     assert 0.3 * cells(4) < calibrated < 0.7 * cells(4)
-
-
-@pytest.mark.parametrize("rho", REACH)
-def test_the_echos_correlation_varies_much_less_than_intensitys(rho):
-    echo, intensity = sampled(rho).reshape(2, -1).std(axis=1)
-    assert intensity > 1.3 * echo
-
-
-@pytest.mark.parametrize("of_echo", [True, False])
-def test_arrays_and_numbers_are_treated_alike(of_echo):
-    rho, count = np.linspace(0, 1, 11), np.linspace(20, 70, 11)
-    one_by_one = [correlation_variance(r, n, of_echo) for r, n in zip(rho, count, strict=True)]
-    np.testing.assert_allclose(correlation_variance(rho, count, of_echo), one_by_one, rtol=1e-14)
-    assert one_by_one[-1] == 0
-    assert (np.diff(one_by_one[5:]) < 0).all()

@@ -8,18 +8,13 @@ from igtl_examples import decoded
 from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.igtl.messages import ImageReceived, TransformReceived
-from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
-from speckle3d.live.checks import GOOD, LOST, TOO_FAST
+from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
-from speckle3d.live.progress import Devices
 from speckle3d.live.session import MOST_BEFORE, MOST_WAITING, Session, SessionSettings
-from speckle3d.live.tracking import LivePose
 from speckle3d.live.volume import MOST_IMAGES, GrowingVolume
-from speckle3d.matching.quality import FrameFlag
 
 RF = ImportSettings(
     sampling_rate_hz=2e8 / 3,
@@ -139,30 +134,6 @@ def test_words_and_a_volume_go_out(recorded, tmp_path, monkeypatch):
     assert volumes[-1].pixels.max() > 100
 
 
-def test_the_first_image_says_what_is_missing():
-    grey = ImageReceived("Image", 0.0, np.zeros((64, 48), np.uint8), np.eye(4), np.ones(3))
-    with pytest.raises(MissingSettingsError, match="dynamic-range-db"):
-        ImageLayout.of(grey, ImportSettings(), "sweep")
-    with pytest.raises(InvalidInputError):
-        ImageLayout.of(grey, RF, "sweep")
-    echoes = ImageReceived("Image", 0.0, np.zeros((64, 48), np.int16), np.eye(4), np.ones(3))
-    with pytest.raises(MissingSettingsError, match="--bandwidth-hz"):
-        ImageLayout.of(echoes, ImportSettings(speed_of_sound_m_s=1540.0), "sweep")
-
-
-def test_devices_that_never_come_are_named_beside_those_that_do():
-    devices = Devices("Image", "ProbeToReference", None)
-    assert devices.missing == "no IMAGE Image yet; no TRANSFORM ProbeToReference yet"
-    echoes = ImageReceived("Image", 0.0, np.zeros((4, 4), np.int16), np.eye(4), np.ones(3))
-    for k in range(1000):
-        devices.hear(reading(0.0, f"Stylus{k % 2}To{k}"))
-    devices.hear(echoes)
-    assert devices.missing.startswith("no TRANSFORM ProbeToReference, but Stylus0To0, ")
-    assert len(devices.missing) < 2000
-    devices.hear(reading(0.0))
-    assert devices.missing == ""
-
-
 def test_a_flood_before_and_behind_the_first_frame_costs_no_frame(recorded, tmp_path):
     frames, curves = recorded
     other = ImageReceived("Camera", 0.0, np.zeros((9, 9, 3), np.uint8), np.eye(4), np.ones(3), 3)
@@ -196,20 +167,6 @@ def test_when_placing_fails_recording_goes_on(recorded, tmp_path, monkeypatch):
     assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 14
 
 
-def test_a_gap_that_frames_left_for_later_make_is_not_called_too_fast(monkeypatch, tmp_path):
-    session = Session(None, [], None, SessionSettings(tmp_path / "sweep.h5", check=True))
-    said = []
-    monkeypatch.setattr("speckle3d.live.session.Words.take", lambda _, words, __: said.append(words))
-    unlike, lost, like = (
-        LivePose(1, 0.0, RigidTransform.identity(), flags, median, median)
-        for flags, median in ((0, 0.05), (int(FrameFlag.UNMATCHED), 0.01), (0, 0.9))
-    )
-    for pose in (unlike, lost, like):
-        for after_gap in (False, True):
-            session._advise(pose, 0.0, after_gap)
-    assert said == [TOO_FAST, LOST, GOOD, GOOD]
-
-
 def test_what_waits_at_the_end_is_recorded(recorded, tmp_path):
     frames, curves = recorded
 
@@ -231,12 +188,6 @@ def test_what_waits_at_the_end_is_recorded(recorded, tmp_path):
     messages.session.run()
     assert messages.session.progress.recorded == 15
     assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 15
-
-
-def test_grey_images_stand_upright_and_say_their_pixels():
-    grey = ImageReceived("Image", 0.0, np.zeros((64, 48), np.uint8), np.eye(4), np.array([0.2, 0.1, 1.0]))
-    grid = ImageLayout.of(grey, ImportSettings(dynamic_range_db=60.0), "sweep").example.grid
-    assert (grid.vectors, grid.samples, grid.vector_pitch_mm, grid.sample_spacing_mm) == (64, 48, 0.2, 0.1)
 
 
 def test_a_pose_takes_pixels_to_slicers_axes(recorded):

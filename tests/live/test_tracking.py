@@ -67,17 +67,6 @@ def test_learning_from_the_latest_frames_alone_keeps_the_place(shipped, monkeypa
     assert apart_mm(sweep, tracker.poses, track(sweep, curves).image).max() < 0.1
 
 
-@pytest.mark.slow
-def test_a_thread_of_its_own_revises_and_ends(shipped):
-    sweep, curves = shipped_part(shipped)
-    with LiveTracker(sweep, curves) as tracker:
-        for k in range(12):
-            tracker.append(sweep.frames[k], float(k))
-        tracker.revise()
-        assert len(tracker) == len(tracker.poses) == 12
-    assert not tracker._thread.is_alive()
-
-
 def test_a_frame_of_noise_is_flagged_and_the_sweep_goes_on(shipped):
     sweep, curves = shipped_part(shipped)
     tracker = LiveTracker(sweep, curves, background=False)
@@ -88,15 +77,6 @@ def test_a_frame_of_noise_is_flagged_and_the_sweep_goes_on(shipped):
     assert not any(each.flags for each in told[13:])
     whole = track(sweep.part(0, 20), curves).image
     assert apart_mm(sweep, tracker.poses, whole)[[11, 14, 19]].max() < 0.1
-
-
-def test_nothing_but_noise_stays_finite(shipped):
-    sweep, curves = shipped_part(shipped)
-    tracker, rng = LiveTracker(sweep, curves, background=False), np.random.default_rng(0)
-    for k in range(7):
-        noise = rng.integers(-900, 900, sweep.frames.shape[1:]).astype(np.int16)
-        pose = tracker.append(noise, float(k))
-    assert np.isfinite(pose.world_from_image.as_matrix()).all()
 
 
 def test_curves_of_another_probe_are_refused_before_any_frame(shipped):

@@ -8,16 +8,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from report_examples import HOSTILE, MODES, REASON
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.sweep import ImageGrid
-from speckle3d.report.data import StudyData, load_view, read_study
-from speckle3d.report.figures import draw_overview, plot_curves, plot_outlines, plot_rejected
+from speckle3d.report.data import load_view, read_study
+from speckle3d.report.figures import plot_curves, plot_rejected
 from speckle3d.report.page import write_report
-from speckle3d.report.tables import summary_lines
 from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import label_of
 
@@ -126,28 +123,6 @@ def test_a_sweep_whose_file_is_gone_or_changed_is_shown_without_its_reference(pa
         load_view(report_study, entry | {"folder": "../elsewhere"})
 
 
-def test_the_lead_says_what_the_sweeps_tell():
-    def lead(**contents):
-        done = {"name": "a", "status": "done", "path": "a.h5"}
-        return summary_lines(StudyData.model_validate(study_of([done], **contents)))
-
-    assert len(lead()) == 1
-    _, reference = lead(rows=[row("a", "image", 1.0)])
-    assert reference == "Reference: truth."
-    mean = {
-        "quantity": "length_error_percent",
-        "mode": "pose",
-        "sweeps": 8,
-        "mean": 2.0,
-        "low": 1.0,
-        "high": 3.0,
-    }
-    pair = {"quantity": "FDR_percent", "mode": "image", "against": "pose", "better": "pose"}
-    length, apart, *_ = lead(rows=[row("a", "image", 1.0)], intervals=[mean], paired=[pair])
-    assert "pose 2.0 [1.0, 3.0] (8 sweeps)" in length
-    assert apart == "Less FDR: pose than image."
-
-
 @pytest.mark.parametrize("content", [None, "{", '{"format": "speckle3d.study", "version": 1}'])
 def test_what_is_no_study_is_refused(tmp_path, content):
     if content is not None:
@@ -188,22 +163,3 @@ def test_differences_from_the_reference_are_a_button_away():
     np.testing.assert_allclose(image.y, 0.1 * ramp[0], atol=1e-6)
     low, high = [t for t in shown if t.line.width == 0]
     np.testing.assert_allclose(np.subtract(high.y, low.y), 1.0, atol=1e-6)
-
-
-def test_the_overview_has_a_point_for_every_part_and_a_bar_at_the_mean():
-    rows = [row("a", "image", 1.0), row("a", "image", -3.0), row("b", "image", 8.0), row("a", "pose", 2.0)]
-    length, _ = draw_overview(rows, ["image", "pose"], "").axes
-    _, bar, points, *_ = length.lines
-    np.testing.assert_array_equal(bar.get_xydata(), [[-4.0, 0.0], [4.0, 0.0]])
-    assert points.get_xdata().tolist() == [1.0, -3.0, 8.0]
-    assert [label.get_text() for label in length.get_yticklabels()] == ["image", "pose"]
-
-
-def test_outlines_are_closed_and_apart():
-    poses = RigidTransform.from_translation([[0.0, 0, 7], [0, 0, 8], [0, 0, 9]])
-    truth, image = plot_outlines({"image": poses, "truth": poses}, ImageGrid(11, 21, 1.0, 1.0, 2.0)).data
-    assert (truth.name, image.name) == ("truth", "image")
-    # The first frames are laid on each other; the elevational axis comes first, and depth points down.
-    assert np.isnan(image.x[5::6]).all()
-    np.testing.assert_array_equal(image.x[12:16], 2.0)
-    assert (image.y[2], image.z[2]) == (10.0, 22.0)
