@@ -77,9 +77,9 @@ def viewing(*arguments):
         assert not [line for line in said if "Traceback" in line], "".join(said)
 
 
-def opened(browser, address, width=1366, height=768):
+def opened(browser, address):
     """A page with what it complained of and asked for in `complaints` and `requests`."""
-    page = browser.new_page(viewport={"width": width, "height": height})
+    page = browser.new_page(viewport={"width": 1366, "height": 768})
     # Where no kernel has been compiled yet, that comes first.
     page.set_default_timeout(120_000)
     page.complaints, page.requests = [], []

@@ -58,15 +58,11 @@ def scan_plane(
     yaw_deg: float = 90.0,
     depth_mm: tuple[float, float] = (12.0, 34.0),
     beam_mm: float = 0.0,
-    noisy: bool = False,
     line_noise_mm: float = 0.0,
     sensor_from_image: RigidTransform = TRIAL_1,
     floor: RigidTransform | None = None,
 ) -> PlaneScan:
-    """The recipe that reproduces TR 303's Tables 3 and 6: uniform angles and depths, its noise column.
-
-    The published amplitudes of the noise, 0.8 mm, 0.15 degrees and 0.9 mm, are peak to peak.
-    """
+    """The recipe that reproduces TR 303's Tables 3 and 6: uniform angles and depths."""
     turn = hand_turns(rng, count, tilt_deg, roll_deg, yaw_deg)
     up = turn.inv().apply([0.0, 0.0, 1.0])
     height = rng.uniform(*depth_mm, count) * np.abs(up[:, 1])
@@ -78,12 +74,6 @@ def scan_plane(
     depth = -(height[:, None] + up[:, :1] * ends * PIXEL_MM[0]) / up[:, 1:2]
     depth -= beam_mm / 2 * np.abs(up[:, 2:] / up[:, 1:2])
     readings = world_from_image * sensor_from_image.inv()
-    if noisy:
-        depth += rng.uniform(-0.45, 0.45, (count, 2))
-        shift, angles = readings.as_components()
-        shift = shift + rng.uniform(-0.4, 0.4, (count, 3))
-        angles = angles * Rotation.from_euler("xyz", np.deg2rad(rng.uniform(-0.075, 0.075, (count, 3))))
-        readings = RigidTransform.from_components(shift, angles)
     depth += line_noise_mm * rng.standard_normal((count, 2))
     points = np.stack([np.broadcast_to(ends, depth.shape), depth / PIXEL_MM[1]], axis=-1)
     return PlaneScan(ImagePoints.of_lines(np.arange(count), points, readings), world_from_image, up)
@@ -96,7 +86,6 @@ def line_directions(
     noise_deg: float = 0.1,
     sensor_noise_deg: float = 0.1,
     heading_deg: float = 0.0,
-    slope: Rotation | None = None,
     from_below: bool = False,
     mounting: Rotation | None = None,
     **turns: float,
@@ -106,8 +95,7 @@ def line_directions(
     turn = hand_turns(rng, count, **({"yaw_deg": 30.0} | turns))
     if from_below:
         turn = Rotation.from_euler("x", np.pi) * turn
-    floor = Rotation.identity() if slope is None else slope
-    normal = turn.inv().apply(floor.apply([0.0, 0.0, 1.0]))
+    normal = turn.inv().apply([0.0, 0.0, 1.0])
     along = np.column_stack([-normal[:, 1], normal[:, 0]])
     along *= np.sign(along[:, :1]) / np.linalg.norm(along, axis=1, keepdims=True)
     angle = np.arctan2(along[:, 1], along[:, 0]) + np.deg2rad(noise_deg) * rng.standard_normal(count)
@@ -120,12 +108,8 @@ def scan_wires(
     rng: np.random.Generator,
     places_mm: np.ndarray,
     *,
-    sensor_from_image: RigidTransform = TRIAL_1,
     world_from_phantom: RigidTransform | None = None,
     noise_mm: float = 0.0,
-    tilt_deg: float = 35.0,
-    roll_deg: float = 35.0,
-    yaw_deg: float = 90.0,
 ) -> tuple[np.ndarray, RigidTransform]:
     """Pixels at which images show points of a phantom, one to a frame, and the sensor's readings.
 
@@ -136,12 +120,12 @@ def scan_wires(
     """
     count = len(places_mm)
     seen = rng.uniform([2.0, 5.0], [38.0, 38.0], (count, 2))
-    turn = hand_turns(rng, count, tilt_deg, roll_deg, yaw_deg)
+    turn = hand_turns(rng, count, 35.0, 35.0)
     where = RigidTransform.identity() if world_from_phantom is None else world_from_phantom
     flat = np.column_stack([seen, np.zeros(count)])
     world_from_image = RigidTransform.from_components(where.apply(places_mm) - turn.apply(flat), turn)
     pixels = (seen + noise_mm * rng.standard_normal((count, 2))) / PIXEL_MM
-    return pixels, world_from_image * sensor_from_image.inv()
+    return pixels, world_from_image * TRIAL_1.inv()
 
 
 def centre_of(sensor_from_image: RigidTransform, pixel_mm: np.ndarray) -> np.ndarray:

@@ -29,9 +29,9 @@ BLOCK_BYTES = 256 * 1024
 G = 9.80665
 
 
-def sweep_of(kind, frames=4, vectors=5, samples=40):
+def sweep_of(kind, frames=4, samples=40):
     """A sweep of noise, its sensor in bursts: "rf", "iq" or "env"; `GIVEN` is what its package lacks."""
-    made = rf_sweep(frames, vectors, samples)
+    made = rf_sweep(frames, 5, samples)
     times = bursts_s(9.9, 10.4)
     sensor = sensor_of(swayed(times), times)
     # At 11 frames/s and every third frame left out, as RF is interleaved.
@@ -45,14 +45,13 @@ def sweep_of(kind, frames=4, vectors=5, samples=40):
         return replace(made, frames=data, signal=BModeSettings(60.0))
     pairs = rng.integers(-3000, 3000, (*made.frames.shape, 2)).astype(np.float32)
     signal = RFSettings(15e6, 1540.0, 6e6, (4e6, 8e6), 6e6)
-    grid = ImageGrid(vectors, samples, 0.3, signal.sample_spacing_mm, 2.0)
+    grid = ImageGrid(5, samples, 0.3, signal.sample_spacing_mm, 2.0)
     return replace(made, frames=pairs.view(np.complex64)[..., 0], signal=signal, grid=grid)
 
 
-def write_package(target, sweep, *, packed=False, sensor=True, name=NAME, others=(), **fields):
-    """Write a folder, or a tar file where the target's name says so; `others` are further files by name."""
-    files = package_files(sweep, packed=packed, sensor=sensor, name=name, **fields) | dict(others)
-    return write_files(target, files)
+def write_package(target, sweep, **fields):
+    """Write a folder, or a tar file where the target's name says so."""
+    return write_files(target, package_files(sweep, **fields))
 
 
 def write_files(target, files):
@@ -70,19 +69,25 @@ def write_files(target, files):
 
 
 def package_files(
-    sweep, *, packed=False, sensor=True, name=NAME, tgc=None, stamps=None, imu_text=None,
-    element_mm=ELEMENT_MM, kind=None, yml_kind=None, delay=None, yml=None,
-):  # fmt: skip
-    """Content of a package's files by name; `tgc` has a curve for each frame, None for an empty file."""
+    sweep,
+    *,
+    packed=False,
+    name=NAME,
+    imu_text=None,
+    element_mm=ELEMENT_MM,
+    kind=None,
+    yml_kind=None,
+    yml=None,
+):
+    """Content of a package's files by name."""
     kind = kind or kind_of(sweep)
-    times = frame_times_ns(sweep) if stamps is None else stamps
-    raw = raw_bytes(sweep, times)
+    raw = raw_bytes(sweep)
     files = {
         f"{name}_{kind}.raw{'.lzo' if packed else ''}": lzop_bytes(raw) if packed else raw,
-        f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm, yml_kind or kind, delay)).encode(),
-        f"{name}_{kind}.tgc": tgc_text(times, tgc).encode(),
+        f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm, yml_kind or kind)).encode(),
+        f"{name}_{kind}.tgc": tgc_text(frame_times_ns(sweep)).encode(),
     }
-    if sensor and sweep.orientation is not None:
+    if sweep.orientation is not None:
         files[f"{name}_imu.yml"] = (imu_text or sensor_text(sweep.orientation)).encode()
     return files
 
@@ -97,11 +102,11 @@ def frame_times_ns(sweep):
     return np.round(sweep.frame_time_s * 1e9).astype(np.int64)
 
 
-def raw_bytes(sweep, times_ns):
+def raw_bytes(sweep):
     n, lines, samples = sweep.frames.shape
     frames = [sweep.frames[i] for i in range(n)]
     parts = [struct.pack("<5I", 1, n, lines, samples, sample_bytes(sweep))]
-    for time_ns, frame in zip(times_ns, frames, strict=True):
+    for time_ns, frame in zip(frame_times_ns(sweep), frames, strict=True):
         if np.iscomplexobj(frame):
             frame = np.stack([frame.real, frame.imag], axis=-1)
         stored = np.uint8 if kind_of(sweep) == "env" else "<i2"
@@ -113,13 +118,12 @@ def sample_bytes(sweep):
     return {"rf": 2, "iq": 4, "env": 1}[kind_of(sweep)]
 
 
-def yml_text(sweep, element_mm=ELEMENT_MM, kind=None, delay=None):
+def yml_text(sweep, element_mm=ELEMENT_MM, kind=None):
     """The description; the delay has the microsecond that passes before depth 0."""
     n, lines, samples = sweep.frames.shape
     grid, signal = sweep.grid, sweep.signal
     rate_hz = getattr(signal, "sampling_rate_hz", 1540e3 / (2 * grid.sample_spacing_mm))
-    if delay is None:
-        delay = rate_hz * (grid.first_sample_depth_mm * 2e-3 / 1540.0 + 1e-6)
+    delay = rate_hz * (grid.first_sample_depth_mm * 2e-3 / 1540.0 + 1e-6)
     step = grid.vector_pitch_mm / element_mm
     centre_mhz = getattr(signal, "centre_frequency_hz", 10e6) / 1e6
     lists = "".join(
@@ -144,19 +148,16 @@ def yml_text(sweep, element_mm=ELEMENT_MM, kind=None, delay=None):
     )
 
 
-def tgc_text(times_ns, curves=None):
-    rows = [
-        f"timestamp: {t} " + "".join(f"{{ {d:.2f}mm, {g:.2f}dB }}" for d, g in (curves[i] if curves else ()))
-        for i, t in enumerate(times_ns)
-    ]
+def tgc_text(times_ns):
+    rows = [f"timestamp: {t} " for t in times_ns]
     return f"# tgc curves per frame\n\nframes: {len(rows)}\n\n" + "\n".join(rows) + " "
 
 
-def sensor_text(sensor, quaternions=None, times_ns=None):
+def sensor_text(sensor, quaternions=None):
     """Samples of the sensor, documents of YAML: accelerometer in g, against the specific force."""
     if quaternions is None:
         quaternions = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
-    times = np.round(sensor.readings.time_s * 1e9).astype(np.int64) if times_ns is None else times_ns
+    times = np.round(sensor.readings.time_s * 1e9).astype(np.int64)
     rows = zip(
         times.tolist(), (-sensor.accelerometer_m_s2 / G).tolist(), sensor.gyroscope_rad_s.tolist(),
         sensor.magnetometer_au.tolist(), np.asarray(quaternions).tolist(), strict=True,
@@ -200,27 +201,22 @@ def swayed(time_s, degrees=8.0):
     return Rotation.from_euler("zyx", np.array([70.0, 20.0, 80.0]) + degrees * np.sin(phase), degrees=True)
 
 
-def bursts_s(start_s, stop_s, step_s=0.012, burst=3, pause_s=0.05):
-    """Times of samples that come in bursts."""
+def bursts_s(start_s, stop_s):
+    """Times of samples that come three by three, 12 ms apart, 50 ms between."""
     times, t = [], start_s
     while t < stop_s:
-        times += [t + step_s * k for k in range(burst)]
-        t += step_s * (burst - 1) + pause_s
+        times += [t, t + 0.012, t + 0.024]
+        t += 0.074
     return np.round(np.array(times), 9)
 
 
-def lzop_bytes(content, *, block=BLOCK_BYTES, flags=0x3000001, name=b"x.raw"):
-    """Content packed as by lzop: Adler-32 of the unpacked blocks, or what `flags` say."""
-    head = struct.pack(">HHHBBIIII", 0x1040, 0x20A0, 0x0940, 1, 5, flags, 0x81A4, 0, 0)
-    head += bytes([len(name)]) + name
+def lzop_bytes(content):
+    """Content packed as by lzop, with Adler-32 of the unpacked blocks."""
+    head = struct.pack(">HHHBBIIII", 0x1040, 0x20A0, 0x0940, 1, 5, 0x3000001, 0x81A4, 0, 0) + b"\5x.raw"
     parts = [b"\x89LZO\x00\r\n\x1a\n", head, struct.pack(">I", zlib.adler32(head))]
     compressor = lzallright.LZOCompressor()
-    for at in range(0, len(content), block):
-        plain = content[at : at + block]
-        packed = compressor.compress(plain)
-        packed = packed if len(packed) < len(plain) else plain
-        sums = [zlib.adler32(plain)] * bool(flags & 1) + [zlib.crc32(plain)] * bool(flags & 0x100)
-        if len(packed) < len(plain):
-            sums += [zlib.adler32(packed)] * bool(flags & 2) + [zlib.crc32(packed)] * bool(flags & 0x200)
-        parts += [struct.pack(f">II{len(sums)}I", len(plain), len(packed), *sums), packed]
+    for at in range(0, len(content), BLOCK_BYTES):
+        plain = content[at : at + BLOCK_BYTES]
+        packed = min(compressor.compress(plain), plain, key=len)
+        parts += [struct.pack(">III", len(plain), len(packed), zlib.adler32(plain)), packed]
     return b"".join([*parts, struct.pack(">I", 0)])

@@ -53,14 +53,10 @@ class Probe:
         """Points in mm from the array's middle."""
         return (np.asarray(pixels) - self.corner_px) * self.pixel_mm
 
-    def inside(self, pixels, margin_mm=0.0):
+    def inside(self, pixels):
         """Whether pixels show anything."""
-        place = self.from_image(pixels)
-        beam, sample = self.beam_range(place[..., 0], place[..., 1])
-        edge = margin_mm / self.width_mm * self.beams
-        low = margin_mm / self.depth_mm * self.samples
-        held = (beam > edge) & (beam < self.beams - 1 - edge)
-        held &= (sample > low) & (sample < self.samples - 1 - low)
+        beam, sample = self.beam_range(*self.from_image(pixels).T)
+        held = (beam > 0) & (beam < self.beams - 1) & (sample > 0) & (sample < self.samples - 1)
         return held & np.all((pixels >= 0) & (pixels <= np.array(self.shape) - 1), axis=-1)
 
 
@@ -113,8 +109,6 @@ class World:
     crossing_px: np.ndarray
     shown: np.ndarray
     sensor_from_image: RigidTransform
-    probe: Probe
-    look: Look
 
 
 def random_probe(rng):
@@ -164,19 +158,13 @@ def random_look(rng, probe):
     )
 
 
-def crossing_world(
-    seed, frames=54, recorded=None, absent=0.12, probe=None, look=None, noise=(0.25, 0.15, 0.3)
-):
+def crossing_world(seed, frames=54, recorded=None, probe=None, look=None):
     """Images of a crossing by a hand that turns the probe about it, and a tracker's readings.
 
     Parameters
     ----------
     recorded : (picks, poses), optional
         Of real frames: their rotations, and where in the image the crossing was, are used.
-    absent : float
-        Share of frames in which the beam misses the crossing.
-    noise : tuple of float
-        Of the tracker: jitter in mm and degrees, and a drift in mm.
     """
     rng = np.random.default_rng([seed, 15])
     probe = probe or random_probe(rng)
@@ -184,7 +172,7 @@ def crossing_world(
     where, turns = _hand(rng, frames) if recorded is None else _as_recorded(rng, frames, *recorded)
     centre, pixels = rng.uniform(-300, 300, 3), _places(rng, probe, where)
     away = 0.35 * look.elevation_mm * rng.standard_normal(frames)
-    lost = rng.random(frames) < absent
+    lost = rng.random(frames) < 0.12  # the beam misses the crossing
     away = np.where(lost, rng.choice([-1, 1], frames) * rng.uniform(4, 9, frames) * look.elevation_mm, away)
     flat = np.column_stack([pixels * probe.pixel_mm, away])
     base = Rotation.random(rng=rng)
@@ -202,9 +190,9 @@ def crossing_world(
         [_frame(rng, probe, look, pose, wires, points, floor, texture, letters) for pose in world_from_image]
     )
     mounting = RigidTransform.from_components(rng.uniform(-120, 120, 3), Rotation.random(rng=rng))
-    readings = world_from_image * mounting.inv() * _errors(rng, frames, *noise)
+    readings = world_from_image * mounting.inv() * _errors(rng, frames)
     shown = (np.abs(away) < 1.2 * look.elevation_mm) & probe.inside(pixels) & seen[best]
-    return World(images, probe.pixel_mm, readings, pixels, shown, mounting, probe, look)
+    return World(images, probe.pixel_mm, readings, pixels, shown, mounting)
 
 
 def _hand(rng, frames):
@@ -447,13 +435,13 @@ def _lettering(rng, probe):
     return picture
 
 
-def _errors(rng, frames, jitter_mm, jitter_deg, drift_mm):
-    """A tracker's jitter, and a wander that takes some ten frames to change."""
+def _errors(rng, frames):
+    """A tracker's jitter, and a wander by 0.3 mm that takes some ten frames to change."""
     keep = np.exp(-1 / 12.0)
     wander = np.zeros((frames, 3))
     wander[0] = rng.standard_normal(3)
     for n in range(1, frames):
         wander[n] = keep * wander[n - 1] + np.sqrt(1 - keep**2) * rng.standard_normal(3)
-    turn = Rotation.from_rotvec(np.deg2rad(jitter_deg) * rng.standard_normal((frames, 3)))
-    shift = jitter_mm * rng.standard_normal((frames, 3)) + drift_mm * wander
+    turn = Rotation.from_rotvec(np.deg2rad(0.15) * rng.standard_normal((frames, 3)))
+    shift = 0.25 * rng.standard_normal((frames, 3)) + 0.3 * wander
     return RigidTransform.from_components(shift, turn)

@@ -14,20 +14,21 @@ from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import ImageGrid
 
+LENGTH_MM, FAN_DEG, VOXEL_MM = 24.0, 40.0, 0.5
 MOUNTING = RigidTransform.from_components([12.0, -85.0, 23.0], rotation_from_fixed_angles(1.9, -0.8, 0.35))
 
 
-def tissue(rng, size_mm, voxel_mm):
+def tissue(rng, size_mm):
     """Echogenicity in dB and a sheet's depth by lateral position, over a box (x, depth, z)."""
-    shape = tuple((np.asarray(size_mm) / voxel_mm).astype(int))
+    shape = tuple((np.asarray(size_mm) / VOXEL_MM).astype(int))
     level = sum(
         sd
-        * gaussian_filter(rng.standard_normal(shape, dtype=np.float32), mm / voxel_mm)
-        * (mm / voxel_mm) ** 1.5
+        * gaussian_filter(rng.standard_normal(shape, dtype=np.float32), mm / VOXEL_MM)
+        * (mm / VOXEL_MM) ** 1.5
         for mm, sd in ((1.2, 16.0), (3.0, 16.0), (6.0, 12.0))
     )
     x, depth, z = np.meshgrid(
-        *(np.arange(n, dtype=np.float32) * voxel_mm for n in shape), indexing="ij", sparse=True
+        *(np.arange(n, dtype=np.float32) * VOXEL_MM for n in shape), indexing="ij", sparse=True
     )
     for _ in range(14):
         centre, radius = rng.uniform(0.1, 0.9, 3) * size_mm, rng.uniform(1.5, 5.0, 3)
@@ -42,40 +43,35 @@ def tissue(rng, size_mm, voxel_mm):
     return level.astype(np.float32), sheets
 
 
-def seen_by(rng, level, sheets, voxel_mm, elevation_axis, tilt_rad):
+def seen_by(rng, level, sheets, elevation_axis):
     """Grey voxels as one sweep sees them: its own speckle, beam and reflections."""
     power = 10.0 ** (level / 10.0) * rng.standard_exponential(level.shape, dtype=np.float32)
     for away, slope in sheets:
-        met = np.hypot(*slope) + abs(tilt_rad)
+        met = np.hypot(*slope) + 0.15  # of the beam, rad
         power += 60.0 * np.exp(-((met / 0.2) ** 2)) * np.exp(-0.5 * (away / 0.3) ** 2)
     blur = np.full(3, 0.45)
     blur[1], blur[elevation_axis] = 0.2, 1.1
-    return 10.0 * np.log10(gaussian_filter(power, blur / voxel_mm, truncate=3.0) + 1e-3)
+    return 10.0 * np.log10(gaussian_filter(power, blur / VOXEL_MM, truncate=3.0) + 1e-3)
 
 
 def crossing_sweeps(
     seed=0,
     frames=60,
-    length_mm=24.0,
-    fan_deg=40.0,
-    crossing_deg=90.0,
     grid=None,
     jitter=(0.1, 0.05),
-    voxel_mm=0.5,
     speckle=True,
 ):
     """Two sweeps of one scene, and the true sensor_from_image; jitter in mm and degrees."""
     rng = np.random.default_rng(seed)
     grid = grid or ImageGrid(64, 240, 0.45, 0.14)
-    fans = np.broadcast_to(fan_deg, 2)
-    side = max(length_mm, grid.width_mm) + 14.0 + grid.depth_mm * np.tan(np.deg2rad(max(fans) / 2.0))
+    side = max(LENGTH_MM, grid.width_mm) + 14.0 + grid.depth_mm * np.tan(np.deg2rad(FAN_DEG / 2.0))
     size = np.array([side, grid.depth_mm + 12.0, side])
-    level, sheets = tissue(rng, size, voxel_mm)
+    level, sheets = tissue(rng, size)
     made = []
     for number in range(2):
-        grey = seen_by(rng, level, sheets, voxel_mm, 2 - 2 * number, 0.15) if speckle else level
-        poses = _path(rng, frames, length_mm, fans[number], crossing_deg * number, grid, size)
-        images = _frames(grey, voxel_mm, poses, grid)
+        grey = seen_by(rng, level, sheets, 2 - 2 * number) if speckle else level
+        poses = _path(rng, frames, 90.0 * number, grid, size)
+        images = _frames(grey, poses, grid)
         sensor = poses * MOUNTING.inv() * _jitter(rng, frames, jitter)
         time_s = np.arange(frames) * 0.04
         made.append(
@@ -95,13 +91,13 @@ def centre_error_mm(found, truth, grid):
     return (truth.inv() * found).apply(grid.centre_mm) - grid.centre_mm
 
 
-def _path(rng, frames, length_mm, fan_deg, turn_deg, grid, size_mm):
+def _path(rng, frames, turn_deg, grid, size_mm):
     """A slow sweep along z that tilts as it goes, turned about the depth axis, with a hand's wander."""
     s = np.linspace(-0.5, 0.5, frames) + 0.02 * np.sin(np.linspace(0, 9.0, frames) + rng.uniform(0, 6))
     wander = np.cumsum(rng.normal(0, 1, (frames, 6)), axis=0) / np.sqrt(frames)
-    tilt = np.deg2rad(fan_deg) * s + 0.01 * wander[:, 3]
+    tilt = np.deg2rad(FAN_DEG) * s + 0.01 * wander[:, 3]
     turned = rotation_from_fixed_angles(0.01 * wander[:, 5], 0.01 * wander[:, 4], tilt)
-    place = np.column_stack([0.5 * wander[:, 0], 0.3 * wander[:, 1], length_mm * s])
+    place = np.column_stack([0.5 * wander[:, 0], 0.3 * wander[:, 1], LENGTH_MM * s])
     middle = RigidTransform.from_translation([-grid.width_mm / 2.0, 0.0, 0.0])
     about = RigidTransform.from_components(
         [size_mm[0] / 2.0, 3.0, size_mm[2] / 2.0], Rotation.from_euler("y", turn_deg, degrees=True)
@@ -109,13 +105,13 @@ def _path(rng, frames, length_mm, fan_deg, turn_deg, grid, size_mm):
     return about * RigidTransform.from_components(place, turned) * middle
 
 
-def _frames(grey, voxel_mm, poses, grid):
+def _frames(grey, poses, grid):
     u, v = np.meshgrid(np.arange(grid.vectors), np.arange(grid.samples), indexing="ij")
     points = np.stack([u * grid.vector_pitch_mm, v * grid.sample_spacing_mm, 0.0 * u], axis=-1).reshape(-1, 3)
     low, high = np.percentile(grey, [2.0, 99.9])
     images = np.empty((len(poses), grid.vectors, grid.samples), np.uint8)
     for n, pose in enumerate(poses):
-        cut = map_coordinates(grey, pose.apply(points).T / voxel_mm, order=1, mode="nearest")
+        cut = map_coordinates(grey, pose.apply(points).T / VOXEL_MM, order=1, mode="nearest")
         images[n] = np.clip(255.0 * (cut - low) / (high - low), 0, 255).reshape(u.shape)
     return images
 

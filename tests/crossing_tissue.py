@@ -73,8 +73,8 @@ class MadePair:
     truth: tuple[RigidTransform, RigidTransform]
 
 
-def made_pair(case, scale_sigma=0.08, turn_sigma_per_mm=0.002):
-    """Make the two sweeps of a case; the sigmas are what the solver is told."""
+def made_pair(case):
+    """Make the two sweeps of a case."""
     rng = np.random.default_rng([case.seed, 611])
     strength = _strength(case, rng)
     shared = rng.standard_normal((2, *strength.shape), np.float32)
@@ -96,9 +96,7 @@ def made_pair(case, scale_sigma=0.08, turn_sigma_per_mm=0.002):
             poses = RigidTransform.from_matrix(flip @ poses.as_matrix() @ flip)
         sensed = world * truth.rotation * _slow_errors(len(truth), rng, world, truth) if case.sensed else None
         name = ("first", "second")[number]
-        sweeps.append(
-            CrossingSweep(name, stack, poses, GRID.centre_mm, scale_sigma, turn_sigma_per_mm, sensed)
-        )
+        sweeps.append(CrossingSweep(name, stack, poses, GRID.centre_mm, 0.08, 0.002, sensed))
         truths.append(truth)
     return MadePair(*sweeps, tuple(truths))
 

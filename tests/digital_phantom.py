@@ -103,7 +103,7 @@ class Phantom:
         return [self.image(pose) for pose in poses]
 
 
-def curved_path(frames, length_mm, seed=0, turn_deg=4.0):
+def curved_path(frames, length_mm, seed=0):
     """A freehand sweep: bends, wanders, tilts, yaws and rolls, at an uneven speed."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 1.0, frames)
@@ -111,5 +111,5 @@ def curved_path(frames, length_mm, seed=0, turn_deg=4.0):
     waves = [np.sin(2 * np.pi * (0.6 + 0.3 * k) * t + phase[k]) for k in range(6)]
     uneven = t + 0.04 * np.sin(4 * np.pi * t) / (4 * np.pi)
     places = np.column_stack([0.8 * waves[0], 0.5 * waves[1], length_mm * uneven])
-    roll, yaw, tilt = (np.deg2rad(turn_deg) * wave for wave in waves[3:])
+    roll, yaw, tilt = (np.deg2rad(4.0) * wave for wave in waves[3:])
     return RigidTransform.from_components(places, rotation_from_fixed_angles(roll / 2, yaw, tilt))

@@ -42,8 +42,8 @@ def accumulate(first_from_steps):
     return RigidTransform.from_matrix(np.array(matrices))
 
 
-def drifted(truth, rng, stretch=0.15, tilt_deg=1.5, step_noise_mm=0.005, step_noise_deg=0.01):
-    """Image-based poses: elevational steps too long by `stretch`, tilt that drifts `tilt_deg` per 20 mm.
+def drifted(truth, rng):
+    """Image-based poses: elevational steps too long by 15 %, tilt that drifts by 1.5 degrees per 20 mm.
 
     Both drifts vary by a third along the sweep and follow the signed distance travelled.
     """
@@ -51,21 +51,21 @@ def drifted(truth, rng, stretch=0.15, tilt_deg=1.5, step_noise_mm=0.005, step_no
     n = len(steps)
     at_centre = steps.apply(CENTRE_MM) - CENTRE_MM
     uneven = 1.0 + wobble(rng, n, 1.0 / 3.0, 0.3, 1.2)
-    moved = at_centre + rng.normal(0.0, step_noise_mm, (n, 3))
-    moved[:, 2] += stretch * uneven * at_centre[:, 2]
-    angles = np.deg2rad(rng.normal(0.0, step_noise_deg, (n, 3)))
-    angles[:, 0] += np.deg2rad(tilt_deg) / 20.0 * uneven * at_centre[:, 2]
+    moved = at_centre + rng.normal(0.0, 0.005, (n, 3))
+    moved[:, 2] += 0.15 * uneven * at_centre[:, 2]
+    angles = np.deg2rad(rng.normal(0.0, 0.01, (n, 3)))
+    angles[:, 0] += np.deg2rad(1.5) / 20.0 * uneven * at_centre[:, 2]
     rotation = steps.rotation * rotation_from_fixed_angles(angles[:, 2], angles[:, 1], angles[:, 0])
     about_centre = RigidTransform.from_components(CENTRE_MM + moved, rotation)
     return accumulate(about_centre * RigidTransform.from_translation(-CENTRE_MM))
 
 
-def tracked(truth, rng, noise_mm=0.15, noise_deg=0.1, outliers=0.0, outlier_mm=2.0):
-    """Tracker readings: Gaussian noise per axis at the image origin, a share of poses off by `outlier_mm`."""
+def tracked(truth, rng, noise_mm=0.15, noise_deg=0.1, outliers=0.0):
+    """Tracker readings: Gaussian noise per axis at the image origin, a share of poses off by 2 mm."""
     n = len(truth)
     offset = rng.normal(0.0, noise_mm, (n, 3))
     direction = rng.normal(size=(n, 3))
-    direction *= outlier_mm / np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= 2.0 / np.linalg.norm(direction, axis=1, keepdims=True)
     offset += np.where(rng.uniform(size=(n, 1)) < outliers, direction, 0.0)
     turn = Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, noise_deg, (n, 3))))
     return truth * RigidTransform.from_components(offset, turn)

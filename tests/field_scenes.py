@@ -75,12 +75,12 @@ class Motion(NamedTuple):
     known: np.ndarray
 
 
-def scenes(folder, split, kinds=tuple(PLAN)):
+def scenes(folder, split):
     """Scenes of a split, `tune` or `judge`, one after the other, of a folder of BROAD trials."""
     half = ("tune", "judge").index(split)
     names = trials_in(folder)[half::2]
     motions = {name: recorded(folder, name) for name in names}
-    for kind in kinds:
+    for kind in PLAN:
         fit = [name for name in names if fits(kind, motions[name])]
         for i, amount in enumerate(PLAN[kind]):
             name = fit[(len(kind) + i) % len(fit)]

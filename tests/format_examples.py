@@ -13,46 +13,40 @@ def rf(seed=0, frames=FRAMES, vectors=VECTORS, samples=SAMPLES):
     return np.random.default_rng(seed).integers(-2000, 2000, (frames, vectors, samples)).astype(np.int16)
 
 
-def grey(seed=0, frames=FRAMES, vectors=VECTORS, samples=SAMPLES):
-    return np.random.default_rng(seed).integers(0, 256, (frames, vectors, samples)).astype(np.uint8)
+def grey(seed=0, frames=FRAMES, vectors=VECTORS):
+    return np.random.default_rng(seed).integers(0, 256, (frames, vectors, SAMPLES)).astype(np.uint8)
 
 
-def iq(seed=0, **shape):
-    return (rf(seed, **shape) + 1j * rf(seed + 1, **shape)).astype(np.complex64)
+def iq(**shape):
+    return (rf(0, **shape) + 1j * rf(1, **shape)).astype(np.complex64)
 
 
-def axes(vectors=VECTORS, samples=SAMPLES, grid=None):
-    """Lateral positions and depths, m, of the examples' grid or of another."""
-    pitch, spacing, first = PITCH_MM, SPACING_MM, FIRST_MM
-    if grid is not None:
-        pitch, spacing, first = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
-    x = pitch * (np.arange(vectors) - (vectors - 1) / 2)
-    return 1e-3 * x, 1e-3 * (first + spacing * np.arange(samples))
+def axes(vectors=VECTORS, samples=SAMPLES):
+    """Lateral positions and depths, m, of the examples' grid."""
+    x = PITCH_MM * (np.arange(vectors) - (vectors - 1) / 2)
+    return 1e-3 * x, 1e-3 * (FIRST_MM + SPACING_MM * np.arange(samples))
 
 
-def write_uff(
-    path, frames, modulation_hz=0.0, pulse=(6e6, 0.5), scan="uff.linear_scan", name="b_data", grid=None
-):
+def write_uff(path, frames, modulation_hz=0.0):
     """Write beamformed data as USTB does from MATLAB: axes in reverse, last ones of length 1 left out."""
     data = frames.reshape(len(frames), 1, 1, -1)
     if len(frames) == 1:
         data = data.reshape(1, -1)
-    x, z = axes(*frames.shape[1:], grid)
+    x, z = axes(*frames.shape[1:])
     with h5py.File(path, "a") as file:
         file.attrs["version"] = np.array([b"v1.2.0"])
-        group = _object(file, name, "uff.beamformed_data")
+        group = _object(file, "b_data", "uff.beamformed_data")
         _put(group, "data", data)
         _put(group, "modulation_frequency", np.array([[modulation_hz]]))
         _put(group, "frame_rate", np.array([[1.0]]))
-        held = _object(group, "scan", scan)
+        held = _object(group, "scan", "uff.linear_scan")
         for axis, values in (("x_axis", x), ("z_axis", z)):
             _put(held, axis, values[None])
         for axis, values in (("x", np.repeat(x, z.size)), ("z", np.tile(z, x.size))):
             _put(held, axis, values[None])
-        if pulse is not None:
-            held = _object(group, "pulse", "uff.pulse")
-            _put(held, "center_frequency", np.array([[pulse[0]]]))
-            _put(held, "fractional_bandwidth", np.array([[pulse[1]]]))
+        held = _object(group, "pulse", "uff.pulse")
+        _put(held, "center_frequency", np.array([[6e6]]))
+        _put(held, "fractional_bandwidth", np.array([[0.5]]))
     return path
 
 
@@ -162,33 +156,29 @@ def write_dicom(
     return path
 
 
-def write_zea(path, frames, kind="beamformed_data", home="", placed=True, scan=(), positions=None, grid=None):
-    """Write `frames` (frame, vector, sample) as zea 0.0.12 does; not `placed`, as earlier versions did."""
+def write_zea(path, frames, kind="beamformed_data", home="", scan=()):
+    """Write `frames` (frame, vector, sample) as zea 0.0.12 does."""
     turned = frames.transpose(0, 2, 1)
     if kind == "beamformed_data":
         parts = (turned.real, turned.imag) if np.iscomplexobj(frames) else (turned,)
         turned = np.stack(parts, axis=-1).astype("f4")
-    x, z = axes(*frames.shape[1:], grid)
-    if positions is None:
-        positions = np.stack([*np.broadcast_arrays(x[None], 0.0, z[:, None])], axis=-1)
+    x, z = axes(*frames.shape[1:])
+    positions = np.stack([*np.broadcast_arrays(x[None], 0.0, z[:, None])], axis=-1)
     given = {"sound_speed": 1480.0, "center_frequency": 6e6, "demodulation_frequency": 6e6} | dict(scan)
     with h5py.File(path, "a") as file:
         file.attrs.update({"zea_version": "0.0.12", "probe_name": "L11-4v"})
-        if placed:
-            group = file.create_group(f"{home}data/{kind}")
-            group.create_dataset("values", data=turned, compression="gzip", chunks=(1, *turned.shape[1:]))
-            group["coordinates"] = np.broadcast_to(positions, (len(frames), *positions.shape)).astype("f4")
-        else:
-            file[f"{home}data/{kind}"] = turned
+        group = file.create_group(f"{home}data/{kind}")
+        group.create_dataset("values", data=turned, compression="gzip", chunks=(1, *turned.shape[1:]))
+        group["coordinates"] = np.broadcast_to(positions, (len(frames), *positions.shape)).astype("f4")
         for name, value in given.items():
             if value is not None:
                 file[f"{home}scan/{name}"] = np.asarray(value, "f4")
     return path
 
 
-def carrying(frequency_hz, sound_speed=1480.0, seed=0):
+def carrying(frequency_hz, sound_speed=1480.0):
     """Complex echoes of a frequency, of a band a fifth of it, on the examples' grid."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     white = rng.normal(size=(2, FRAMES, VECTORS, SAMPLES))
     smooth = np.apply_along_axis(np.convolve, 3, white, np.hanning(9), "same")
     turn = 2 * np.pi * frequency_hz * 2e-3 * SPACING_MM / sound_speed * np.arange(SAMPLES)

@@ -10,20 +10,20 @@ from pyigtl.messages import CRC64
 from speckle3d.io.igtl.messages import HEADER, body_bytes, decode
 
 
-def image(columns=6, rows=9, dtype=np.int16, device="Image_Reference", seed=0, version=1, **said):
+def image(columns=6, rows=9, dtype=np.int16, version=1, **said):
     """An IMAGE of pyigtl, the pixels (column, row) in it, and where they lie."""
-    pixels = np.random.default_rng(seed).integers(0, 200, (columns, rows)).astype(dtype)
+    pixels = np.random.default_rng(0).integers(0, 200, (columns, rows)).astype(dtype)
     place = np.array([[0.0, 0, 2, 1], [0.3, 0, 0, 2], [0, 0.1, 0, 3], [0, 0, 0, 1]])
-    message = pyigtl.ImageMessage(pixels.T[None], place, said.pop("world", "ras"), 12.25, device)
+    message = pyigtl.ImageMessage(pixels.T[None], place, said.pop("world", "ras"), 12.25, "Image_Reference")
     message.header_version, message.metadata = version, said
     return message.pack(), pixels, place
 
 
-def transform(device="ProbeToTracker", seed=1, version=1, time_s=12.5, **said):
+def transform(device="ProbeToTracker", version=1, **said):
     """A TRANSFORM of pyigtl and its matrix."""
     matrix = np.eye(4)
-    matrix[:3] += np.random.default_rng(seed).normal(0, 1, (3, 4))
-    message = pyigtl.TransformMessage(matrix, time_s, device)
+    matrix[:3] += np.random.default_rng(1).normal(0, 1, (3, 4))
+    message = pyigtl.TransformMessage(matrix, 12.5, device)
     message.header_version, message.metadata = version, said
     return message.pack(), matrix
 
@@ -31,10 +31,10 @@ def transform(device="ProbeToTracker", seed=1, version=1, time_s=12.5, **said):
 LAST = transform("Last")[0]
 
 
-def with_body(message, body, crc=None):
-    """The message with another body and the right length and check sum, or another."""
+def with_body(message, body):
+    """The message with another body and the right length and check sum."""
     fields = list(HEADER.unpack(message[: HEADER.size]))
-    fields[5:] = len(body), CRC64(body) if crc is None else crc
+    fields[5:] = len(body), CRC64(body)
     return HEADER.pack(*fields) + body
 
 

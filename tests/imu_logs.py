@@ -19,9 +19,9 @@ from xsens.messages.rawcounts import RawCalibration
 G = 9.80665
 
 
-def samples(m=200, rate_hz=100.0, seed=0):
+def samples(m=200, rate_hz=100.0):
     """Slow turning about a tilted axis: what the sensor measures, and its orientation (NWU)."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     time_s = np.arange(m) / rate_hz
     rate = np.array([0.3, -0.2, 0.5])
     world_from_sensor = Rotation.from_rotvec([0.2, -0.4, 1.0]) * Rotation.from_rotvec(np.outer(time_s, rate))
@@ -70,10 +70,10 @@ def mt9_records(s, unit, first=0):
     return framed(mtdata_payloads(DataLayout(OutputMode.MT9), raw_values(s, unit, first)))
 
 
-def mt9_bin(s, unit, first=0, stray=15):
+def mt9_bin(s, unit, first=0):
     """A file of the MT9 software: the block, the end of a record, records."""
     records = mt9_records(s, unit, first)
-    return encode(calibration_message(unit)) + records[0][-stray:] + b"".join(records)
+    return encode(calibration_message(unit)) + records[0][-15:] + b"".join(records)
 
 
 def configured(layout, period=1152):

@@ -58,11 +58,11 @@ def _item(item):
     return struct.pack(">HB", item.identifier, len(data)) + data
 
 
-def configuration_message(units, period=1152, skip=0, length=0):
+def configuration_message(units, period=1152):
     """The answer to a request for the configuration, of units of some mode and settings."""
-    payload = struct.pack(">IHH88xH", 0x1234, period, skip, len(units))
+    payload = struct.pack(">IHH88xH", 0x1234, period, 0, len(units))
     for mode, settings in units:
-        payload += struct.pack(">IHHI8x", 0x1234, length, mode, settings)
+        payload += struct.pack(">IHHI8x", 0x1234, 0, mode, settings)
     return Message(MessageId.CONFIGURATION, payload)
 
 

@@ -238,17 +238,17 @@ def cut_at(point, images, image_from_world, pixels, max_gap_mm):
     return level + near / (near + far) * (other - level)
 
 
-def elevational_width_mm(beam, level_db=-6.0):
+def elevational_width_mm(beam):
     """Full two-way thickness of a beam at each depth, by the pulse's power summed over lateral positions.
 
     So a rough surface across the image sends it back. Where the profile has two peaks (nearer than half the
-    lens's focus) its outermost crossings of `level_db`, relative to its maximum, count.
+    lens's focus) its outermost crossings of -6 dB, relative to its maximum, count.
     """
     spectra = beam.spectra(np.linspace(0.0, beam.probe.sampling_rate_hz / 2.0, 513))
     field, sides = beam.residual, np.where(beam.lateral_mm > 0.0, 2.0, 1.0)
     gram = spectra @ spectra.conj().T
     power = np.einsum("yxzk,kl,yxzl,x->yz", field, gram, field.conj(), sides, optimize=True).real
-    level = power.max(axis=1) * 10.0 ** (level_db / 10.0)
+    level = power.max(axis=1) * 10.0**-0.6
     last = power.shape[1] - 1 - np.argmax((power >= level[:, None])[:, ::-1], axis=1)
     assert (last < power.shape[1] - 1).all()
     inner, outer = (power[np.arange(len(power)), last + k] for k in (0, 1))

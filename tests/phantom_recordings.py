@@ -13,30 +13,29 @@ MEMBRANE_MM = 6.0
 """How far above the floor a second echo lies, along the columns."""
 
 
-def floor_recording(path, frames=40, seed=3, membrane=()):
+def floor_recording(path):
     """Write a recording of a floor; returns the row of its line at the middle column of each frame.
 
-    `membrane` are frames in which a second, equal echo lies above the floor's.
+    In the first frame, a second, equal echo lies above the floor's.
     """
-    rng = np.random.default_rng(seed)
+    rng, frames = np.random.default_rng(3), 40
     scan = scan_plane(rng, frames, tilt_deg=30.0, roll_deg=15.0)
     ends = scan.lines.pixels.reshape(-1, 2, 2)
     columns, rows = np.arange(COLUMNS)[None, :, None], np.arange(COLUMNS)[None, None]
     share = (columns - ends[:, :1, None, 0]) / (ends[:, 1:, None, 0] - ends[:, :1, None, 0])
     at = ends[:, :1, None, 1] * (1 - share) + ends[:, 1:, None, 1] * share
     level = rng.rayleigh(8.0, (frames, COLUMNS, COLUMNS))
-    for above_mm in (0.0, MEMBRANE_MM):
-        shown = np.isin(np.arange(frames), membrane) if above_mm else np.ones(frames, bool)
-        away_mm = (rows - at) * PIXEL_MM[1] + above_mm
-        level += shown[:, None, None] * 200.0 * np.exp(-(away_mm**2) / 0.4**2 / 2)
+    away_mm = (rows - at) * PIXEL_MM[1]
+    level += 200.0 * np.exp(-(away_mm**2) / 0.4**2 / 2)
+    level[0] += 200.0 * np.exp(-((away_mm[0] + MEMBRANE_MM) ** 2) / 0.4**2 / 2)
     images = np.clip(level, 0, 255).astype(np.uint8)
     _write(path, images, PIXEL_MM, scan.lines.world_from_sensor[::2])
     return at[:, (COLUMNS - 1) // 2 : (COLUMNS - 1) // 2 + 2, 0].mean(axis=1)
 
 
-def wire_recording(path, config, frames=16, seed=4):
+def wire_recording(path, config):
     """Write a recording of N-wires and PLUS's configuration of them; returns the scene."""
-    shown = scene(seed, frames)
+    shown = scene(4, 16)
     images = np.stack([picture(pixels, seed=i) for i, pixels in enumerate(shown.pixels)])
     _write(path, images, WIRE_PIXEL_MM, shown.world_from_sensor)
     phantom = shown.phantom

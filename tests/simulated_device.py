@@ -1,8 +1,7 @@
 """A sensor on a pseudo-terminal that speaks the vendor's protocol, written from its description alone.
 
-It shares no code with the package: what it sends is packed here, byte by byte. It can be unplugged, plugged
-in again (as another terminal behind the same path), lose its power, fall silent, corrupt and drop what it
-sends.
+It shares no code with the package: what it sends is packed here, byte by byte. It can be unplugged and
+plugged in again, as another terminal behind the same path.
 """
 
 import contextlib
@@ -81,16 +80,13 @@ class SimulatedDevice:
         A symbolic link to the terminal, as ``/dev/serial/by-id`` has; it disappears with the plug.
     """
 
-    def __init__(self, path, kind="mt9", rate_hz=200.0, device_id=DEVICE_ID, wake_s=0.5):
-        self.path, self.kind, self.device_id, self.wake_s = path, kind, device_id, wake_s
+    def __init__(self, path, kind="mt9", rate_hz=200.0):
+        self.path, self.kind, self.wake_s = path, kind, 0.5
         self.rate_hz = rate_hz
         self.mode = {"mt9": 0x8000, "legacy": 0x0004}.get(kind, 0)
         self.settings, self.skip, self.outputs = 0, 0, ((0x2010, 50),)
-        self.iron, self.drop, self.corrupt, self.mute = 0.0, set(), set(), False
-        self.deaf_to: set[int] = set()
+        self.iron = 0.0
         self.runs: list[list[int]] = []
-        self.requests: list[int] = []
-        self.counter_start = 0
         self._master = self._slave = None
         self._paused = threading.Event()
         self._quiet = threading.Event()
@@ -123,19 +119,16 @@ class SimulatedDevice:
             os.set_blocking(self._master, False)
             with contextlib.suppress(FileNotFoundError):
                 self.path.unlink()
-            if self.state == MEASUREMENT:  # nobody heard what it sent meanwhile
-                self._next = self._first + int((time.monotonic() - self._started) * self.rate_hz)
-            elif self.state == OFF:
-                self._power_on()
+            self.state, self._woken_at, self._said = ASLEEP, time.monotonic(), False
+            self._buffer, self._next = b"", 0
             self.path.symlink_to(os.ttyname(self._slave))
 
-    def unplug(self, power=True):
-        """Pull the plug when all that was sent has arrived; the power goes with it, or stays."""
+    def unplug(self):
+        """Pull the plug when all that was sent has arrived; the power goes with it."""
         self.settle()
         with self._lock:
             self._pull()
-            if power:
-                self.state = OFF
+            self.state = OFF
         self._paused.clear()
 
     def _pull(self):
@@ -154,16 +147,7 @@ class SimulatedDevice:
     def resume(self):
         self._paused.clear()
 
-    def power_cycle(self):
-        with self._lock:
-            self._power_on()
-
     # what it does
-
-    def _power_on(self):
-        self.state, self._woken_at, self._said = ASLEEP, time.monotonic(), False
-        self._buffer = b""
-        self._next = self.counter_start
 
     def _run(self):
         while not self._stop.is_set():
@@ -179,7 +163,7 @@ class SimulatedDevice:
     def _wake(self):
         if self.state == ASLEEP and not self._said:
             self._said = True
-            self._write(frame(0x3E, struct.pack(">I", self.device_id)))
+            self._write(frame(0x3E, struct.pack(">I", DEVICE_ID)))
         if self.state == ASLEEP and time.monotonic() - self._woken_at > self.wake_s:
             self._measure()
 
@@ -196,7 +180,7 @@ class SimulatedDevice:
                 self._started = time.monotonic() - (self._next - self._first) / self.rate_hz
             return 0.002
         self._quiet.clear()
-        while self.state == MEASUREMENT and not self.mute:
+        while self.state == MEASUREMENT:
             due = self._started + (self._next - self._first) / self.rate_hz
             early_s = due - time.monotonic()
             if early_s > 0:
@@ -207,10 +191,7 @@ class SimulatedDevice:
 
     def _send(self, index):
         counter = index & 0xFFFF
-        message = bytearray(self._data(index, counter))
-        if index in self.corrupt:
-            message[len(message) // 2] ^= 0x10
-        if index not in self.drop and self._write(bytes(message)) and index not in self.corrupt:
+        if self._write(self._data(index, counter)):
             self.runs[-1].append(counter)
 
     def _data(self, index, counter):
@@ -267,9 +248,6 @@ class SimulatedDevice:
                 self._heed(message[2], message[4:-1])
 
     def _heed(self, mid, payload):
-        self.requests.append(mid)
-        if self.mute or mid in self.deaf_to:
-            return
         if mid == 0x30 or (mid == 0x3F and self.state == ASLEEP):
             self.state = CONFIGURATION
             if mid == 0x30:
@@ -286,7 +264,7 @@ class SimulatedDevice:
     def _answer(self, mid, payload):
         legacy = self.kind == "legacy"
         if mid == 0x00:
-            return struct.pack(">I", self.device_id)
+            return struct.pack(">I", DEVICE_ID)
         if mid == 0x0C:
             return self._configuration()
         if mid == 0x04 and self.kind != "mtdata2":
@@ -316,14 +294,14 @@ class SimulatedDevice:
         length = {"mt9": 22, "mtdata2": 0}.get(
             self.kind, 36 * bool(self.mode & 2) + 16 * bool(self.mode & 4) + 2
         )
-        struct.pack_into(">IHH", block, 0, self.device_id, round(115200 / self.rate_hz), self.skip)
-        struct.pack_into(">HIHHI", block, 96, 1, self.device_id, length, self.mode, self.settings)
+        struct.pack_into(">IHH", block, 0, DEVICE_ID, round(115200 / self.rate_hz), self.skip)
+        struct.pack_into(">HIHHI", block, 96, 1, DEVICE_ID, length, self.mode, self.settings)
         return bytes(block)
 
     def _calibration_block(self):
         block = bytearray(168)
         identity = (16384, 0, 0, 0, 16384, 0, 0, 0, 16384)
-        struct.pack_into(">I", block, 0, self.device_id)
+        struct.pack_into(">I", block, 0, DEVICE_ID)
         for at in (8, 26, 132, 150):
             struct.pack_into(">9h", block, at, *identity)
         struct.pack_into(">H", block, 81, round(115200 / self.rate_hz))

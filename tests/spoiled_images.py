@@ -20,18 +20,16 @@ def spoiled(sweep, frames, order=None):
     )
 
 
-def narrowed(sweep, vectors=24):
-    """The first vectors of a sweep, held in memory."""
-    frames = np.stack([sweep.frames[k][:vectors] for k in range(len(sweep))]).astype(np.float32)
-    return spoiled(replace(sweep, frames=frames, grid=replace(sweep.grid, vectors=vectors)), frames)
+def narrowed(sweep):
+    """The first 24 vectors of a sweep, held in memory."""
+    frames = np.stack([sweep.frames[k][:24] for k in range(len(sweep))]).astype(np.float32)
+    return spoiled(replace(sweep, frames=frames, grid=replace(sweep.grid, vectors=24)), frames)
 
 
-def shadowed(sweep, columns, rows, seed=5):
+def shadowed(sweep, columns, rows):
     """A bone's shadow: nothing but fresh noise of 3 counts in some vectors and samples of every frame."""
-    rng, frames = (
-        np.random.default_rng(seed),
-        np.array([sweep.frames[k] for k in range(len(sweep))], np.float32),
-    )
+    rng = np.random.default_rng(5)
+    frames = np.array([sweep.frames[k] for k in range(len(sweep))], np.float32)
     frames[:, columns, rows] *= 0.002
     return spoiled(sweep, np.rint(frames + rng.normal(0.0, 3.0, frames.shape)))
 
@@ -56,9 +54,9 @@ def band_noise(rng, sweep, shape):
     return noise / noise.std()
 
 
-def noisy(sweep, snr_db, seed=1):
+def noisy(sweep, snr_db):
     """Fresh noise added to every frame, as strong at each depth as the signal is, less `snr_db`."""
-    rng, level = np.random.default_rng(seed), level_by_depth(sweep.frames)
+    rng, level = np.random.default_rng(1), level_by_depth(sweep.frames)
     noise = np.stack([band_noise(rng, sweep, frame.shape) for frame in sweep.frames])
     return spoiled(sweep, sweep.frames + 10 ** (-snr_db / 20) * level * noise)
 

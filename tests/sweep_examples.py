@@ -56,11 +56,11 @@ class Pairs:
         return self.pairs[index].astype(np.float32).view(np.complex64)[..., 0]
 
 
-def iq_sweep(paired=True, frames=6, vectors=5, samples=40, demodulation_frequency_hz=6e6, seed=0):
-    rng = np.random.default_rng(seed)
-    pairs = rng.integers(-32768, 32768, (frames, vectors, samples, 2)).astype(np.int16)
-    signal = replace(RF, sampling_rate_hz=10e6, demodulation_frequency_hz=demodulation_frequency_hz)
-    plain = rf_sweep(frames, vectors, samples, seed=seed)
+def iq_sweep(paired=True, frames=6):
+    rng = np.random.default_rng(0)
+    pairs = rng.integers(-32768, 32768, (frames, 5, 40, 2)).astype(np.int16)
+    signal = replace(RF, sampling_rate_hz=10e6, demodulation_frequency_hz=6e6)
+    plain = rf_sweep(frames)
     grid = replace(plain.grid, sample_spacing_mm=signal.sample_spacing_mm)
     held = Pairs(pairs)
     if not paired:
@@ -68,8 +68,8 @@ def iq_sweep(paired=True, frames=6, vectors=5, samples=40, demodulation_frequenc
     return replace(plain, frames=held, grid=grid, signal=signal)
 
 
-def bmode_sweep(frames=4, columns=6, rows=9):
-    data = np.random.default_rng(0).integers(0, 256, (frames, columns, rows)).astype(np.uint8)
-    plain = rf_sweep(frames, columns, rows)
-    grid = ImageGrid(columns, rows, 0.085, 0.09, 0.0)
+def bmode_sweep(frames=4):
+    data = np.random.default_rng(0).integers(0, 256, (frames, 6, 9)).astype(np.uint8)
+    plain = rf_sweep(frames, 6, 9)
+    grid = ImageGrid(6, 9, 0.085, 0.09, 0.0)
     return replace(plain, frames=data, grid=grid, signal=BModeSettings(60.0, 250.0))

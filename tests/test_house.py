@@ -47,21 +47,6 @@ def test_every_module_of_the_sensor_package_stays_clear_of_numba_and_h5py(python
     assert loaded_after(python, code, ("numba", "h5py")) == []
 
 
-@pytest.mark.parametrize(
-    ("package", "name"), [(package, name) for package in (speckle3d, xsens) for name in package.__all__]
-)
-def test_public_names_are_there_and_documented(package, name):
-    assert getattr(package, name).__doc__
-    assert name in dir(package)
-    assert package.__all__ == sorted(package.__all__)
-
-
-def test_the_lists_of_public_names_are_installed_with_the_packages(project):
-    settings = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-    for package in (speckle3d, xsens):
-        assert "__init__.pyi" in settings["package-data"][package.__name__]
-
-
 def test_the_version_is_the_distributions_and_a_misspelt_name_an_attribute_error():
     assert speckle3d.__version__ == importlib.metadata.version("speckle3d")
     for package in (speckle3d, xsens):

@@ -9,31 +9,11 @@ from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.pipeline import track
 
-FRAMES = 32
-
-
-class First:
-    """The first of some frames."""
-
-    def __init__(self, frames):
-        self._frames, self.dtype = frames, frames.dtype
-        self.shape = (FRAMES, *frames.shape[1:])
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
 
 @pytest.fixture(scope="module")
 def part(sweep):
     """5 mm of the shipped sweep, without sensors."""
-    return replace(
-        sweep,
-        frames=First(sweep.frames),
-        frame_time_s=sweep.frame_time_s[:FRAMES],
-        truth=sweep.truth[:FRAMES],
-        tracker=None,
-        orientation=None,
-    )
+    return replace(sweep.part(0, 32), tracker=None, orientation=None)
 
 
 def turned_over(curves):
@@ -67,18 +47,9 @@ def test_reversed_curves_are_refused(part, curves):
         track(part, turned_over(curves))
 
 
-@pytest.mark.parametrize(("factor", "why"), [(1.5, "tilt"), (1000.0, "tilt")])
-def test_scaled_distances_are_refused(part, curves, factor, why):
-    with pytest.raises(MismatchError, match=f"^phantom: curves: expected {why}"):
-        track(part, replace(curves, distance_mm=factor * curves.distance_mm))
-
-
-def test_scaled_distances_of_curves_without_tilt_are_refused_where_no_beam_is_so_wide(part, curves):
-    scaled = replace(curves, distance_mm=1000 * curves.distance_mm, tilt=None)
-    with pytest.raises(
-        MismatchError, match=r"^phantom: curves: expected correlation to fall within 8 mm, got"
-    ):
-        track(part, scaled)
+def test_scaled_distances_are_refused(part, curves):
+    with pytest.raises(MismatchError, match=r"^phantom: curves: expected tilt"):
+        track(part, replace(curves, distance_mm=1.5 * curves.distance_mm))
 
 
 def test_curves_of_other_depths_are_refused(part, curves):
@@ -87,9 +58,8 @@ def test_curves_of_other_depths_are_refused(part, curves):
         track(part, deeper)
 
 
-@pytest.mark.parametrize("factor", [2.0, 0.5])
-def test_curves_and_sweep_at_another_sampling_rate_are_refused(part, curves, factor):
-    other = at_rate(part, factor)
+def test_curves_and_sweep_at_another_sampling_rate_are_refused(part, curves):
+    other = at_rate(part, 2.0)
     key = replace(curves.key, signal=other.signal)
     with pytest.raises(MismatchError, match=r"^phantom: (images: expected echoes|the curves do not match)"):
         track(other, replace(curves, key=key))

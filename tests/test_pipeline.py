@@ -20,21 +20,6 @@ from speckle3d.motion.direction import SensorSettings, settle_direction, smooth_
 from speckle3d.pipeline import track
 
 
-class FirstFrames:
-    """The first frames of a sweep."""
-
-    def __init__(self, frames, count):
-        self._frames, self.shape, self.dtype = frames, (count, *frames.shape[1:]), frames.dtype
-
-    def __getitem__(self, index):
-        return self._frames[index]
-
-
-def head(sweep, count):
-    frames, truth = FirstFrames(sweep.frames, count), sweep.truth[:count]
-    return replace(sweep, frames=frames, frame_time_s=sweep.frame_time_s[:count], truth=truth)
-
-
 def test_steps_follow_the_truth(sweep, tracked):
     centre = sweep.grid.centre_mm
     found, true = ((p[:-1].inv() * p[1:]).apply(centre) - centre for p in (tracked.image, sweep.truth))
@@ -44,7 +29,7 @@ def test_steps_follow_the_truth(sweep, tracked):
 
 
 def test_two_runs_are_equal(sweep, curves):
-    short = head(sweep, 20)
+    short = sweep.part(0, 20)
     one, two = (track(short, curves) for _ in range(2))
     np.testing.assert_array_equal(one.image.as_matrix(), two.image.as_matrix())
     np.testing.assert_array_equal(one.subset.as_matrix(), two.subset.as_matrix())
@@ -59,7 +44,7 @@ def test_few_frames_are_kept_however_long_the_sweep(sweep, curves, monkeypatch):
         return ready
 
     monkeypatch.setattr(FrameMatcher, "prepare", prepare)
-    track(head(sweep, 48), curves, progress=lambda *_: most.append(sum(r() is not None for r in made)))
+    track(sweep.part(0, 48), curves, progress=lambda *_: most.append(sum(r() is not None for r in made)))
     s = Config().trajectory
     assert len(made) == 48
     # References, the frame itself, and those read ahead: three waiting, one being made, one handed over.
@@ -68,7 +53,7 @@ def test_few_frames_are_kept_however_long_the_sweep(sweep, curves, monkeypatch):
 
 def test_progress_images_and_pairs_come_in_order(sweep, curves):
     progress, images, pairs = [], [], []
-    short = head(sweep, 12)
+    short = sweep.part(0, 12)
     found = track(
         short,
         curves,
@@ -84,22 +69,15 @@ def test_progress_images_and_pairs_come_in_order(sweep, curves):
     assert all((table.first < table.second).all() for table in pairs)
 
 
-def test_a_tracker_settles_the_direction(sweep, tracked):
+def test_setting_then_tracker_then_nothing_settles_the_direction(sweep, tracked):
     assert tracked.direction_from == "tracker"
     assert not tracked.flags.any()
-    assert settle_direction(sweep, tracked.image, SensorSettings()) == (1, "tracker")
-    assert settle_direction(sweep, mirrored(tracked.image), SensorSettings()) == (-1, "tracker")
-
-
-def test_the_user_settles_the_direction_before_any_sensor(sweep, tracked):
-    for sign in (1, -1):
-        settings = SensorSettings(direction=sign)
-        assert settle_direction(sweep, tracked.image, settings) == (sign, "setting")
-
-
-def test_without_sensors_the_direction_is_assumed(sweep, tracked):
     bare = replace(sweep, tracker=None, orientation=None, truth=None)
-    assert settle_direction(bare, mirrored(tracked.image), SensorSettings()) == (1, "assumed")
+    other = mirrored(tracked.image)
+    assert settle_direction(sweep, tracked.image, SensorSettings()) == (1, "tracker")
+    assert settle_direction(sweep, other, SensorSettings()) == (-1, "tracker")
+    assert settle_direction(sweep, tracked.image, SensorSettings(direction=-1)) == (-1, "setting")
+    assert settle_direction(bare, other, SensorSettings()) == (1, "assumed")
 
 
 def test_turns_seen_by_the_orientation_sensor_settle_the_direction(sweep):
@@ -131,53 +109,34 @@ def test_smoothing_keeps_slow_turns_and_loses_jitter():
     assert left < 0.3 / 3
 
 
-class NoiseFrames:
-    """A sweep's frames, from some frame on replaced by independent noise."""
-
-    def __init__(self, frames, first):
-        self._frames, self._first, self.shape, self.dtype = frames, first, frames.shape, frames.dtype
-
-    def __getitem__(self, index):
-        frame = self._frames[index]
-        if index < self._first:
-            return frame
-        return np.random.default_rng(index).normal(0, 300, frame.shape).astype(frame.dtype)
+def spoilt(sweep, numbers, change):
+    """The sweep with some frames changed by a function of the frame."""
+    frames = np.stack([sweep.frames[k] for k in range(len(sweep))])
+    for number in numbers:
+        frames[number] = change(frames[number])
+    return replace(sweep, frames=frames)
 
 
 def test_frames_without_speckle_are_flagged_and_too_many_refused(sweep, curves):
-    short = head(sweep, 20)
+    short, rng = sweep.part(0, 20), np.random.default_rng(0)
+
+    def noise(frame):
+        return rng.normal(0, 300, frame.shape)
+
     # The last three share nothing with anything; with the last twelve it is no sweep any more.
-    found = track(replace(short, frames=NoiseFrames(short.frames, 17)), curves)
+    found = track(spoilt(short, range(17, 20), noise), curves)
     assert np.flatnonzero(found.flags).tolist() == [17, 18, 19]
     assert (found.flags[17:] & (FrameFlag.NO_SPECKLE | FrameFlag.LIFTED)).all()
     with pytest.raises(InsufficientDataError, match="frames"):
-        track(replace(short, frames=NoiseFrames(short.frames, 8)), curves)
+        track(spoilt(short, range(8, 20), noise), curves)
 
 
-class SpoiltFrames:
-    """A sweep's frames, some of them changed by a function of the frame."""
-
-    def __init__(self, frames, spoilt, change):
-        self._frames, self._spoilt, self._change = frames, spoilt, change
-        self.shape, self.dtype = frames.shape, frames.dtype
-
-    def __getitem__(self, index):
-        frame = self._frames[index]
-        return self._change(frame) if index in self._spoilt else frame
-
-
-SPOILT = {
-    "saturated": (lambda f: np.clip(30 * f.astype(int), -8192, 8191).astype(f.dtype), FrameFlag.SATURATED),
-    "empty": (lambda f: 0 * f, FrameFlag.NO_SPECKLE),
-}
-
-
-@pytest.mark.parametrize("kind", SPOILT)
-def test_a_spoilt_frame_is_placed_between_its_neighbours_and_not_trusted(sweep, curves, kind):
-    change, flag = SPOILT[kind]
-    short = head(sweep, 24)
+@pytest.mark.parametrize("flag", [FrameFlag.SATURATED, FrameFlag.NO_SPECKLE])
+def test_a_spoilt_frame_is_placed_between_its_neighbours_and_not_trusted(sweep, curves, flag):
+    short = sweep.part(0, 24)
     good = track(short, curves)
-    found = track(replace(short, frames=SpoiltFrames(short.frames, {11}, change)), curves)
+    gain = 30 if flag == FrameFlag.SATURATED else 0
+    found = track(spoilt(short, [11], lambda f: np.clip(gain * f.astype(int), -8192, 8191)), curves)
     assert found.flags[11] & flag
     assert not np.delete(found.flags, 11).any()
     centre = sweep.grid.centre_mm

@@ -10,7 +10,7 @@ from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.motion.diffraction import half_distance
 from speckle3d.pipeline import track
-from speckle3d.tracked_curves import jitters, tracked_curves, tracker_scale
+from speckle3d.tracked_curves import tracked_curves, tracker_scale
 
 
 def shaken(sweep, jitter_mm, seed=3):
@@ -43,21 +43,6 @@ def test_curves_of_few_tracked_frames_claim_what_they_leave_open(sweep, curves):
     found = track(rest, corrected)
     error = abs(found.image.apply(rest.grid.centre_mm)[-1, 2] / true[-1]) - 1
     assert abs(error) < 2 * found.scale_sigma
-
-
-def test_a_sweep_without_a_calibrated_tracker_is_named(sweep, tracked):
-    bare = replace(sweep, tracker=None)
-    with pytest.raises(InsufficientDataError, match=r"^phantom: expected a tracker that is calibrated"):
-        tracker_scale(bare, tracked)
-
-
-def test_a_stage_in_steps_does_not_jitter(sweep):
-    steps = RigidTransform.from_translation(np.arange(len(sweep))[:, None] * [0.0, 0.0, 0.05])
-    steps = steps * sweep.tracker.sensor_from_image.inv()
-    exact = replace(sweep.tracker, readings=TimedPoses(sweep.frame_time_s, steps), time_offset_s=0.0)
-    assert not jitters(replace(sweep, truth=None, tracker=exact))
-    assert not jitters(sweep)
-    assert jitters(replace(sweep, truth=None))
 
 
 @pytest.mark.slow

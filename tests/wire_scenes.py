@@ -76,7 +76,7 @@ def cut(ends, phantom_from_image):
     return (front + share[:, None] * (back - front))[:, :2] / PIXEL_MM
 
 
-def picture(pixels, seed=None, strength=None, lobes=0.3, tails=0.35, haze=0.02):
+def picture(pixels, seed=None, strength=None, haze=0.02):
     """Grey levels (column, row) of wires at `pixels`: dots with side lobes across and ringing beneath.
 
     Amplitudes over 60 dB from a saturated 255; `haze` is the mean amplitude of the speckle between them.
@@ -88,9 +88,9 @@ def picture(pixels, seed=None, strength=None, lobes=0.3, tails=0.35, haze=0.02):
     for (u, v), a in zip(np.asarray(pixels) * PIXEL_MM, strength, strict=True):
         across, down = x - u, y - v
         amplitude += a * np.exp(-(across**2) / 0.7**2 / 2 - down**2 / 0.25**2 / 2)
-        amplitude += lobes * a * np.exp(-(across**2) / 2.0**2 / 2 - down**2 / 0.15**2 / 2)
+        amplitude += 0.3 * a * np.exp(-(across**2) / 2.0**2 / 2 - down**2 / 0.15**2 / 2)
         for k in range(1, 4):
-            amplitude += a * tails**k * np.exp(-(across**2) / 0.5**2 / 2 - (down - 0.7 * k) ** 2 / 0.2**2 / 2)
+            amplitude += a * 0.35**k * np.exp(-(across**2) / 0.5**2 / 2 - (down - 0.7 * k) ** 2 / 0.2**2 / 2)
     if seed is not None and haze > 0:
         amplitude = np.abs(amplitude + haze * (rng.normal(size=SHAPE) + 1j * rng.normal(size=SHAPE)) / 1.25)
     level = 255.0 * (1.0 + 20.0 * np.log10(np.maximum(amplitude, 1e-9)) / 60.0)
@@ -111,7 +111,7 @@ def plus_results(folder, kind):
     return frames, np.array(points, dtype=float), np.array(errors, dtype=float), matrix
 
 
-def candidates(shown, seed, noise_mm=0.1, wrong=6, missing=()):
+def candidates(shown, seed, noise_mm=0.1, missing=()):
     """Dots as found, strongest first: most wires and, weaker, wrong dots and ringing under some wires.
 
     `missing` holds (frame, wire) pairs without a dot.
@@ -122,10 +122,10 @@ def candidates(shown, seed, noise_mm=0.1, wrong=6, missing=()):
         there = [w for w in range(len(true)) if (i, w) not in missing]
         wires = true[there] + rng.normal(size=(len(there), 2)) * noise_mm / PIXEL_MM
         ringing = wires[rng.permutation(len(wires))[:4]] + [0.0, 1.2 / PIXEL_MM[1]]
-        anywhere = rng.uniform(0, 1, (wrong, 2)) * SHAPE
+        anywhere = rng.uniform(0, 1, (6, 2)) * SHAPE
         pixels = np.concatenate([wires, ringing, anywhere])
         score = np.concatenate(
-            [rng.uniform(60, 150, len(wires)), rng.uniform(20, 50, 4), rng.uniform(20, 100, wrong)]
+            [rng.uniform(60, 150, len(wires)), rng.uniform(20, 50, 4), rng.uniform(20, 100, 6)]
         )
         order = np.argsort(-score)
         found.append((np.full(len(score), i), pixels[order], score[order]))

@@ -61,23 +61,6 @@ def uncalibrated(changed):
     return changed(forget)
 
 
-def test_calibrations_from_files_do_what_those_in_the_sweep_do(
-    run, sweep, uncalibrated, saved, reconstructed, tmp_path
-):
-    options = ["--drift", "orientation", "--drift", "pose"]
-    for sensor in ("tracker", "orientation"):
-        options += ["--calibration", saved(of_sweep(sweep, sensor), f"{sensor}.h5")]
-    code, _, err = run("reconstruct", uncalibrated, "-o", tmp_path / "o", *options)
-    assert code == 0, err
-    got, before = (
-        read_reconstruction(folder / "reconstruction.h5").poses for folder in (tmp_path / "o", reconstructed)
-    )
-    assert set(got) == {"image", "orientation", "pose"}
-    for mode, poses in before.items():
-        # The same numbers but for a rotation that went through a matrix.
-        np.testing.assert_allclose(got[mode].as_matrix(), poses.as_matrix(), atol=1e-6)
-
-
 def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_path):
     """The image turned by 30 degrees about its own normal: the world's poses turn with it."""
     about_z = Rotation.from_euler("z", 30, degrees=True)

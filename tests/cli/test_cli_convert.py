@@ -44,21 +44,6 @@ def test_the_suffix_of_out_says_what_is_written(done, sequence, tmp_path):
     assert not (tmp_path / "d.zraw").exists()  # of the header that was replaced
 
 
-def test_options_reach_the_sweep(done, tmp_path):
-    pixels = np.random.default_rng(0).integers(-900, 900, (3, 4, 30)).astype(np.int16)
-    path = write_mha(tmp_path / "rf.mha", pixels, frames=tracked(3)[2])
-    done("convert", path, tmp_path / "o.h5", "--sampling-rate-hz", "30e6", "--vector-pitch-mm", "0.2",
-         "--speed-of-sound-m-s", "1480", "--centre-frequency-hz", "5e6", "--bandwidth-hz", "3e6", "7e6",
-         "--first-sample-depth-mm", "1.5", "--probe", "L14", "--frame-rate-hz", "20",
-         "--reference-transform", "none")  # fmt: skip
-    sweep = load_sweep(tmp_path / "o.h5")
-    assert (sweep.signal.speed_of_sound_m_s, sweep.signal.sampling_rate_hz) == (1480, 30e6)
-    assert (sweep.grid.vector_pitch_mm, sweep.grid.first_sample_depth_mm, sweep.probe) == (0.2, 1.5, "L14")
-    np.testing.assert_allclose(sweep.frame_time_s, [0, 0.05, 0.1])
-    expected = tracked(3)[0].as_matrix()
-    np.testing.assert_allclose(sweep.tracker.readings.world_from_sensor.as_matrix(), expected, atol=1e-3)
-
-
 CONFIG = "PlusDeviceSet_"
 SPINE = f"{CONFIG}SpinePhantomFreehandReconstructionOnly.xml"
 LINEAR = f"{CONFIG}RfProcessingAlgoLinearTest.xml"

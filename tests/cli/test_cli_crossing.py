@@ -65,13 +65,3 @@ def test_two_sequences_give_a_calibration_with_its_report(run, sequences, tmp_pa
     assert found.frames.given == 80
     assert (tmp_path / "cal.txt").is_file()
     assert (tmp_path / "cal.png").stat().st_size > 50_000
-
-
-def test_what_is_missing_or_cannot_tell_is_said(refused, sequences, tmp_path):
-    first, second, truth = sequences
-    command = ("calibrate", "images", first, second, "-o", tmp_path / "cal.h5", *PIXELS)
-    assert "--start" in refused(*command)
-    assert "--start-deg" in refused(*command, "--start-mm", "0", "0", "0")
-    parallel = ("calibrate", "images", first, first, "-o", tmp_path / "cal.h5", *PIXELS)
-    assert "0 degrees" in refused(*parallel, *start_of(truth))
-    assert not (tmp_path / "cal.h5").exists()

@@ -37,13 +37,6 @@ def log_file(tmp_path):
     return path
 
 
-def test_a_log_is_told(run, log_file):
-    out = run("imu", "info", log_file, "--json")[1]
-    told = {row["description"]: row["value"] for row in json.loads(out)}
-    assert told["samples"] == "2000"
-    assert told["lost"] == "0"
-
-
 def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path):
     method = "filter"
     sweep_file = tmp_path / "sweep.h5"

@@ -1,9 +1,5 @@
 """No command writes over what it reads, or over a file of another kind than it writes."""
 
-import shutil
-
-import h5py
-import numpy as np
 import pytest
 from imu_logs import samples
 
@@ -66,14 +62,3 @@ def test_what_the_command_wrote_before_is_replaced(run, calls, tmp_path, name):
     for _ in range(2):
         code, _, err = run(*calls[name](place))
         assert code == 0, err
-
-
-def test_a_recorded_sweep_is_not_replaced_by_a_simulated_one(refused, bench, calls, tmp_path):
-    recorded = tmp_path / "recorded.h5"
-    shutil.copy(bench / "sweep.h5", recorded)
-    with h5py.File(recorded, "r+") as file:
-        del file["simulation"]
-        before = np.asarray(file["rf"])
-    assert "recorded.h5" in refused(*calls["simulate"](recorded))
-    with h5py.File(recorded) as file:
-        np.testing.assert_array_equal(file["rf"], before)

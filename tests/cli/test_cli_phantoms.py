@@ -5,16 +5,10 @@ import json
 import h5py
 import numpy as np
 import pytest
-from calibration_examples import PIXEL_MM, TRIAL_1, scan_wires
 from commands import run_command
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
-from speckle3d.core.wires import three_wires
 from speckle3d.io.calibrations import read_calibration
-from speckle3d.io.points import PickedPoints, write_points
-from speckle3d.io.sweep_writer import write_sweep
 
 SCAN = ("--preset", "plane", "--vectors", "40", "--frames", "60", "--duration-s", "12", "--seed", "77")
 
@@ -36,14 +30,6 @@ def truth(path, name):
         return np.array(json.loads(file["simulation"].attrs[name]))
 
 
-def changed(scan, path, change):
-    """A copy of a scan in which something is changed."""
-    path.write_bytes(scan.read_bytes())
-    with h5py.File(path, "r+") as file:
-        change(file)
-    return path
-
-
 def error_of(path, scan):
     """Degrees, and millimetres at 20 mm depth in the middle of the image."""
     mounting = RigidTransform.from_matrix(truth(scan, "tracker_sensor_from_image"))
@@ -61,12 +47,7 @@ def test_a_plane_calibrates_a_tracker(run, scans, tmp_path):
     # Exact sensors: lines found to 0.02 mm over 12 mm of width. Measured 0.06 degrees and 0.09 mm.
     assert turned < 0.3
     assert moved < 0.3
-    found = read_calibration(out)
-    assert found.method == "plane"
-    assert found.frames.given == 60
-    assert found.source.input_path.endswith("bar.h5")
-    assert found.verdict in table
-    assert "ImageToProbe" in table
+    assert read_calibration(out).verdict in table
     assert "on noisy.h5, not used: RMS residual" in table
     assert out.with_suffix(".txt").read_text() == table
     assert out.with_suffix(".png").stat().st_size > 20_000
@@ -87,41 +68,6 @@ def test_a_missing_motion_is_refused_and_nothing_written(refused, scans, tmp_pat
     line = refused("calibrate", "plane", scans / "untilted.h5", "-o", tmp_path / "c.h5")
     assert "untilted.h5" in line
     assert "tilt" in line
-
-
-def scan_of_wires(folder, seed, count=90):
-    """Blank images, the sensor's readings, and picks of a phantom that is where it was: sweep and CSV."""
-    rng = np.random.default_rng(seed)
-    wire = np.repeat([0, 1, 2], count // 3)
-    places = rng.uniform(-30, 30, (count, 1)) * np.eye(3)[wire]
-    stand = RigidTransform.from_components([200.0, -50.0, 120.0], Rotation.from_rotvec([0.4, -0.3, 1.1]))
-    pixels, readings = scan_wires(rng, places, world_from_phantom=stand, noise_mm=0.1)
-    times = np.arange(count) / 10.0
-    tracker = Tracker(TimedPoses(times, readings))
-    images = np.zeros((count, 290, 290), np.uint8)
-    sweep = Sweep(images, ImageGrid(290, 290, 1.0, 1.0), BModeSettings(60.0), times, tracker=tracker)
-    files = folder / f"wires-{seed}.h5", folder / f"picked-{seed}.csv"
-    write_sweep(files[0], sweep)
-    write_points(files[1], PickedPoints(np.arange(count), pixels, wire), three_wires().names)
-    return files
-
-
-def test_picked_points_calibrate_with_wires(run, tmp_path):
-    kind = "three"
-    (sweep, picked), (other, others) = (scan_of_wires(tmp_path, seed) for seed in (5, 6))
-    out = tmp_path / "c.h5"
-    options = ("--phantom", kind, "--points", picked, "--validation", other, "--validation-points", others)
-    code, table, err = run("calibrate", "wires", sweep, "-o", out, *options)
-    assert code == 0, err
-    found = read_calibration(out)
-    step = (TRIAL_1.inv() * found.sensor_from_image).translation
-    # Picks of 0.1 mm in 90 frames; the claimed standard errors are 0.05 mm.
-    assert np.linalg.norm(step) < 0.3
-    np.testing.assert_allclose(found.pixel_mm, PIXEL_MM, rtol=0.01)
-    assert out.with_suffix(".csv").read_text().startswith("frame,column_px,row_px")
-    # The noise of the picks, in the two directions of each equation's three that it has.
-    validated = float(table.split("wires-6.h5, not used: RMS residual ")[1].split()[0])
-    assert 0.05 < validated < 0.15
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
-import SimpleITK
 
 from speckle3d.io.headers import read_header
 from speckle3d.io.reconstructions import read_reconstruction
@@ -18,19 +17,7 @@ def made(reconstructed):
     return reconstructed / "reconstruction.h5"
 
 
-def test_the_pose_of_a_frame_becomes_a_transform(run, made, tmp_path):
-    name = "t.h5"
-    for _ in range(2):
-        code, out, err = run(
-            "trajectory", "export", made, "-o", tmp_path / name, "--frame", 7, "--mode", "pose"
-        )
-        assert (code, out) == (0, ""), err
-    pose = read_reconstruction(made).poses["pose"][7]
-    found = SimpleITK.ReadTransform(str(tmp_path / name)).TransformPoint(pose.apply([1.0, 2.0, 3.0]).tolist())
-    np.testing.assert_allclose(found, [1.0, 2.0, 3.0], atol=1e-9)
-
-
-def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, refused, made, bench, tmp_path):
+def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, made, tmp_path):
     name = "s.seq.nrrd"
     code, out, err = run("convert", made, tmp_path / name, "--mode", "orientation")
     assert (code, out) == (0, ""), err
@@ -39,9 +26,6 @@ def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, refused, made, 
     pose = read_reconstruction(made).poses["orientation"][11]
     matrix = np.reshape([float(x) for x in header.frames[11]["ImageToWorldTransform"].split()], (4, 4))
     np.testing.assert_allclose(matrix[:3, 3] * [-1, -1, 1], pose.apply([0, 0, 0]), atol=1e-6)
-    assert "--mode" in refused("convert", bench / "sweep.h5", tmp_path / name, "--mode", "image")
-    assert "reconstruction" in refused("convert", made, tmp_path / name, "--frame-rate-hz", 20)
-    assert "s.h5" in refused("convert", made, tmp_path / "s.h5")
 
 
 def test_a_scene_of_two_modes(run, refused, made, tmp_path):
@@ -49,9 +33,6 @@ def test_a_scene_of_two_modes(run, refused, made, tmp_path):
     options = ("--mode", "image", "--mode", "pose", "--voxel-mm", 0.5, "--deviation")
     code, out, err = run("scene", made, "-o", target, *options)
     assert (code, out) == (0, ""), err
-    assert [line.split(": ")[0] for line in err.splitlines()] == [
-        str(target / f"volume-{mode}.nrrd") for mode in ("image", "pose")
-    ]
     names = {node.get("name") for node in ElementTree.parse(target / "scene.mrml").getroot()}
     assert {"sweep, image", "sweep, pose", "sweep, image: outlines"} <= names
     assert read_volume(target / "volume-pose.nrrd").fields["poses"] == "pose"
@@ -61,7 +42,6 @@ def test_a_scene_of_two_modes(run, refused, made, tmp_path):
     assert np.nanmin(deviation.voxels) >= 0
     assert run("scene", made, "-o", target, "--voxel-mm", 0.5)[0] == 0
     assert not (target / "volume-pose.nrrd").exists()
-    assert str(made.parent) in refused("scene", made, "-o", made.parent)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "mine.txt").write_text("precious")
     assert "another folder" in refused("scene", made, "-o", tmp_path / "other")

@@ -9,13 +9,10 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.reconstruction import Provenance, SharedErrors, Trust
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
-from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.shapes.surfaces import read_surface
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
-from speckle3d.study.reslices.cuts import CutPicture, DrawnCut
-from speckle3d.study.reslices.reslice_figures import save_reslices
 
 GRID = ImageGrid(51, 51, 0.2, 0.2)
 N = 41
@@ -32,7 +29,7 @@ def rec(tmp_path):
     covariance = shared_covariance(POSES, GRID.centre_mm, SCALE)
     with ReconstructionWriter(path, 0.04 * np.arange(N), GRID) as writer:
         trust = Trust(covariance, np.zeros(N, dtype=np.int64), SCALE)
-        writer.finish({"image": POSES, "fused": POSES}, Provenance("sweep.h5", "", ""), "", trust)
+        writer.finish({"image": POSES}, Provenance("sweep.h5", "", ""), "", trust)
     return path
 
 
@@ -60,28 +57,8 @@ def test_a_distance_along_the_sweep_is_as_sure_as_its_scale(run, rec):
     assert second["by_poses"] == pytest.approx(0.0, abs=1e-6)
     assert line["value"] == pytest.approx(12.0)
     assert angle["value"] == pytest.approx(90.0)
-    code, out, err = run("measure", rec, *points, "--pick-mm", "0.05")
+    _, out, _ = run("measure", rec, *points, "--pick-mm", "0.05")
     assert out.splitlines()[0].startswith("distance 1 2: 8.00 +- 0.41 mm [7.20, 8.80]")
-    assert out.splitlines()[-1].startswith("mode image; points picked to 0.05 mm per axis")
-    assert "claims no errors" not in err
-    _, _, err = run("measure", rec, *points, "--mode", "fused")
-    assert "mode fused claims no errors of its own: those of the images are taken" in err
-
-
-def picture_of(path, mode, plane, anchors=None):
-    image = np.ones((51, 41), np.float32)
-    return save_reslices(CutPicture({mode: DrawnCut(image, plane)}, anchors={mode: anchors or {}}), path)
-
-
-def test_points_may_be_picked_in_a_cut(run, rec, tmp_path):
-    turned = RigidTransform.from_matrix([[0, 0, 1, 5], [0, 1, 0, 0], [-1, 0, 0, 9], [0, 0, 0, 1.0]])
-    picture = picture_of(tmp_path / "cut.png", "fused", ReslicePlane(turned, 8.0, 10.0, 0.2))
-    code, out, err = run("measure", rec, "--on", picture, "--point", "0,5", "--point", "6,5", "--json")
-    assert code == 0, err
-    told = json.loads(out)
-    assert told["mode"] == "fused"
-    assert told["measurements"][0]["value"] == pytest.approx(6.0)
-    assert told["measurements"][0]["by_poses"] == pytest.approx(0.05 * 6.0, rel=1e-3)
 
 
 def test_a_ball_has_its_volume_and_what_the_scale_does_to_it(run, ball, rec, tmp_path):
@@ -95,6 +72,3 @@ def test_a_ball_has_its_volume_and_what_the_scale_does_to_it(run, ball, rec, tmp
     surface = read_surface(out)
     assert len(surface) == told["triangles"]
     np.testing.assert_allclose(surface.vertices_mm.mean(axis=0), 5.0, atol=0.01)
-    code, text, err = run("surface", ball, "-o", out, "--level", "128", "--smooth", "5", "--largest")
-    assert "smoothing changed the volume by" in text
-    assert "1 part" in text

@@ -60,23 +60,3 @@ def test_the_whole_calibration_places_levels_as_they_are_stored(run, recording, 
     mean = np.divide(total, count, out=np.zeros_like(total), where=count > 0)
     np.testing.assert_allclose(volume.voxels, mean, atol=0.51)
     assert (count == 0).any()
-
-
-def test_a_cut_takes_the_same_options_and_shows_levels_where_decibels_are_not_known(run, recording, tmp_path):
-    path, pixels = recording
-    options = "--plus-config", tmp_path / "set.xml", "--frame", 2, "--pixel-mm", 0.5
-    code, _, told = run("reslice", path, *options, "-o", tmp_path / "c.nrrd")
-    assert code == 0, told
-    assert "1 of 6 frames have no valid pose" in told
-    cut = read_volume(tmp_path / "c.nrrd")
-    assert cut.fields["levels"].startswith("grey levels of the B-mode")
-    # As stored, but for one level that all frames are raised by; 0 where nothing was seen.
-    seen = cut.voxels[cut.voxels > 0].astype(float)
-    assert np.ptp(seen) == pytest.approx(np.ptp(pixels[2].astype(float)), abs=4)
-    part = "rectangle 0,0 3,9"
-    assert run("reslice", path, *options, "--region", part, "-o", tmp_path / "p.nrrd")[0] == 0
-    assert 0 < (read_volume(tmp_path / "p.nrrd").voxels > 0).sum() < 0.7 * (cut.voxels > 0).sum()
-    other = tmp_path / "c.nrrd", "--plus-config", tmp_path / "set.xml", "-o", tmp_path / "d.png"
-    code, _, told = run("reslice", *other)
-    assert code == 2
-    assert "--plus-config: expected a sweep" in told

@@ -13,7 +13,7 @@ from speckle3d.io.igtl.messages import ImageReceived, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
-from speckle3d.live.session import MOST_BEFORE, MOST_WAITING, Session, SessionSettings
+from speckle3d.live.session import MOST_WAITING, Session, SessionSettings
 from speckle3d.live.volume import MOST_IMAGES, GrowingVolume
 
 RF = ImportSettings(
@@ -132,25 +132,6 @@ def test_words_and_a_volume_go_out(recorded, tmp_path, monkeypatch):
     volumes = [each for each in sent if each.device == VOLUME]
     assert volumes[-1].pixels.ndim == 3
     assert volumes[-1].pixels.max() > 100
-
-
-def test_a_flood_before_and_behind_the_first_frame_costs_no_frame(recorded, tmp_path):
-    frames, curves = recorded
-    other = ImageReceived("Camera", 0.0, np.zeros((9, 9, 3), np.uint8), np.eye(4), np.ones(3), 3)
-    before = [reading(k / 1000) for k in range(MOST_BEFORE + 50)]
-    behind = [reading(10.0 + k / 1000, "StylusToReference") for k in range(1, MOST_BEFORE + 50)]
-    session, _ = run(
-        [[other, *before, image(frames[0], 5.0), *behind, image(frames[1], 5.04)]],
-        lambda p: p.matched == 2,
-        curves,
-        tmp_path,
-        image="Image_Reference",
-        transform="ProbeToReference",
-    )
-    assert session.progress.recorded == 2
-    assert session.progress.missing == ""
-    kept = s3.load_sweep(tmp_path / "sweep.h5")
-    assert kept.tracker.readings.time_s[-1] == pytest.approx((MOST_BEFORE + 49) / 1000 - 5.0)
 
 
 def test_when_placing_fails_recording_goes_on(recorded, tmp_path, monkeypatch):

@@ -11,9 +11,8 @@ from report_examples import HOSTILE, MODES, REASON
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
-from speckle3d.core.reconstruction import FramePairs
 from speckle3d.report.data import load_view, read_study
-from speckle3d.report.figures import plot_curves, plot_rejected
+from speckle3d.report.figures import plot_curves
 from speckle3d.report.page import write_report
 from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import label_of
@@ -139,18 +138,6 @@ def test_a_study_of_broken_sweeps_alone_is_still_a_page(tmp_path):
     assert "no speckle" in words
     # The sweep whose folder is gone is told with it.
     assert str(tmp_path / "sweeps" / "lost-1") in words
-
-
-def test_rejected_patches_count_only_those_with_a_distance():
-    distance = np.array([[1.0, 1.0, np.nan], [1.0, 1.0, np.nan], [1.0, np.nan, np.nan], [1.0, 1.0, np.nan]])
-    used = np.array([[1, 0, 0], [1, 0, 0], [0, 0, 0], [1, 1, 0]], dtype=bool)
-    first, centres = np.array([0, 0, 2, 3]), np.array([[1.0, 2], [3, 2], [5, 2]])
-    poses = np.tile(np.eye(4), (4, 1, 1))
-    pairs = FramePairs(first, first + 1, poses, np.zeros((4, 6, 6)), distance, distance, used, centres)
-    heat, line = plot_rejected(pairs, 5).data
-    np.testing.assert_allclose(heat.z, [[25.0, 200 / 3, np.nan]], rtol=1e-6)
-    assert (list(heat.x), list(heat.y)) == ([1.0, 3.0, 5.0], [2.0])
-    np.testing.assert_allclose(line.y, [50.0, np.nan, 100.0, 0.0, np.nan])
 
 
 def test_differences_from_the_reference_are_a_button_away():

@@ -5,8 +5,6 @@ import pytest
 
 from speckle3d.app.sweep.findings import FrameFindings
 from speckle3d.config import Config
-from speckle3d.core.doubts import Doubt
-from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
 from speckle3d.matching.quality import FrameFlag
 
 
@@ -43,18 +41,3 @@ def test_without_a_reconstruction_frames_are_judged_here_and_say_why(spoilt):
     assert f"{clipped:.2g} %" in saturated
     assert "2 %" in saturated
     assert "4 of 10" in findings.state()
-
-
-def test_a_reconstructions_flags_and_doubts_are_taken_as_they_are(spoilt):
-    flags = np.zeros(10, dtype=np.int64)
-    flags[7] = FrameFlag.UNMATCHED
-    doubts = [Doubt("images", "speed", "expected less, got more", False, ((7, 7),))]
-    made = Reconstruction(
-        spoilt.frame_time_s, spoilt.grid, {"image": spoilt.truth}, Provenance("s.h5", "", ""),
-        trust=Trust(np.zeros((10, 6, 6)), flags),
-    )  # fmt: skip
-    findings = FrameFindings(spoilt, Config(), made, doubts)
-    assert findings.doubts == tuple(doubts)
-    (reason,) = findings.reasons(7)
-    assert reason.startswith("unmatched")
-    assert findings.reasons(3) == []

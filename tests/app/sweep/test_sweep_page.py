@@ -9,7 +9,7 @@ from browsers import needs_browser, opened, viewing
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.app.folder import Folder
-from speckle3d.app.sweep.page import SweepPage, _Player, streams_of
+from speckle3d.app.sweep.page import SweepPage, _Player
 from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
@@ -107,24 +107,6 @@ def test_flags_and_doubts_are_marked_at_their_frames_and_a_click_goes_there(play
     player._times._jump(int(np.argmin(np.abs(time_s - marks["left"][spikes]))))
     assert abs(time_s[player.frame] - marks["left"][spikes]) < 0.04
     assert player._times.cursor.location == time_s[player.frame]
-
-
-def test_a_recording_alone_is_judged_in_the_background(sweep, shipped):
-    player = _Player(SweepPage(sweep.part(0, 6), Folder(shipped / "phantom.h5")))
-    player.layout()
-    assert "0 of 6" in player._state.object
-    for _ in range(100):
-        player._judge()
-    assert "None of 6 frames flagged" in player._state.object
-
-
-def test_streams_are_the_images_path_and_turn(sweep):
-    (_, about, _, turn), (_, parts, time_s, path) = streams_of(sweep)
-    assert (about[0], parts[2]) == ("tilt", "elevational")
-    frame = np.interp(sweep.frame_time_s, time_s, path[:, 2])
-    expected = (sweep.truth[0].inv() * sweep.truth).apply(sweep.grid.centre_mm)[:, 2]
-    assert np.abs(frame - frame[0] - expected).max() < 1.0
-    assert np.nanmax(np.abs(turn)) < 2.0
 
 
 @pytest.mark.slow
