@@ -158,18 +158,12 @@ def random_look(rng, probe):
     )
 
 
-def crossing_world(seed, frames=54, recorded=None, probe=None, look=None):
-    """Images of a crossing by a hand that turns the probe about it, and a tracker's readings.
-
-    Parameters
-    ----------
-    recorded : (picks, poses), optional
-        Of real frames: their rotations, and where in the image the crossing was, are used.
-    """
+def crossing_world(seed, frames=54, probe=None, look=None):
+    """Images of a crossing by a hand that turns the probe about it, and a tracker's readings."""
     rng = np.random.default_rng([seed, 15])
     probe = probe or random_probe(rng)
     look = look or random_look(rng, probe)
-    where, turns = _hand(rng, frames) if recorded is None else _as_recorded(rng, frames, *recorded)
+    where, turns = _hand(rng, frames)
     centre, pixels = rng.uniform(-300, 300, 3), _places(rng, probe, where)
     away = 0.35 * look.elevation_mm * rng.standard_normal(frames)
     lost = rng.random(frames) < 0.12  # the beam misses the crossing
@@ -209,15 +203,6 @@ def _hand(rng, frames):
     # About the beam's axis, about the array's, and in the image.
     turn = Rotation.from_euler("yxz", angles)
     return where, turn
-
-
-def _as_recorded(rng, frames, picks, poses):
-    """Of real frames: rotations from their middle one, and places as parts of the range."""
-    chosen = np.sort(rng.permutation(len(picks))[:frames]) if frames <= len(picks) else None
-    if chosen is None:
-        chosen = np.arange(frames) % len(picks)
-    where = (picks - picks.min(axis=0)) / np.ptp(picks, axis=0)
-    return where[chosen], (poses[len(poses) // 2].inv() * poses[chosen]).rotation
 
 
 def _places(rng, probe, where):
@@ -410,28 +395,15 @@ def _skin(rng, probe, look):
 
 
 def _lettering(rng, probe):
-    """Letters, a ruler, a grey wedge and a focus mark, as scanners burn in."""
+    """Lines of letters and a grey wedge, as scanners burn in."""
     picture = np.zeros(probe.shape)
     columns, rows = probe.shape
     for _ in range(rng.integers(3, 9)):
-        scale, length = rng.integers(1, 3), rng.integers(4, 16)
-        letters = np.kron(rng.random((length, 5, 7)) < 0.45, np.ones((1, scale, scale)))
-        block = np.concatenate([np.pad(one, ((0, scale), (0, 0))) for one in letters])
-        if rng.random() < 0.65:
-            u, v = (
-                rng.choice([rng.integers(0, 40), max(0, columns - len(block) - 5)]),
-                rng.integers(0, rows - 20),
-            )
-        else:
-            u, v = rng.integers(0, max(1, columns - len(block))), rng.choice([2, rows - 18])
+        block = np.kron(rng.random((rng.integers(20, 90), 7)) < 0.45, np.ones((1, rng.integers(1, 3))))
+        u, v = rng.integers(0, columns - len(block)), rng.choice([2, rows - 18])
         part = picture[u : u + len(block), v : v + block.shape[1]]
-        part[:] = np.maximum(part, 230 * block[: part.shape[0], : part.shape[1]])
-    edge = int(rng.integers(3, 12))
-    side = edge if rng.random() < 0.5 else columns - edge - 12
-    for v in np.arange(probe.corner_px[1], rows, 10.0 / probe.pixel_mm[1]):
-        picture[side : side + 8, int(v)] = 210
-    wedge = columns - edge - 30 if side == edge else edge
-    picture[wedge : wedge + 8, 30 : 30 + rows // 4] = np.linspace(255, 5, rows // 4)
+        part[:] = np.maximum(part, 230 * block)
+    picture[6:14, 30 : 30 + rows // 4] = np.linspace(255, 5, rows // 4)
     return picture
 
 

@@ -25,35 +25,23 @@ RESIDUAL = 0.01
 ROOM = 0.02
 """Of the earth's field, what a room without iron near adds here and there."""
 
-TURNING_RAD = 0.7
-"""RMS turn from the mean attitude of a sensor that turns: BROAD's rotations have 1.0 and more."""
-
-SLOW_RAD_S = 2.2
-"""Highest mean rate of slow turning: BROAD has 1 to 2 in slow rotations, 4 and more in fast ones."""
-
 BRIDGED_S = 0.1
 """In longer gaps of the optical orientation, it is not interpolated, and the magnetometer is missing."""
 
 PLAN = {
     "attached": (2.0, 5.0, 12.0, 30.0, 60.0),  # uT, a magnet on the sensor, with 3 % of soft iron
-    "attached, below": (5.0, 15.0),  # the same under the board; BROAD's at 4 cm adds 4.8 uT along z
-    "attached, level": (5.0, 30.0),  # the same on a sensor that keeps its attitude, where only sigma can tell
     "walk": (0.1, 0.2, 0.2, 0.4),  # RMS departure from the earth's field, a fraction of it
     "linger": (0.1, 0.2, 0.4),  # the same, with 20 to 60 s beside one piece of iron
     "passing": (30.0, 200.0),  # uT at the nearest, a few seconds each
     "start": (5.0, 20.0, 60.0),  # uT until 5 s after the first movement
     "drift": (10.0, 30.0),  # degrees of heading over the recording
-    "missing": (40.0,),  # s
     "saturated": (40.0,),  # uT
     "frozen": (30.0,),  # s
     "spikes": (100.0,),  # uT, one reading in a hundred
-    "bias": (0.5, 2.0),  # deg/s, of the gyroscope
     "truncated": (0.12, 0.25),  # deg/s, the gyroscope's step, cut toward zero as BROAD's own
-    "truncated, slow": (0.12, 0.25),  # the same in slow turning
-    "scale": (0.01,),  # of the gyroscope
     "cut": (5.0, 15.0, 25.0, 35.0),  # s of movement left out, and all before: no rest to start from
 }
-"""Kinds of scene, and how strong; the last five leave the magnetometer as recorded."""
+"""Kinds of scene, and how strong; the last two leave the magnetometer as recorded."""
 
 
 class Scene(NamedTuple):
@@ -81,25 +69,10 @@ def scenes(folder, split):
     names = trials_in(folder)[half::2]
     motions = {name: recorded(folder, name) for name in names}
     for kind in PLAN:
-        fit = [name for name in names if fits(kind, motions[name])]
         for i, amount in enumerate(PLAN[kind]):
-            name = fit[(len(kind) + i) % len(fit)]
+            name = names[(len(kind) + i) % len(names)]
             rng = np.random.default_rng([half, i, *kind.encode()])  # the same whatever else the plan holds
             yield scene(motions[name], kind, amount, rng, name[:2])
-
-
-def fits(kind, motion):
-    """True for motion that turns, slowly, or keeps its attitude, if the kind asks for it."""
-    turns = motion.turns[motion.moving]
-    turning = np.sqrt(((turns * turns.mean().inv()).magnitude() ** 2).mean()) > TURNING_RAD
-    slow = np.linalg.norm(motion.log.gyroscope_rad_s[motion.moving], axis=1).mean() < SLOW_RAD_S
-    asked = {
-        "attached": turning,
-        "attached, below": turning,
-        "attached, level": not turning,
-        "truncated, slow": turning and slow,
-    }
-    return asked.get(kind, True)
 
 
 def scene(motion, kind, amount, rng, label=""):
@@ -190,15 +163,7 @@ def room_ut(motion, rng):
 
 def attached(motion, amount, rng):
     """Iron and a magnet that turn with the sensor."""
-    return fixed(motion, amount * direction(rng), rng)
-
-
-def attached_below(motion, amount, rng):
-    return fixed(motion, np.array([0.0, 0.0, -amount]), rng)
-
-
-def fixed(motion, magnet_ut, rng):
-    soft = np.eye(3) + 0.03 * rng.standard_normal((3, 3))
+    magnet_ut, soft = amount * direction(rng), np.eye(3) + 0.03 * rng.standard_normal((3, 3))
     return room(motion, None, rng) @ soft.T + magnet_ut
 
 
@@ -276,14 +241,12 @@ def drift(motion, amount, rng):
 
 FIELDS = {
     "attached": attached,
-    "attached, below": attached_below,
-    "attached, level": attached,
     "walk": walk,
     "linger": linger,
     "passing": passing,
     "start": start,
     "drift": drift,
-    **dict.fromkeys(("missing", "saturated", "frozen", "spikes"), room),
+    **dict.fromkeys(("saturated", "frozen", "spikes"), room),
 }
 
 
@@ -294,10 +257,6 @@ def during(motion, seconds, rng):
     """A stretch of the recording while the sensor moves, as many seconds long."""
     middle_s = rng.uniform(0.35, 0.65) * motion.log.time_s[-1]
     return np.abs(motion.log.time_s - middle_s) < 0.5 * seconds
-
-
-def missing(motion, readings, amount, rng):
-    return np.where(during(motion, amount, rng)[:, None], np.nan, readings)
 
 
 def saturated(motion, readings, amount, rng):
@@ -314,7 +273,7 @@ def spikes(motion, readings, amount, rng):
     return readings + np.where(hit[:, None], amount * rng.standard_normal(readings.shape), 0.0)
 
 
-FAULTS = {"missing": missing, "saturated": saturated, "frozen": frozen, "spikes": spikes}
+FAULTS = {"saturated": saturated, "frozen": frozen, "spikes": spikes}
 
 
 # -- other gyroscopes: log, truth, where it moves
@@ -322,20 +281,6 @@ FAULTS = {"missing": missing, "saturated": saturated, "frozen": frozen, "spikes"
 
 def worse_gyroscope(motion, rate):
     return with_readings(motion.log, gyroscope_rad_s=rate), motion.true_wxyz, motion.moving
-
-
-def bias(motion, amount, rng):
-    """Another bias, a fifth of which comes in the course of the recording."""
-    part = 0.8 + 0.2 * motion.log.time_s / motion.log.time_s[-1]
-    return worse_gyroscope(
-        motion, motion.log.gyroscope_rad_s + np.outer(part, np.deg2rad(amount) * direction(rng))
-    )
-
-
-def scale(motion, amount, rng):
-    """Wrong scales and axes that are not square."""
-    wrong = np.eye(3) + amount * rng.uniform(-1.0, 1.0, (3, 3))
-    return worse_gyroscope(motion, motion.log.gyroscope_rad_s @ wrong.T)
 
 
 def truncated(motion, amount, rng):
@@ -355,8 +300,5 @@ def cut(motion, amount, rng):
 
 SENSORS = {
     "cut": cut,
-    "bias": bias,
     "truncated": truncated,
-    "truncated, slow": truncated,
-    "scale": scale,
 }

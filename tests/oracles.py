@@ -141,32 +141,42 @@ def scatter_echoes(position_mm, amplitude, vector_mm, field, reach, curvature, g
     return out
 
 
-def patch_correlations(fixed, moving, first, size, shift, least_overlap, radius):
-    """Twin of `patch_kernels.patch_correlations`: `numpy.corrcoef` sample by sample.
+def of_patches(fixed, moving, first, size, shift, least_overlap, alike):
+    """Twin of the kernels in `patch_kernels`: `alike` of the samples that lie in both frames at every lag.
 
-    radius: (lateral, axial). Returns (p, 2 * lateral + 1, 2 * axial + 1).
+    alike: function of both frames' samples and of their places in the patch, (n, 2). Returns (p, 3, 3).
     """
-    lags = [(i, j) for i in range(-radius[0], radius[0] + 1) for j in range(-radius[1], radius[1] + 1)]
+    lags = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     out = np.full((len(first), len(lags)), np.nan)
     for p, (corner, about) in enumerate(zip(first, shift, strict=True)):
-        patch = [(corner[0] + v, corner[1] + s) for v in range(size[0]) for s in range(size[1])]
-        inside = [
-            (v, s)
-            for v, s in patch
-            if (0 <= v < fixed.shape[0] and 0 <= s < fixed.shape[1])
-            and all(
-                0 <= v + about[0] + i < moving.shape[0] and 0 <= s + about[1] + j < moving.shape[1]
-                for i, j in lags
-            )
-        ]
-        if not inside or len(inside) < least_overlap * size[0] * size[1]:
+        partners = {}
+        for v, s in np.ndindex(*size):
+            at = corner[0] + v, corner[1] + s
+            theirs = [(at[0] + about[0] + i, at[1] + about[1] + j) for i, j in lags]
+            if all(0 <= a < fixed.shape[0] and 0 <= b < fixed.shape[1] for a, b in [at, *theirs]):
+                partners[v, s] = at, theirs
+        if not partners or len(partners) < least_overlap * size[0] * size[1]:
             continue
-        a = np.array([fixed[at] for at in inside], float)
-        for n, (i, j) in enumerate(lags):
-            b = np.array([moving[v + about[0] + i, s + about[1] + j] for v, s in inside], float)
-            if np.ptp(a) > 0 and np.ptp(b) > 0:
-                out[p, n] = np.corrcoef(a, b)[0, 1]
-    return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)
+        a = np.array([fixed[at] for at, _ in partners.values()])
+        for n in range(len(lags)):
+            b = np.array([moving[theirs[n]] for _, theirs in partners.values()])
+            out[p, n] = alike(a, b, np.array(list(partners)))
+    return out.reshape(len(first), 3, 3)
+
+
+def pearson(a, b, _):
+    return np.corrcoef(a, b)[0, 1] if np.ptp(a) > 0 and np.ptp(b) > 0 else np.nan
+
+
+def coherence(ramp_rad):
+    """Squared coherence of complex samples, a ramp of phase undone on the second."""
+
+    def alike(a, b, places):
+        energy = np.vdot(a, a).real * np.vdot(b, b).real
+        turned = b * np.exp(1j * places @ ramp_rad)
+        return np.abs(np.vdot(a, turned)) ** 2 / energy if energy > 0 else np.nan
+
+    return alike
 
 
 def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
@@ -190,34 +200,6 @@ def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
     most = max(count for count, _, _ in tried)
     closest = min(misfit for count, misfit, _ in tried if count == most)
     return [s for count, misfit, s in tried if count == most and misfit <= closest + 1e-9]
-
-
-def patch_coherences(fixed, moving, first, size, shift, ramp_rad, least_overlap, radius):
-    """Twin of `patch_kernels.patch_coherences`: complex sums sample by sample.
-
-    fixed, moving: complex (vector, sample); radius: (lateral, axial). The ramp is undone on `moving`.
-    Returns (p, 2 * lateral + 1, 2 * axial + 1).
-    """
-    lags = [(i, j) for i in range(-radius[0], radius[0] + 1) for j in range(-radius[1], radius[1] + 1)]
-    out = np.full((len(first), len(lags)), np.nan)
-    for p, (corner, about) in enumerate(zip(first, shift, strict=True)):
-        partners = {}
-        for v, s in np.ndindex(*size):
-            at = corner[0] + v, corner[1] + s
-            theirs = [(at[0] + about[0] + i, at[1] + about[1] + j) for i, j in lags]
-            everyone = [at, *theirs]
-            if all(0 <= a < fixed.shape[0] and 0 <= b < fixed.shape[1] for a, b in everyone):
-                partners[at] = theirs
-        if not partners or len(partners) < least_overlap * size[0] * size[1]:
-            continue
-        a = np.array([fixed[at] for at in partners], complex)
-        turn = np.exp(1j * np.array([v * ramp_rad[0] + s * ramp_rad[1] for v, s in partners]))
-        for n in range(len(lags)):
-            b = np.array([moving[theirs[n]] for theirs in partners.values()], complex) * turn
-            energy = np.vdot(a, a).real * np.vdot(b, b).real
-            if energy > 0:
-                out[p, n] = np.abs(np.vdot(a, b)) ** 2 / energy
-    return out.reshape(len(first), 2 * radius[0] + 1, 2 * radius[1] + 1)
 
 
 def cut_at(point, images, image_from_world, pixels, max_gap_mm):

@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -15,29 +14,15 @@ _TIMEOUT_S = 1800
 _LEFT_OUT = ("pip ", "python -m pytest")
 
 
-@dataclass(frozen=True)
-class Block:
-    """One fenced block of a page: its language, its text, and the line it begins at."""
-
-    language: str
-    text: str
-    line: int
-
-
-def blocks(page: Path) -> list[Block]:
-    """All fenced blocks of a page in order."""
-    text = page.read_text()
-    return [Block(m[1], m[2], text.count("\n", 0, m.start()) + 1) for m in _FENCE.finditer(text)]
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Language and text of all fenced blocks of a page in order."""
+    return _FENCE.findall(page.read_text())
 
 
 def shown_commands(page: Path) -> list[str]:
     """Command lines behind a `$` in blocks that are shown, continued lines joined."""
-    found = []
-    for block in blocks(page):
-        if block.language == "console":
-            joined = block.text.replace("\\\n", " ")
-            found += [line[2:] for line in joined.splitlines() if line.startswith("$ ")]
-    return found
+    shown = "".join(text for language, text in blocks(page) if language == "console")
+    return [line[2:] for line in shown.replace("\\\n", " ").splitlines() if line.startswith("$ ")]
 
 
 def run_page(page: Path, folder: Path) -> str:
@@ -60,22 +45,21 @@ def run_page(page: Path, folder: Path) -> str:
     script = command / "page.py"
     printed = ""
     python: list[str] = []
-    for block in blocks(page):
-        if block.language == "sh":
-            runs = _without_installing(block.text)
+    for language, text in blocks(page):
+        if language == "sh":
+            runs = _without_installing(text)
             arguments = ["bash", "-euo", "pipefail", "-c", runs]
-        elif block.language == "python":
+        elif language == "python":
             # Blocks of a page share their names; those before are run again, without what they print.
-            script.write_text(_after(python, block.text))
-            python.append(block.text)
+            script.write_text(_after(python, text))
+            python.append(text)
             arguments = [sys.executable, "-W", "error::DeprecationWarning:__main__", str(script)]
         else:
             continue
         done = subprocess.run(
             arguments, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S
         )
-        where = f"{page.name}, line {block.line}"
-        assert done.returncode == 0, f"{where}:\n{block.text}\n{done.stdout}{done.stderr}"
+        assert done.returncode == 0, f"{page.name}:\n{text}\n{done.stdout}{done.stderr}"
         printed += done.stdout
     return printed
 

@@ -6,22 +6,13 @@ import sys
 import imu_logs
 import numpy as np
 import pytest
-import speckle
 import sweep_examples
-from calibration_files import made
 from disks import FULL, limited
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import NoSpaceError
-from speckle3d.core.labels import STATE_SEGMENTS, LabelMap
-from speckle3d.core.reconstruction import FramePairs, Provenance
 from speckle3d.core.volume import Volume
-from speckle3d.io.calibrations import write_calibration
-from speckle3d.io.curves import write_curves
 from speckle3d.io.plus.write import write_sequence
-from speckle3d.io.points import PickedPoints, write_points
-from speckle3d.io.reconstructions import ReconstructionWriter
-from speckle3d.io.shapes.surfaces import write_polylines
 from speckle3d.io.sweep_writer import attach_orientation, write_sweep
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.study.figures import new_figure, save_figure
@@ -37,21 +28,6 @@ VOLUME = Volume(
     (0.5, 0.5, 1.0),
     RigidTransform.identity(),
 )
-LABELS = LabelMap(VOLUME.voxels % 3, VOLUME.spacing_mm, VOLUME.world_from_grid, {}, STATE_SEGMENTS)
-
-
-def reconstruction(path):
-    frames, patches = 20, VALUES.shape[1]
-    with ReconstructionWriter(path, 0.04 * np.arange(frames), SWEEP.grid) as writer:
-        for first in range(frames - 1):
-            number = np.array([first])
-            pose = sweep_examples.poses(1, first).as_matrix()
-            values = VALUES[[first]]
-            centre = np.zeros((patches, 2))
-            writer.append_pairs(
-                FramePairs(number, number + 1, pose, np.eye(6)[None], values, values, values > 0.5, centre)
-            )
-        writer.finish({"image": sweep_examples.poses(frames)}, Provenance("s.h5", "ab" * 32, "0"))
 
 
 def figure():
@@ -70,26 +46,12 @@ def recorded(path):
 
 
 WRITERS = {
-    "curves.h5": lambda path: write_curves(path, speckle.curves(sigma_mm=[0.3, 0.6])),
-    "calibration.h5": lambda path: write_calibration(path, made()),
     "sweep.h5": lambda path: write_sweep(path, SWEEP),
-    "plain.h5": lambda path: write_sweep(path, SWEEP, compression=None),
-    "sequence.mha": lambda path: write_sequence(path, SWEEP),
     "sequence.mhd": lambda path: write_sequence(path, SWEEP, compressed=False),
-    "sequence.nrrd": lambda path: write_sequence(path, SWEEP),
     "attached.h5": lambda path: attach_orientation(path, SWEEP.orientation),
-    "reconstruction.h5": reconstruction,
-    "volume.nrrd": lambda path: write_volume(path, VOLUME),
-    "volume.mha": lambda path: write_volume(path, VOLUME),
     "volume.nii.gz": lambda path: write_volume(path, VOLUME),
-    "volume.nii": lambda path: write_volume(path, VOLUME),
-    "plain.nrrd": lambda path: write_volume(path, VOLUME, compress=False),
-    "state.seg.nrrd": lambda path: write_volume(path, LABELS),
-    "frames.seq.nrrd": lambda path: write_sequence(path, SWEEP),
-    "outlines.vtk": lambda path: write_polylines(path, np.zeros((9, 5, 3))),
     "figure.png": lambda path: save_figure(figure(), path),
     "summary.json": lambda path: write_texts(path.parent, {path.name: "0123456789" * 500}),
-    "points.csv": lambda path: write_points(path, PickedPoints(np.arange(99), VALUES[:, :2])),
     "log.csv": lambda path: write_csv(
         path, parse_stream(b"".join(imu_logs.mtdata2_messages(imu_logs.samples())))
     ),

@@ -16,7 +16,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag
-from speckle3d.motion.direction import SensorSettings, settle_direction, smooth_rotations
+from speckle3d.motion.direction import SensorSettings, settle_direction
 from speckle3d.pipeline import track
 
 
@@ -97,16 +97,6 @@ def test_a_sensor_that_does_not_turn_with_the_image_settles_nothing(sweep):
     sensor = OrientationSensor(TimedRotations(sweep.frame_time_s, sensed), Rotation.identity())
     oriented = replace(sweep, tracker=None, orientation=sensor, truth=None)
     assert settle_direction(oriented, RigidTransform.from_rotation(image), SensorSettings()) == (1, "assumed")
-
-
-def test_smoothing_keeps_slow_turns_and_loses_jitter():
-    time_s = np.arange(200) / 25
-    slow = np.outer(np.deg2rad(3) * np.sin(2 * np.pi * time_s / 8), [1.0, 0.5, 0.0])
-    jitter = np.random.default_rng(0).normal(0, np.deg2rad(0.3), slow.shape)
-    smooth = smooth_rotations(Rotation.from_rotvec(slow + jitter), time_s, 0.2).as_rotvec()
-    # A Gaussian of 5 frames averages about 2 sqrt(pi) 5 = 18 of them: jitter falls to a quarter.
-    left = np.rad2deg(smooth - slow)[20:-20].std()
-    assert left < 0.3 / 3
 
 
 def spoilt(sweep, numbers, change):

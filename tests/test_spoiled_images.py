@@ -67,15 +67,9 @@ def test_what_stands_still_outside_the_region_changes_nothing(sweep, curves):
 
 
 REFUSED = {
-    "clutter at -6 dB": lambda s, p: spoil.cluttered(s, p, -6.0),
     "clutter in the upper half": lambda s, p: spoil.cluttered(s, p, 6.0, (0.0, 0.5)),
-    "noise at 6 dB at rest": lambda s, p: spoil.at_rest(s, 6.0),
     "every frame twice": lambda s, p: spoil.in_order(s, np.repeat(np.arange(len(s)), 2)),
     "shuffled": lambda s, p: spoil.in_order(s, np.random.default_rng(0).permutation(len(s))),
-    "there and back in turn": lambda s, p: spoil.interleaved(s, spoil.in_order(s, range(len(s))[::-1])),
-    "three in turn": lambda s, p: spoil.interleaved(
-        *(spoil.in_order(s, range(k, k + 32)) for k in (0, 32, 64))
-    ),
 }
 
 
@@ -91,9 +85,7 @@ HONEST = {
     "gain that flickers": lambda s: spoil.spoiled(
         s, s.frames * np.random.default_rng(0).uniform(0.5, 1.0, (len(s), 1, 1))
     ),
-    "every second frame": lambda s: spoil.in_order(s, range(0, len(s), 2)),
     "a third of the time at rest": spoil.resting_first,
-    "backwards": lambda s: spoil.in_order(s, range(len(s))[::-1]),
     "noise at 10 dB": lambda s: spoil.noisy(s, 10.0),
 }
 
@@ -109,9 +101,8 @@ def test_what_can_be_measured_is_and_holds(narrow, curves, case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("decibel", [-14.0, -10.0])
-def test_a_little_clutter_is_told(narrow, curves, pattern, decibel):
-    found = track(spoil.cluttered(narrow, pattern, decibel), curves)
+def test_a_little_clutter_is_told(narrow, curves, pattern):
+    found = track(spoil.cluttered(narrow, pattern, -14.0), curves)
     assert "static clutter" in found.doubts[0].suspect
 
 

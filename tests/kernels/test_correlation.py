@@ -52,9 +52,9 @@ def test_they_are_numpys_of_what_overlaps_at_every_lag(seed, first, data, ramp, 
     place = first, SIZE, shift
     # Sums in float32 are right to 1e-7 of the energy.
     a, b = np.abs(one) ** 2, np.abs(two) ** 2
-    expected = oracles.patch_correlations(a, b, *place, least_overlap, (1, 1))[:, *CROSS]
+    expected = oracles.of_patches(a, b, *place, least_overlap, oracles.pearson)[:, *CROSS]
     np.testing.assert_allclose(correlated(a, b, first, shift, least_overlap), expected, atol=5e-6)
-    expected = oracles.patch_coherences(one, two, *place, ramp, least_overlap, (1, 1))[:, *CROSS]
+    expected = oracles.of_patches(one, two, *place, least_overlap, oracles.coherence(ramp))[:, *CROSS]
     np.testing.assert_allclose(cohered(one, two, first, shift, ramp, least_overlap), expected, atol=5e-6)
 
 

@@ -1,8 +1,7 @@
 """Crossing wires found in simulated B-mode images, and picks of which half or more are wrong.
 
 The images come from `crossing_images`: wires met by a thick beam, with all that scanners add, of linear and
-convex probes 40 to 150 mm deep. Every other recording has the rotations, and the places in the image, of 54
-real frames where those are at hand.
+convex probes 40 to 150 mm deep.
 """
 
 import sys
@@ -22,18 +21,8 @@ from calibration.points import ImagePoints
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 
-RECORDED = Path(__file__).resolve().parents[4] / "shared" / "realdata" / "cross-wire"
 NEAR_MM = 2.0
 WORLDS, PICKED, CHANCE = 60, 200, 400
-
-
-def recorded():
-    """Points picked in real frames, and their poses; None where they are not at hand."""
-    if not RECORDED.is_dir():
-        return None
-    picks = np.loadtxt(RECORDED / "crossWirePhantom2DPoints.txt")
-    rows = np.loadtxt(RECORDED / "crossWirePhantomTransformations.txt").reshape(-1, 3, 4)
-    return picks, RigidTransform.from_components(rows[:, :, 3], Rotation.from_matrix(rows[:, :, :3]))
 
 
 def away_mm(world, pixels, frame):
@@ -52,7 +41,7 @@ def solved(points, pixel_mm):
 def of_images(seed):
     """Share offered, share found, share of the used that are wrong, RMS, corner error, exchanged accepted."""
     rng = np.random.default_rng([seed, 1])
-    world = crossing_world(seed, recorded=recorded() if seed % 2 else None)
+    world = crossing_world(seed)
     # The size a user reads off the scanner's ruler.
     given = world.pixel_mm * rng.uniform(0.95, 1.05, 2)
     seen = crossings_in_frames(world.images, given)
