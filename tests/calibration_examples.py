@@ -108,6 +108,7 @@ def scan_wires(
     rng: np.random.Generator,
     places_mm: np.ndarray,
     *,
+    sensor_from_image: RigidTransform = TRIAL_1,
     world_from_phantom: RigidTransform | None = None,
     noise_mm: float = 0.0,
 ) -> tuple[np.ndarray, RigidTransform]:
@@ -125,7 +126,7 @@ def scan_wires(
     flat = np.column_stack([seen, np.zeros(count)])
     world_from_image = RigidTransform.from_components(where.apply(places_mm) - turn.apply(flat), turn)
     pixels = (seen + noise_mm * rng.standard_normal((count, 2))) / PIXEL_MM
-    return pixels, world_from_image * TRIAL_1.inv()
+    return pixels, world_from_image * sensor_from_image.inv()
 
 
 def centre_of(sensor_from_image: RigidTransform, pixel_mm: np.ndarray) -> np.ndarray:

@@ -47,8 +47,3 @@ def test_modules_that_a_page_names_exist(page: Path) -> None:
         for name in re.findall(r"`(\w+)`", names):
             there = ROOT / folder / name
             assert there.is_dir() or there.with_suffix(".py").exists(), f"{page.name}: {folder}/{name}"
-
-
-def test_the_index_leads_to_every_page() -> None:
-    index = (ROOT / "docs" / "methods" / "index.md").read_text()
-    assert {f"{page.stem}.md" for page in PAGES} - {"index.md"} == set(re.findall(r"\((\S+\.md)\)", index))

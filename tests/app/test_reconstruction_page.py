@@ -7,7 +7,6 @@ from contextlib import chdir, redirect_stdout, suppress
 
 import numpy as np
 import pytest
-from bokeh.events import Tap
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d import cli
@@ -81,25 +80,6 @@ def test_a_cut_is_what_its_command_makes(viewer, page, cut, mode):
     seen = levels > 0
     assert seen.mean() > 0.6
     assert np.abs(grey - (levels - 1) * 255 / 254)[seen].max() < 2.0
-
-
-def click(viewer, cut, x, y):
-    plot = viewer._plots[cut]
-    plot._tapped(viewer._go, Tap(plot.plot, x=x, y=y))
-
-
-def test_a_click_in_one_cut_moves_the_others_and_beside_the_tissue_nothing(viewer):
-    click(viewer, "along", 4.0, 12.5)
-    assert (viewer.frame, viewer.depth_mm) == (10, 12.5)
-    click(viewer, "frame", 3.0, 6.0)
-    assert (viewer.frame, viewer.lateral_mm, viewer.depth_mm) == (10, 3.0, 6.0)
-    click(viewer, "depth", 8.0, 13.0)
-    assert (viewer.frame, viewer.lateral_mm, viewer.depth_mm) == (20, 13.0, 6.0)
-    upright, level = viewer._plots["along"]._lines
-    assert (upright.location, level.location) == (pytest.approx(8.0), pytest.approx(6.0))
-    for place in ((-3.0, 5.0), (30.0, 5.0), (4.0, -2.0), (4.0, 25.0)):
-        click(viewer, "along", *place)
-    assert (viewer.frame, viewer.lateral_mm, viewer.depth_mm) == (20, 13.0, 6.0)
 
 
 def test_points_are_measured_as_their_command_measures(viewer, page):

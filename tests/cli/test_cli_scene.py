@@ -5,8 +5,6 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from speckle3d.io.headers import read_header
-from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.voxels.volumes import read_volume
 
 DEVIATION_AND_STATE = (("deviation", ".nrrd"), ("state", ".seg.nrrd"))
@@ -15,17 +13,6 @@ DEVIATION_AND_STATE = (("deviation", ".nrrd"), ("state", ".seg.nrrd"))
 @pytest.fixture
 def made(reconstructed):
     return reconstructed / "reconstruction.h5"
-
-
-def test_a_reconstruction_becomes_a_sequence_with_its_poses(run, made, tmp_path):
-    name = "s.seq.nrrd"
-    code, out, err = run("convert", made, tmp_path / name, "--mode", "orientation")
-    assert (code, out) == (0, ""), err
-    header = read_header(tmp_path / name)
-    assert (header.size, header.transforms) == ((26, 600, 24), ["ImageToWorld"])
-    pose = read_reconstruction(made).poses["orientation"][11]
-    matrix = np.reshape([float(x) for x in header.frames[11]["ImageToWorldTransform"].split()], (4, 4))
-    np.testing.assert_allclose(matrix[:3, 3] * [-1, -1, 1], pose.apply([0, 0, 0]), atol=1e-6)
 
 
 def test_a_scene_of_two_modes(run, refused, made, tmp_path):

@@ -44,7 +44,7 @@ def cohered(fixed, moving, first, shift, ramp=(0.0, 0.0), least_overlap=0.6):
     first=patches,
     data=st.data(),
     ramp=st.tuples(st.floats(-0.6, 0.6), st.floats(-0.3, 0.3)),
-    least_overlap=st.sampled_from([0.0, 0.3, 0.6, 1.0]),
+    least_overlap=st.sampled_from([0.2, 0.6, 1.0]),
 )
 def test_they_are_numpys_of_what_overlaps_at_every_lag(seed, first, data, ramp, least_overlap):
     shift = data.draw(st.lists(lags, min_size=len(first), max_size=len(first)))

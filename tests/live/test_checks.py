@@ -5,10 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from speckle3d.correction.crossing.pair import CrossingSoFar
-from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.live.checks import GOOD, LIFTED, LOST, SEEN_S, STAYS_S, TOO_FAST, Words, words_for
-from speckle3d.live.crossing import NO_PLACE, NOT_YET, TURN_MORE, words_of
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.matching.schedule import TrajectorySettings
 
@@ -40,11 +37,3 @@ def test_words_come_when_they_are_so_for_a_while_and_stay_to_be_read():
     assert [each for each, _ in said] == [TOO_FAST, GOOD]
     assert said[0][1] == pytest.approx(20 / 25 + SEEN_S, abs=0.05)
     assert said[1][1] >= said[0][1] + STAYS_S
-
-
-@pytest.mark.parametrize(
-    ("similarity", "angle", "overlap", "words"),
-    [(0.2, 90, 30, NO_PLACE), (0.8, 12, 30, TURN_MORE), (0.8, 80, 5, NOT_YET), (0.8, 80, 30, GOOD)],
-)
-def test_a_crossing_is_told_by_the_limits_it_would_be_refused_by(similarity, angle, overlap, words):
-    assert words_of(CrossingSoFar(similarity, angle, overlap), CrossingSettings()) == words

@@ -12,9 +12,7 @@ from report_examples import HOSTILE, MODES, REASON
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.report.data import load_view, read_study
-from speckle3d.report.figures import plot_curves
 from speckle3d.report.page import write_report
-from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import label_of
 
 
@@ -138,15 +136,3 @@ def test_a_study_of_broken_sweeps_alone_is_still_a_page(tmp_path):
     assert "no speckle" in words
     # The sweep whose folder is gone is told with it.
     assert str(tmp_path / "sweeps" / "lost-1") in words
-
-
-def test_differences_from_the_reference_are_a_button_away():
-    ramp = np.tile(np.linspace(0, 10, 50), (4, 1))
-    plot = plot_curves(SweepCurves({"image": 1.1 * ramp}, ramp, "tracker", 0.5 * np.ones((4, 50))))
-    absolute, minus = (button.args[0]["visible"] for button in plot.layout.updatemenus[0].buttons)
-    assert list(absolute) == [not shown for shown in minus] == [trace.visible for trace in plot.data]
-    shown = [t for t, visible in zip(plot.data, minus, strict=True) if visible and t.xaxis == "x"]
-    (image,) = [t for t in shown if t.name == "image"]
-    np.testing.assert_allclose(image.y, 0.1 * ramp[0], atol=1e-6)
-    low, high = [t for t in shown if t.line.width == 0]
-    np.testing.assert_allclose(np.subtract(high.y, low.y), 1.0, atol=1e-6)

@@ -61,13 +61,3 @@ def test_what_a_reconstruction_keeps_of_a_pair_is_shown_as_it_is_kept(part, kept
     unpaired = pairs.values(8, 7, with_correlation=False)
     assert unpaired.used is None
     assert np.nanmedian(unpaired.correlation) > 0.5
-
-
-def test_patches_lie_in_the_later_frame_where_the_earlier_ones_are_found_again(part, kept):
-    pairs = SweepPairs(part, Config(), kept)
-    there, at_rest = pairs.values(3, 2, False), pairs.values(2, 3, False)
-    np.testing.assert_array_equal(at_rest.centre_mm, kept.patch_centre_mm)
-    assert (at_rest.turn_rad, there.turn_rad) == (0.0, pytest.approx(-0.02))
-    inside = np.column_stack([there.centre_mm, np.zeros(len(there.centre_mm)), np.ones(len(there.centre_mm))])
-    back = inside @ kept.first_from_second[0].T
-    np.testing.assert_allclose(back[:, :2], kept.patch_centre_mm, atol=1e-9)
