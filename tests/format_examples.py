@@ -112,13 +112,9 @@ def write_dicom(
     images,
     regions=(),
     photometric="MONOCHROME2",
-    syntax=None,
-    claimed=None,
-    packed=None,
-    deflated=None,
     **elements,
 ):
-    """Write `images` (frame, row, column[, colour]) as a scanner does, packed by `syntax` or `claimed` so."""
+    """Write `images` (frame, row, column[, colour]) as a scanner does."""
     from pydicom.dataset import FileDataset, FileMetaDataset
     from pydicom.sequence import Sequence
     from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage, generate_uid
@@ -143,15 +139,6 @@ def write_dicom(
         if value is not None:
             setattr(made, name, value)
     made.PixelData = images.tobytes()
-    if syntax is not None:
-        made.compress(syntax)
-    if claimed is not None:
-        from pydicom.encaps import encapsulate
-
-        made.PixelData = encapsulate(packed or [image.tobytes() for image in images])
-        made["PixelData"].is_undefined_length = True
-        meta.TransferSyntaxUID = claimed
-    meta.TransferSyntaxUID = deflated or meta.TransferSyntaxUID
     made.save_as(path, enforce_file_format=True)
     return path
 
@@ -190,14 +177,14 @@ def matlab_order(frames):
     return frames.transpose(2, 1, 0)
 
 
-def write_mat(path, new=False, packed=True, **variables):
+def write_mat(path, new=False, **variables):
     """Save variables as MATLAB does, dictionaries as structs, lists as cells; `new` is version 7.3."""
     if new:
         _write_mat_73(path, variables)
         return path
     from scipy.io import savemat
 
-    savemat(path, {name: _old(value) for name, value in variables.items()}, do_compression=packed)
+    savemat(path, {name: _old(value) for name, value in variables.items()}, do_compression=True)
     return path
 
 

@@ -31,10 +31,6 @@ PATTERNS = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
 NAMES = tuple("abcdefghi")
 
 
-def n_phantom(pose=None, ends=ENDS_MM, patterns=PATTERNS):
-    return WirePhantom(NAMES[: len(ends)], ends, patterns, pose)
-
-
 @dataclass(frozen=True)
 class Scene:
     """A sequence: poses of the sensor, where the image truly is, and the pixels of every wire."""
@@ -49,7 +45,7 @@ class Scene:
         return self.sensor_from_image.as_matrix() @ np.diag([*PIXEL_MM, 1.0, 1.0])
 
 
-def scene(seed, frames=30, degrees=12.0, ends=ENDS_MM):
+def scene(seed, frames=30, degrees=12.0):
     """Images of a phantom, about square to its wires and turned by up to `degrees` about each axis."""
     rng = np.random.default_rng(seed)
     world_from_phantom = RigidTransform.from_components([20.0, -30.0, 60.0], Rotation.random(rng=rng))
@@ -63,9 +59,13 @@ def scene(seed, frames=30, degrees=12.0, ends=ENDS_MM):
     centre = np.array([*(PIXEL_MM * SHAPE / 2), 0.0])
     phantom_from_image = RigidTransform.from_components(middle - turned.apply(centre), turned)
     world_from_sensor = world_from_phantom * phantom_from_image * sensor_from_image.inv()
-    pixels = np.stack([cut(ends, phantom_from_image[i]) for i in range(frames)])
-    phantom = n_phantom(world_from_phantom, ends, PATTERNS[: len(ends) // 3])
-    return Scene(phantom, sensor_from_image, world_from_sensor, pixels)
+    pixels = np.stack([cut(ENDS_MM, phantom_from_image[i]) for i in range(frames)])
+    return Scene(
+        WirePhantom(NAMES, ENDS_MM, PATTERNS, world_from_phantom),
+        sensor_from_image,
+        world_from_sensor,
+        pixels,
+    )
 
 
 def cut(ends, phantom_from_image):
