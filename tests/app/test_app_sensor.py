@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.app.sensor.log import LogReadings
 from speckle3d.app.sensor.page import SensorPage
-from speckle3d.app.sensor.source import thinned
 from speckle3d.app.sensor.watch import SensorWatch
 from xsens.fusion.field import Trust
 from xsens.fusion.online import OnlineState
@@ -60,17 +59,6 @@ def test_a_log_without_readings_shows_the_sensors_own_and_says_why_nothing_is_ju
     facts = dict(shown.facts(1.0))
     assert facts["orientation"].startswith("the sensor's own")
     assert "3 samples in 1 gaps" in facts["lost"]
-
-
-def test_thinning_keeps_every_extreme():
-    rng = np.random.default_rng(1)
-    values = rng.normal(size=100_000)
-    values[[31_415, 92_653]] = 50.0, -50.0
-    values[:60] = np.nan
-    kept = thinned({"t": np.arange(values.size) / 100.0, "x": values}, most=2000)
-    assert len(kept["x"]) <= 2100
-    assert (np.nanmax(kept["x"]), np.nanmin(kept["x"])) == (50.0, -50.0)
-    assert (np.diff(kept["t"]) > 0).all()
 
 
 def live(elapsed_s, heading_deg=0.0, started=True, stray=0.01, disturbed=False, **more):

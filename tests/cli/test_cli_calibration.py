@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from calibration_files import made
-from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
 
 from speckle3d.io.calibrations import write_calibration
@@ -87,16 +86,3 @@ def test_convert_puts_a_calibration_into_a_sweep(run, uncalibrated, saved, tmp_p
     assert got.orientation.sensor_from_image is None
     # RF says itself how far apart its samples are.
     assert got.grid == before.grid
-
-
-def test_images_get_the_fitted_pixels_unless_given(run, saved, tmp_path):
-    sequence = write_mha(tmp_path / "a.mha", grey(), {"UltrasoundImageOrientation": "MF"}, tracked(3)[2])
-    arguments = ("convert", sequence, tmp_path / "out.h5", "--dynamic-range-db", "60")
-    arguments = (*arguments, "--calibration", saved(made()))
-    for options, expected in (((), (0.137, 0.138)), (("--column-pitch-mm", "0.2"), (0.2, 0.138))):
-        code, _, err = run(*arguments, *options)
-        assert code == 0, err
-        got = load_sweep(tmp_path / "out.h5")
-        assert (got.grid.vector_pitch_mm, got.grid.sample_spacing_mm) == expected
-        mounting, own = got.tracker.sensor_from_image, made().sensor_from_image
-        np.testing.assert_allclose(mounting.as_matrix(), own.as_matrix(), atol=1e-12)

@@ -25,9 +25,3 @@ def test_compare_writes_a_study_and_skips_it_the_second_time(run, bench, torn, t
     assert code == 0, err
     assert json.loads(out)["modes"] == ["image", "pose", "tracker"]
     assert "1 of 2 sweeps" in err
-
-
-def test_a_study_of_broken_sweeps_alone_is_refused_with_the_first_reason(refused, torn, tmp_path):
-    line = refused("compare", torn, "-o", tmp_path / "study")
-    assert str(torn) in line
-    assert not (tmp_path / "study").exists()

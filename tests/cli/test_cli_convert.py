@@ -48,13 +48,10 @@ CONFIG = "PlusDeviceSet_"
 SPINE = f"{CONFIG}SpinePhantomFreehandReconstructionOnly.xml"
 LINEAR = f"{CONFIG}RfProcessingAlgoLinearTest.xml"
 DB = {"dynamic_range_db": "60"}
-SIZE = {"column_pitch_mm": "0.08", "row_spacing_mm": "0.08"}
 ECHOES = {"centre_frequency_hz": "6e6", "bandwidth_hz": "4e6 8e6"}
 
 SWEEPS = {
-    "plus/BoneUltrasound_L14.igs.mha": ("BoneUltrasound_L14_config.xml", DB, (21, 820, 616), 21),
     "plus/SpinePhantomFreehand.igs.mha": (SPINE, DB, (21, 820, 616), 21),
-    "plus/WaterTankBottomTranslationVideoBuffer.igs.mha": (None, DB | SIZE, (201, 820, 616), None),
     "plus/UltrasonixLinearRfData.igs.mha": (
         LINEAR,
         ECHOES | {"sampling_rate_hz": "40e6", "demodulation_frequency_hz": "0"},

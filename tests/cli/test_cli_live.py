@@ -9,11 +9,9 @@ import time
 
 import numpy as np
 import pytest
-from calibration_files import made
 from commands import command
 
 import speckle3d as s3
-from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.load import import_notes
 from speckle3d.io.reconstructions import read_reconstruction
 
@@ -110,18 +108,3 @@ def test_told_to_end_it_closes_the_recording_first(player, shipped, tmp_path):
     assert "Traceback" not in told
     assert import_notes(out / "sweep.h5") == []
     assert len(s3.load_sweep(out / "sweep.h5")) >= 10
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (("--drift", "crossed"), "--drift crossed: expected --crossing"),
-        (("--calibration", "{calibration}"), "expected --transform"),
-    ],
-)
-def test_what_would_be_refused_at_the_end_is_refused_before(refused, given, words, shipped, tmp_path):
-    write_calibration(tmp_path / "c.h5", made())
-    options = (word.format(calibration=tmp_path / "c.h5") for word in given)
-    live = ("live", "localhost:18944", "-o", tmp_path / "out", "--curves", shipped / "curves.h5")
-    assert words in refused(*live, *options)
-    assert not (tmp_path / "out").exists()

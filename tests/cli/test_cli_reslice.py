@@ -55,13 +55,3 @@ def test_along_a_curve_and_along_one_picked_in_a_picture(run, bench, curve, tmp_
     found = read_plane(again).cut
     along = (found.world_from_mm(0.0, 0.0) - begin) @ found.down
     np.testing.assert_allclose(found.world_from_mm(0.0, -along), begin, atol=1e-6)
-
-
-def test_a_volume_is_cut_in_the_world_of_its_own_poses(run, refused, reconstructed, tmp_path):
-    path, made = reconstructed / "reconstruction.h5", tmp_path / "v.nrrd"
-    grid = ("--voxel-mm", "0.5")
-    assert run("volume", path, "-o", made, "--mode", "orientation", *grid)[0] == 0
-    code, _, err = run("reslice", path, "-o", tmp_path / "c.png", "--volume", made)
-    assert code == 0, err
-    assert read_plane(tmp_path / "c.png").mode == "orientation"
-    refused("reslice", path, "-o", tmp_path / "d.png", "--volume", made, "--mode", "image")

@@ -1,23 +1,6 @@
 import json
 
-import numpy as np
 import pytest
-
-from speckle3d.io.reconstructions import read_reconstruction
-from speckle3d.io.tum import read_tum
-
-
-def test_what_is_exported_is_read_back(run, reconstructed, tmp_path):
-    for unit in ("m", "mm"):
-        options = ("--mode", "pose", "--length-unit", unit)
-        code, out, err = run("trajectory", "export", reconstructed / "reconstruction.h5", "-o",
-                             tmp_path / "pose.tum", *options)  # fmt: skip
-        assert (code, out) == (0, ""), err
-        back = read_tum(tmp_path / "pose.tum", unit)
-        held = read_reconstruction(reconstructed / "reconstruction.h5")
-        np.testing.assert_array_equal(back.time_s, held.frame_time_s)
-        expected = held.poses["pose"].as_matrix()
-        np.testing.assert_allclose(back.world_from_sensor.as_matrix(), expected, rtol=0, atol=1e-9)
 
 
 def test_a_reconstruction_is_scored_as_its_exported_text_is(run, bench, reconstructed, tmp_path):

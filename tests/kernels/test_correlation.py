@@ -58,17 +58,6 @@ def test_they_are_numpys_of_what_overlaps_at_every_lag(seed, first, data, ramp, 
     np.testing.assert_allclose(cohered(one, two, first, shift, ramp, least_overlap), expected, atol=5e-6)
 
 
-def test_gain_and_a_common_phase_do_not_matter():
-    one, two = echoes(1)
-    gain = 1e6
-    place = [(4, 10)], [(1, -2)]
-    np.testing.assert_allclose(
-        cohered(one, gain * np.exp(2j) * two, *place), cohered(one, two, *place), atol=2e-6
-    )
-    a, b = np.abs(one) ** 2, np.abs(two) ** 2
-    np.testing.assert_allclose(correlated(a, gain * b, *place), correlated(a, b, *place), atol=2e-6)
-
-
 def test_flat_patches_have_no_correlation_nor_empty_ones_coherence():
     one, _ = echoes(2)
     assert np.isnan(correlated(np.full(SHAPE, 1e5), np.abs(one), [(4, 10)], [(0, 0)])).all()

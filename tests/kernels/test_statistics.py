@@ -48,20 +48,6 @@ def sampled(rho):
     return found
 
 
-def coherence_of_cells(rho, count, draws=8000):
-    a, b = (re + 1j * im for re, im in np.random.default_rng(3).normal(size=(2, 2, draws, count)))
-    b = speckle.decorrelated(a, b, rho)
-    cross = np.abs((a.conj() * b).sum(axis=1)) ** 2
-    return cross / ((np.abs(a) ** 2).sum(axis=1) * (np.abs(b) ** 2).sum(axis=1))
-
-
-@pytest.mark.parametrize(("rho", "count"), [(0.0, 25), (0.2, 80), (0.8, 25)])
-def test_variance_of_the_echos_correlation_over_independent_cells(rho, count):
-    """8000 draws know a variance to 3 %; terms of second order in 1 / N, kept at rho = 0 alone, make 17 %."""
-    claimed = correlation_variance(rho, count, True)
-    assert coherence_of_cells(rho, count).var() == pytest.approx(claimed, rel=0.2 if count < 50 else 0.1)
-
-
 @pytest.mark.parametrize("rho", [0.0, 0.4, 0.9])
 def test_variance_of_the_echos_correlation_over_speckle(rho):
     """With cells from the field's own autocorrelation, nothing fitted: 10 % of the deviation."""
