@@ -27,7 +27,7 @@ def axes(vectors=VECTORS, samples=SAMPLES):
     return 1e-3 * x, 1e-3 * (FIRST_MM + SPACING_MM * np.arange(samples))
 
 
-def write_uff(path, frames, modulation_hz=0.0):
+def write_uff(path, frames, modulation_hz=0.0, scan="uff.linear_scan"):
     """Write beamformed data as USTB does from MATLAB: axes in reverse, last ones of length 1 left out."""
     data = frames.reshape(len(frames), 1, 1, -1)
     if len(frames) == 1:
@@ -39,7 +39,7 @@ def write_uff(path, frames, modulation_hz=0.0):
         _put(group, "data", data)
         _put(group, "modulation_frequency", np.array([[modulation_hz]]))
         _put(group, "frame_rate", np.array([[1.0]]))
-        held = _object(group, "scan", "uff.linear_scan")
+        held = _object(group, "scan", scan)
         for axis, values in (("x_axis", x), ("z_axis", z)):
             _put(held, axis, values[None])
         for axis, values in (("x", np.repeat(x, z.size)), ("z", np.tile(z, x.size))):
