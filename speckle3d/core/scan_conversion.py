@@ -26,15 +26,17 @@ class ScanConversion:
         Of the images.
     grid : ImageGrid, optional
         Of the pictures; by default with square pixels, a quarter of the vectors' pitch or a sample wide.
+    left_mm : float
+        Where the first column lies in the image frame P.
 
     Attributes
     ----------
     grid : ImageGrid
-        In the same image frame P.
+        In the same image frame P, `left_mm` to the side.
     """
 
-    def __init__(self, fan: ImageGrid, grid: ImageGrid | None = None) -> None:
-        self._fan = fan
+    def __init__(self, fan: ImageGrid, grid: ImageGrid | None = None, left_mm: float = 0.0) -> None:
+        self._fan, self._left_mm = fan, left_mm
         if grid is None:
             side = max(fan.vector_pitch_mm / _PIXELS_PER_PITCH, fan.sample_spacing_mm)
             low, high = fan.corners_mm[0, :2], fan.corners_mm[2, :2]
@@ -56,7 +58,8 @@ class ScanConversion:
     def _sample(self) -> FloatArray:
         """Vector and sample of each pixel, shape (2, column, row)."""
         column, row = np.arange(self.grid.vectors)[:, None], np.arange(self.grid.samples)
-        sample = np.moveaxis(self._fan.sample_at(self.grid.mm(column, row)), -1, 0)
+        place = self.grid.mm(column, row) + np.array([self._left_mm, 0.0])
+        sample = np.moveaxis(self._fan.sample_at(place), -1, 0)
         # Places on the fan's edge are inside it whatever rounding does.
         last = np.array([self._fan.vectors - 1, self._fan.samples - 1])[:, None, None]
         near = (sample > -1e-6) & (sample < last + 1e-6)

@@ -247,6 +247,16 @@ class Strip:
 
     def __init__(self, sweep: Sweep, config: Config) -> None:
         grid = IntensityExtractor.for_sweep(sweep, config.intensity).grid
+        self._convert = None
+        if grid.fan is not None:
+            middle = (grid.vectors - 1) / 2
+            (x, top), (_, bottom) = grid.mm([middle, middle], [0, grid.samples - 1])
+            rows, left_mm = int((bottom - top) / PIXEL_MM) + 1, float(x) - STRIP_MM / 2
+            strip = ImageGrid(round(STRIP_MM / PIXEL_MM) + 1, rows, PIXEL_MM, PIXEL_MM, float(top))
+            self._convert = ScanConversion(grid, strip, left_mm)
+            self._vectors, self.left_mm = slice(None), left_mm
+            self.stack = ImageStack(strip, PIXEL_MM)
+            return
         width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
         first = (grid.vectors - width) // 2
         self._vectors, self.left_mm = slice(first, first + width), first * grid.vector_pitch_mm
@@ -254,4 +264,5 @@ class Strip:
 
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep the strip of a frame."""
-        self.stack.keep(index, intensity[self._vectors])
+        picture = intensity if self._convert is None else self._convert(intensity)
+        self.stack.keep(index, picture[self._vectors])
