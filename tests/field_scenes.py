@@ -1,15 +1,12 @@
 """Recordings in invented magnetic fields, whose true orientation is known.
 
-The gyroscope and the accelerometer are those of a BROAD trial, errors and all; the magnetometer is computed
-from the optical orientation. `tune` scenes may guide the choice of settings, `judge` scenes, of other trials
-and seeds, only tell how good the choice was.
+The motion is a simulated hand's; the magnetometer is computed from the true orientation.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from broad import read_trial, trials_in
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from xsens.logs.samples import VECTORS, ImuLog
 
@@ -25,29 +22,10 @@ RESIDUAL = 0.01
 ROOM = 0.02
 """Of the earth's field, what a room without iron near adds here and there."""
 
-BRIDGED_S = 0.1
-"""In longer gaps of the optical orientation, it is not interpolated, and the magnetometer is missing."""
-
-PLAN = {
-    "attached": (2.0, 5.0, 12.0, 30.0, 60.0),  # uT, a magnet on the sensor, with 3 % of soft iron
-    "walk": (0.1, 0.2, 0.2, 0.4),  # RMS departure from the earth's field, a fraction of it
-    "linger": (0.1, 0.2, 0.4),  # the same, with 20 to 60 s beside one piece of iron
-    "passing": (30.0, 200.0),  # uT at the nearest, a few seconds each
-    "start": (5.0, 20.0, 60.0),  # uT until 5 s after the first movement
-    "drift": (10.0, 30.0),  # degrees of heading over the recording
-    "saturated": (40.0,),  # uT
-    "frozen": (30.0,),  # s
-    "spikes": (100.0,),  # uT, one reading in a hundred
-    "truncated": (0.12, 0.25),  # deg/s, the gyroscope's step, cut toward zero as BROAD's own
-    "cut": (5.0, 15.0, 25.0, 35.0),  # s of movement left out, and all before: no rest to start from
-}
-"""Kinds of scene, and how strong; the last two leave the magnetometer as recorded."""
-
 
 class Scene(NamedTuple):
     """A recording and its truth: quaternions, world x east, NaN where the cameras saw nothing."""
 
-    name: str
     log: ImuLog
     true_wxyz: np.ndarray
     moving: np.ndarray
@@ -63,31 +41,18 @@ class Motion(NamedTuple):
     known: np.ndarray
 
 
-def scenes(folder, split):
-    """Scenes of a split, `tune` or `judge`, one after the other, of a folder of BROAD trials."""
-    half = ("tune", "judge").index(split)
-    names = trials_in(folder)[half::2]
-    motions = {name: recorded(folder, name) for name in names}
-    for kind in PLAN:
-        for i, amount in enumerate(PLAN[kind]):
-            name = names[(len(kind) + i) % len(names)]
-            rng = np.random.default_rng([half, i, *kind.encode()])  # the same whatever else the plan holds
-            yield scene(motions[name], kind, amount, rng, name[:2])
-
-
-def scene(motion, kind, amount, rng, label=""):
+def scene(motion, kind, amount, rng):
     """A recording as it would be in such a field or of such a sensor."""
-    name = f"{kind} {amount:g} {label}".rstrip()
     if kind in SENSORS:
-        return Scene(name, *SENSORS[kind](motion, amount, rng))
+        return Scene(*SENSORS[kind](motion, amount, rng))
     readings = FIELDS[kind](motion, amount, rng)
     residual = np.eye(3) + RESIDUAL * rng.standard_normal((3, 3))
     readings = readings @ residual.T + RESIDUAL * np.linalg.norm(EARTH_UT) * rng.standard_normal(3)
     readings = readings + NOISE_UT * rng.standard_normal(readings.shape)
-    if kind in FAULTS:
-        readings = FAULTS[kind](motion, readings, amount, rng)
+    if kind == "frozen":
+        readings = frozen(motion, readings, amount, rng)
     log = with_readings(motion.log, magnetometer_au=np.where(motion.known[:, None], readings, np.nan))
-    return Scene(name, log, motion.true_wxyz, motion.moving)
+    return Scene(log, motion.true_wxyz, motion.moving)
 
 
 def with_readings(log, **changed):
@@ -96,23 +61,6 @@ def with_readings(log, **changed):
 
 
 # -- motions
-
-
-def recorded(folder, name):
-    """The motion of a BROAD trial."""
-    log, true, moving = read_trial(folder, name)
-    seen = np.flatnonzero(np.isfinite(true).all(axis=1))
-    part = slice(seen[0], seen[-1] + 1)
-    log = ImuLog(
-        log.time_s[part] - log.time_s[seen[0]],
-        *(getattr(log, each)[part] for each in VECTORS),
-        source=name,
-    )
-    true, seen = true[part], seen - seen[0]
-    turns = Slerp(log.time_s[seen], Rotation.from_quat(true[seen], scalar_first=True))(log.time_s)
-    after = np.clip(np.searchsorted(seen, np.arange(len(log))), 1, len(seen) - 1)
-    known = log.time_s[seen[after]] - log.time_s[seen[after - 1]] < BRIDGED_S
-    return Motion(log, true, moving[part], turns, known)
 
 
 def simulated(rng, seconds, rate_hz=100.0, period_s=2.0):
@@ -163,7 +111,11 @@ def room_ut(motion, rng):
 
 def attached(motion, amount, rng):
     """Iron and a magnet that turn with the sensor."""
-    magnet_ut, soft = amount * direction(rng), np.eye(3) + 0.03 * rng.standard_normal((3, 3))
+    return fixed(motion, amount * direction(rng), rng)
+
+
+def fixed(motion, magnet_ut, rng):
+    soft = np.eye(3) + 0.03 * rng.standard_normal((3, 3))
     return room(motion, None, rng) @ soft.T + magnet_ut
 
 
@@ -187,29 +139,19 @@ def dipoles(position_m, place_m, moment_a_m2):
     return out
 
 
-def walk(motion, amount, rng, stays=False):
+def walk(motion, amount, rng):
     """Indoors among desks, columns and a lift at walking pace, wherever the sensor moves at all."""
     place_m = rng.uniform([0.0, 0.0, -1.2], [20.0, 10.0, 0.3], (60, 3))
     moment = direction(rng, (60,)) * rng.lognormal(0.0, 0.8, (60, 1))
     corners = rng.uniform([0.0, 0.0, 0.0], [20.0, 10.0, 0.0], (80, 3))
-    pause_s = np.zeros(80)
-    if stays:
-        pause_s[1::3] = rng.uniform(20.0, 60.0, 27)
-        beside = direction(rng, (27,)) * [0.5, 0.5, 0.0]
-        corners[1::3] = place_m[rng.permutation(60)[:27]] * [1.0, 1.0, 0.0] + beside
     lasting_s = np.linalg.norm(np.diff(corners, axis=0), axis=1) / rng.uniform(0.8, 1.4, 79)
-    arrive_s = np.concatenate([[0.0], np.cumsum(lasting_s + pause_s[:-1])])
-    at_s = np.column_stack([arrive_s, arrive_s + pause_s + 1e-6]).ravel()
+    at_s = np.concatenate([[0.0], np.cumsum(lasting_s)])
     walked_s = np.cumsum(motion.moving) / motion.log.rate_hz
-    path = np.column_stack([np.interp(walked_s, at_s, np.repeat(c, 2)) for c in corners.T])
+    path = np.column_stack([np.interp(walked_s, at_s, c) for c in corners.T])
     path = path + 0.05 * wandering(walked_s, rng, 1.0, 1.5)
     iron = dipoles(path, place_m, moment)
     strength = np.sqrt((iron[motion.moving] ** 2).sum(axis=1).mean())
     return seen_by(motion, EARTH_UT + iron * (amount * np.linalg.norm(EARTH_UT) / strength))
-
-
-def linger(motion, amount, rng):
-    return walk(motion, amount, rng, stays=True)
 
 
 def passing(motion, amount, rng):
@@ -229,24 +171,12 @@ def start(motion, amount, rng):
     return seen_by(motion, room_ut(motion, rng) + np.outer(near, amount * direction(rng) * [1.0, 1.0, 0.5]))
 
 
-def drift(motion, amount, rng):
-    """The field's heading, norm and dip go away slowly."""
-    part = motion.log.time_s / motion.log.time_s[-1]
-    turned = Rotation.from_rotvec(np.outer(np.deg2rad(amount) * part, [0, 0, rng.choice([-1, 1])]))
-    return seen_by(
-        motion,
-        turned.apply(room_ut(motion, rng)) + np.outer(part, 0.05 * np.linalg.norm(EARTH_UT) * direction(rng)),
-    )
-
-
 FIELDS = {
     "attached": attached,
     "walk": walk,
-    "linger": linger,
     "passing": passing,
     "start": start,
-    "drift": drift,
-    **dict.fromkeys(("saturated", "frozen", "spikes"), room),
+    "frozen": room,
 }
 
 
@@ -259,21 +189,9 @@ def during(motion, seconds, rng):
     return np.abs(motion.log.time_s - middle_s) < 0.5 * seconds
 
 
-def saturated(motion, readings, amount, rng):
-    return np.clip(readings, -amount, amount)
-
-
 def frozen(motion, readings, amount, rng):
     stuck = during(motion, amount, rng)
     return np.where(stuck[:, None], readings[np.flatnonzero(stuck)[0]], readings)
-
-
-def spikes(motion, readings, amount, rng):
-    hit = rng.random(len(readings)) < 0.01
-    return readings + np.where(hit[:, None], amount * rng.standard_normal(readings.shape), 0.0)
-
-
-FAULTS = {"saturated": saturated, "frozen": frozen, "spikes": spikes}
 
 
 # -- other gyroscopes: log, truth, where it moves

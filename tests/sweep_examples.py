@@ -73,3 +73,14 @@ def bmode_sweep(frames=4):
     plain = rf_sweep(frames, 6, 9)
     grid = ImageGrid(6, 9, 0.085, 0.09, 0.0)
     return replace(plain, frames=data, grid=grid, signal=BModeSettings(60.0, 250.0))
+
+
+def frames_of(sweep):
+    """All frames in one array."""
+    return np.stack([sweep.frames[i] for i in range(len(sweep))])
+
+
+def sizes_of(grid):
+    """Numbers of a grid of parallel lines."""
+    assert grid.fan is None
+    return [value for name, value in vars(grid).items() if name != "fan"]

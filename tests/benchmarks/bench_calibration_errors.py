@@ -18,7 +18,7 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 HERE = Path(__file__).resolve().parent
 KINDS = sorted(
-    path.stem for path in (HERE / "calibration_errors").glob("[!_]*.py") if path.stem not in ("rows", "hand")
+    path.stem for path in (HERE / "calibration_errors").glob("[!_]*.py") if path.stem not in ("rows", "floor")
 )
 FIRST_SEED = 900_001
 

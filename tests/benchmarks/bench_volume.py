@@ -4,9 +4,8 @@ Run: ``python tests/benchmarks/bench_volume.py [--runs 5]`` on a quiet machine. 
 640 x 480 pixels of 0.1 mm, 8 bits each, of a sweep that wavers go into 273 x 193 x 240 voxels of 0.25 mm.
 A ``!`` marks a target that is missed.
 
-Beside it, on the same frames and voxels or on fewer of the frames where they are slow:
+Beside it, on the same frames and voxels:
 
-- NumPy: ``bincount`` over all voxels, of sums and counts.
 - SimpleITK: the frames taken for one stack of parallel planes, which they are not, resampled to the voxels,
   linearly; backward, so that it looks at each voxel and not at each pixel.
 - IGSIO, the reconstruction inside PLUS and 3D Slicer, was built and timed elsewhere, on a machine of two
@@ -17,6 +16,7 @@ import argparse
 import os
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -38,8 +38,6 @@ from speckle3d.imaging.voxels.volume import compound
 GRID = ImageGrid(640, 480, 0.1, 0.1)
 VOXELS = VoxelGrid((273, 193, 240), (0.25, 0.25, 0.25), RigidTransform.identity())
 FRAMES = 300
-FEW = 12
-"""Frames that the slow ones get."""
 TARGETS = {"nearest": 400, "linear": 120}
 IGSIO = {("nearest", 1): 172, ("nearest", 2): 207, ("linear", 1): 15, ("linear", 2): 28}
 """Million pixels per second, with the mean, by threads: IGSIO of 2024, measured elsewhere."""
@@ -62,10 +60,7 @@ def ours(images: np.ndarray, poses: RigidTransform, runs: int) -> list[Row]:
             compound(images, GRID, poses, voxel_grid=VOXELS, splat=splat, fill_radius=0, voxel_type="uint8")
 
         for threads in (1, 2):
-            if threads == 1:
-                with on_one_thread():
-                    timing = timed(work, runs)
-            else:
+            with on_one_thread() if threads == 1 else nullcontext():
                 timing = timed(work, runs)
             rows.append(
                 Row(
@@ -81,44 +76,12 @@ def ours(images: np.ndarray, poses: RigidTransform, runs: int) -> list[Row]:
     return rows
 
 
-def others(images: np.ndarray, poses: RigidTransform, runs: int) -> list[Row]:
+def beside_simpleitk(images: np.ndarray, poses: RigidTransform, runs: int) -> Row:
     best = timed(
         lambda: compound(images, GRID, poses, voxel_grid=VOXELS, fill_radius=0, voxel_type="uint8"), runs
     )
-    value = images.size / best.seconds / 1e6
-    rows = []
-    for name, function, frames in (
-        ("NumPy bincount", by_bincount, FEW),
-        ("SimpleITK resample of a stack", by_simpleitk, FRAMES),
-    ):
-        some = np.linspace(0, FRAMES - 1, frames).astype(int)
-        seconds = function(images[some], poses[some])
-        peer = images[some].size / seconds / 1e6
-        rows.append(Row("nearest + mean", value, "Mpixel/s", name, peer, cores=best.cores))
-    return rows
-
-
-def index_of(pose: RigidTransform) -> np.ndarray:
-    """Fractional voxel of each sample of a frame, shape (samples, 3)."""
-    v, s = np.meshgrid(np.arange(GRID.vectors), np.arange(GRID.samples), indexing="ij")
-    local = np.stack([v * GRID.vector_pitch_mm, s * GRID.sample_spacing_mm, 0 * v], axis=-1)
-    return (VOXELS.world_from_grid.inv() * pose).apply(local.reshape(-1, 3)) / VOXELS.spacing_mm
-
-
-def flat_of(pose: RigidTransform) -> np.ndarray:
-    """Place of each sample's voxel in memory; one past the last for samples outside."""
-    index = np.floor(index_of(pose) + 0.5).astype(np.int64)
-    flat = np.ravel_multi_index(tuple(index.T), VOXELS.shape, mode="clip")
-    return np.where(((index >= 0) & (index < VOXELS.shape)).all(axis=1), flat, np.prod(VOXELS.shape))
-
-
-def by_bincount(images: np.ndarray, poses: RigidTransform) -> float:
-    size = int(np.prod(VOXELS.shape)) + 1
-    began = time.perf_counter()
-    flat = np.concatenate([flat_of(pose) for pose in poses])
-    total, count = np.bincount(flat, images.ravel(), size), np.bincount(flat, minlength=size)
-    total /= np.maximum(count, 1)
-    return time.perf_counter() - began
+    value, peer = (images.size / seconds / 1e6 for seconds in (best.seconds, by_simpleitk(images, poses)))
+    return Row("nearest + mean", value, "Mpixel/s", "SimpleITK resample of a stack", peer, cores=best.cores)
 
 
 def by_simpleitk(images: np.ndarray, poses: RigidTransform) -> float:
@@ -149,7 +112,7 @@ def main() -> None:
     poses = sweep(FRAMES, 56.0)
     rows = [
         *ours(images, poses, options.runs),
-        *others(images, poses, options.runs),
+        beside_simpleitk(images, poses, options.runs),
         filling(images, poses, options.runs),
     ]
     print_table(rows)

@@ -83,60 +83,6 @@ def test_a_second_run_is_refused_until_the_first_is_gone_however_it_went(tmp_pat
     assert held(tmp_path) == {f"out/{name}": "new" for name in FILES.names}
 
 
-KILLED = """
-import json, os, signal, sys
-from pathlib import Path
-from speckle3d.io import fileset
-from speckle3d.io.fileset import FileSet
-
-files = FileSet("main.h5", ("a.txt", "b.txt"), ("made/page.html",))
-EVENTS = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "shutil.rmtree", "open"}
-
-def write(folder, content):
-    with files.replaced(folder) as part:
-        for name in files.names:
-            (part / name).write_text(content)
-
-def held(folder):
-    return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
-
-def killed_at(number, folder):
-    child = os.fork()
-    if child == 0:
-        seen = 0
-        def count(event, _):
-            nonlocal seen
-            if event in EVENTS:
-                seen += 1
-                if seen > number:
-                    os.kill(os.getpid(), signal.SIGKILL)
-        sys.addaudithook(count)
-        write(folder, "new")
-        os._exit(0)
-    return os.WIFSIGNALED(os.waitpid(child, 0)[1])
-
-found = []
-for there in (False, True):
-    for number in range(1000):
-        base = Path(sys.argv[1]) / f"{there}-{number}"
-        folder = base / "out"
-        if there:
-            write(folder, "old")
-            (folder / "mine.txt").write_text("mine")
-            (folder / "made").mkdir()
-            (folder / "made" / "page.html").write_text("old")
-        else:
-            base.mkdir()
-        killed = killed_at(number, folder)
-        after = held(folder) if folder.exists() else None
-        write(folder, "again")
-        found.append((there, killed, after, held(base)))
-        if not killed:
-            break
-print(json.dumps(found))
-"""
-
-
 def test_broken_off_between_two_files_nothing_is_of_both_results(tmp_path, monkeypatch):
     write(tmp_path, "old")
     monkeypatch.setattr(fileset.shutil, "move", lambda *_: (_ for _ in ()).throw(OSError("broken off")))

@@ -10,17 +10,6 @@ def write_then(path, text, error=None):
             raise error
 
 
-def test_a_path_appears_when_the_block_succeeds(tmp_path):
-    target = tmp_path / "volume.nii.gz"
-    with atomic_path(target) as part:
-        assert part.name.endswith(".nii.gz")
-        assert part.parent == tmp_path
-        part.write_text("new")
-        assert not target.exists()
-    assert target.read_text() == "new"
-    assert list(tmp_path.iterdir()) == [target]
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no")])
 def test_nothing_remains_of_a_block_that_fails(tmp_path, error):
     (tmp_path / "a").write_text("old")

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from image_examples import grey, text_of, tracked, write_mha
 from scipy.spatial.transform import RigidTransform, Rotation
+from sweep_examples import frames_of
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
@@ -20,10 +21,6 @@ RF = ImportSettings(
     sampling_rate_hz=40e6, vector_pitch_mm=0.3, centre_frequency_hz=6e6, bandwidth_hz=(4e6, 8e6)
 )
 LEVELS = ImportSettings(dynamic_range_db=60.0)
-
-
-def frames_of(sweep):
-    return np.stack([sweep.frames[i] for i in range(len(sweep))])
 
 
 def given_over(base, **more):

@@ -1,4 +1,3 @@
-import pickle
 import signal
 import subprocess
 import sys
@@ -12,7 +11,6 @@ import sweep_examples
 
 from speckle3d.core.errors import FileError
 from speckle3d.core.sweep import ImageGrid, stored_dtype
-from speckle3d.io.frames import FileFrames
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
 
@@ -24,17 +22,13 @@ def path(tmp_path):
     return target
 
 
-def all_frames(sweep):
-    return np.stack([sweep.frames[i] for i in range(len(sweep))])
-
-
 @pytest.mark.parametrize("paired", [True, False])
 def test_i_and_q_are_stored_as_they_were_read(tmp_path, paired):
     sweep = sweep_examples.iq_sweep(paired)
     write_sweep(tmp_path / "s.h5", sweep)
     write_sweep(tmp_path / "t.h5", load_sweep(tmp_path / "s.h5"))
     got = load_sweep(tmp_path / "t.h5")
-    np.testing.assert_array_equal(all_frames(got), all_frames(sweep))
+    np.testing.assert_array_equal(sweep_examples.frames_of(got), sweep_examples.frames_of(sweep))
     assert stored_dtype(got.part(1, 3).frames) == (np.int16 if paired else np.complex64)
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["version"] == 2
@@ -54,7 +48,7 @@ def test_a_file_written_by_hand_from_the_description_is_read(tmp_path):
         file["tracker/world_from_sensor"] = np.stack([np.eye(4), np.full((4, 4), np.nan), np.eye(4)])
         file["tracker/valid"] = np.array([1, 0, 1], dtype=np.uint8)
     sweep = load_sweep(tmp_path / "s.h5")
-    np.testing.assert_array_equal(all_frames(sweep), np.arange(24).reshape(2, 3, 4))
+    np.testing.assert_array_equal(sweep_examples.frames_of(sweep), np.arange(24).reshape(2, 3, 4))
     assert sweep.orientation.time_offset_s == 0.0
     assert sweep.orientation.sensor_from_image is None
     np.testing.assert_array_equal(sweep.tracker.readings.time_s, [0.0, 0.02])
@@ -73,19 +67,6 @@ def test_reading_a_frame_touches_no_other(path):
     np.testing.assert_array_equal(sweep.frames[3], sweep_examples.rf_sweep().frames[3])
     with pytest.raises(FileError, match=r"frame 2: cannot be read"):
         sweep.frames[2]
-
-
-def test_frames_may_be_closed_indexed_and_sent_elsewhere(path):
-    frames = load_sweep(path).frames
-    assert isinstance(frames, FileFrames)
-    last = frames[-1]
-    frames.close()
-    frames.close()
-    np.testing.assert_array_equal(frames[np.int64(5)], last)
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(frames))[5], last)
-    with pytest.raises(IndexError):
-        frames[6]
-    assert len(list(frames)) == 6
 
 
 def test_rewriting_keeps_unknown_groups(path, tmp_path):

@@ -1,15 +1,6 @@
-"""RF sweeps whose length is to be found, and curves that do not belong to their probe.
+"""RF sweeps whose length is to be found, and curves that do not belong to their probe."""
 
-``python tests/benchmarks/length/scenes.py [--first-seed N] [--count N] [--kind KIND ...]`` makes them ahead.
-"""
-
-import argparse
-import sys
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from cache import DEFAULT, key_of
 
@@ -31,7 +22,6 @@ FIRST_SEED = 970_001
 LENGTH_MM = 24.0
 _CROSSED = {"preset": "crossed", "vectors": 96, "samples": 2600, "length_mm": LENGTH_MM, "frames": 150}
 _STEPS = {"steps": 41, "step_mm": 0.05, "blocks": 3}
-KINDS = ("crossed", "oblique", "short")
 
 
 def crossing_pair(seed: int, angle_deg: float, folder: Path = DEFAULT) -> tuple[Path, Path]:
@@ -92,29 +82,3 @@ def borrowed_curves(
         sweeps = [stepped_phantom(probe, attenuation_db_cm_mhz, seed, folder) for seed in (11, 12)]
         write_curves(path, calibrate_curves(sweeps))
     return read_curves(path)
-
-
-def _make(kind: str, seed: int, folder: Path) -> list[Path]:
-    if kind in ("crossed", "oblique"):
-        return list(crossing_pair(seed, 90.0 if kind == "crossed" else 45.0, folder))
-    return [short(seed, folder)]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    parser.add_argument("--count", type=int, default=6)
-    parser.add_argument("--kind", nargs="*", default=list(KINDS), choices=KINDS)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--cache", type=Path, default=DEFAULT)
-    options = parser.parse_args()
-    seeds = range(options.first_seed, options.first_seed + options.count)
-    # Spawned, not forked: numba's threads do not survive a fork.
-    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        for kind in options.kind:
-            for made in pool.map(_make, [kind] * len(seeds), seeds, [options.cache] * len(seeds)):
-                print(*made, flush=True)
-
-
-if __name__ == "__main__":
-    main()

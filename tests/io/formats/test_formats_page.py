@@ -8,11 +8,10 @@ import tomllib
 
 import numpy as np
 import pytest
-from format_examples import matlab_order, rf, write_mat
+from format_examples import rf
 
 from speckle3d.core.sweep import ImageGrid, RFSettings
 from speckle3d.io import readers
-from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, recording_files
 
@@ -22,12 +21,9 @@ def page(project):
     return (project / "docs" / "howto" / "formats.md").read_text(encoding="utf-8")
 
 
-def blocks(page, language):
-    return re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
-
-
 def block(page, language, holding):
-    (found,) = (text for text in blocks(page, language) if holding in text)
+    texts = re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
+    (found,) = (text for text in texts if holding in text)
     return found
 
 
@@ -66,28 +62,6 @@ def test_a_reader_of_ones_own(tmp_path, installed, page):
     assert sweep.grid == ImageGrid(6, 40, 0.3, sweep.signal.sample_spacing_mm)
     np.testing.assert_array_equal(sweep.frame_time_s, said["time_s"])
     assert recording_files(tmp_path / "arm.json")[1:] == [tmp_path / "arm.bin"]
-    (tmp_path / "import.toml").write_text("bandwidth_hz = [4e6, 8e6]\n")
-    rows = {name: value for name, value, _ in describe(tmp_path / "arm.json")}
-    assert (rows["format"], rows["frames"]) == ("our rig", "4")
-    assert len([line for line in block(page, "python", "READER = ").splitlines() if line.strip()]) <= 36
-
-
-@pytest.mark.parametrize("new", [False, True])
-def test_the_mapping_of_matlab_arrays(tmp_path, page, new):
-    path = write_mat(
-        tmp_path / "scan.mat",
-        new,
-        RData=[matlab_order(rf())],
-        TimeTag=np.arange(4) / 25,
-        Trans={"spacingMm": 0.3, "frequency": 6.0},
-        Receive={"decimSampleRate": 40.0},
-    )
-    (tmp_path / "scan.mat.toml").write_text(block(page, "toml", "[arrays]"))
-    sweep = load_sweep(path)
-    np.testing.assert_array_equal(np.stack([sweep.frames[i] for i in range(4)]), rf())
-    assert sweep.signal == RFSettings(40e6, 1540.0, 6e6, (4e6, 8e6))
-    assert sweep.grid.vector_pitch_mm == 0.3
-    np.testing.assert_array_equal(sweep.frame_time_s, np.arange(4) / 25)
 
 
 def test_every_format_is_in_the_table(page):

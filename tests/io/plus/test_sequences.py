@@ -7,7 +7,6 @@ import pytest
 import sweep_examples
 from image_examples import grey, write_mha
 
-from speckle3d.io.describe import describe
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
@@ -26,7 +25,7 @@ RF = ImportSettings(
 @pytest.mark.parametrize("make", [sweep_examples.bmode_sweep, sweep_examples.rf_sweep])
 @pytest.mark.parametrize(
     ("suffix", "compressed"),
-    [(".mha", True), (".mha", False), (".mhd", True), (".mhd", False), (".nrrd", True), (".seq.nrrd", False)],
+    [(".mha", True), (".mhd", False), (".seq.nrrd", False)],
 )
 def test_a_sweep_with_sensors_is_interpolated_at_its_frames(tmp_path, make, suffix, compressed):
     sweep = make()
@@ -82,7 +81,6 @@ def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
     assert np.rad2deg(sweep.tracker.image_skew_rad) == pytest.approx(-2.745, abs=1e-3)
     write_sweep(tmp_path / "a.h5", sweep)
     held = load_sweep(tmp_path / "a.h5")
-    assert ("image axes off square", "-2.74", "deg") in describe(tmp_path / "a.h5")
     write_sequence(tmp_path / "b.mha", held)
     back = load_sweep(tmp_path / "b.mha").tracker
     assert back.image_skew_rad == pytest.approx(sweep.tracker.image_skew_rad, abs=1e-9)

@@ -14,15 +14,12 @@ SIGMAS = 2.5
 """RMS error over RMS claimed sigma that is still honest: as of the worst of BROAD's trials."""
 
 KINDS = [
+    ("attached", 5.0),
     ("attached", 30.0),
     ("walk", 0.3),
-    ("linger", 0.2),
     ("passing", 100.0),
     ("start", 20.0),
-    ("drift", 20.0),
-    ("saturated", 40.0),
     ("frozen", 20.0),
-    ("spikes", 100.0),
     ("truncated", 0.25),
     ("cut", 10.0),
 ]
