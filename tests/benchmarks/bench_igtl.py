@@ -3,13 +3,12 @@
 Run: ``python tests/benchmarks/bench_igtl.py [SECONDS]`` (60; 600 for the README's figure). For RF of 127 x
 3818 samples and B-mode of 640 x 480 pixels, each at 25 frames/s: `speckle3d play` in a process of its own,
 received by a `Connection` and recorded by a `GrowingSweep` here. Every frame carries its number. Printed are
-frames received and recorded, the time from due to recorded, and this process's share of a core. Then the
-server is killed and started again while a recording goes on. Of killed recorders: bench_growing.py.
+frames received and recorded, the time from due to recorded, and this process's share of a core. Of killed
+recorders: bench_growing.py.
 """
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 import tempfile
@@ -55,34 +54,22 @@ def played(path, port):
     return process, int(said.split(":")[1])
 
 
-def ended(process, number=signal.SIGTERM):
-    process.send_signal(number)
-    process.communicate()
-
-
-def recorded(path, sweep, port, seconds, kill=None):
+def recorded(path, sweep, port, seconds):
     """Receive and record; returns numbers of the frames, delays, and the connection's state."""
-    numbers, delays, later_s, last_s = [], [], 0.0, -1.0
+    numbers, delays = [], []
     end = time.monotonic() + seconds
     with (
         Connection("127.0.0.1", port) as connection,
         GrowingSweep(path, sweep.grid, sweep.signal, sweep.frames.dtype) as growing,
     ):
-        start = None
         while time.monotonic() < end:
-            if kill is not None and time.monotonic() > end - seconds / 2:
-                kill = kill()
             for each in connection.receive(0.1):
                 if not isinstance(each, ImageReceived):
                     continue
                 frame = each.pixels.T if sweep.signal is RF else each.pixels
-                if each.time_s + later_s <= last_s:  # its server has begun anew
-                    later_s, start = last_s + 1.0 - each.time_s, None
-                last_s = each.time_s + later_s
-                growing.append(frame, last_s)
+                growing.append(frame, each.time_s)
                 numbers.append(int(frame[0, 0]))
-                start = time.monotonic() - last_s if start is None else start
-                delays.append(time.monotonic() - start - last_s)
+                delays.append(time.monotonic() - each.time_s)
         return numbers, delays, connection.state
 
 
@@ -98,7 +85,8 @@ def measure(kind, seconds, folder):
     busy = time.process_time()
     numbers, delays, state = recorded(folder / "recorded.h5", sweep, port, seconds)
     busy = (time.process_time() - busy) / seconds
-    ended(server)
+    server.terminate()
+    server.communicate()
     found = load_sweep(folder / "recorded.h5")
     same = all(int(found.frames[i][0, 0]) == number for i, number in enumerate(numbers))
     late = 1e3 * (np.array(delays) - min(delays))
@@ -113,33 +101,11 @@ def measure(kind, seconds, folder):
     return lost(numbers) + (not same)
 
 
-def kill_server(folder):
-    """Kill the server within a recording and start it again."""
-    sweep = example("rf")
-    server, port = played(folder / "rf.h5", 0)
-    servers = [server]
-
-    def kill():
-        ended(servers[0], signal.SIGKILL)
-        servers.append(played(folder / "rf.h5", port)[0])
-
-    numbers, _, state = recorded(folder / "recorded.h5", sweep, port, 20.0, kill=kill)
-    ended(servers[1])
-    found = len(load_sweep(folder / "recorded.h5"))
-    print(
-        f"server killed and started again: {state.reconnections} reconnection, {len(numbers)} frames "
-        f"received, {found} recorded"
-    )
-    (folder / "recorded.h5").unlink()
-    return (state.reconnections != 1) + (found != len(numbers))
-
-
 def main(seconds=60.0):
     """Run all; returns how much was lost."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        wrong = sum(measure(kind, seconds, folder) for kind in ("rf", "bmode"))
-        return wrong + kill_server(folder)
+        return sum(measure(kind, seconds, folder) for kind in ("rf", "bmode"))
 
 
 if __name__ == "__main__":

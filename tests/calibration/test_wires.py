@@ -106,16 +106,6 @@ def test_any_mounting_and_any_place_of_three_wires_is_found(seed):
     assert solution.condition_number < 15
 
 
-@pytest.mark.parametrize("fit_pixels", [True, False])
-def test_exact_dots_give_the_exact_calibration(fit_pixels):
-    points = scan_phantom(0, three_wires(), world_from_phantom=PLACE)
-    solution = calibrate_wires(points, three_wires(), PIXEL_MM, WireFit(fixed_pixels=not fit_pixels))
-    np.testing.assert_allclose(solution.chain.sensor_from_image.as_matrix(), TRIAL_1.as_matrix(), atol=1e-7)
-    np.testing.assert_allclose(solution.chain.pixel_mm, PIXEL_MM, rtol=1e-9)
-    assert len(solution.free) == (14 if fit_pixels else 12)
-    assert solution.used.all()
-
-
 @pytest.mark.parametrize(("labels", "registered"), [([1, 0, 3, 2], False), ([0, 1, 3, 2], True)])
 def test_labels_swapped_throughout_are_refused(labels, registered):
     points = scan_phantom(0, SKEW, 200, noise_mm=0.2, world_from_phantom=PLACE)

@@ -15,13 +15,8 @@ BMODE = BModeSettings(60.0)
     ("setting", "value"),
     [
         ("speed_of_sound_m_s", 1580.0),
-        ("centre_frequency_hz", 6e6),
         ("bandwidth_hz", (4e6, 9e6)),
         ("vector_pitch_mm", 1.25),
-        ("patch_width_mm", 1.25),
-        ("patch_height_mm", 1.25),
-        ("equalise_mm", 1.25),
-        ("edge_fraction", 0.2),
         ("correlation_of", "echo"),
     ],
 )
@@ -99,12 +94,6 @@ def test_cells_and_the_response_to_tilt_are_interpolated_with_the_curves():
     assert speckle.curves().at(np.array([12.5])).tilt is None
 
 
-@pytest.mark.parametrize("changes", [{"pivot": (1.0, np.nan)}, {"spread": (1.0, 2.0, 3.0)}])
-def test_a_response_to_tilt_that_cannot_be_is_refused(changes):
-    with pytest.raises(InvalidInputError, match=next(iter(changes))):
-        tilted(**changes)
-
-
 def spoiled(**changes):
     made = speckle.curves()
     arrays = {
@@ -126,14 +115,9 @@ def put(index, value):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"correlation": lambda a: a[:, 1:]}, "correlation"),
         ({"correlation": put((1, 5), np.nan)}, "correlation"),
-        ({"correlation": put((1, -1), 0.0)}, "correlation"),
         ({"correlation": put((1, 30), 0.999)}, "rises"),
-        ({"distance_mm": lambda a: a + 0.1}, "distance_mm"),
-        ({"distance_mm": put(3, np.nan)}, "distance_mm"),
         ({"distance_mm": lambda a: a**1.1}, "distance_mm"),
-        ({"cells": put(0, 0.0)}, "cells"),
         ({"cells": lambda a: a[:1]}, "cells"),
     ],
 )

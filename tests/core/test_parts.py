@@ -1,11 +1,8 @@
 """Temporary files, and what a disk that is full is called."""
 
-import os
-
 import pytest
 
-from speckle3d.core.errors import FileError, NoSpaceError
-from speckle3d.core.parts import cannot_write, whole_file
+from speckle3d.core.parts import whole_file
 
 
 def fail_to_write(target):
@@ -30,12 +27,3 @@ def test_what_a_killed_process_left_is_removed_and_what_is_at_work_is_not(tmp_pa
     with pytest.raises(ZeroDivisionError):
         fail_to_write(target)
     assert sorted(tmp_path.iterdir()) == sorted([target, other])
-
-
-@pytest.mark.parametrize("code", ["ENOSPC", "EFBIG", "EDQUOT", "EACCES"])
-def test_only_a_lack_of_room_is_one(code):
-    number = getattr(__import__("errno"), code)
-    error = cannot_write("a.h5", OSError(number, os.strerror(number)))
-    assert isinstance(error, FileError)
-    assert isinstance(error, NoSpaceError) == (code != "EACCES")
-    assert str(error) == f"a.h5: cannot be written: {os.strerror(number)}"

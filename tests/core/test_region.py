@@ -92,10 +92,7 @@ def test_the_part_of_the_images_that_a_region_needs():
     "text",
     [
         "",
-        "circle 1,1 2,2",
         "rectangle 1,1 2;2",
-        "rectangle 2,1 1,2",
-        "fan 0,0 30,-30 1,2",
         "fan 0,0 9,30 2,1",
     ],
 )
@@ -103,8 +100,3 @@ def test_what_is_no_region_is_refused_in_one_line(text):
     with pytest.raises(InvalidInputError) as error:
         Region(text)
     assert "\n" not in str(error.value)
-
-
-def test_a_region_beside_the_image_is_refused():
-    with pytest.raises(InvalidInputError):
-        Region("rectangle 20,0 30,5").mask(GRID)

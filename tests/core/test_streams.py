@@ -42,14 +42,6 @@ def test_gaps_and_times_outside_the_samples_are_not_covered():
             stream.at([0.1, time_s])
 
 
-def test_a_single_sample_serves_its_own_time_alone():
-    stream = TimedPoses(np.array([0.5]), RigidTransform.identity(1))
-    assert stream.covers([0.5, 0.6]).tolist() == [True, False]
-    assert len(stream.at([0.5, 0.5])) == 2
-    with pytest.raises(InsufficientDataError):
-        stream.at([0.6])
-
-
 @pytest.mark.parametrize("times", [[], [0.0, 0.1], [0.0, 0.2, 0.1]])
 def test_samples_without_as_many_increasing_times_are_refused(times):
     samples = Rotation.from_quat(np.tile([0.0, 0, 0, 1], (3 if times else 0, 1)))

@@ -27,12 +27,6 @@ def test_does_every_item_once(count):
     assert (done == 1).all()
 
 
-def test_small_work_stays_on_the_calling_thread():
-    used = set()
-    in_parallel(lambda first, stop: used.add(threading.get_ident()), 10, grain=10)
-    assert used == {threading.get_ident()}
-
-
 def test_an_error_of_any_thread_reaches_the_caller():
     def bad(first, stop):
         if first <= 37 < stop:
@@ -65,11 +59,6 @@ def test_workers_of_a_cluster_and_the_environment_limit_the_threads(monkeypatch)
     assert cores() >= 1
 
 
-def test_work_ahead_may_be_nested():
-    nested = ahead(lambda i: sum(ahead(lambda j: i * j, range(20))), range(20))
-    assert sum(nested) == 190**2
-
-
 def test_results_made_ahead_come_in_order_and_not_too_many_of_them():
     begun = []
 
@@ -97,18 +86,6 @@ def test_work_ahead_stops_where_no_more_is_asked_for():
     next(results)
     results.close()
     assert len(made) <= 4
-
-
-def test_no_more_is_begun_after_an_error():
-    begun = []
-
-    def bad(first, stop):
-        begun.append(first)
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        in_parallel(bad, 1000)
-    assert len(begun) <= 4
 
 
 INTERRUPTED = """

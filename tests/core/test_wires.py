@@ -64,16 +64,11 @@ def test_three_wires_that_are_no_n_are_none(spoil):
     assert WirePhantom(NAMES, ends, ((0, 1, 2),)).n_shapes == ()
 
 
-def test_patterns_of_other_numbers_are_no_n():
-    assert WirePhantom(NAMES, N_ENDS, ((0, 1), (2,))).crossings_mm().shape == (0, 2, 3)
-
-
 @pytest.mark.parametrize(
     "change",
     [
         {"names": ("a", "b", "a")},
         {"patterns": ((0, 1, 3),)},
-        {"ends_mm": np.full((3, 2, 3), np.nan)},
         {"ends_mm": N_ENDS[:2]},
         {"ends_mm": N_ENDS[:, [0, 0]]},
     ],

@@ -1,7 +1,6 @@
 """OpenIGTLink against pyigtl, and both ends of a connection over the loopback."""
 
 import socket
-import threading
 import time
 
 import numpy as np
@@ -63,7 +62,6 @@ def test_pyigtl_and_we_read_an_image_of_ours(shape):
 
 @pytest.mark.parametrize(("said", "valid"), [
     ({}, True),
-    ({"TransformValid": "True", "TransformStatus": "OK"}, True),
     ({"TransformValid": "False"}, False),
     ({"TransformStatus": "OUT_OF_VIEW"}, False),
 ])  # fmt: skip
@@ -78,12 +76,8 @@ IMAGE = image()[0]
 
 @pytest.mark.parametrize("message", [
     IMAGE[:-1] + bytes([IMAGE[-1] ^ 1]),
-    with_body(IMAGE, IMAGE[58:-1]),
     changed(6, ">3H", 65535, 65535, 65535),
-    changed(12, ">f", float("nan")),
     with_body(transform()[0], bytes(47)),
-    b"\0\0" + IMAGE[2:],
-    IMAGE[:42] + b"\xff" * 8 + IMAGE[50:],
 ])  # fmt: skip
 def test_what_makes_no_sense_is_refused_in_one_line(message):
     with pytest.raises(MessageError) as error:
@@ -188,21 +182,6 @@ def test_a_peer_that_dies_or_stalls_within_a_message_costs_that_message(listenin
         assert connection.state.reconnections == 1
         peer.close()
         again.close()
-
-
-def test_a_peer_that_reads_nothing_loses_the_oldest_and_nobody_waits_for_it(listening, monkeypatch):
-    monkeypatch.setattr(link, "_MOST_SENDING", 3)
-    server, port = listening
-    with Connection("127.0.0.1", port) as connection:
-        peer, _ = server.accept()
-        for k in range(60):
-            connection.send(packed_image("I", k, np.zeros((500, 1000), np.int16), np.eye(4)))
-        assert connection.state.dropped > 20
-        begin = time.monotonic()
-        connection.close()
-        assert time.monotonic() - begin < 5.0
-        peer.close()
-    assert not [thread for thread in threading.enumerate() if "_guarded" in thread.name]
 
 
 def test_pyigtl_connects_to_our_server():

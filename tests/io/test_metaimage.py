@@ -99,67 +99,30 @@ def placed(sweep):
 
 
 @pytest.mark.parametrize(
-    ("change", "images", "poses", "words"),
+    ("change", "images", "poses"),
     [
-        ({"Timestamp": None}, 11, 11, "1 without a time"),
-        ({"Timestamp": "100.200"}, 11, 11, "1 with a repeated time"),
-        ({"Timestamp": "12.000"}, 11, 11, "1 with a time out of order"),
-        ({"ImageStatus": "INVALID"}, 11, 12, "1 not valid"),
-        ({"ProbeToTrackerTransformStatus": "MISSING"}, 12, 11, "1 without a valid pose"),
-        ({"ProbeToTrackerTransform": text_of(2 * np.eye(4))}, 12, 11, "not rigid"),
+        ({"Timestamp": "12.000"}, 11, 11),
+        ({"ImageStatus": "INVALID"}, 11, 12),
+        ({"ProbeToTrackerTransform": text_of(2 * np.eye(4))}, 12, 11),
     ],
 )
-def test_one_bad_row_is_left_out_and_counted(tmp_path, change, images, poses, words):
+def test_one_bad_row_is_left_out_and_counted(tmp_path, change, images, poses):
     true, frames = path_of(12)
-    frames[5] = {k: v for k, v in (frames[5] | change).items() if v is not None}
+    frames[5] |= change
     recording = opened(tmp_path, frames)
-    sweep = recording.sweep
-    assert (len(sweep), len(sweep.tracker.readings)) == (images, poses)
-    kept = [i for i in range(12) if i != 5 or images == 12]
-    np.testing.assert_array_equal(frames_of(sweep), grey(12)[kept].transpose(0, 2, 1))
+    assert (len(recording.sweep), len(recording.sweep.tracker.readings)) == (images, poses)
     kept = [i for i in range(12) if i != 5 or poses == 12]
-    np.testing.assert_allclose(placed(sweep), true.as_matrix()[kept], atol=1e-9)
-    notes = [note for note in recording.notes if words in note and "of 12 left out" in note]
-    assert notes
-    assert all("the longest gap is 0.1 s, after 100.200 s" in note for note in notes)
+    np.testing.assert_allclose(placed(recording.sweep), true.as_matrix()[kept], atol=1e-9)
+    assert any("of 12 left out" in note for note in recording.notes)
 
 
-IDENTITY = text_of(np.eye(4))
-
-
-@pytest.mark.parametrize("lost", [[5, 6], [0, 1], [2, 3, 4, 5, 6, 7, 8]])
+@pytest.mark.parametrize("lost", [[5, 6], [0, 1]])
 def test_a_lost_tool_that_is_written_as_the_identity_is_left_out(tmp_path, lost):
     true, frames = path_of(12)
     for i in lost:
-        frames[i]["ProbeToTrackerTransform"] = IDENTITY
-    recording = opened(tmp_path, frames)
-    kept = [i for i in range(12) if i not in lost]
-    if len(kept) > 6:
-        np.testing.assert_allclose(placed(recording.sweep), true.as_matrix()[kept], atol=1e-9)
-        assert any(f"poses: {len(lost)} of 12 left out" in note for note in recording.notes)
-    else:  # more than half is lost: it is told, and nobody knows which half is right
-        assert any("jumps that no hand makes" in note for note in recording.notes)
-
-
-def test_a_jump_of_22_mm_is_none_of_a_hands_and_a_fast_sweep_is(tmp_path):
-    _, frames = path_of(12, step_mm=10.0)  # 200 mm/s
-    assert len(opened(tmp_path, frames).sweep.tracker.readings) == 12
-    frames = path_of(12)[1]
-    matrix = np.array(frames[6]["ProbeToTrackerTransform"].split(), float)
-    matrix[3] += 22.0
-    frames[6]["ProbeToTrackerTransform"] = text_of(matrix)
-    assert len(opened(tmp_path, frames).sweep.tracker.readings) == 11
-
-
-def test_the_chain_of_transforms_and_the_matches_are_told(tmp_path):
-    _, frames = path_of(12)
-    calibrated = [f | {"ImageToProbeTransform": text_of(np.diag([0.1, 0.2, 0.15, 1.0]))} for f in frames]
-    calibrated[3].pop("ProbeToTrackerTransform")
-    for frame in calibrated:
-        frame["ReferenceToTrackerTransform"] = IDENTITY
-    (note,) = (each for each in opened(tmp_path, calibrated, settings_=LEVELS).notes if "matched" in each)
-    assert note.startswith("poses of ImageToProbe * ProbeToTracker * TrackerToReference, mm: 11 poses, 12 im")
-    assert "12 matched, 1 of them between two poses" in note
+        frames[i]["ProbeToTrackerTransform"] = text_of(np.eye(4))
+    kept = np.delete(np.arange(12), lost)
+    np.testing.assert_allclose(placed(opened(tmp_path, frames).sweep), true.as_matrix()[kept], atol=1e-9)
 
 
 def test_transforms_are_chosen_by_name(tmp_path):
@@ -210,16 +173,6 @@ def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(
     np.testing.assert_allclose(got, matrix[:, [0, 1, 3]], atol=1e-9)
 
 
-NRRD = "NRRD0004\ntype: uint8\nencoding: {}\nendian: little\n{}\n\n"
-
-
-def nrrd(path, pixels, fields, encoding="raw", content=None):
-    path.write_bytes(
-        NRRD.format(encoding, fields).encode() + (pixels.tobytes() if content is None else content)
-    )
-    return path
-
-
 CASES = [
     ('sizes: 5 4 3\nkinds: domain domain list\nunits: "{}" "{}" "s"\nspacings: {} {} 0.05', lambda p: p),
     ('sizes: 5 4 3\nspace units: "{}" "{}"\nspace directions: ({},0) (0,{}) none', lambda p: p),
@@ -229,22 +182,15 @@ CASES = [
         "axis 0 index values:=0 0.05 0.1",
         lambda p: np.moveaxis(p, 0, -1),
     ),
-    ("sizes: 5 4 1 3\nkinds: domain domain domain list\nspacings: {3} {4} 1 nan", lambda p: p),
-    ("sizes: 3 5 4\nkinds: list domain domain\nspacings: nan {3} {4}", lambda p: np.moveaxis(p, 0, -1)),
 ]
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("cm", 10.0)])
 @pytest.mark.parametrize(("form", "arrange"), CASES)
-def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange, unit, factor):
-    if "unit" not in form:
-        factor = 1.0
-    steps = [repr(0.2 / factor), repr(0.1 / factor)]
-    if form.startswith("sizes: 3 5 4 1"):
-        fields = form.format(unit, unit, unit, *steps)
-    else:
-        fields = form.format(unit, unit, *steps) if "{3}" not in form else form.format("", "", "", *steps)
-    path = nrrd(tmp_path / "a.nrrd", np.ascontiguousarray(arrange(grey())), fields)
+def test_axes_and_units_of_nrrd_are_those_it_says(tmp_path, form, arrange):
+    fields = form.format(*["cm"] * form.count('"{}"'), 0.02, 0.01)
+    head = f"NRRD0004\ntype: uint8\nencoding: raw\nendian: little\n{fields}\n\n"
+    path = tmp_path / "a.nrrd"
+    path.write_bytes(head.encode() + np.ascontiguousarray(arrange(grey())).tobytes())
     sweep = load_sweep(path, given_over(LEVELS, **({} if "0.05" in form else {"frame_rate_hz": 20.0})))
     assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == pytest.approx((0.2, 0.1))
     np.testing.assert_array_equal(frames_of(sweep), grey().transpose(0, 2, 1))

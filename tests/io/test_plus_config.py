@@ -56,10 +56,6 @@ def test_the_phantoms_pose_is_read_either_way_round_by_the_names_of_the_set(
     np.testing.assert_allclose((pose.inv() if inverse else pose).apply([1.0, 2.0, 3.0]), [8.0, 21.0, 33.0])
 
 
-ENTITIES = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]><a>&b;</a>'
-OUTSIDE = '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/hostname">]><a>&x;</a>'
-
-
 @pytest.mark.realdata
 def test_the_published_device_set_is_read(realdata):
     config = read_wire_phantom(realdata / "plus" / "PlusDeviceSet_fCal_Sim_SpatialCalibration_2.0.xml")

@@ -22,16 +22,6 @@ def images(tmp_path):
     return write_mha(tmp_path / "a.mha", grey(), frames=tracked(3)[2])
 
 
-def test_a_file_beside_a_recording_gives_what_it_lacks(images):
-    with pytest.raises(MissingSettingsError):
-        load_sweep(images)
-    images.with_name("a.mha.toml").write_text(BMODE)
-    sweep = load_sweep(images)
-    assert sweep.grid.vector_pitch_mm == 0.1
-    assert sweep.grid.sample_spacing_mm == 0.2
-    assert sweep.signal == BModeSettings(60.0)
-
-
 def test_a_recordings_own_file_comes_before_the_folders_and_options_before_both(images):
     images.with_name("import.toml").write_text(BMODE)
     assert load_sweep(images).signal == BModeSettings(60.0)

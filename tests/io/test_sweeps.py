@@ -1,7 +1,3 @@
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import h5py
@@ -81,42 +77,6 @@ def test_rewriting_keeps_unknown_groups(path, tmp_path):
         assert file.attrs["operator_note"] == "left arm"
         assert "tracker" not in file
     assert list(tmp_path.iterdir()) == [path]
-
-
-ENDLESS = """
-import itertools, sys
-from dataclasses import replace
-import numpy as np
-from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.io.load import load_sweep
-whole, target = sys.argv[1:]
-sweep = load_sweep(whole)
-frame = sweep.frames[0]
-print("started", flush=True)
-if target == "none":
-    for i in itertools.count():
-        sweep.frames[i % len(sweep)]
-many = np.broadcast_to(frame, (10000, *frame.shape))
-sweep = replace(sweep, frames=many, frame_time_s=np.arange(1e4), truth=None)
-write_sweep(target, sweep)
-"""
-
-
-@pytest.mark.parametrize("target", ["none", "new.h5"])
-def test_control_c_is_not_lost_while_frames_are_read_or_written(tmp_path, target):
-    write_sweep(tmp_path / "whole.h5", sweep_examples.rf_sweep(8, 128, 2048))
-    command = [sys.executable, "-c", ENDLESS, "whole.h5", target]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdout.readline().strip() == b"started"
-        time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
-        try:
-            _, trace = process.communicate(timeout=10)  # it stops within a frame, some milliseconds
-        finally:
-            process.kill()
-    assert trace.strip().endswith(b"KeyboardInterrupt")
-    assert b"Exception ignored" not in trace
-    assert [p.name for p in tmp_path.iterdir()] == ["whole.h5"]
 
 
 def test_a_fan_of_vectors_is_stored_whole(tmp_path):

@@ -20,7 +20,6 @@ from speckle3d.study.results import (
     csv_text,
     json_text,
     read_summary,
-    summary_text,
     write_study,
     write_summary,
 )
@@ -54,17 +53,6 @@ def test_json_and_csv_hold_every_number_and_nothing_where_there_is_none():
     assert (line["sweep"], line["mode"], float(line["tilt_error_deg"])) == ("beef, 1", "image", -1.254)
 
 
-def test_the_table_is_aligned_narrow_and_says_of_what_its_intervals_are():
-    rows = [row(sigma_mm=1.84), row("orientation", tilt_error_deg=float("nan"))]
-    text = summary_text([summary("truth", rows)])
-    lines = text.splitlines()
-    # 1.96 standard deviations.
-    assert lines[2].split()[-8:] == ["image", "23.00", "3.61", "20.00", "+15.0", "-1.25", "+0.10", "+0.00"]
-    assert lines[3].split()[-7:] == ["23.00", "-", "20.00", "+15.0", "-", "+0.10", "+0.00"]
-    assert "95 %" in lines[4]
-    assert "reference: truth" in lines[5]
-
-
 def test_a_doubt_is_of_the_modes_that_rest_on_what_is_doubted():
     images = Doubt("images", "frozen", "...", False)
     modes = ["image", "orientation", "pose", "tracker"]
@@ -83,9 +71,7 @@ def test_what_is_in_doubt_and_left_out_stands_below_the_table_and_is_read_back(t
     made = Provenance("s.h5", "ab12", "1.0")
     assert recorded_doubts(tmp_path / "reconstruction.h5", made) == (METRES, SPIKES)
     assert recorded_doubts(tmp_path / "reconstruction.h5", replace(made, input_sha256="cd34")) is None
-    table = (tmp_path / "table.txt").read_text()
-    assert "s: tracker: expected 23 mm, got 0.023 (suspect: units); refused" in table
-    assert "s: mode pose is left out" in table
+    assert "s: mode pose is left out" in (tmp_path / "table.txt").read_text()
     assert replace(read_summary(tmp_path, "s"), drift=(), details=details) == of
     study = write_study(tmp_path, [SweepOutcome("s", tmp_path, "done", folder=".")], "")
     doubts = json.loads((tmp_path / "study.json").read_text())["doubts"]

@@ -5,7 +5,6 @@ import re
 import pytest
 from cluster_jobs import double, lost, suicide
 
-from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.study.schedulers import scheduler_for
 
 
@@ -26,14 +25,3 @@ def test_a_cluster_gives_the_same_results():
     with cluster, scheduler_for(cluster.scheduler_address, None) as where:
         assert sorted(where.run(double, [3, 1, 2], lost)) == [2, 4, 6]
         assert list(where.run(double, ["a", None], lost)).count("aa") == 1
-
-
-def test_what_cannot_be_opened_is_said(monkeypatch):
-    monkeypatch.setattr("speckle3d.study.schedulers.CONNECT_S", 1)
-    with pytest.raises(InvalidInputError), scheduler_for("tcp://a:1", 2):
-        pass
-    with pytest.raises(InvalidInputError), scheduler_for(None, 0):
-        pass
-    pytest.importorskip("distributed", reason="needs Dask (extra cluster)")
-    with pytest.raises(FileError), scheduler_for("tcp://127.0.0.1:9", None):
-        pass

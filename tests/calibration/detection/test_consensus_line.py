@@ -20,14 +20,3 @@ def test_most_points_agree_wherever_the_others_lie(seed, tolerance, share):
         assert agree.sum() >= (~wrong).sum() - 3
         assert possible == 40
         assert np.abs(start + slope * column - true).max() < 2 * tolerance
-
-
-def test_a_point_agrees_only_where_the_region_holds_the_line():
-    inside = np.ones((5, 30), bool)
-    inside[3, 10:] = False
-    column, row = np.arange(5.0), np.array([12.0, 12.0, 12.0, 12.0, np.nan])
-    agree, possible, start, slope = consensus_line(column, row, inside, 2.0)
-    assert agree.tolist() == [True, True, True, False, False]
-    assert possible == 4
-    np.testing.assert_allclose([start, slope], [12.0, 0.0], atol=1e-9)
-    assert consensus_line(column, np.full(5, np.nan), inside, 2.0)[1:] == (0, 0.0, 0.0)

@@ -4,7 +4,6 @@ from wire_scenes import PIXEL_MM, candidates, scene
 
 from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.plane import Chain
-from calibration.points import Seen
 
 
 def away_mm(labelled, shown):
@@ -29,21 +28,6 @@ def test_wires_are_told_apart_among_wrong_dots_however_the_image_lies(seed, degr
     # Of 1440 such frames none was dropped, and in 7 a wrong dot, stronger and in line, stood for a wire.
     assert len(frames) >= 11
     assert (away_mm(labelled, shown).reshape(-1, 9).max(axis=1) > RIGHT_MM).sum() <= 1
-
-
-def test_a_frame_says_which_rule_failed_and_by_how_much():
-    shown = scene(5, frames=1)
-
-    def reason(pixels):
-        dots = Seen(np.zeros(len(pixels), int), pixels)
-        return label_dots(dots, shown.phantom, PIXEL_MM).dropped[0]
-
-    right = shown.pixels[0]
-    assert "8 dots for 9 wires" in reason(np.delete(right, 4, axis=0))
-    assert "narrower than the wires'" in reason(0.7 * right)
-    assert "28 % narrower" in reason(right * [1.0, 0.7])
-    bent = right + np.where(np.arange(9)[:, None] == 4, [0.0, 2.0 / PIXEL_MM[1]], 0.0)
-    assert "two layers" in reason(bent)
 
 
 def truth(shown):

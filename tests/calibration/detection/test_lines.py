@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calibration.detection.lines import LineFinder, NoLineError, detect_lines
+from calibration.detection.lines import LineFinder, NoLineError
 from calibration.settings import LineSettings
 
 PIXEL_MM = (0.25, 0.08)
@@ -133,47 +133,3 @@ def test_images_without_a_line_are_refused():
     for image in (*noise, darker, np.zeros(SHAPE), np.where(np.eye(*SHAPE) > 0, np.nan, floor_echo(0))):
         with pytest.raises(NoLineError):
             detect_line(image, FRONT)
-
-
-class Reading:
-    """Frames that can be read one at a time only."""
-
-    def __init__(self, images):
-        self.images = images
-        self.shape = (len(images), *images[0].shape)
-        self.dtype = images[0].dtype
-
-    def __getitem__(self, index):
-        assert isinstance(index, int)
-        return self.images[index]
-
-
-def moving_floor(count=12, **keywords):
-    depths, degrees = np.linspace(9.0, 13.0, count), np.linspace(-8.0, 8.0, count)
-    images = [floor_image(k, d, a, **keywords) for k, (d, a) in enumerate(zip(depths, degrees, strict=True))]
-    return images, depths, degrees
-
-
-def assert_on_floors(found, depths, degrees):
-    for k, points in zip(found.frame, found.pixels, strict=True):
-        assert_on_floor(type("Line", (), {"points_px": points}), depths[k], degrees[k])
-
-
-def test_the_screen_around_the_image_and_the_ring_down_do_not_matter():
-    images, depths, degrees = moving_floor()
-    ring = 255 * (np.sin(np.arange(36) / 36 * 6 * np.pi) ** 2)
-    letters = np.random.default_rng(1).integers(0, 2, (60, 12)) * 255
-    screens = []
-    for k, image in enumerate(images):
-        flicker = np.random.default_rng(k).normal(0, 6, (SHAPE[0], 36))
-        image[:, :36] = np.clip(np.maximum(image[:, :36], ring + flicker), 0, 255)
-        screen = np.zeros((SHAPE[0] + 140, SHAPE[1] + 60), np.uint8)
-        screen[70:-70, 40:-20] = image
-        screen[5:65, 100:112] = letters
-        screen[100:160, 10:22] = letters
-        screen[-60:, 150:162] = letters
-        screens.append(screen)
-    found = detect_lines(Reading(screens), PIXEL_MM, FRONT)
-    found.pixels[:] -= [70, 40]
-    assert found.dropped == {}
-    assert_on_floors(found, depths, degrees)

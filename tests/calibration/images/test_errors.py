@@ -9,23 +9,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.errors import (
     DEEP_MM,
-    _left_out,
 )
 from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_from_sweeps
 from calibration.settings import ImageFit
 from speckle3d.core.streams import TimedPoses
-
-
-def test_leaving_out_blocks_gives_the_standard_error_of_a_mean():
-    rng = np.random.default_rng(0)
-    values = 3.0 * rng.standard_normal(400)
-    # A mean as an answer: slopes are residuals and each value bends by one; four values make a block.
-    slopes, bends = (values - values.mean())[:, None], np.ones((400, 1, 1))
-    found = _left_out(slopes, bends, np.arange(400) // 4, np.array([[400.0]]))
-    blocks = values.reshape(-1, 4).mean(axis=1)
-    # The textbook's standard error of a mean of 100 blocks; leaving one out shares what is left, 1 / 99.
-    assert found[0, 0] == pytest.approx(blocks.var(ddof=1) / 100.0, rel=0.03)
 
 
 @pytest.fixture(scope="module")

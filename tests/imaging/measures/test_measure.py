@@ -68,20 +68,3 @@ def test_points_outside_the_sweep_are_refused_by_number():
     with pytest.raises(InvalidInputError, match=r"point 2 .*3\.00 mm"):
         require_inside(np.array([centre, WORLD.apply([10, 20, -3.0])]), GRID, poses)
     assert require_inside(centre[None], GRID, poses).frames[0, 0] == 10
-
-
-def test_belonging_is_found_as_by_looking_at_every_frame():
-    poses = swept()
-    points = WORLD.apply(np.random.default_rng(5).uniform([-4, -4, -4], [24, 44, 24], (200, 3)))
-    near = belonging_of(points, GRID, poses)
-    for k, point in enumerate(points):
-        own = np.array([pose.inv().apply(point) for pose in poses])
-        beside = own[:, :2] - np.clip(own[:, :2], 0, [GRID.width_mm, GRID.depth_mm])
-        away = np.linalg.norm(np.column_stack([beside, own[:, 2]]), axis=1)
-        best = int(away.argmin())
-        assert near.frames[k, 0] == best
-        sides = [f for f in (best - 1, best + 1) if 0 <= f < len(poses) and own[f, 2] * own[best, 2] < 0]
-        shares = [abs(own[best, 2]) / (abs(own[best, 2]) + abs(own[f, 2])) for f in sides]
-        assert near.weights[k, 1] == pytest.approx(max(shares, default=0.0))
-        assert near.weights[k].sum() == pytest.approx(1.0)
-        assert near.gap_mm[k] == pytest.approx(np.linalg.norm(beside[best]) if sides else away[best])

@@ -88,14 +88,6 @@ def test_zeros_at_the_border_are_empty_and_those_inside_are_black():
     assert len(whole) > len(surface)
 
 
-def test_a_cavity_is_no_volume():
-    volume, _ = ball(4.0)
-    hollow = np.minimum(volume.voxels, 2.0 - volume.voxels)
-    surface = surface_of(Volume(hollow, volume.spacing_mm, PLACED), 0.0)
-    assert surface.volume_mm3 == pytest.approx(4 / 3 * np.pi * (4**3 - 2**3), rel=0.01)
-    assert measures_of(surface).volume_mm3 == pytest.approx(surface.volume_mm3)
-
-
 def test_smoothing_evens_noise_out_and_keeps_the_volume():
     volume, centre = ball(4.0)
     rng = np.random.default_rng(0)
@@ -141,7 +133,3 @@ def test_levels_and_volumes_that_have_no_surface_are_refused():
         surface_of(volume, 99.0)
     with pytest.raises(InsufficientDataError):
         surface_of(Volume(volume.voxels[:1], volume.spacing_mm, PLACED), -2.0)
-    with pytest.raises(InvalidInputError):
-        surfaces_of_labels(volume)
-    with pytest.raises(InsufficientDataError):
-        surfaces_of_labels(Volume(np.zeros((3, 3, 3), np.uint8), (1.0, 1.0, 1.0), PLACED))

@@ -57,18 +57,3 @@ def test_empty_voxels_have_no_value_and_one_voxel_has_its_own():
     one = deviation_volume(errors, GRID, VoxelGrid((1, 1, 1), (0.5, 0.5, 0.5), centre))
     # Half of the sweep at 5 % of 20 mm.
     assert one[0, 0, 0] == pytest.approx(0.5, rel=1e-3)
-
-
-def test_variances_are_those_of_rigid_displacements():
-    rng = np.random.default_rng(2)
-    poses = scaled(turn_deg=8.0).world_from_image
-    errors = PosedErrors(PoseErrors(np.cumsum(rng.normal(size=(9, 41, 6)), axis=1)), poses, GRID.centre_mm)
-    points = rng.uniform([0, 0, -1], [15, 20, 21], (300, 3))
-    directions = Rotation.random(300, rng=rng).apply([0.0, 0.0, 1.0])
-    near = belonging_of(points, GRID, poses)
-    first, factors = poses[0].rotation, errors.errors.factors
-    arms = first.inv().apply(points)[:, None] - first.inv().apply(poses.apply(GRID.centre_mm))[near.frames]
-    shifts = factors[:, near.frames, :3] + np.cross(factors[:, near.frames, 3:], arms)
-    shifts = (shifts * near.weights[..., None]).sum(axis=2)
-    moved = np.einsum("mka,ka->mk", shifts, first.inv().apply(directions))
-    np.testing.assert_allclose(errors.variance(points, directions, near), (moved**2).sum(axis=0))

@@ -1,7 +1,6 @@
 """Filling of holes: against brute force, on any number of threads."""
 
 import numpy as np
-import oracles
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,28 +27,6 @@ def filled_by_definition(voxels, state, boxes):
                 filled[tuple(at)], marked[tuple(at)] = measured.mean(dtype=np.float64), FILLED
                 break
     return filled, marked
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    shape=st.tuples(st.integers(1, 7), st.integers(1, 8), st.integers(1, 9)),
-    share=st.sampled_from([0.0, 0.01, 0.1, 0.5, 1.0]),
-    radius=st.integers(0, 5),
-)
-def test_cubes_are_those_of_brute_force(seed, shape, share, radius):
-    voxels, state = some_voxels(np.random.default_rng(seed), shape, share)
-    expected = oracles.fill_holes(np.where(state == MEASURED, voxels, np.nan), radius)
-    before, measured = voxels.copy(), state == MEASURED
-    fill_holes(voxels, state, radius)
-    np.testing.assert_array_equal(voxels[measured], before[measured])
-    np.testing.assert_array_equal(
-        state, np.where(np.isnan(expected), EMPTY, np.where(measured, MEASURED, FILLED))
-    )
-    # Means of some hundred levels, worked out in double and in single precision.
-    np.testing.assert_allclose(voxels[state == FILLED], expected[state == FILLED], rtol=2e-6)
-    # Where nothing was found, nothing is written.
-    np.testing.assert_array_equal(voxels[state == EMPTY], before[state == EMPTY])
 
 
 @settings(max_examples=20, deadline=None)

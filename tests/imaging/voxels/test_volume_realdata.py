@@ -1,7 +1,6 @@
 """Volumes of a real tracked sweep beside those that PLUS made of it.
 
-With the rule "plus" they are PLUS's to the last voxel. Of ours by default, bounds are what was measured, with
-room for rounding of another machine.
+With the rule "plus" they are PLUS's to the last voxel.
 """
 
 import re
@@ -12,19 +11,14 @@ from unittest import mock
 import igsio_twin
 import numpy as np
 import pytest
-from commands import run_command
 from igsio_twin import Clip
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.labels import MEASURED
-from speckle3d.core.region import Region
 from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.images import PosedImages
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.splatting import splat_images
-from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.voxels.volumes import read_volume
-from speckle3d.study.posed import open_posed
 
 pytestmark = pytest.mark.realdata
 
@@ -109,18 +103,6 @@ def case(request, realdata):
     return Case(request.param, images, voxels, np.array(plus.GetOrigin()), placed)
 
 
-def opened(folder):
-    """The recording with its images and poses, as the command opens it."""
-    settings = ImportSettings(plus_config=str(device_set(folder)))
-    source, meaning = open_posed(folder / "SpinePhantomFreehand.igs.mha", settings=settings).source()
-    assert meaning == "B-mode as stored, 0 to 255"
-    return source
-
-
-def share_within(levels, ours, theirs, where):
-    return (np.abs(ours[where].astype(float) - theirs[where]) <= levels).mean()
-
-
 def test_the_rule_plus_makes_the_volumes_of_plus_to_the_last_voxel(case):
     """At the poses as written, and on PLUS's grid before its header was."""
     origin, shape = case.own_grid
@@ -129,36 +111,3 @@ def test_the_rule_plus_makes_the_volumes_of_plus_to_the_last_voxel(case):
     volume, measured = case.pasted
     assert measured.sum() > 1e5
     np.testing.assert_array_equal(volume[measured], case.reference[measured])
-
-
-def test_the_command_makes_the_volumes_of_plus(case, realdata, tmp_path):
-    folder, out, state = realdata / "plus", tmp_path / "volume.mha", tmp_path / "state.mha"
-    fan = ()
-    if case.splat == "linear":
-        fan = "--splat", "linear", "--region", region_of(case.clip, opened(folder).grid)
-    run_command(
-        "volume", folder / "SpinePhantomFreehand.igs.mha", "--plus-config", device_set(folder),
-        "--like", reference_path(folder, case.name), "--fill-radius", 0, "--rule", "plus", "--state", state,
-        *fan, "-o", out,
-    )  # fmt: skip
-    made, measured = read_volume(out), read_volume(state).voxels == MEASURED
-    assert made.fields["rule"] == "plus"
-    # The header's origin lacks 0.0005 mm, and poses are made rigid, 0.0001 mm off the written ones.
-    assert (measured != case.pasted[1]).mean() < 0.001
-    assert share_within(2, made.voxels, case.reference, measured) > 0.998
-    assert share_within(0, made.voxels, case.reference, measured) > (0.95 if fan else 0.99)
-
-
-def region_of(clip, grid):
-    """A fan with a part in the middle left out, as a polygon for --region: past both ends of each row."""
-    spans = clip.spans(WIDTH, HEIGHT)
-    used = np.flatnonzero(spans[:, 0, 0] <= spans[:, 0, 1])
-    forked = used[spans[used, 1, 0] <= spans[used, 1, 1]]
-    right = [spans[r, int(r in forked), 1] + 0.5 for r in used]
-    outline = [*zip(right, used, strict=True), *((spans[r, 0, 0] - 0.5, r) for r in used[::-1])]
-    outline += [(spans[r, 0, 1] + 0.5, r) for r in forked]
-    outline += [(clip.fan[0], forked[-1] + 0.5), *((spans[r, 1, 0] - 0.5, r) for r in forked[::-1])]
-    placed = np.asarray(outline, float) @ grid.image_from_sample[:2, :2].T + grid.image_from_sample[:2, 2]
-    text = "polygon " + " ".join(f"{x:.6f},{y:.6f}" for x, y in placed)
-    np.testing.assert_array_equal(Region(text).mask(grid), clip.mask(WIDTH, HEIGHT).T)
-    return text

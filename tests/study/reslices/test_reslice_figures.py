@@ -8,7 +8,7 @@ from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.study.reslices.cut_geometry import read_plane
 from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, length_words
-from speckle3d.study.reslices.reslice_figures import busiest_rows, draw_cuts, save_reslices
+from speckle3d.study.reslices.reslice_figures import draw_cuts, save_reslices
 
 PLACED = RigidTransform.from_components([3.0, -40.0, 12.0], Rotation.from_euler("ZYX", [0.4, -0.7, 1.0]))
 PLANE = ReslicePlane(PLACED, 15.0, 20.0, 0.5, (-1.0, 2.5))
@@ -47,10 +47,3 @@ def test_where_planes_and_sheets_lie_comes_back_from_the_file(tmp_path):
         np.testing.assert_allclose(shown.world_from_mm(x, y), cut.world_from_mm(x, y), atol=1e-9)
         assert shown.shape == cut.shape
     np.testing.assert_allclose(read_plane(path).cut.world_from_mm(-1.0, 2.5), PLACED.translation)
-
-
-def test_the_enlarged_part_is_where_structures_run_along_the_sweep():
-    image = np.random.default_rng(1).normal(0.0, 5.0, (300, 80)).astype(np.float32)
-    image[200:230, 20:60] += 12.0
-    assert 120 <= busiest_rows(image, 110) <= 200
-    assert busiest_rows(np.full((300, 80), np.nan, np.float32), 110) == 0

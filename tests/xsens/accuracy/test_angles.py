@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.core.streams import TimedRotations
 from xsens.accuracy.angles import (
@@ -16,7 +15,6 @@ from xsens.accuracy.angles import (
     mounting_from_motion,
     pair_errors,
 )
-from xsens.accuracy.figures import figure_turns, turns_about
 from xsens.accuracy.mechanism import MechanismSettings, read_mechanism_csv, readings_at
 
 TILTS_DEG, YAWS_DEG = np.linspace(-16.4, 2.2, 11), np.linspace(-5.5, 5.5, 7)
@@ -116,13 +114,6 @@ class TestMechanism:
         assert (found.base_from_image.inv() * expected).magnitude().max() < 1e-12
         assert found.time_s is None
 
-    @pytest.mark.parametrize(
-        "text", ["", "tilt,roll\n1,2\n", "1,2,3,4\n", "tilt,yaw\n1,2,3\n", "tilt,yaw\n1,inf\n"]
-    )
-    def test_what_holds_no_settings_is_refused(self, tmp_path, text):
-        with pytest.raises(InvalidInputError, match=r"settings\.csv"):
-            read_mechanism_csv(self.write(tmp_path, text))
-
     def test_readings_are_averaged_while_the_mechanism_stands_still(self):
         times = np.arange(0.0, 20.0, 0.01)
         true = grid()[[0, 40]]
@@ -131,26 +122,3 @@ class TestMechanism:
         bounds = MechanismSettings(true, np.array([1.0, 11.0]), np.array([9.0, 19.0]))
         # A degree's uniform noise about each axis over sqrt(3), averaged over 800 readings: 0.02 degrees.
         assert np.rad2deg((readings_at(sensor, bounds).inv() * true).magnitude().max()) < 0.08
-
-
-class TestFigure:
-    def errors(self, scale, seed=0):
-        """A sensor whose yaw grows too fast, with calibrations of the paper's precision."""
-        spread = np.random.default_rng(seed).normal(0.0, np.deg2rad([[1.5, 1.1, 0.08]]), (4, 3))
-        yaw, tilt = np.meshgrid(YAWS_DEG * scale, TILTS_DEG, indexing="ij")
-        read = rotation_from_fixed_angles(0.0, np.deg2rad(yaw).ravel(), np.deg2rad(tilt).ravel())
-        return pair_errors(read, grid(), Rotation.from_rotvec(spread))
-
-    def test_worst_and_best_are_told_apart(self):
-        experiments = {"near iron": self.errors(1.3), "clear": self.errors(1.0)}
-        turns = turns_about("yaw", experiments)
-        worst = max(turns, key=lambda turn: turn.drift_rad.max())
-        best = min(turns, key=lambda turn: turn.drift_rad.min())
-        assert (worst.experiment, best.experiment) == ("near iron", "clear")
-        # 30 % of a turn of 11 degrees; the calibrations' cosine takes away less than a hundredth.
-        assert np.rad2deg(worst.drift_rad.max()) == pytest.approx(3.3, abs=0.1)
-        figure = figure_turns(experiments)
-        titles = [axes.get_title() for axes in figure.axes]
-        assert len(titles) == 4  # the mechanism did not roll
-        assert titles[0].startswith("worst yaw: near iron")
-        assert titles[1].startswith("best yaw: clear")

@@ -1,13 +1,12 @@
 """Every engine on one known movement: axes of the world, holes, pieces, pauses, units, knocks."""
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.online import OnlineFilter
 from xsens.fusion.orient import orient
 from xsens.fusion.settings import Method
@@ -81,14 +80,6 @@ def test_fields_that_come_more_slowly_are_carried_to_vqf(method):
     assert error_deg(truth, orient(replace(log, magnetometer_au=field), method=method)).max() < 1.5
 
 
-def test_a_python_without_vqf_is_told(monkeypatch):
-    monkeypatch.setitem(sys.modules, "vqf", None)
-    _, log = swung(1.0)
-    assert len(orient(log, method="filter")) == 100
-    with pytest.raises(InvalidInputError, match=r"pip install vqf.*smoother"):
-        orient(log, method="vqf")
-
-
 @OURS
 def test_the_heading_of_a_sensor_at_rest_stays(method):
     truth, log = swung(90.0, begins_s=100.0)
@@ -157,7 +148,5 @@ def test_missing_readings_are_bridged_and_bad_ones_refused():
     state = online.state
     assert apart_deg(state.world_from_sensor, Rotation.identity()) < 1e-6
     assert state.standard_deviation_rad[2] > 1.0  # nothing has told the heading
-    with pytest.raises(MismatchError):
-        online.push(0.01, [0.0, 0.0], [0.0, 0.0, 9.8])
     with pytest.raises(InvalidInputError):
         online.push(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8])

