@@ -7,6 +7,7 @@ that lies inside: no voxels, no splatting, and no model of the estimator.
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import rotation_from_fixed_angles
@@ -54,32 +55,9 @@ class Helix:
         return np.asarray(self.centre_mm) + np.stack([x, y, rise], axis=-1)
 
     def depth(self, points):
-        return self.tube_mm - np.linalg.norm(points - self.at(self.nearest_angle(points)), axis=-1)
-
-    def nearest_angle(self, points):
-        """Where along the helix is nearest, by Newton's steps from every turn."""
-        last = 2 * np.pi * self.turns
-        own = points - np.asarray(self.centre_mm)
-        round_ = np.arctan2(own[..., 1], own[..., 0])
-        best, nearest = np.full(points.shape[:-1], np.inf), np.zeros(points.shape[:-1])
-        for turn in range(int(np.ceil(self.turns)) + 1):
-            angle = np.clip(round_ + 2 * np.pi * turn, 0.0, last)
-            for _ in range(6):
-                angle = np.clip(angle - self._step(own, angle), 0.0, last)
-            away = np.linalg.norm(points - self.at(angle), axis=-1)
-            nearest = np.where(away < best, angle, nearest)
-            best = np.minimum(best, away)
-        return nearest
-
-    def _step(self, own, angle):
-        """First over second derivative of half the squared distance."""
-        rise = self.pitch_mm / (2 * np.pi)
-        out = own[..., 0] * np.sin(angle) - own[..., 1] * np.cos(angle)
-        height = rise * (angle - np.pi * self.turns) - own[..., 2]
-        second = own[..., 0] * np.cos(angle) + own[..., 1] * np.sin(angle)
-        curved = self.radius_mm * second + rise**2
-        slope = self.radius_mm * out + rise * height
-        return np.clip(slope / np.where(curved > 0.1, curved, 0.1), -0.5, 0.5)
+        # Places 0.01 mm apart: at the tube's surface, 0.9 mm away, the nearest is right to 2e-5 mm.
+        angle = np.linspace(0.0, 2 * np.pi * self.turns, int(self.length_mm / 0.01))
+        return self.tube_mm - cKDTree(self.at(angle)).query(points)[0]
 
 
 @dataclass(frozen=True)

@@ -38,10 +38,6 @@ def test_the_suffix_of_out_says_what_is_written(done, sequence, tmp_path):
         np.testing.assert_array_equal(sweep.frames[2], grey()[2].T)
         assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == (0.1, 0.2)
         assert len(sweep.tracker.readings) == 3
-    assert (tmp_path / "d.zraw").is_file()
-    done("convert", h5, mhd, "--compression", "none")
-    assert (tmp_path / "d.raw").stat().st_size == grey().size
-    assert not (tmp_path / "d.zraw").exists()  # of the header that was replaced
 
 
 CONFIG = "PlusDeviceSet_"

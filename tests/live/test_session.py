@@ -8,13 +8,11 @@ from igtl_examples import decoded
 from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.igtl.messages import ImageReceived, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
 from speckle3d.live.session import MOST_WAITING, Session, SessionSettings
-from speckle3d.live.volume import MOST_IMAGES, GrowingVolume
 
 RF = ImportSettings(
     sampling_rate_hz=2e8 / 3,
@@ -181,12 +179,3 @@ def test_a_pose_takes_pixels_to_slicers_axes(recorded):
     at = found.matrix @ [100, 10, 0, 1]
     assert at[:3] == pytest.approx([-(1.0 + 3.0), -(2.0 + 1.155), 3.0], abs=1e-4)
     assert np.linalg.det(found.matrix[:3, :3]) > 0
-
-
-def test_memory_of_the_volume_is_bounded():
-    growing, rng = GrowingVolume(ImageGrid(16, 32, 0.5, 0.5)), np.random.default_rng(0)
-    for k in range(2 * MOST_IMAGES + 5):
-        growing.keep(k, rng.exponential(size=(16, 32)).astype(np.float32))
-    numbers, images = growing.kept()
-    assert numbers.size == len(images) <= MOST_IMAGES
-    assert set(np.diff(numbers)) <= {2, 4}

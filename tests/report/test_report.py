@@ -52,11 +52,6 @@ def study_of(sweeps, **more):
     return {"format": "speckle3d.study", "version": 2, "modes": ["image"], "sweeps": sweeps, **more}
 
 
-def row(sweep, mode, percent):
-    return {"sweep": sweep, "mode": mode, "part": "f", "length_error_percent": percent, "tilt_error_deg": 1.0,
-            "reference": "truth", "sigma_mm": 0.1}  # fmt: skip
-
-
 def test_the_page_stands_alone(page, text):
     assert page.addresses
     assert all(address.startswith(("data:image/", "#")) for address in page.addresses)
