@@ -68,27 +68,17 @@ def write_files(target, files):
     return target
 
 
-def package_files(
-    sweep,
-    *,
-    packed=False,
-    name=NAME,
-    imu_text=None,
-    element_mm=ELEMENT_MM,
-    kind=None,
-    yml_kind=None,
-    yml=None,
-):
+def package_files(sweep, packed=False, name=NAME, element_mm=ELEMENT_MM, yml=None):
     """Content of a package's files by name."""
-    kind = kind or kind_of(sweep)
+    kind = kind_of(sweep)
     raw = raw_bytes(sweep)
     files = {
         f"{name}_{kind}.raw{'.lzo' if packed else ''}": lzop_bytes(raw) if packed else raw,
-        f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm, yml_kind or kind)).encode(),
+        f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm)).encode(),
         f"{name}_{kind}.tgc": tgc_text(frame_times_ns(sweep)).encode(),
     }
     if sweep.orientation is not None:
-        files[f"{name}_imu.yml"] = (imu_text or sensor_text(sweep.orientation)).encode()
+        files[f"{name}_imu.yml"] = sensor_text(sweep.orientation).encode()
     return files
 
 
@@ -118,7 +108,7 @@ def sample_bytes(sweep):
     return {"rf": 2, "iq": 4, "env": 1}[kind_of(sweep)]
 
 
-def yml_text(sweep, element_mm=ELEMENT_MM, kind=None):
+def yml_text(sweep, element_mm=ELEMENT_MM):
     """The description; the delay has the microsecond that passes before depth 0."""
     n, lines, samples = sweep.frames.shape
     grid, signal = sweep.grid, sweep.signal
@@ -130,7 +120,7 @@ def yml_text(sweep, element_mm=ELEMENT_MM, kind=None):
         f"  - {{rx element: {i * step!r}, tx element: {(i // 2 * 2 + 0.5) * step!r}, angle: 0 °}}\n"
         for i in range(lines)
     )
-    spoken = {"rf": "RF", "iq": "IQ", "env": "B pre-scan"}[kind or kind_of(sweep)]
+    spoken = {"rf": "RF", "iq": "IQ", "env": "B pre-scan"}[kind_of(sweep)]
     shift = getattr(signal, "demodulation_frequency_hz", None)
     focus = ""
     if shift:

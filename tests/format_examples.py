@@ -9,16 +9,16 @@ FRAMES, VECTORS, SAMPLES = 4, 6, 40
 PITCH_MM, SPACING_MM, FIRST_MM = 0.3, 0.0493, 4.0
 
 
-def rf(seed=0, frames=FRAMES, vectors=VECTORS, samples=SAMPLES):
-    return np.random.default_rng(seed).integers(-2000, 2000, (frames, vectors, samples)).astype(np.int16)
+def rf(seed=0, frames=FRAMES):
+    return np.random.default_rng(seed).integers(-2000, 2000, (frames, VECTORS, SAMPLES)).astype(np.int16)
 
 
-def grey(seed=0, frames=FRAMES, vectors=VECTORS):
-    return np.random.default_rng(seed).integers(0, 256, (frames, vectors, SAMPLES)).astype(np.uint8)
+def grey():
+    return np.random.default_rng(0).integers(0, 256, (FRAMES, VECTORS, SAMPLES)).astype(np.uint8)
 
 
-def iq(**shape):
-    return (rf(0, **shape) + 1j * rf(1, **shape)).astype(np.complex64)
+def iq(frames=FRAMES):
+    return (rf(0, frames) + 1j * rf(1, frames)).astype(np.complex64)
 
 
 def axes(vectors=VECTORS, samples=SAMPLES):
@@ -143,7 +143,7 @@ def write_dicom(
     return path
 
 
-def write_zea(path, frames, kind="beamformed_data", home="", scan=()):
+def write_zea(path, frames, kind="beamformed_data", scan=()):
     """Write `frames` (frame, vector, sample) as zea 0.0.12 does."""
     turned = frames.transpose(0, 2, 1)
     if kind == "beamformed_data":
@@ -154,12 +154,12 @@ def write_zea(path, frames, kind="beamformed_data", home="", scan=()):
     given = {"sound_speed": 1480.0, "center_frequency": 6e6, "demodulation_frequency": 6e6} | dict(scan)
     with h5py.File(path, "a") as file:
         file.attrs.update({"zea_version": "0.0.12", "probe_name": "L11-4v"})
-        group = file.create_group(f"{home}data/{kind}")
+        group = file.create_group(f"data/{kind}")
         group.create_dataset("values", data=turned, compression="gzip", chunks=(1, *turned.shape[1:]))
         group["coordinates"] = np.broadcast_to(positions, (len(frames), *positions.shape)).astype("f4")
         for name, value in given.items():
             if value is not None:
-                file[f"{home}scan/{name}"] = np.asarray(value, "f4")
+                file[f"scan/{name}"] = np.asarray(value, "f4")
     return path
 
 

@@ -65,7 +65,6 @@ def scene(
     scale_sigma: float = 0.03,
     motion: HandMotion | None = None,
     tracker: TrackerModel | None = None,
-    orientation: OrientationModel | None = None,
 ) -> Scene:
     """A sweep of a hand at 25 frames/s, with a tracker and an orientation sensor."""
     rng = np.random.default_rng(seed)
@@ -89,7 +88,7 @@ def scene(
         scale_sigma,
         turn,
         times,
-        simulate_orientation(path, span, orientation or OrientationModel(), rng),
+        simulate_orientation(path, span, OrientationModel(), rng),
         simulate_tracker(path, span, tracker or TrackerModel(), rng),
     )
 

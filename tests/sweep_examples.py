@@ -20,8 +20,8 @@ def poses(n, seed=0):
     return RigidTransform.from_components(places, turns)
 
 
-def rf_sweep(frames=6, vectors=5, samples=40, dtype=np.int16, seed=0):
-    rng = np.random.default_rng(seed)
+def rf_sweep(frames=6, vectors=5, samples=40, dtype=np.int16):
+    rng = np.random.default_rng(0)
     data = rng.normal(0, 1000, (frames, vectors, samples)).astype(dtype)
     grid = ImageGrid(vectors, samples, 0.3, RF.sample_spacing_mm, 2.0)
     m = 3 * frames
