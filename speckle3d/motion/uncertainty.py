@@ -168,7 +168,8 @@ def weigh_slopes(planes: PairPlanes, scale_sigma: float, settings: PlaneSettings
     false = UNEVENNESS * scale_sigma / np.maximum(lever_mm, 1e-6)
     travel = np.maximum((planes.offset_mm**2).sum(), 1e-12)
     seen = (planes.coefficients[:, 1:] * planes.coefficients[:, :1]).sum(axis=0) / travel
+    noise = planes.offset_mm**2 @ np.diagonal(own, axis1=1, axis2=2)[:, 1:] / travel**2
     usual = np.deg2rad(settings.turn_deg_per_mm) ** 2
-    expected = np.maximum(usual, seen**2 - (BEYOND_DOUBT * false) ** 2)
+    expected = np.maximum(usual, seen**2 - BEYOND_DOUBT**2 * (false**2 + noise))
     share = expected / (expected + false**2)
     return SlopeWeights(share, np.sqrt(share) * false)
