@@ -16,8 +16,8 @@ from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.texture import spread_frames
 
-SPECTRA = 3
-"""Frames looked at, evenly spread over the sweep."""
+SPECTRA, VECTORS = 3, 16
+"""Frames looked at, evenly spread over the sweep, and vectors of each whose spectra are taken at least."""
 WIDEST_MM = 8.0
 """Distance over which no beam keeps 0.6 of its correlation: that of an unfocused element 35 mm high, which
 keeps (1 - d / 35)^2 of the echo's. Probes' elements are 2 to 15 mm high, and focused."""
@@ -83,7 +83,8 @@ def doubt_band(sweep: Sweep) -> Doubt | None:
     if not isinstance(signal, RFSettings):
         return None
     (low, high), samples = signal.bandwidth_hz, min(sweep.grid.samples, _SEGMENT)
-    some = np.concatenate([sweep.frames[k] for k in spread_frames(len(sweep), SPECTRA)])
+    each = max(1, sweep.grid.vectors // VECTORS)
+    some = np.concatenate([sweep.frames[k][::each] for k in spread_frames(len(sweep), SPECTRA)])
     _, power = welch(some, nperseg=samples, return_onesided=False, detrend=False)
     # Mains, gain control and steps between samples are below.
     frequency = signal.bin_frequency_hz(samples)

@@ -1,36 +1,65 @@
-"""Running means of an image over a rectangular window."""
+"""Running means of an image over a rectangular window, and what is divided by them."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from speckle3d.core.arrays import Float32Array
+from speckle3d.core.arrays import Complex64Array, Float32Array
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
 def box_means(image: Float32Array, wide: int, high: int, out: Float32Array) -> None:
-    """Fill `out` with the means of an image's windows of `wide` x `high` samples that begin at each sample.
+    """Fill `out` with the means of an image over windows of `wide` x `high` samples about each sample.
 
-    Sums run in double precision: over vectors from row to row, along a vector as differences of sums from its
-    start. Four times as fast as `scipy.ndimage.uniform_filter`.
+    Windows are odd; the image's edges go on beyond it. Sums run in double precision: over vectors from row to
+    row, along a vector as differences of sums from its start. Four times as fast as
+    `scipy.ndimage.uniform_filter`.
 
     Parameters
     ----------
-    image : float32, shape (vector + wide - 1, sample + high - 1)
-    out : float32, shape (vector, sample)
+    image, out : float32, shape (vector, sample)
     """
-    samples = image.shape[1]
-    lateral, upto = np.zeros(samples), np.zeros(samples + 1)
-    later = upto[high:]
-    for v in range(wide - 1):
-        lateral += image[v]
-    for row in range(out.shape[0]):
-        entering, leaving, target, total = image[row + wide - 1], image[row], out[row], 0.0
+    rows, samples = image.shape
+    lateral, upto = np.zeros(samples), np.zeros(samples + high)
+    later, half = upto[high:], high // 2
+    for v in range(-(wide // 2), wide // 2):
+        lateral += image[min(max(v, 0), rows - 1)]
+    for row in range(rows):
+        entering, leaving = image[min(row + wide // 2, rows - 1)], image[max(row - wide // 2, 0)]
+        target, total = out[row], 0.0
         for k in range(samples):
             lateral[k] += entering[k]
-            total += lateral[k]
+        for k in range(samples + high - 1):
+            total += lateral[min(max(k - half, 0), samples - 1)]
             upto[k + 1] = total
-            lateral[k] -= leaving[k]
-        for k in range(target.size):
+        for k in range(samples):
             target[k] = (later[k] - upto[k]) / (wide * high)
+            lateral[k] -= leaving[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def squared_magnitude(analytic: Complex64Array, out: Float32Array) -> None:
+    """Fill `out` from complex samples of its shape, (vector, sample)."""
+    for v in range(len(out)):
+        source, target = analytic[v], out[v]
+        for k in range(target.size):
+            target[k] = source[k].real * source[k].real + source[k].imag * source[k].imag
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=False)
+def amplify(analytic: Complex64Array, gain: Float32Array, image: Float32Array, parts: Float32Array) -> None:
+    """Fill `parts` with real and imaginary parts times the root of a gain, `image` with their power.
+
+    Parameters
+    ----------
+    analytic : complex64, shape (vector, sample)
+    gain, image : float32, shape (vector, sample)
+    parts : float32, shape (2, vector, sample)
+    """
+    for v in range(len(gain)):
+        source, power, real, imaginary = analytic[v], image[v], parts[0, v], parts[1, v]
+        for k in range(power.size):
+            root = np.sqrt(gain[v, k])
+            real[k], imaginary[k] = source[k].real * root, source[k].imag * root
+            power[k] = real[k] * real[k] + imaginary[k] * imaginary[k]

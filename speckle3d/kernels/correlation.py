@@ -79,42 +79,55 @@ def correlate_patch(
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _turn_back(a: Float32Array, turn: Float32Array, window: Window, out: Float32Array) -> float:
-    """Fill `out` with a patch's echo, turned back by a phase; return its power."""
-    v0, v1, s0, s1 = window
-    power: Any = np.float32(0.0)
-    for v in range(v0, v1):
-        real, imaginary, cosine, sine = a[0, v, s0:s1], a[1, v, s0:s1], turn[0, v - v0], turn[1, v - v0]
-        x, xi = out[0, v - v0], out[1, v - v0]
-        for k in range(real.size):
-            x[k] = real[k] * cosine[k] + imaginary[k] * sine[k]
-            xi[k] = imaginary[k] * cosine[k] - real[k] * sine[k]
-            power += real[k] * real[k] + imaginary[k] * imaginary[k]
-    return float(power)
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-def _echo_sums(a: Float32Array, b: Float32Array, window: Window, lag: Lag) -> tuple[Sums, Sums, Sums]:
-    """Real and imaginary sums of conj(a) b, and sums of b's power, at the five lags from the window."""
+def _echo_sums(
+    a: Float32Array, b: Float32Array, turn: Float32Array, window: Window, lag: Lag
+) -> tuple[float, Sums, Sums, Sums]:
+    """Sum of a's power; real and imaginary sums of conj(a) b, a turned back, and of b's power at the lags."""
     v0, v1, s0, s1 = window
     start, end = s0 + lag[1], s1 + lag[1]
     zero: Any = np.float32(0.0)
-    r0 = r1 = r2 = r3 = r4 = i0 = i1 = i2 = i3 = i4 = p0 = p1 = p2 = p3 = p4 = zero
+    own = r0 = r1 = r2 = r3 = r4 = i0 = i1 = i2 = i3 = i4 = p0 = p1 = p2 = p3 = p4 = zero
     for v in range(v0, v1):
-        w, x, xi = v + lag[0], a[0, v - v0, : s1 - s0], a[1, v - v0, : s1 - s0]
-        above, beside, below = b[0, w - 1, start:end], b[0, w, start - 1 : end + 1], b[0, w + 1, start:end]
-        above_i, beside_i, below_i = b[1, w - 1, start:end], b[1, w, start - 1 : end + 1], b[1, w + 1, start:end]
-        for k in range(x.size):
-            re, im, up, left, at, right, down = x[k], xi[k], above[k], beside[k], beside[k + 1], beside[k + 2], below[k]
-            up_i, left_i, at_i, right_i, down_i = above_i[k], beside_i[k], beside_i[k + 1], beside_i[k + 2], below_i[k]
-            r0, i0 = r0 + re * up + im * up_i, i0 + re * up_i - im * up
-            r1, i1 = r1 + re * left + im * left_i, i1 + re * left_i - im * left
-            r2, i2 = r2 + re * at + im * at_i, i2 + re * at_i - im * at
-            r3, i3 = r3 + re * right + im * right_i, i3 + re * right_i - im * right
-            r4, i4 = r4 + re * down + im * down_i, i4 + re * down_i - im * down
-            p0, p1, p2 = p0 + up * up + up_i * up_i, p1 + left * left + left_i * left_i, p2 + at * at + at_i * at_i
-            p3, p4 = p3 + right * right + right_i * right_i, p4 + down * down + down_i * down_i
-    return (r0, r1, r2, r3, r4), (i0, i1, i2, i3, i4), (p0, p1, p2, p3, p4)
+        w, real, imaginary, cosine, sine = (
+            v + lag[0],
+            a[0, v, s0:s1],
+            a[1, v, s0:s1],
+            turn[0, v - v0],
+            turn[1, v - v0],
+        )
+        above, above_i = b[0, w - 1, start:end], b[1, w - 1, start:end]
+        beside, beside_i = b[0, w, start - 1 : end + 1], b[1, w, start - 1 : end + 1]
+        below, below_i = b[0, w + 1, start:end], b[1, w + 1, start:end]
+        for k in range(real.size):
+            x = real[k] * cosine[k] + imaginary[k] * sine[k]
+            y = imaginary[k] * cosine[k] - real[k] * sine[k]
+            up, left, at, right, down = above[k], beside[k], beside[k + 1], beside[k + 2], below[k]
+            up_i, left_i, at_i, right_i, down_i = (
+                above_i[k],
+                beside_i[k],
+                beside_i[k + 1],
+                beside_i[k + 2],
+                below_i[k],
+            )
+            own += x * x + y * y
+            r0, i0, p0 = r0 + x * up + y * up_i, i0 + x * up_i - y * up, p0 + up * up + up_i * up_i
+            r1, i1, p1 = (
+                r1 + x * left + y * left_i,
+                i1 + x * left_i - y * left,
+                p1 + left * left + left_i * left_i,
+            )
+            r2, i2, p2 = r2 + x * at + y * at_i, i2 + x * at_i - y * at, p2 + at * at + at_i * at_i
+            r3, i3, p3 = (
+                r3 + x * right + y * right_i,
+                i3 + x * right_i - y * right,
+                p3 + right * right + right_i * right_i,
+            )
+            r4, i4, p4 = (
+                r4 + x * down + y * down_i,
+                i4 + x * down_i - y * down,
+                p4 + down * down + down_i * down_i,
+            )
+    return own, (r0, r1, r2, r3, r4), (i0, i1, i2, i3, i4), (p0, p1, p2, p3, p4)
 
 
 @njit(cache=True, nogil=True, fastmath=False, error_model="numpy")
@@ -132,11 +145,9 @@ def cohere_patch(
     window, lag
         As for `correlate_patch`.
     """
-    turned = np.empty_like(turn)
-    a_power = _turn_back(fixed, turn, window, turned)
-    real, imaginary, power = _echo_sums(turned, moving, window, lag)
+    own, real, imaginary, power = _echo_sums(fixed, moving, turn, window, lag)
     for k in range(5):
-        both = a_power * power[k]
+        both = own * power[k]
         out[k] = (real[k] ** 2 + imaginary[k] ** 2) / both if both > 0.0 else np.nan
 
 

@@ -19,7 +19,7 @@ from scipy import fft
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
-from speckle3d.kernels.box_means import box_means
+from speckle3d.kernels.box_means import box_means, squared_magnitude
 
 _RATE_OVER_BAND = 100 / 27
 """Rate of the intensity's samples over the width of the pass-band, edges included, whatever the echoes were
@@ -128,7 +128,7 @@ class IntensityExtractor:
             chosen += spectrum.take(-plan.bins, axis=1, mode="wrap").conj() * plan.mirrored
         band = np.zeros((len(frame), plan.out_length), np.complex64)
         band[:, plan.destination] = chosen
-        return np.asarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])
+        return np.ascontiguousarray(fft.ifft(band, axis=1, overwrite_x=True)[:, : self.grid.samples])
 
     def intensity(self, frame: npt.NDArray[Any]) -> Float32Array:
         """Echo intensity, shape (vector, grid.samples), arbitrary units, from RF or B-mode grey levels."""
@@ -147,9 +147,8 @@ class IntensityExtractor:
             return np.ones_like(intensity)
         sides = (self.grid.vector_pitch_mm, self.grid.sample_spacing_mm)
         window = [2 * int(self.settings.equalise_mm / 2 / side) + 1 for side in sides]
-        padded = np.pad(intensity, [(n // 2, n // 2) for n in window], mode="edge")
         mean = np.empty_like(intensity)
-        box_means(padded, window[0], window[1], mean)
+        box_means(intensity, window[0], window[1], mean)
         np.maximum(mean, _LEAST_MEAN * mean.max() + np.finfo(np.float32).tiny, out=mean)
         return np.reciprocal(mean, out=mean)
 
@@ -160,8 +159,8 @@ class IntensityExtractor:
 
 def intensity_of(analytic: Complex64Array) -> Float32Array:
     """Squared magnitude."""
-    intensity = analytic.real * analytic.real
-    intensity += analytic.imag * analytic.imag
+    intensity = np.empty(analytic.shape, np.float32)
+    squared_magnitude(analytic, intensity)
     return intensity
 
 
@@ -213,4 +212,4 @@ def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -
 def _decompress(frame: npt.NDArray[Any], signal: BModeSettings) -> Float32Array:
     """Invert log compression: full scale is 0 dB, zero is the bottom of the dynamic range."""
     decibel = (frame.astype(np.float32) / np.float32(signal.full_scale) - 1) * signal.dynamic_range_db
-    return np.asarray(10 ** (decibel / 10), dtype=np.float32)
+    return np.ascontiguousarray(10 ** (decibel / 10), dtype=np.float32)

@@ -19,6 +19,7 @@ from speckle3d.core.curves import CurveKey
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.core.threads import in_parallel
+from speckle3d.kernels.box_means import amplify
 from speckle3d.kernels.inplane import Frame, Geometry, Matches, match_pair
 from speckle3d.matching.intensity import (
     IntensityExtractor,
@@ -121,11 +122,10 @@ class FrameMatcher:
     def equalised(self, echo: Echo) -> tuple[Float32Array, Float32Array]:
         """Intensity and, where there is phase, echo over their local mean; see `Frame`."""
         gain = self.extractor.gain(echo.intensity)
-        image, parts = echo.intensity * gain, np.empty((2, 0, 0), np.float32)
-        if echo.analytic is not None:
-            np.sqrt(gain, out=gain)
-            parts = np.stack([echo.analytic.real, echo.analytic.imag])
-            parts *= gain
+        if echo.analytic is None:
+            return echo.intensity * gain, np.empty((2, 0, 0), np.float32)
+        image, parts = np.empty_like(gain), np.empty((2, *gain.shape), np.float32)
+        amplify(echo.analytic, gain, image, parts)
         return image, parts
 
     def prepare(self, echo: Echo, usable: BoolArray | None = None) -> Frame:

@@ -26,6 +26,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from speckle3d.kernels.patch_statistics import patch_statistics
 from speckle3d.matching.patches import PatchGrid
 
 _CONSTANT = 1e-4
@@ -143,16 +144,10 @@ def inspect_frame(
         On the grid of the intensity images.
     """
     s = settings or QualitySettings()
-    tiles = patches.tiles(intensity, max(1, int(patches.size[1]) // _SAMPLES))
-    wide, high, inside = tiles.shape[1] // 2, tiles.shape[2] // 2, patches.inside
-    with np.errstate(all="ignore"):  # Flat patches, and samples that are not finite, come out as NaN.
-        mean = tiles.mean(axis=(1, 2))
-        tiles = tiles / mean[:, None, None]
-        tiles -= 1
-        contrast = np.sqrt(_mean_product(tiles, tiles))
-        alike = _pearson(tiles[:, 1:], tiles[:, :-1])
-        across = _pearson(tiles[:, :wide], tiles[:, -wide:])
-        along = _pearson(tiles[..., :high], tiles[..., -high:])
+    inside, statistics = patches.inside, np.empty((len(patches), 5))
+    step = max(1, int(patches.size[1]) // _SAMPLES)
+    patch_statistics(intensity, patches.first, patches.size, step, statistics)
+    mean, contrast, alike, across, along = statistics.T
     # A sample that is not finite spoils its whole vector, and equalising then the others.
     echo = (contrast > s.least_contrast) & np.isfinite(intensity.sum())
     together = (alike > s.neighbour_correlation) | (patches.spacing_mm[0] > s.neighbour_pitch_mm)
@@ -167,17 +162,6 @@ def inspect_frame(
     return FrameFeatures(
         mean, _clipped(frame, is_bmode, s), share(together & fine), share(~together), echo & together & inside
     )
-
-
-def _pearson(a: Float32Array, b: Float32Array) -> Float32Array:
-    """Correlation of two parts of each patch, shapes (p, v, s)."""
-    x, y = a.mean(axis=(1, 2)), b.mean(axis=(1, 2))
-    xy, xx, yy = (_mean_product(*pair) for pair in ((a, b), (a, a), (b, b)))
-    return np.asarray((xy - x * y) / np.sqrt((xx - x * x) * (yy - y * y)))
-
-
-def _mean_product(a: Float32Array, b: Float32Array) -> Float32Array:
-    return np.asarray(np.einsum("pvs,pvs->p", a, b) / np.float32(a[0].size))
 
 
 def _clipped(frame: npt.NDArray[Any], is_bmode: bool, settings: QualitySettings) -> float:

@@ -87,11 +87,15 @@ def consistent_subset(
     for pair, known in enumerate(np.isfinite(distance_mm)):
         if not known.any():
             continue
-        d, sigma, farther = (v[pair, known] for v in (distance_mm, sigma_mm, raised_mm))
+        d, sigma, farther = (v[pair, known].astype("f4") for v in (distance_mm, sigma_mm, raised_mm))
         offset = np.concatenate([d - farther, -d - farther] if either_side[pair] else [d - farther])
-        misfit = np.abs(np.abs(offset[:, None] + farther) - d) / sigma
+        misfit = np.abs(offset[:, None] + farther)
+        misfit -= d
+        misfit *= 1 / sigma
+        np.abs(misfit, out=misfit)
         agree = misfit <= support_sigma
         # Among placements of equal support, the one whose supporters lie closest.
-        score = agree.sum(axis=1) - (misfit * agree).sum(axis=1) / (d.size * support_sigma + 1.0)
+        misfit *= agree
+        score = agree.sum(axis=1) - misfit.sum(axis=1) / (d.size * support_sigma + 1.0)
         support[pair, known] = agree[score.argmax()]
     return support

@@ -74,7 +74,7 @@ def test_box_means_are_scipys_also_where_the_window_is_larger_than_the_image(see
     image = np.random.default_rng(seed).exponential(size=shape).astype(np.float32)
     wide, high = (2 * n + 1 for n in half)
     out = np.empty_like(image)
-    box_means(np.pad(image, [(n, n) for n in half], mode="edge"), wide, high, out)
+    box_means(image, wide, high, out)
     np.testing.assert_allclose(
         out, uniform_filter(image.astype(float), (wide, high), mode="nearest"), rtol=1e-5
     )
