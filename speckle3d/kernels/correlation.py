@@ -79,6 +79,12 @@ def correlate_patch(
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _added(x, y, re, im, real, imaginary, power):  # type: ignore[no-untyped-def]
+    """Sums of conj(x + iy) (re + i im) and of its second factor's power, with one more sample."""
+    return real + x * re + y * im, imaginary + x * im - y * re, power + re * re + im * im
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
 def _echo_sums(
     a: Float32Array, b: Float32Array, turn: Float32Array, window: Window, lag: Lag
 ) -> tuple[float, Sums, Sums, Sums]:
@@ -88,45 +94,20 @@ def _echo_sums(
     zero: Any = np.float32(0.0)
     own = r0 = r1 = r2 = r3 = r4 = i0 = i1 = i2 = i3 = i4 = p0 = p1 = p2 = p3 = p4 = zero
     for v in range(v0, v1):
-        w, real, imaginary, cosine, sine = (
-            v + lag[0],
-            a[0, v, s0:s1],
-            a[1, v, s0:s1],
-            turn[0, v - v0],
-            turn[1, v - v0],
-        )
-        above, above_i = b[0, w - 1, start:end], b[1, w - 1, start:end]
-        beside, beside_i = b[0, w, start - 1 : end + 1], b[1, w, start - 1 : end + 1]
-        below, below_i = b[0, w + 1, start:end], b[1, w + 1, start:end]
+        real, imaginary, cosine, sine = a[0, v, s0:s1], a[1, v, s0:s1], turn[0, v - v0], turn[1, v - v0]
+        w = v + lag[0]
+        up, up_i = b[0, w - 1, start:end], b[1, w - 1, start:end]
+        at, at_i = b[0, w, start - 1 : end + 1], b[1, w, start - 1 : end + 1]
+        down, down_i = b[0, w + 1, start:end], b[1, w + 1, start:end]
         for k in range(real.size):
             x = real[k] * cosine[k] + imaginary[k] * sine[k]
             y = imaginary[k] * cosine[k] - real[k] * sine[k]
-            up, left, at, right, down = above[k], beside[k], beside[k + 1], beside[k + 2], below[k]
-            up_i, left_i, at_i, right_i, down_i = (
-                above_i[k],
-                beside_i[k],
-                beside_i[k + 1],
-                beside_i[k + 2],
-                below_i[k],
-            )
             own += x * x + y * y
-            r0, i0, p0 = r0 + x * up + y * up_i, i0 + x * up_i - y * up, p0 + up * up + up_i * up_i
-            r1, i1, p1 = (
-                r1 + x * left + y * left_i,
-                i1 + x * left_i - y * left,
-                p1 + left * left + left_i * left_i,
-            )
-            r2, i2, p2 = r2 + x * at + y * at_i, i2 + x * at_i - y * at, p2 + at * at + at_i * at_i
-            r3, i3, p3 = (
-                r3 + x * right + y * right_i,
-                i3 + x * right_i - y * right,
-                p3 + right * right + right_i * right_i,
-            )
-            r4, i4, p4 = (
-                r4 + x * down + y * down_i,
-                i4 + x * down_i - y * down,
-                p4 + down * down + down_i * down_i,
-            )
+            r0, i0, p0 = _added(x, y, up[k], up_i[k], r0, i0, p0)
+            r1, i1, p1 = _added(x, y, at[k], at_i[k], r1, i1, p1)
+            r2, i2, p2 = _added(x, y, at[k + 1], at_i[k + 1], r2, i2, p2)
+            r3, i3, p3 = _added(x, y, at[k + 2], at_i[k + 2], r3, i3, p3)
+            r4, i4, p4 = _added(x, y, down[k], down_i[k], r4, i4, p4)
     return own, (r0, r1, r2, r3, r4), (i0, i1, i2, i3, i4), (p0, p1, p2, p3, p4)
 
 
