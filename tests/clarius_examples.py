@@ -143,14 +143,13 @@ def tgc_text(times_ns):
     return f"# tgc curves per frame\n\nframes: {len(rows)}\n\n" + "\n".join(rows) + " "
 
 
-def sensor_text(sensor, quaternions=None):
+def sensor_text(sensor):
     """Samples of the sensor, documents of YAML: accelerometer in g, against the specific force."""
-    if quaternions is None:
-        quaternions = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
+    quaternions = sensor.readings.world_from_sensor.as_quat(scalar_first=True)
     times = np.round(sensor.readings.time_s * 1e9).astype(np.int64)
     rows = zip(
         times.tolist(), (-sensor.accelerometer_m_s2 / G).tolist(), sensor.gyroscope_rad_s.tolist(),
-        sensor.magnetometer_au.tolist(), np.asarray(quaternions).tolist(), strict=True,
+        sensor.magnetometer_au.tolist(), quaternions.tolist(), strict=True,
     )  # fmt: skip
     return "---\n".join(sample_text(*row) for row in rows)
 

@@ -20,9 +20,9 @@ def poses(n, seed=0):
     return RigidTransform.from_components(places, turns)
 
 
-def rf_sweep(frames=6, vectors=5, samples=40, dtype=np.int16):
+def rf_sweep(frames=6, vectors=5, samples=40):
     rng = np.random.default_rng(0)
-    data = rng.normal(0, 1000, (frames, vectors, samples)).astype(dtype)
+    data = rng.normal(0, 1000, (frames, vectors, samples)).astype(np.int16)
     grid = ImageGrid(vectors, samples, 0.3, RF.sample_spacing_mm, 2.0)
     m = 3 * frames
     return Sweep(
