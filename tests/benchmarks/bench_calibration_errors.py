@@ -17,9 +17,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
 HERE = Path(__file__).resolve().parent
-KINDS = sorted(
-    path.stem for path in (HERE / "calibration_errors").glob("[!_]*.py") if path.stem not in ("rows", "floor")
-)
+sys.path.insert(0, str(HERE.parent))  # processes of trials have it, too
+KINDS = sorted(path.stem for path in (HERE / "calibration_errors").glob("[!_]*.py") if path.stem != "rows")
 FIRST_SEED = 900_001
 
 

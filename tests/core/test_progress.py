@@ -1,6 +1,6 @@
 """A bar where somebody looks, and nothing in a log."""
 
-from speckle3d.core.progress import after, progress_bar
+from speckle3d.core.progress import progress_bar
 
 
 def test_a_bar_tells_what_is_done_of_how_much_in_a_terminal(capsys, monkeypatch):
@@ -20,11 +20,3 @@ def test_a_log_stays_clean(capsys, monkeypatch):
     with progress_bar("tracking") as told:
         told(3, 12)
     assert capsys.readouterr().err == ""
-
-
-def test_several_sweeps_have_one_bar():
-    seen = []
-    told = after(lambda done, total: seen.append((done, total)), 40, 100)
-    told(3, 60)
-    assert seen == [(43, 100)]
-    assert after(None, 40, 100) is None

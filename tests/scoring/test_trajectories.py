@@ -93,8 +93,5 @@ def test_times_rounded_in_text_lose_no_pose():
     reference = Trajectory("r", times, true)
     found = compare_trajectories(Trajectory("e", np.round(times, 6), true), reference)
     assert (found["poses"], found["left_out"]) == (40, 0)
-    # What is not rounding is no pose of the reference, and poses of other times are refused.
-    aside = compare_trajectories(Trajectory("e", times + np.linspace(-2e-6, 2e-6, 40), true), reference)
-    assert aside["left_out"] == 2
     with pytest.raises(MismatchError):
         compare_trajectories(Trajectory("late", times + 9.0, true), reference)

@@ -67,16 +67,3 @@ def test_moving_medium_and_probe_together_changes_nothing(beam):
     there = SimulatedFrames(beam, PointMedium(shift.apply(position), strength), shift * STILL, image(8, beam))
     # Rounding of positions may tip a count over its edge.
     assert np.abs(here[0].astype(int) - there[0]).max() <= 1
-
-
-def test_tissue_has_cysts_layers_and_a_poorly_filled_depth():
-    medium = tissue(4, 20.0)
-    blocks = medium.seen(RigidTransform.identity(), (np.zeros(3), np.array([18.0, 0.0, 10.0])))
-    position = np.concatenate([p for p, _ in blocks])
-    power = np.concatenate([s for _, s in blocks]).astype(float) ** 2
-    by_depth = np.histogram(position[:, 1], [3.0, 6.0, 17.0, 22.0, 32.0, 42.0], weights=power)[0]
-    by_depth /= [3.0, 11.0, 5.0, 10.0, 10.0]
-    assert by_depth[-1] < 0.2 * by_depth[2]
-    assert by_depth[0] < 0.6 * by_depth[2]
-    for cyst in medium.spheres:
-        assert (np.linalg.norm(position - cyst.centre_mm, axis=1) >= cyst.radius_mm).all()

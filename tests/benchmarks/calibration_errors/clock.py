@@ -7,6 +7,7 @@ wander besides.
 from dataclasses import replace
 
 import numpy as np
+from floor_scenes import Floor
 
 from calibration.points import Seen
 from calibration.recording import Recording
@@ -15,7 +16,6 @@ from speckle3d.calibrating.settings import PlaneSettings
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.core.streams import TimedPoses
 
-from .floor import Floor
 from .rows import Row, trials
 
 TRACKER_HZ, COUNT = 50.0, 100

@@ -4,19 +4,14 @@ The images come from `crossing_images`: wires met by a thick beam, with all that
 convex probes 40 to 150 mm deep.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
+from crossing_images import crossing_world
 
 from calibration.detection.crossings import crossings_in_frames
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 
 from .rows import Row, trials
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from crossing_images import crossing_world
 
 NEAR_MM, WORLDS = 2.0, 60
 

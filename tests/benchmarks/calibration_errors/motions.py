@@ -1,6 +1,7 @@
 """Motions that are missing, and good scans: what is accepted, how wrong it is, what is named."""
 
 import numpy as np
+from floor_scenes import Floor
 
 from calibration.motion import MOTIONS
 from calibration.orientation import OrientationFit, calibrate_orientation
@@ -8,7 +9,6 @@ from calibration.plane import PlaneFit, calibrate_plane
 from calibration.points import ImagePoints
 from speckle3d.core.errors import InsufficientDataError
 
-from .floor import Floor
 from .rows import Row, trials
 
 WRONG = np.array([5.0, 5.0])

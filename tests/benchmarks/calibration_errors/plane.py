@@ -3,12 +3,12 @@
 from functools import partial
 
 import numpy as np
+from floor_scenes import Floor
 
 from calibration.plane import calibrate_plane
 from calibration.points import ImagePoints
 from speckle3d.core.errors import InsufficientDataError
 
-from .floor import Floor
 from .rows import Row, coverage_row, trials
 
 COUNT = 150

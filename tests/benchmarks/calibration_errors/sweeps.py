@@ -4,11 +4,10 @@ The tissue is that of `crossing_scenes`, which is not the calibration's model; e
 1.5 mm and degrees in each parameter.
 """
 
-import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
+from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
 
 from calibration.images.angulation import angulation
 from calibration.images.solver import calibrate_images
@@ -16,9 +15,6 @@ from calibration.settings import ImageFit
 from speckle3d.core.errors import InsufficientDataError
 
 from .rows import Row, trials
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-from crossing_scenes import centre_error_mm, crossing_sweeps, displaced
 
 COUNT = 24
 

@@ -3,14 +3,9 @@
 Every motion is a sum of slow sines with a hand's tremor, as a function of time: nothing here interpolates.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from calibration_examples import BEAM_DOWN, about
+from scipy.spatial.transform import RigidTransform, Rotation
 
 MOTIONS = ("tilt", "roll", "yaw", "depth", "x", "y")
 """About the image's x, the beam and up, in degrees; the line's depth in the image and shifts, in mm."""
