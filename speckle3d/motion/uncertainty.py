@@ -141,11 +141,15 @@ class SlopeWeights:
     deviation_per_mm: FloatArray
 
     def applied(self, planes: PairPlanes) -> PairPlanes:
-        """Keep only the believed shares of planes' slopes; their offsets follow as the fits have it."""
+        """Keep only the believed shares of planes' slopes; their offsets follow as the fits have it.
+
+        Offsets stay on their side: it is the path's, and a plane's sign is open.
+        """
         covariance = planes.covariance
         keep = np.tile(np.diag([1.0, *self.share]), (len(planes), 1, 1))
         keep[:, :1, 1:] = -covariance[:, :1, 1:] @ np.linalg.inv(covariance[:, 1:, 1:]) * (1.0 - self.share)
         kept = (keep @ planes.coefficients[:, :, None])[:, :, 0]
+        kept *= np.where(kept[:, :1] * planes.coefficients[:, :1] < 0, -1.0, 1.0)
         covariance = keep @ covariance @ keep.transpose(0, 2, 1)
         left = np.maximum(np.abs(kept[:, :1]), NEAR_MM) * self.deviation_per_mm
         covariance[:, [1, 2], [1, 2]] += left**2

@@ -81,6 +81,22 @@ def test_tilt_is_believed_less_than_yaw_and_not_at_all_where_curves_know_nothing
     assert abs(weights.deviation_per_mm[1] / EXPECTED - 1) < 0.01
 
 
+@pytest.mark.parametrize(("variance", "least", "most"), [(3e-3, 0.0, 0.1), (3e-6, 0.9, 1.0)])
+def test_a_turn_is_deliberate_only_beyond_its_own_noise(variance, least, most):
+    """Eleven degrees in a millimetre, seen by few patches to nine, and by many to a third."""
+    covariance = np.diag([0.02, variance, variance])
+    planes = made([0.1, -0.1] * 6, np.tile([0.02, -0.02], 6), 0.0, covariance)
+    assert least <= weigh_slopes(planes, TISSUE, SETTINGS).share[0] <= most
+
+
+def test_offsets_stay_on_their_side_when_slopes_are_left_out():
+    covariance = np.diag([0.02, 3e-3, 3e-3])
+    covariance[0, 1] = covariance[1, 0] = -5e-3
+    planes = made([0.1, -0.1], [-0.1, 0.1], 0.0, covariance)
+    kept = SlopeWeights(np.zeros(2), np.zeros(2)).applied(planes)
+    np.testing.assert_allclose(kept.offset_mm, [0.2 / 3, -0.2 / 3])
+
+
 @pytest.mark.parametrize("sigma", [0.01, 0.04])
 def test_deviations_are_those_of_turns_as_expected_and_feigned(sigma):
     """Over many sweeps whose true and false rates are drawn, kept rates miss the true by what is claimed."""
