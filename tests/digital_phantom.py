@@ -26,10 +26,6 @@ class Ball:
     def volume_mm3(self):
         return 4.0 / 3.0 * np.pi * self.radius_mm**3
 
-    @property
-    def area_mm2(self):
-        return 4.0 * np.pi * self.radius_mm**2
-
     def depth(self, points):
         """How far inside points are; below zero outside."""
         return self.radius_mm - np.linalg.norm(points - np.asarray(self.centre_mm), axis=-1)

@@ -88,7 +88,7 @@ def grid_of(reference_from_image, clip, width, height, spacing_mm):
     return low, tuple((np.rint((high - low) / spacing_mm).astype(int) + 1).tolist())
 
 
-def paste(images, voxel_from_pixel, shape, clip, linear=False, rule="mean", mask=None):
+def paste(images, voxel_from_pixel, shape, clip, linear=False, mask=None):
     """Volume and weights, both indexed [i, j, k], of images (frame, row, column) put in one after another.
 
     Parameters
@@ -104,26 +104,23 @@ def paste(images, voxel_from_pixel, shape, clip, linear=False, rule="mean", mask
     rows, columns = np.nonzero(clip.mask(*images.shape[:0:-1]) if mask is None else mask)  # row by row
     for image, axes in zip(images, maps, strict=True):
         for row, column in zip(rows, columns, strict=True):
-            put(volume, weight, axes @ [column, row, 1], int(image[row, column]), rule)
+            put(volume, weight, axes @ [column, row, 1], int(image[row, column]))
     return volume.astype(np.uint8), weight.astype(np.uint16)
 
 
-def _nearest(volume, weight, place, level, rule):
+def _nearest(volume, weight, place, level):
     at = tuple((place + ONE // 2) // ONE)
     if any(not 0 <= a < n for a, n in zip(at, volume.shape, strict=True)):
         return
     held, so_far = int(volume[at]), int(weight[at])
-    if rule != "mean":
-        volume[at] = max(level, held) if rule == "maximum" else level
-        weight[at] = ONE_PIXEL
-    elif so_far <= LAST:
+    if so_far <= LAST:
         volume[at] = (level * ONE_PIXEL + held * so_far) // (so_far + ONE_PIXEL)
         weight[at] = so_far + ONE_PIXEL
     else:
         volume[at] = int(level / 256 + held * 255 / 256)
 
 
-def _linear(volume, weight, place, level, rule):
+def _linear(volume, weight, place, level):
     first, ahead = place // ONE, place % ONE
     if (first < 0).any() or (first + (ahead > 0) >= volume.shape).any():
         return
@@ -134,13 +131,6 @@ def _linear(volume, weight, place, level, rule):
             continue
         at = tuple(first + corner)
         held, so_far = int(volume[at]), int(weight[at])
-        if rule == "mean":
-            r = so_far * ONE // 256
-            volume[at] = (round((f * level + r * held) / (f + r) * ONE) + ONE // 2) // ONE
-            new = (f + r) * 256
-        elif 8 * f >= ONE and (rule == "latest" or level > held):
-            volume[at] = level
-            new = f * 256
-        else:
-            continue
-        weight[at] = min((new + ONE // 2) // ONE, MOST)
+        r = so_far * ONE // 256
+        volume[at] = (round((f * level + r * held) / (f + r) * ONE) + ONE // 2) // ONE
+        weight[at] = min(((f + r) * 256 + ONE // 2) // ONE, MOST)

@@ -70,18 +70,6 @@ def _reached(points, splat):
         yield (low + corner).astype(int), np.prod(1 - np.abs(points - low - corner), axis=-1)
 
 
-def fill_holes(voxels, cap):
-    """Twin of `speckle3d.imaging.voxels.holes.fill_holes`: grow a cube until it holds a value."""
-    filled = voxels.copy()
-    for at in np.argwhere(np.isnan(voxels)):
-        for radius in range(1, cap + 1):
-            cube = voxels[tuple(slice(max(c - radius, 0), c + radius + 1) for c in at)]
-            if not np.isnan(cube).all():
-                filled[tuple(at)] = np.nanmean(cube)
-                break
-    return filled
-
-
 def linear_array_response(points_mm, frequency_hz, *, step_mm, pitch_mm, elements, focus_mm, widths_mm,
                           edge_weight, height_mm, lens_focus_mm, speed_m_s):  # fmt: skip
     """Two-way response of a focused linear array with a lens at points of one depth, point by point.

@@ -40,10 +40,6 @@ class Scene:
     world_from_sensor: RigidTransform
     pixels: np.ndarray  # (frame, wire, 2)
 
-    @property
-    def pixel_matrix(self):
-        return self.sensor_from_image.as_matrix() @ np.diag([*PIXEL_MM, 1.0, 1.0])
-
 
 def scene(seed, frames=30, degrees=12.0):
     """Images of a phantom, about square to its wires and turned by up to `degrees` about each axis."""

@@ -60,10 +60,8 @@ def test_errors_and_score_are_those_the_challenge_publishes(tmp_path):
 
 
 def test_what_has_no_error_is_refused():
-    for frames in ([], [51]):
-        marks = Landmarks(np.array(frames, dtype=int), np.zeros((len(frames), 3)))
-        with pytest.raises(InvalidInputError):
-            point_errors(sliding(1.0), sliding(1.0), None, marks)
+    with pytest.raises(InvalidInputError):
+        point_errors(sliding(1.0), sliding(1.0), None, Landmarks(np.array([51]), np.zeros((1, 3))))
     with pytest.raises(InsufficientDataError):
         drift_rates(sliding(1.0), RigidTransform.identity(51), CENTRE_MM)
     with pytest.raises(MismatchError):

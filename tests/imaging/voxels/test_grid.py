@@ -70,9 +70,6 @@ def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
     steps = ("1.0", "1.2", "1.5", "2.0", "2.5", "3.0", "4.0", "5.0", "6.0", "8.0")
     assert f"{found:.1e}".split("e")[0] in steps
     assert memory(found) <= gigabytes
-    size = (40.0, 30.0, 20.0)
-    spacing = spacing_within(GRID, poses, gigabytes, axes, size_mm=size)
-    assert grid_around(GRID, poses, spacing, axes, size_mm=size).size_gb("uint8") <= gigabytes
     if found > 0.4:  # the samples' spacing, than which none is finer
         rounds = [float(f"{step}e{power}") for power in range(-2, 3) for step in steps]
         assert memory(max(spacing for spacing in rounds if spacing < found)) > gigabytes
