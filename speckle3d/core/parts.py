@@ -56,7 +56,8 @@ def whole_file(target: Path) -> Iterator[Path]:
     except OSError as error:
         raise cannot_write(target, error) from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):  # none was made, or the folder has gone
+            part.unlink()
 
 
 def locks() -> Any:
