@@ -291,6 +291,6 @@ def _require_coverage(covered: BoolArray, settings: DriftSettings) -> None:
     end = int(settings.maximum_end_gap * frames) + 1
     if count < least or not (covered[:end].any() and covered[-end:].any()):
         raise InsufficientDataError(
-            f"drift correction: expected sensor readings for at least {least:.0f} of {frames} frames, among "
-            f"them the first {end} and the last {end}, got {count}"
+            f"drift correction: expected sensor readings for at least {least:.0f} of {frames} frames, also "
+            f"among the first {end} and the last {end}, got {count}"
         )

@@ -10,7 +10,7 @@ from scipy.signal import welch
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.patches import PatchGrid
@@ -84,7 +84,8 @@ def doubt_band(sweep: Sweep) -> Doubt | None:
         return None
     (low, high), samples = signal.bandwidth_hz, min(sweep.grid.samples, _SEGMENT)
     each = max(1, sweep.grid.vectors // VECTORS)
-    some = np.concatenate([sweep.frames[k][::each] for k in spread_frames(len(sweep), SPECTRA)])
+    chosen = [read_frame(sweep.frames, k)[::each] for k in spread_frames(len(sweep), SPECTRA)]
+    some = np.nan_to_num(np.concatenate(chosen), posinf=0.0, neginf=0.0)  # such frames are flagged
     _, power = welch(some, nperseg=samples, return_onesided=False, detrend=False)
     # Mains, gain control and steps between samples are below.
     frequency = signal.bin_frequency_hz(samples)
@@ -113,7 +114,7 @@ def doubt_white(sweep: Sweep) -> Doubt | None:
     signal = sweep.signal
     if not isinstance(signal, BModeSettings):
         return None
-    some = np.stack([sweep.frames[k] for k in spread_frames(len(sweep), SPECTRA)])
+    some = np.stack([read_frame(sweep.frames, k) for k in spread_frames(len(sweep), SPECTRA)])
     share = float((some >= signal.full_scale).sum()) / max(int((some > 0).sum()), 1)
     if share <= MOST_WHITE:
         return None
