@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.stacks import TrackedImages
@@ -13,6 +16,7 @@ from calibration.recording import Recording
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
+from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
 from speckle3d.io.metaimage import lacking_poses, read_poses
@@ -47,6 +51,7 @@ def open_recording(
     sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, sensor, transform)
     size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
     first_row = grid.first_sample_depth_mm / size[1]
+    pictures = pictures if sweep.grid.fan is None else _BlackOutside(pictures)
     return Recording(pictures, size, first_row, sweep.frame_time_s, readings, offset_s)
 
 
@@ -78,6 +83,24 @@ def open_tracked(
     return TrackedImages(pictures, grid, sweep.frame_time_s, readings, offset_s, images.name), mounting
 
 
+@dataclass(frozen=True)
+class _BlackOutside:
+    """Scan-converted images, black outside the fan, where there is nothing to detect."""
+
+    source: Frames
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.source.shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return self.source.dtype
+
+    def __getitem__(self, index: int) -> npt.NDArray[Any]:
+        return np.asarray(np.nan_to_num(self.source[index]))
+
+
 def _opened(
     images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, sensor: str, transform: str | None
 ) -> tuple[Sweep, Frames, ImageGrid, TimedPoses | TimedRotations, float]:
@@ -87,9 +110,11 @@ def _opened(
     require_sequence(images if poses is None else poses, transform)
     sweep = _load(images, pixel_mm, transform if poses is None else None)
     given = _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
-    if isinstance(sweep.signal, BModeSettings):
+    is_grey = isinstance(sweep.signal, BModeSettings)
+    if is_grey and sweep.grid.fan is None:
         return sweep, sweep.frames, sweep.grid, *given
-    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False)
+    levels: Levels = "stored" if is_grey else "log"
+    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False, levels=levels)
     return sweep, pictures, pictures.grid, *given
 
 

@@ -64,9 +64,10 @@ class Region:
         """
         inside = self._inside(grid)
         if not inside.any():
+            (left, top), (right, bottom) = grid.extent_mm
             raise InvalidInputError(
-                "region: expected samples of the image inside, which is x 0 to "
-                f"{grid.width_mm:g} mm and y {grid.first_sample_depth_mm:g} to {grid.depth_mm:g} mm, got none"
+                f"region: expected samples of the image inside, which is x {left:g} to {right:g} mm and y "
+                f"{top:g} to {bottom:g} mm, got none"
             )
         return inside
 

@@ -264,7 +264,7 @@ class ImageGrid:
         middle = radius_mm + first_sample_depth_mm + (samples - 1) / 2 * sample_spacing_mm
         fan = FanLines((0.0, 0.0), radius_mm, first, step)
         grid = cls(vectors, samples, middle * step, sample_spacing_mm, first_sample_depth_mm, fan=fan)
-        left, top = grid._extent_mm[0]
+        left, top = grid.extent_mm[0]
         return replace(grid, fan=replace(fan, apex_mm=(float(-left), float(-top))))
 
     def angle_rad(self, vector: npt.ArrayLike) -> FloatArray:
@@ -295,8 +295,8 @@ class ImageGrid:
         return np.stack([vector, depth / self.sample_spacing_mm], axis=-1)
 
     @property
-    def _extent_mm(self) -> FloatArray:
-        """Least and largest x and y of the samples, shape (2, 2)."""
+    def extent_mm(self) -> FloatArray:
+        """Least and largest x and y of the samples in P, shape (2, 2), mm."""
         v, s = self.vectors - 1, self.samples - 1
         at = [0.0, v, 0.0, v, 0.0, v]
         places = self.mm(at, [0, 0, s, s, 0, s])
@@ -310,7 +310,7 @@ class ImageGrid:
     def width_mm(self) -> float:
         """Width of the image; of parallel vectors, from the first to the last, mm."""
         if self.fan is not None:
-            return float(np.ptp(self._extent_mm[:, 0]))
+            return float(np.ptp(self.extent_mm[:, 0]))
         return (self.vectors - 1) * self.vector_pitch_mm
 
     @property
@@ -329,7 +329,7 @@ class ImageGrid:
         v, s = self.vectors - 1, self.samples - 1
         corners = self.mm([0, v, v, 0], [0, 0, s, s])
         if self.fan is not None:
-            (left, top), (right, bottom) = self._extent_mm
+            (left, top), (right, bottom) = self.extent_mm
             corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
         return np.column_stack([corners, np.zeros(4)])
 
@@ -343,7 +343,7 @@ class ImageGrid:
             If the vectors are a fan's, which no affine map places.
         """
         if self.fan is not None:
-            raise InvalidInputError("expected parallel vectors, got a fan's: convert its images first")
+            raise InvalidInputError("expected parallel vectors, got a fan's: take its images scan-converted")
         along, beside = np.cos(self.skew_rad / 2), np.sin(self.skew_rad / 2)
         across, down = self.vector_pitch_mm, self.sample_spacing_mm
         return np.array(
@@ -568,19 +568,25 @@ class Sweep:
         ]
 
     def to_xarray(self) -> Any:
-        """All frames as an `xarray.DataArray` over frame, lateral_mm and depth_mm; read into memory."""
+        """All frames as an `xarray.DataArray` over frame, lateral_mm and depth_mm; read into memory.
+
+        Vectors of a fan are at their angle_rad.
+        """
         xarray = extra_module("xarray", "notebook", "a labelled array")
-        grid = self.grid
-        axes_mm = {
-            "lateral_mm": np.arange(grid.vectors) * grid.vector_pitch_mm,
-            "depth_mm": grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm,
-        }
+        grid, vector = self.grid, np.arange(self.grid.vectors)
+        lateral, unit, values = "lateral_mm", "mm", vector * grid.vector_pitch_mm
+        if grid.fan is not None:
+            lateral, unit, values = "angle_rad", "rad", grid.angle_rad(vector)
+        depth_mm = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
         frames = {"frame": np.arange(len(self)), "time_s": ("frame", self.frame_time_s, {"units": "s"})}
-        places = {name: (name, values, {"units": "mm"}) for name, values in axes_mm.items()}
+        places = {
+            lateral: (lateral, values, {"units": unit}),
+            "depth_mm": ("depth_mm", depth_mm, {"units": "mm"}),
+        }
         return xarray.DataArray(
             np.stack([np.asarray(self.frames[i]) for i in range(len(self))]),
             coords=frames | places,
-            dims=("frame", *axes_mm),
+            dims=("frame", lateral, "depth_mm"),
             name=self.name,
         )
 

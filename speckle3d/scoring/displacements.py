@@ -195,13 +195,14 @@ def _mean_over_landmarks(differences: FloatArray, landmarks: Landmarks) -> float
 
 def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:
     """Mean length of the differences over all pixels, a frame at a time."""
-    x = np.arange(grid.vectors)[:, None] * grid.vector_pitch_mm
-    y = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
+    x, y = np.moveaxis(grid.mm(np.arange(grid.vectors)[:, None], np.arange(grid.samples)), -1, 0)
+    if grid.fan is None:
+        x, y = x[:, :1], y[:1]
     means = []
     for across, down, _, middle in differences.swapaxes(1, 2):
-        # |m + a x + d y|^2 in powers of y: three passes over the image in place of nine.
-        along = middle + x * across
-        squares = (along**2).sum(axis=1)[:, None] + 2.0 * (along @ down)[:, None] * y + down @ down * y**2
+        # |m + a x + d y|^2 in powers of y: of parallel vectors three passes over the image in place of nine.
+        along = middle + x[..., None] * across
+        squares = (along**2).sum(axis=-1) + 2.0 * (along @ down) * y + down @ down * y**2
         means.append(np.sqrt(np.maximum(squares, 0.0)).mean())
     return float(np.mean(means))
 

@@ -1,10 +1,17 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform
 
+from speckle3d.calibrating.recordings import open_recording
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.region import Region
 from speckle3d.core.scan_conversion import ScanConversion
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.streams import TimedPoses
+from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.imaging.cuts.planes import lateral_line
+from speckle3d.imaging.measures.belonging import belonging_of
+from speckle3d.io.plus.write import write_sequence
+from speckle3d.io.sweep_writer import write_sweep
 
 CURVED = ImageGrid.of_fan(97, 401, 0.1, 60.0, tuple(np.deg2rad((-30.0, 30.0))))
 PHASED = ImageGrid.of_fan(65, 301, 0.2, 0.0, tuple(np.deg2rad((-45.0, 45.0))), 2.0)
@@ -23,6 +30,14 @@ def test_image_of_a_curved_array_begins_at_its_top_left():
     np.testing.assert_allclose(CURVED.corners_mm[2, :2], [-2 * left, 100.0 - top], atol=1e-9)
     np.testing.assert_allclose(CURVED.centre_mm, [-left, 80.0 - top, 0.0], atol=1e-9)
     assert CURVED.vector_pitch_mm == pytest.approx(80.0 * np.deg2rad(60.0) / 96)
+
+
+def test_the_lowest_point_of_a_fan_is_in_its_image():
+    lowest = np.append(CURVED.mm(48, 400), 0.0)
+    assert lowest[1] > CURVED.depth_mm + 7.0
+    place = belonging_of(lowest[None], CURVED, RigidTransform.from_translation(np.zeros((1, 3))))
+    assert place.gap_mm == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(lateral_line(CURVED, lowest[0])[1], lowest)
 
 
 def test_lines_of_a_phased_array_begin_at_one_point():
@@ -64,3 +79,19 @@ def test_a_region_in_millimetres_chooses_samples_of_a_fan():
     radius_mm = np.linalg.norm(place - CURVED.fan.apex_mm, axis=1)
     of_sample_mm2 = radius_mm * CURVED.fan.step_rad * CURVED.sample_spacing_mm
     assert of_sample_mm2.sum() == pytest.approx(100.0, rel=0.03)
+
+
+def test_grey_images_of_a_fan_are_calibrated_scan_converted_and_no_sequence_takes_them(tmp_path):
+    frames = np.full((2, CURVED.vectors, CURVED.samples), 100, np.uint8)
+    time_s = np.array([0.0, 0.04])
+    tracker = Tracker(TimedPoses(time_s, RigidTransform.from_translation(np.zeros((2, 3)))))
+    sweep = Sweep(frames, CURVED, BModeSettings(60.0), time_s, tracker=tracker)
+    with pytest.raises(InvalidInputError, match="parallel vectors"):
+        write_sequence(tmp_path / "fan.mha", sweep)
+    write_sweep(tmp_path / "fan.h5", sweep)
+    recording = open_recording(tmp_path / "fan.h5", None, None, "tracker")
+    picture = recording.images[0]
+    np.testing.assert_allclose(
+        (np.array(picture.shape) - 1) * recording.pixel_mm, CURVED.corners_mm[2, :2], atol=0.3
+    )
+    assert set(np.unique(picture)) == {0.0, 100.0}

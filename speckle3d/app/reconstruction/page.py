@@ -121,14 +121,14 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         modes = {label_of(mode): mode for mode in page.modes}
         self.param.mode.objects, self.param.other.objects = modes, {"(nothing)": "", **modes}
         self.param.frame.bounds = (0, len(page.reconstruction.frame_time_s) - 1)
-        self.param.lateral_mm.bounds = (0.0, grid.width_mm)
-        self.param.depth_mm.bounds = (grid.first_sample_depth_mm, grid.depth_mm)
+        middle_mm = grid.extent_mm.mean(axis=0).round(2).tolist()
+        self.param.lateral_mm.bounds, self.param.depth_mm.bounds = map(tuple, grid.extent_mm.T.tolist())
         super().__init__(
             mode=page.mode,
             other="",
             frame=self.param.frame.bounds[1] // 2,
-            lateral_mm=round(grid.width_mm / 2, 2),
-            depth_mm=round((grid.first_sample_depth_mm + grid.depth_mm) / 2, 2),
+            lateral_mm=middle_mm[0],
+            depth_mm=middle_mm[1],
         )
         self._plots = {
             name: CutPlot(name, (_COLOURS[upright], _COLOURS[level]), self._go)

@@ -118,4 +118,6 @@ def _frames(sweep: Sweep, kind: Kind | None) -> tuple[Frames, ImageGrid, bool]:
         is_stored = is_grey and sweep.frames.dtype == "uint8"
         images = grey_images(sweep, levels="stored" if is_stored else "log")
         return images, images.grid, True
+    if sweep.grid.fan is not None:
+        raise InvalidInputError(f"{sweep.name}: expected parallel vectors to send, got a fan's: --as bmode")
     return sweep.frames, sweep.grid, False

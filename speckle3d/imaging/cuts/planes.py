@@ -148,21 +148,20 @@ def require_pixels(width_mm: float, height_mm: float, pixel_mm: float) -> None:
 
 def image_plane(world_from_image: RigidTransform, grid: ImageGrid, pixel_mm: float) -> ReslicePlane:
     """The plane of one image, as large as the image: what another sweep shows there."""
-    top = RigidTransform.from_translation([0.0, grid.first_sample_depth_mm, 0.0])
-    height = grid.depth_mm - grid.first_sample_depth_mm
-    first = (0.0, grid.first_sample_depth_mm)
-    return ReslicePlane(world_from_image * top, grid.width_mm, height, pixel_mm, first)
+    first, (width, height) = grid.extent_mm[0].tolist(), np.ptp(grid.extent_mm, axis=0).tolist()
+    corner = RigidTransform.from_translation([*first, 0.0])
+    return ReslicePlane(world_from_image * corner, width, height, pixel_mm, (first[0], first[1]))
 
 
 def lateral_line(grid: ImageGrid, lateral_mm: float) -> FloatArray:
     """Line of an image down its depth at one lateral position, shape (2, 3), mm."""
-    ends = np.array([[0.0, grid.first_sample_depth_mm, 0.0], [grid.width_mm, grid.depth_mm, 0.0]])
+    ends = np.column_stack([grid.extent_mm, np.zeros(2)])
     return _line(ends, 0, "lateral_mm", lateral_mm)
 
 
 def depth_line(grid: ImageGrid, depth_mm: float) -> FloatArray:
     """Line of an image across its width at one depth, shape (2, 3), mm."""
-    ends = np.array([[0.0, grid.first_sample_depth_mm, 0.0], [grid.width_mm, grid.depth_mm, 0.0]])
+    ends = np.column_stack([grid.extent_mm, np.zeros(2)])
     return _line(ends, 1, "depth_mm", depth_mm)
 
 

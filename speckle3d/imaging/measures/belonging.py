@@ -70,8 +70,8 @@ def _place(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Frames, weights and gaps of some points."""
     x, y, q = np.moveaxis(image_from_world[:, :3] @ np.insert(points, 3, 1.0, axis=1).T, 1, 0)
-    beside = (x - np.clip(x, 0.0, grid.width_mm)) ** 2
-    beside += (y - np.clip(y, grid.first_sample_depth_mm, grid.depth_mm)) ** 2
+    (left, top), (right, bottom) = grid.extent_mm
+    beside = (x - np.clip(x, left, right)) ** 2 + (y - np.clip(y, top, bottom)) ** 2
     away = q**2 + beside
     row, best = np.arange(len(points)), away.argmin(axis=0)
     own, second, weight = q[best, row], np.zeros(len(points), dtype=np.int64), np.zeros(len(points))

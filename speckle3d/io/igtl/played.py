@@ -118,7 +118,7 @@ def _pixels(frames: Frames, i: int, upright: bool) -> tuple[npt.NDArray[Any], in
         pairs = np.ascontiguousarray(frame, np.complex64).view(np.float32).reshape(*frame.shape, 2)
         return (pairs if upright else pairs.transpose(1, 0, 2)), 2
     if frame.dtype.kind == "f" and upright:
-        frame = np.clip(np.round(frame), 0, 255).astype(np.uint8)
+        frame = np.clip(np.round(np.nan_to_num(frame)), 0, 255).astype(np.uint8)
     return (frame if upright else frame.T), 1
 
 

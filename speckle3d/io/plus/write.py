@@ -106,7 +106,7 @@ def write_sequence(
     Raises
     ------
     InvalidInputError
-        If the suffix is another.
+        If the suffix is another, or the vectors are a fan's.
     FileError
         If the file cannot be written.
     """
@@ -114,6 +114,10 @@ def write_sequence(
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}, got {suffix!r}")
+    if sweep.grid.fan is not None:
+        raise InvalidInputError(
+            f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
+        )
     fields, frames = _standard_fields(sweep), _timed(sweep.frame_time_s)
     omitted = _add_sensors(frames, sweep)
     for name, matrices in (transforms or {}).items():

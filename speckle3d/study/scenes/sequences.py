@@ -30,7 +30,8 @@ class _Bytes:
 
     def __getitem__(self, index: int) -> ByteArray:
         image: npt.NDArray[Any] = self.source.read_as_stored(index)
-        return np.asarray(np.clip(np.rint(image), 0, 255), dtype=np.uint8)
+        # Outside a fan there is nothing.
+        return np.asarray(np.clip(np.rint(np.nan_to_num(image)), 0, 255), dtype=np.uint8)
 
 
 def slicer_sequence(
