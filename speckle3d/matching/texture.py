@@ -132,9 +132,10 @@ def _patch_powers(echo: Complex64Array, patches: PatchGrid) -> FloatArray:
 
 def _sizes(intensity: Float32Array, patches: PatchGrid) -> FloatArray:
     """Lateral and axial size of each patch's speckle, mm, shape (2, p); NaN unless it is fully developed."""
-    tiles = patches.tiles(intensity).astype(float)
+    varying = patches.tiles(intensity)
     with np.errstate(all="ignore"):  # Flat patches come out as NaN.
-        varying = tiles / tiles.mean(axis=(1, 2), keepdims=True) - 1.0
+        varying /= varying.mean(axis=(1, 2), keepdims=True)
+        varying -= 1.0
         contrast = varying.std(axis=(1, 2))
         lateral, axial = varying[:, :-1] * varying[:, 1:], varying[..., :-1] * varying[..., 1:]
         rho = np.stack([lateral.mean(axis=(1, 2)), axial.mean(axis=(1, 2))]) / contrast**2

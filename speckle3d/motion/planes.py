@@ -320,9 +320,10 @@ def patch_distances(
     least = np.sqrt(np.maximum(LEAST_CORRELATION, curves.amplitude[:, -1] ** 2))
     amplitude = np.where(amplitude > least, amplitude, np.nan)
     distance, slope = np.empty(correlation.shape), np.empty(correlation.shape)
+    falling = -np.gradient(curves.amplitude, curves.step_mm, axis=1)
     for patch, row in enumerate(curves.amplitude):
         distance[:, patch] = np.interp(-amplitude[:, patch], -row, grid)
-        slope[:, patch] = np.interp(distance[:, patch], grid, -np.gradient(row, curves.step_mm))
+        slope[:, patch] = np.interp(distance[:, patch], grid, falling[patch])
     echo = share + (1.0 - share) * amplitude
     noise = correlation_variance(np.minimum(gain * echo**2, 0.999), curves.cells, curves.of_echo)
     by_distance = 2.0 * gain * echo * (1.0 - share) * slope
