@@ -89,25 +89,22 @@ def _echo_sums(
     a: Float32Array, b: Float32Array, turn: Float32Array, window: Window, lag: Lag
 ) -> tuple[float, Sums, Sums, Sums]:
     """Sum of a's power; real and imaginary sums of conj(a) b, a turned back, and of b's power at the lags."""
-    v0, v1, s0, s1 = window
-    start, end = s0 + lag[1], s1 + lag[1]
+    # Unsigned indices are not tested for being negative.
+    one, begin, start = np.uint64(1), np.uint64(window[2]), np.uint64(window[2] + lag[1])
     zero: Any = np.float32(0.0)
     own = r0 = r1 = r2 = r3 = r4 = i0 = i1 = i2 = i3 = i4 = p0 = p1 = p2 = p3 = p4 = zero
-    for v in range(v0, v1):
-        real, imaginary, cosine, sine = a[0, v, s0:s1], a[1, v, s0:s1], turn[0, v - v0], turn[1, v - v0]
-        w = v + lag[0]
-        up, up_i = b[0, w - 1, start:end], b[1, w - 1, start:end]
-        at, at_i = b[0, w, start - 1 : end + 1], b[1, w, start - 1 : end + 1]
-        down, down_i = b[0, w + 1, start:end], b[1, w + 1, start:end]
-        for k in range(real.size):
-            x = real[k] * cosine[k] + imaginary[k] * sine[k]
-            y = imaginary[k] * cosine[k] - real[k] * sine[k]
+    for row in range(np.uint64(window[1] - window[0])):
+        v, w = row + np.uint64(window[0]), row + np.uint64(window[0] + lag[0])
+        for k in range(np.uint64(window[3] - window[2])):
+            i, j = begin + k, start + k
+            real, imaginary, cosine, sine = a[0, v, i], a[1, v, i], turn[0, row, k], turn[1, row, k]
+            x, y = real * cosine + imaginary * sine, imaginary * cosine - real * sine
             own += x * x + y * y
-            r0, i0, p0 = _added(x, y, up[k], up_i[k], r0, i0, p0)
-            r1, i1, p1 = _added(x, y, at[k], at_i[k], r1, i1, p1)
-            r2, i2, p2 = _added(x, y, at[k + 1], at_i[k + 1], r2, i2, p2)
-            r3, i3, p3 = _added(x, y, at[k + 2], at_i[k + 2], r3, i3, p3)
-            r4, i4, p4 = _added(x, y, down[k], down_i[k], r4, i4, p4)
+            r0, i0, p0 = _added(x, y, b[0, w - one, j], b[1, w - one, j], r0, i0, p0)
+            r1, i1, p1 = _added(x, y, b[0, w, j - one], b[1, w, j - one], r1, i1, p1)
+            r2, i2, p2 = _added(x, y, b[0, w, j], b[1, w, j], r2, i2, p2)
+            r3, i3, p3 = _added(x, y, b[0, w, j + one], b[1, w, j + one], r3, i3, p3)
+            r4, i4, p4 = _added(x, y, b[0, w + one, j], b[1, w + one, j], r4, i4, p4)
     return own, (r0, r1, r2, r3, r4), (i0, i1, i2, i3, i4), (p0, p1, p2, p3, p4)
 
 
