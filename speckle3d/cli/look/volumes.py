@@ -180,6 +180,7 @@ def scene(
     images: bool = False,
     deviation: bool = False,
     settings: Annotated[dict[str, Any], Fields(_SETTINGS, _SCENE)],
+    region: MaybeText = None,
     sweep_file: MaybePath = None,
     calibration: Paths = None,
     transform: MaybeText = None,
@@ -203,7 +204,7 @@ def scene(
     ----------------
     deviation
         Also each voxel's standard deviation of position, mm.
-    splat, rule, fill_radius, dynamic_range_db, sweep_file, config_file, transform
+    splat, rule, fill_radius, region, dynamic_range_db, sweep_file, config_file, transform
 
     Examples
     --------
@@ -214,10 +215,10 @@ def scene(
     require_scene_place(out, input_file, sweep_file, *files_of(imported, calibration))
     imports = given_settings(input_file, imported, transform)
     stated = sweep_file, imports, calibration or (), settings.get("dynamic_range_db")
-    request = SceneRequest(
-        compounding_settings(config_file, settings), with_images=images, with_deviation=deviation
-    )
+    checked = compounding_settings(config_file, settings)
     posed = open_sweep_at(mode or [None], input_file, stated)
+    part = region_of(region, input_file, stated, posed[0])
+    request = SceneRequest(checked, region=part, with_images=images, with_deviation=deviation)
     with progress_bar(f"writing {out.name}") as progress:
         reports = write_scene(out, posed, request, progress)
     for report in reports:

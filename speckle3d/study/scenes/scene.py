@@ -18,6 +18,7 @@ from speckle3d.core.labels import STATE_SEGMENTS
 from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import MODES
+from speckle3d.core.region import Region
 from speckle3d.imaging.cuts.outlines import frame_outlines
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.io.fileset import FileSet
@@ -58,6 +59,8 @@ class SceneRequest:
     ----------
     settings : CompoundingSettings
     grid : GridRequest
+    region : Region, optional
+        Of the images; samples outside it do not count in the volumes.
     with_images : bool
         Whether the images are there, too, and move through the volume when they are played.
     with_deviation : bool
@@ -66,6 +69,7 @@ class SceneRequest:
 
     settings: CompoundingSettings = field(default_factory=CompoundingSettings)
     grid: GridRequest = field(default_factory=GridRequest)
+    region: Region | None = None
     with_images: bool = False
     with_deviation: bool = False
 
@@ -155,7 +159,12 @@ def _write_mode(
 ) -> VolumeReport:
     files = {what: folder / name for what, name in request.files(posed.mode).items()}
     voxels = VolumeRequest(
-        files["volume"], request.settings, request.grid, None, files["state"], files.get("deviation")
+        files["volume"],
+        request.settings,
+        request.grid,
+        request.region,
+        files["state"],
+        files.get("deviation"),
     )
     report = write_voxels(posed, voxels, progress)
     sweep, poses = slicer_sequence(posed, request.settings.dynamic_range_db)
