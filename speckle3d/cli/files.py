@@ -82,8 +82,7 @@ def convert(
     A reconstruction becomes a sequence of grey images with its poses as ImageToWorldTransform, which 3D
     Slicer (.seq.nrrd) and SlicerIGSIO (.seq.mha) play in their world: axes lead right, anterior, superior.
 
-    A calibration goes into the file: where the image is relative to its sensor, and the pixel size of B-mode
-    unless options give it.
+    A calibration goes in: the image's place on its sensor, and its pixel size.
 
     Parameters
     ----------
