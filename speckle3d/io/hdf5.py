@@ -5,6 +5,9 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import struct
+import tarfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -26,6 +29,21 @@ Node: TypeAlias = h5py.Group | h5py.Dataset
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
+
+_DAMAGE: tuple[type[Exception], ...] = (
+    OSError,
+    RuntimeError,
+    LookupError,
+    ValueError,
+    TypeError,
+    MemoryError,
+    ArithmeticError,
+    EOFError,
+    struct.error,
+    tarfile.TarError,
+    zlib.error,
+)
+"""What h5py, NumPy and Python's own libraries raise when the bytes of a file do not make sense."""
 
 _HAS_WRITER = ("already open for write", "unable to lock file")
 """HDF5's words for a file that is being written, or whose writer was killed."""
@@ -130,14 +148,18 @@ def require_file(path: PathLike) -> None:
 
 
 @contextmanager
-def reading(where: PathLike) -> Iterator[None]:
-    """Turn what a damaged or unreadable file raises in the block into a `FileError` of one line."""
+def reading(where: PathLike, *others: type[Exception]) -> Iterator[None]:
+    """Turn what a damaged or unreadable file raises in the block into a `FileError` of one line.
+
+    Other exceptions are errors of a program and pass. `others` are those of a library that has its own;
+    `Exception` where the block is a call of such a library and nothing else.
+    """
+    damage = _DAMAGE + others
     try:
         yield
     except Speckle3DError:
         raise
-    # What is damaged shows in whatever its library happens to stumble over.
-    except Exception as error:
+    except damage as error:
         raise FileError(f"{where}: cannot be read: {one_line(error)}") from error
 
 

@@ -182,7 +182,7 @@ class SequenceHeader:
         """
         count = math.prod(self.stored) * int(self.said.get("channels", "1"))
         size_bytes = count * self.dtype.itemsize
-        with reading(self.path), open_regular(self.data) as stream:
+        with reading(self.path, _library.error), open_regular(self.data) as stream:
             length = stream.seek(0, 2)
             stream.seek(max(length - size_bytes, 0) if self.start < 0 else self.start)
             for _ in range(self.skipped_lines):

@@ -174,7 +174,7 @@ class _Unpacker:
     def _unpacked(self, k: int) -> bytes:
         place, packed, unpacked, check = self._blocks[k]
         content = self._member.read(place, packed)
-        with reading(f"{self._member.where}: block {k}"):
+        with reading(f"{self._member.where}: block {k}", Exception):
             plain = content if packed == unpacked else bytes(self._lzo.decompress(content, unpacked))
             if self._check is not None and self._check(plain) != check:
                 raise ValueError("damaged: its check sum is another")

@@ -107,7 +107,7 @@ def _header(path: Path) -> tuple[Any, list[Row]]:
     """Elements beside the pixels, and what they say of the machine."""
     pydicom = extra_module("pydicom", "dicom", f"{path}: DICOM")
     with _reading(str(path)), open_regular(path) as stream:
-        syntax = pydicom.filereader.read_file_meta_info(path)["TransferSyntaxUID"].value
+        syntax = pydicom.filereader.read_file_meta_info(path)["TransferSyntaxUID"].value.name
         header = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=list(_TAGS))
         for name in _TAGS:  # elements are read from their bytes when first asked for
             header.get(name)
@@ -116,7 +116,7 @@ def _header(path: Path) -> tuple[Any, list[Row]]:
         for first, second in (("Manufacturer", "ManufacturerModelName"), ("TransducerType", "TransducerData"))
     )
     rows = [row for row in (("scanner", scanner, ""), ("transducer", transducer, "")) if row[1]]
-    rows.append(("transfer syntax", printable(str(syntax.name)), ""))
+    rows.append(("transfer syntax", printable(syntax), ""))
     if _text(header, "LossyImageCompression") == "01":
         rows.append(("pixels", "packed with loss, which smooths speckle", ""))
     return header, rows
@@ -127,7 +127,7 @@ def _reading(where: str) -> Iterator[None]:
     """Turn what pydicom raises on damaged files into one line, and keep its warnings to itself."""
     import pydicom.config
 
-    with reading(where), warnings.catch_warnings(), pydicom.config.disable_value_validation():
+    with reading(where, Exception), warnings.catch_warnings(), pydicom.config.disable_value_validation():
         warnings.simplefilter("ignore")
         yield
 
@@ -187,7 +187,7 @@ def _place(path: Path, header: Any, rows: list[Row]) -> tuple[tuple[slice, slice
         raise InvalidInputError(f"{path}: expected one region of 2-D tissue, got {len(tissue)} of {listed}")
     (i,) = tissue
     left, top, right, bottom = _corners(path, regions[i])
-    width, height = int(header.Columns), int(header.Rows)
+    width, height = (int(_number(path, header, name)) for name in ("Columns", "Rows"))
     if not (0 <= left < right < width and 0 <= top < bottom < height):
         raise InvalidInputError(f"{path}: expected a region within {width} x {height} pixels, got {told[i]}")
     units, (x_cm, y_cm) = (

@@ -37,7 +37,7 @@ from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
 from speckle3d.io.formats.hdf5_values import Grid, text_of
 from speckle3d.io.frames import HDF5Slices
-from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5
+from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Row, Value, step_of
@@ -146,7 +146,7 @@ def _loaded(path: Path) -> dict[str, Any]:
     """Variables of versions 5 to 7, read whole by SciPy."""
     from scipy.io import loadmat
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), reading(path, Exception):
         warnings.simplefilter("ignore")
         return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
 

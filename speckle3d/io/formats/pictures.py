@@ -42,7 +42,7 @@ class PictureFolder:
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         from PIL import Image
 
-        with reading(self._paths[index]), Image.open(self._paths[index]) as picture:
+        with reading(self._paths[index], Exception), Image.open(self._paths[index]) as picture:
             grey = picture.mode in ("L", "I;16", "I")
             image = np.asarray(picture if grey else picture.convert("RGB"))
         if index and image.shape != self.shape[1:]:
@@ -57,8 +57,9 @@ class Video:
     def __init__(self, path: Path) -> None:
         self._path, self._iio = path, extra_module("imageio.v3", "video", "a video")
         self._next, self._frames = 0, iter(list[npt.NDArray[Any]]())
-        first, self.rate_hz = self[0], self._iio.immeta(path, exclude_applied=False).get("fps")
-        count = sum(1 for _ in self._iio.imiter(path))
+        with reading(path, Exception):  # of whichever plugin imageio takes
+            first, self.rate_hz = self[0], self._iio.immeta(path, exclude_applied=False).get("fps")
+            count = sum(1 for _ in self._iio.imiter(path))
         self.shape, self.dtype = (count, *first.shape), first.dtype
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
@@ -91,7 +92,8 @@ def open_pictures(path: Path, settings: ImportSettings) -> Recording:
     elif path.suffix.lower() in _VIDEOS:
         images = Video(path)
     else:
-        images = np.load(path, mmap_mode="r", allow_pickle=False)
+        with reading(path, Exception):
+            images = np.load(path, mmap_mode="r", allow_pickle=False)
     rate = {"frame_rate_hz": Value(getattr(images, "rate_hz", None), "of the video")}
     colours = "pictures are in colour: taken as grey by luminance; what is drawn over the image stays"
     return Recording(
