@@ -287,6 +287,10 @@ def _registered(moving: RigidTransform, fixed: RigidTransform, centre_mm: FloatA
 def _require_coverage(covered: BoolArray, settings: DriftSettings) -> None:
     """Raise `InsufficientDataError` unless curves through the covered frames are determined everywhere."""
     frames, count = covered.size, int(covered.sum())
+    if frames < settings.minimum_frames:
+        raise InsufficientDataError(
+            f"drift correction: expected {settings.minimum_frames} frames or more, got {frames}"
+        )
     least = max(settings.minimum_coverage * frames, settings.minimum_frames)
     end = int(settings.maximum_end_gap * frames) + 1
     if count < least or not (covered[:end].any() and covered[-end:].any()):

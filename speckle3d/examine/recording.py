@@ -93,7 +93,7 @@ def doubt_band(sweep: Sweep) -> Doubt | None:
     rising = rising[frequency[rising] >= low / 4]
     frequency, power = frequency[rising], power.mean(axis=0)[rising]
     echo = np.maximum(power - 2 * np.quantile(power, _NOISE_QUANTILE), 0.0)
-    if echo.sum() < _LEAST_ECHO * power.sum():
+    if echo.sum() <= _LEAST_ECHO * power.sum():
         return None
     middle = float(np.interp(0.5, np.cumsum(echo) / echo.sum(), frequency))
     inside = float(echo[(frequency >= low) & (frequency <= high)].sum() / echo.sum())
