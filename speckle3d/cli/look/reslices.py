@@ -86,9 +86,9 @@ def reslice(
     straight
         Join the curve's points by straight lines, not by a spline.
     outlines
-        Draw where the frames are instead.
+        Draw where the frames are instead. Not with --volume or --region.
     volume
-        Cut this volume of the sweep, not its frames. Not with --difference-to.
+        Cut this volume of the sweep, not its frames. Not with --difference-to or --region or --reach-mm.
     state
         What `volume --state` wrote: empty voxels are not shown.
     pixel_mm
@@ -140,6 +140,8 @@ def reslice(
         first = open_posed(input_file, modes[0] if modes else None, *stated)
         opened = at_modes(first, modes, difference_to)
         notes(opened.posed.notes())
+        if outlines and as_volume:
+            raise InvalidInputError(f"{out}: expected a picture of --outlines, as .png")
         if outlines:
             save_outlines(opened, out)
             return
