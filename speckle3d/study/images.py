@@ -191,8 +191,9 @@ def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Rec
     """Open a reconstruction and the sweep it was made from, as `sweep_of`."""
     reconstruction = read_reconstruction(path, with_pairs=False)
     stored = Path(reconstruction.provenance.input_path)
-    # The stored path is tried as it is, then from the reconstruction's folder.
-    source = sweep_file or (stored if stored.exists() else path.parent / stored)
+    # The stored path is tried as it is, then from the reconstruction's folder and from the one above.
+    places = (stored, path.parent / stored, path.absolute().parent.parent / stored)
+    source = sweep_file or next((place for place in places if place.exists()), stored)
     return reconstruction, sweep_of(reconstruction, source)
 
 

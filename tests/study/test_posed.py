@@ -11,8 +11,9 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import CalibrationFile, Provenance, Reconstruction
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.load import recording_sha256
+from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.study.images import sweep_of
+from speckle3d.study.images import open_reconstruction, sweep_of
 from speckle3d.study.posed import open_posed
 
 PIXELS = np.diag([0.1, 0.2, 0.15, 1.0])
@@ -66,3 +67,16 @@ def test_a_reconstruction_is_opened_with_the_calibrations_it_was_made_with(tmp_p
         Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, made), tmp_path / "s.h5"
     )
     np.testing.assert_allclose(opened.tracker.sensor_from_image.as_matrix(), mounting.as_matrix())
+
+
+@pytest.mark.parametrize("stored", ["s.h5", "mine/s.h5"], ids=["beside the results", "in them"])
+def test_a_sweep_given_by_a_relative_path_is_found_from_elsewhere(tmp_path, monkeypatch, stored):
+    (tmp_path / "mine").mkdir()
+    sweep = sweep_examples.rf_sweep()
+    write_sweep(tmp_path / stored, sweep)
+    made = Provenance(stored, recording_sha256(tmp_path / stored), "1")
+    with ReconstructionWriter(tmp_path / "mine" / "r.h5", sweep.frame_time_s, sweep.grid) as writer:
+        writer.finish({"image": sweep.truth}, made)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert len(open_reconstruction(tmp_path / "mine" / "r.h5")[1]) == len(sweep)
