@@ -111,6 +111,7 @@ def scan_wires(
     sensor_from_image: RigidTransform = TRIAL_1,
     world_from_phantom: RigidTransform | None = None,
     noise_mm: float = 0.0,
+    **turns: float,
 ) -> tuple[np.ndarray, RigidTransform]:
     """Pixels at which images show points of a phantom, one to a frame, and the sensor's readings.
 
@@ -121,7 +122,7 @@ def scan_wires(
     """
     count = len(places_mm)
     seen = rng.uniform([2.0, 5.0], [38.0, 38.0], (count, 2))
-    turn = hand_turns(rng, count, 35.0, 35.0)
+    turn = hand_turns(rng, count, **({"tilt_deg": 35.0, "roll_deg": 35.0} | turns))
     where = RigidTransform.identity() if world_from_phantom is None else world_from_phantom
     flat = np.column_stack([seen, np.zeros(count)])
     world_from_image = RigidTransform.from_components(where.apply(places_mm) - turn.apply(flat), turn)

@@ -75,6 +75,4 @@ def reversed_in_time(images):
 def test_images_that_do_not_show_where_they_were_taken_are_refused(recording, change, offset_s, search_s):
     whole = tracked(recording, offset_s)
     with pytest.raises(InsufficientDataError, match="--search-s"):
-        delay_from_images(
-            replace(whole, images=change(whole.images)), RigidTransform.identity(), search_s, 20
-        )
+        delay_from_images(replace(whole, images=change(whole.images)), RigidTransform.identity(), search_s)
