@@ -86,7 +86,11 @@ def _command(command: Any) -> list[str]:
         "```",
         "",
     ]
-    for panel, held in command.panels(command.context_class(command)).items():
+    panels: dict[str, list[Any]] = {"Arguments": [], "Options": [], "Other options": []}
+    for parameter in command.params:
+        options = "Options" if parameter.name in command.words.common else "Other options"
+        panels["Arguments" if parameter.param_type_name == "argument" else options].append(parameter)
+    for panel, held in panels.items():
         if held:
             lines += [f"{panel}:", "", "| | |", "|---|---|", *map(_option, held), ""]
     return lines
