@@ -185,11 +185,11 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
         rows = rows if is_jump(piece[-1:], rows[:1]) else np.append(piece, rows)
     worst = int(jumps[0])
     moved_mm = np.linalg.norm(points[worst] - points[worst - 1], axis=-1).max()
-    told = f"{moved_mm:.3g} mm in {1e3 * (time_s[worst] - time_s[worst - 1]):.3g} ms at {time_s[worst]:.3f} s"
+    jump = f"{moved_mm:.3g} mm in {1e3 * (time_s[worst] - time_s[worst - 1]):.3g} ms at {time_s[worst]:.3f} s"
     if rows.size < (1.0 - _MOST_JUMPING) * len(readings):
-        return readings, [f"poses: {jumps.size} jumps that no hand makes, as {told}: all are kept"]
+        return readings, [f"poses: {jumps.size} jumps that no hand makes, as {jump}: all are kept"]
     notes = left_out(
-        "poses", len(readings), {f"after jumps, as {told}": len(readings) - rows.size}, time_s[rows]
+        "poses", len(readings), {f"after jumps, as {jump}": len(readings) - rows.size}, time_s[rows]
     )
     return replace(readings, time_s=time_s[rows], world_from_sensor=readings.world_from_sensor[rows]), notes
 

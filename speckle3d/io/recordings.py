@@ -188,8 +188,8 @@ class Recording:
         if not own or one.is_assumed or shown == own:
             return (words, f"{shown} ({by})", unit), "", ""
         against, is_far = f"{one.said_by} says {own}", differs(given, one.value)
-        told = f"{words} {shown} {unit}, {by}: {against}{source}" if is_far else ""
-        return (words, f"{shown} ({by}, {against})", unit), told, ""
+        contradiction = f"{words} {shown} {unit}, {by}: {against}{source}" if is_far else ""
+        return (words, f"{shown} ({by}, {against})", unit), contradiction, ""
 
     @cached_property
     def needed(self) -> dict[str, Value]:

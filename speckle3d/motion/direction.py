@@ -87,9 +87,9 @@ def settle_direction(
         covered = np.flatnonzero(sensor.covers(time_s))
         if covered.size >= LEAST_FRAMES:
             both = sensor.world_from_image(time_s[covered]), image.rotation[covered]
-            told = same_turns(*((turn[0].inv() * turn).as_rotvec()[:, :2] for turn in both))
-            if told is not None:
-                return told, "orientation sensor"
+            sign = same_turns(*((turn[0].inv() * turn).as_rotvec()[:, :2] for turn in both))
+            if sign is not None:
+                return sign, "orientation sensor"
     if sweep.truth is not None:
         return _same_way(sweep.truth, image, sweep.grid.centre_mm), "truth"
     return 1, "assumed"
@@ -130,7 +130,7 @@ def same_turns(sensed: FloatArray, seen: FloatArray) -> int | None:
     columns = zip(ours.T, theirs.T, strict=True)
     by_lag = sum(np.correlate(a, a, "full") * np.correlate(b, b, "full") for a, b in columns)
     by_chance = np.sqrt(max(float((1.0 - np.abs(np.arange(1 - n, n)) / n) @ by_lag) / n, 0.0))
-    told = correlation >= _LEAST_CORRELATION and abs(product) >= _LEAST_DEVIATIONS * by_chance
+    is_significant = correlation >= _LEAST_CORRELATION and abs(product) >= _LEAST_DEVIATIONS * by_chance
     of_one_size = _ALIKE_SIZE**-2 <= powers[0] / powers[1] <= _ALIKE_SIZE**2
     same = correlation >= _SAME_CORRELATION and of_one_size
-    return int(np.sign(product)) if told or same else None
+    return int(np.sign(product)) if is_significant or same else None

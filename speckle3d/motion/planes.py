@@ -238,7 +238,7 @@ def pair_planes(
     else:
         start = np.maximum(start_mm, NEAR_MM)
     sensed = slopes is not None
-    told = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
+    slopes_used = np.zeros((rows.size, 2)) if slopes is None else np.ascontiguousarray(slopes)
     side = np.ones(rows.size, dtype=bool) if either_side is None else either_side
     settings = problem.planes
     slope_sd = SENSED_SLOPE if sensed else LOOSE_SLOPE
@@ -260,7 +260,7 @@ def pair_planes(
             problem.levers,
             problem.at_patches,
             start[some],
-            told[some],
+            slopes_used[some],
             side[some],
             rules,
             FittedPlanes(*(array[some] for array in fitted)),

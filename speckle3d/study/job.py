@@ -148,8 +148,8 @@ def run_job(
                 if stacks:
                     stacks[0].keep(index, intensity)
 
-            told = after(progress, 0, sum(map(len, sweeps)))
-            tracked = track(sweep, curves, settings, told, writer.append_pairs, keep)
+            report = after(progress, 0, sum(map(len, sweeps)))
+            tracked = track(sweep, curves, settings, report, writer.append_pairs, keep)
             if stacks:
                 try:
                     pair, corrected = _crossed(sweeps, stacks, tracked, curves, settings, progress)

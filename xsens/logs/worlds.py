@@ -160,16 +160,16 @@ def world_of(
             return taken, (f"orientation: {taken}, {claim.by}, although {off}",)
         raise InvalidInputError(f"expected an orientation in ENU, NWU or NED, but {off}: give --world")
     shown = _shown(up > 0.0, north_deg, taken)
-    told = "accelerometer" if np.isnan(north_deg) else "accelerometer and magnetometer"
+    sensors = "accelerometer" if np.isnan(north_deg) else "accelerometer and magnetometer"
     world, notes = taken if claim.final else shown, []
     if world != shown:
-        notes.append(f"orientation: {world}, {claim.by}; by its own {told} it is {shown}")
+        notes.append(f"orientation: {world}, {claim.by}; by its own {sensors} it is {shown}")
     elif world != taken:
-        notes.append(f"orientation: {world} by its own {told}, not {taken}, {claim.by}")
+        notes.append(f"orientation: {world} by its own {sensors}, not {taken}, {claim.by}")
     elif claim.assumed and np.isnan(north_deg):
         notes.append(f"orientation: taken as {world}, {claim.by}: no steady field tells; see --world")
     elif claim.assumed:
-        notes.append(f"orientation: {world} by its own {told}")
+        notes.append(f"orientation: {world} by its own {sensors}")
     west = _apart(north_deg, 90.0 if world == "ENU" else 0.0) * (1.0 if world == "NED" else -1.0)
     if abs(west) > _DECLINATION_DEG:
         side = "west" if west > 0.0 else "east"

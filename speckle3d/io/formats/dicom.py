@@ -180,16 +180,18 @@ def _place(path: Path, header: Any, rows: list[Row]) -> tuple[tuple[slice, slice
         names = ("row_spacing_mm", "column_pitch_mm") if is_sized else ()
         values = {name: Value(mm, "PixelSpacing") for name, mm in zip(names, spacing, strict=False)}
         return (slice(None), slice(None)), values
-    told = [_region_words(path, region) for region in regions]
+    descriptions = [_region_words(path, region) for region in regions]
     tissue = [i for i, region in enumerate(regions) if _kind(path, region) == _TISSUE]
     if len(tissue) != 1:
-        listed = "; ".join(told)
+        listed = "; ".join(descriptions)
         raise InvalidInputError(f"{path}: expected one region of 2-D tissue, got {len(tissue)} of {listed}")
     (i,) = tissue
     left, top, right, bottom = _corners(path, regions[i])
     width, height = (int(_number(path, header, name)) for name in ("Columns", "Rows"))
     if not (0 <= left < right < width and 0 <= top < bottom < height):
-        raise InvalidInputError(f"{path}: expected a region within {width} x {height} pixels, got {told[i]}")
+        raise InvalidInputError(
+            f"{path}: expected a region within {width} x {height} pixels, got {descriptions[i]}"
+        )
     units, (x_cm, y_cm) = (
         tuple(_number(path, regions[i], name.format(axis)) for axis in "XY")
         for name in ("PhysicalUnits{}Direction", "PhysicalDelta{}")
@@ -209,8 +211,8 @@ def _place(path: Path, header: Any, rows: list[Row]) -> tuple[tuple[slice, slice
         # The first row taken is the region's last where y falls.
         depth_mm = 10.0 * (value_cm + ((bottom - top if y_cm < 0 else 0) - pixel) * y_cm)
         values["first_sample_depth_mm"] = Value(depth_mm, "ReferencePixelY0 and its physical value")
-    rows.append(("region read", told[i], ""))
-    rows += [("region left out", other, "") for k, other in enumerate(told) if k != i]
+    rows.append(("region read", descriptions[i], ""))
+    rows += [("region left out", other, "") for k, other in enumerate(descriptions) if k != i]
     if x_cm < 0:
         rows.append(("columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""))
     if y_cm < 0:
