@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 Reflector = Literal["wall", "bar"]
 Signal = Literal["rf", "iq", "bmode"]
@@ -109,4 +109,12 @@ class SimulationSettings(BaseModel):
     def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
         if not 2.0 <= value[0] <= value[1] <= 44.0:
             raise ValueError("expected 2 <= nearest <= farthest <= 44")
+        return value
+
+    @field_validator("radius_mm", "sector_deg")
+    @classmethod
+    def _of_spreading_vectors(cls, value: float, info: ValidationInfo) -> float:
+        parallel = info.data.get("array", "linear") == "linear"
+        if parallel and value != cls.model_fields[str(info.field_name)].default:
+            raise ValueError("expected with array curved or phased, whose vectors spread")
         return value

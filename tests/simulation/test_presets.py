@@ -61,3 +61,9 @@ def test_sweeps_are_stored_as_i_and_q_or_as_grey_levels_where_asked_for():
     assert (iq.grid, iq.signal) == (expected.grid, expected.signal)
     np.testing.assert_array_equal(grey.frames[1], received_as_bmode(rf, 60.0).frames[1])
     np.testing.assert_array_equal(iq.truth.as_matrix(), rf.truth.as_matrix())
+
+
+def test_a_sector_of_parallel_vectors_is_refused():
+    with pytest.raises(ValueError, match="sector_deg"):
+        SimulationSettings(sector_deg=30.0)
+    assert SimulationSettings(array="phased", sector_deg=30.0).sector_deg == 30.0
