@@ -98,6 +98,10 @@ class AppServer:
             looking.stop()
             self._server.stop(wait=False)
 
+    def end(self) -> None:
+        """End `run`, from any thread."""
+        self._server.io_loop.add_callback(self._server.io_loop.stop)
+
     def _look(self) -> None:
         now, before = time.monotonic(), self._sessions
         sessions = self._server.get_sessions()

@@ -162,7 +162,9 @@ def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mappin
     for path in value if isinstance(value, list) else [value]:
         if isinstance(path, Path) and not path.exists() and not info.writable:
             where = f"{flag}: " if isinstance(info, typer.models.OptionInfo) else ""
-            raise FileError(f"{where}{path}: expected a file, got none")
+            is_server = re.fullmatch(r"[^/]+:[0-9]+", str(path))
+            live = f"; a server's sweep: speckle3d live {path} --view" if is_server else ""
+            raise FileError(f"{where}{path}: expected a file, got none{live}")
 
 
 def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> inspect.Parameter:

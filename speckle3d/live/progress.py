@@ -24,6 +24,8 @@ class Progress:
         From a frame's message to its pose's, the last one.
     length_mm : float
         Between the first and the last frame's centres, along the first's elevational axis.
+    length_sigma : float
+        Relative standard deviation of it; NaN before it is known.
     words : str
     volumes : int
         Sent.
@@ -43,6 +45,7 @@ class Progress:
     waiting: int = 0
     delay_s: float = 0.0
     length_mm: float = 0.0
+    length_sigma: float = float("nan")
     words: str = ""
     volumes: int = 0
     refused: int = 0
@@ -52,11 +55,17 @@ class Progress:
     failed: str = ""
 
     @property
+    def length(self) -> str:
+        """The length so far with its error, as far as it is known."""
+        half_mm = 1.96 * self.length_sigma * abs(self.length_mm)
+        return f"{self.length_mm:+.1f} mm" + (f" ±{half_mm:.1f} (95 %)" if half_mm == half_mm else "")
+
+    @property
     def line(self) -> str:
         """All of it in one line."""
         parts = [
             f"{self.recorded} frames",
-            f"{self.length_mm:+.1f} mm",
+            self.length.replace("±", "+-"),
             f"pose after {1e3 * self.delay_s:.0f} ms",
         ]
         parts += [f"{self.left} left for later"] if self.left else []

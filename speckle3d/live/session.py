@@ -16,13 +16,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeGuard
 
+import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import Float32Array
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
+from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import on_one_thread
+from speckle3d.imaging.voxels.volume import CompoundedVolume
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.checks import GOOD, LOST, TOO_FAST, Words, words_for
@@ -104,6 +108,8 @@ class Session:
     ----------
     failure : Exception or None
         Why frames could no longer be placed, or volumes made of them: recording went on.
+    voxels : CompoundedVolume or None
+        The growing volume as it was sent last.
     """
 
     def __init__(
@@ -119,6 +125,7 @@ class Session:
         self.progress = Progress(words=GOOD if settings.check else "")
         self.poses: list[LivePose] = []
         self.tracker: LiveTracker | None = None
+        self.voxels: CompoundedVolume | None = None
         self._volume: GrowingVolume | None = None
         self._layout: ImageLayout | None = None
         self._queue: deque[_Waiting] = deque()
@@ -131,6 +138,20 @@ class Session:
     def end(self) -> None:
         """Let `run` end with what it has."""
         self._over.set()
+
+    def picture(self) -> tuple[Float32Array, ImageGrid] | None:
+        """Grey levels of the latest frame, shape (vector, sample), and where they lie; None without one."""
+        levels = None if self._volume is None else self._volume.latest()
+        return None if self._volume is None or levels is None else (levels, self._volume.grid)
+
+    def path(self) -> tuple[FloatArray, FloatArray, RigidTransform]:
+        """Times of frames, elevation of the image's centre there, mm, and poses, as they are known now."""
+        tracker, layout = self.tracker, self._layout
+        if tracker is None or layout is None:
+            return np.zeros(0), np.zeros(0), RigidTransform.identity(0)
+        times, poses = np.array([pose.time_s for pose in self.poses]), tracker.poses
+        count, centre_mm = min(len(times), len(poses)), layout.example.grid.centre_mm
+        return times[:count], poses[:count].apply(centre_mm)[:, 2], poses[:count]
 
     def run(self, duration_s: float | None = None, show: Callable[[Progress], None] | None = None) -> None:
         """Take messages until ended, for so long at most.
@@ -226,8 +247,7 @@ class Session:
         settings = self._settings
         work = {"placing": self._match}
         with LiveTracker(layout.example, self._curves, settings.config, images=self._keep) as self.tracker:
-            if settings.volume or self._crossing is not None:
-                self._volume = GrowingVolume(self.tracker.image_grid)
+            self._volume = GrowingVolume(self.tracker.image_grid)
             work |= {"volumes": self._send_volumes} if settings.volume else {}
             work |= {"crossing check": self._look_for_crossing} if self._crossing is not None else {}
             threads = [
@@ -277,6 +297,7 @@ class Session:
             self._sent_s = waiting.sent_s
             self.progress.matched += 1
             self.progress.delay_s = time.monotonic() - waiting.came_s
+            self.progress.length_sigma = self.tracker.length_sigma
             self.progress.length_mm = float(
                 pose.world_from_image.apply(centre_mm)[2] - self.poses[0].world_from_image.apply(centre_mm)[2]
             )
@@ -306,7 +327,8 @@ class Session:
             if len(poses) > max(seen, 1):
                 seen = len(poses)
                 with on_one_thread():
-                    self._send(volume_message(self._volume.compounded(poses), self._sent_s))
+                    self.voxels = self._volume.compounded(poses)
+                    self._send(volume_message(self.voxels, self._sent_s))
                 self.progress.volumes += 1
 
     def _look_for_crossing(self) -> None:

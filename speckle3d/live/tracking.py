@@ -157,6 +157,16 @@ class LiveTracker:
             return self._poses
 
     @property
+    def length_sigma(self) -> float:
+        """Relative standard deviation of the length so far; NaN before anything is known of it."""
+        motion = self._motion
+        if motion is None:
+            return float("nan")
+        # Live, no spectrum tells how much more than the phantom the tissue attenuates.
+        curves_sigma = motion.problem.curves.mismatch(self._config.curves.same_probe)
+        return float(np.hypot(motion.scale_sigma, curves_sigma))
+
+    @property
     def flags(self) -> IntArray:
         """`FrameFlag` of all frames; zero for those to be trusted."""
         return self._flags

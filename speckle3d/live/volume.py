@@ -36,6 +36,7 @@ class GrowingVolume:
         self._pooled = ImageStack(grid)
         self._images: dict[int, Float16Array] = {}
         self._every = 1
+        self._latest: Float16Array | None = None
         self._lock = threading.Lock()
 
     @property
@@ -50,14 +51,19 @@ class GrowingVolume:
 
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep a frame's image, unless those of its neighbours are enough."""
+        self._pooled.keep(0, intensity)
+        self._latest = self._pooled.kept(0, 1)[0]
         if index % self._every:
             return
-        self._pooled.keep(0, intensity)
         with self._lock:
-            self._images[index] = self._pooled.kept(0, 1)[0]
+            self._images[index] = self._latest
             if len(self._images) > MOST_IMAGES:
                 self._every *= 2
                 self._images = {k: image for k, image in self._images.items() if k % self._every == 0}
+
+    def latest(self) -> Float32Array | None:
+        """Grey levels of the latest frame's small image, shape (vector, sample); None before the first."""
+        return None if self._latest is None else grey_levels(self._latest[None])[0]
 
     def kept(self) -> tuple[IntArray, Float16Array]:
         """Numbers of the frames whose images are kept, and these, dB, shape (n, vector, sample)."""

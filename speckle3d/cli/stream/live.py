@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 import time
+import webbrowser
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -31,16 +32,20 @@ from speckle3d.core.printable import printable
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from types import FrameType
 
-    from speckle3d.io.igtl.link import LinkState
+    from speckle3d.io.igtl.link import Connection
     from speckle3d.live.progress import Progress
     from speckle3d.live.session import Session
 
 _LOG_EVERY_S = 5.0
 _SILENT_S = 2.0
 """After which a connection on which nothing comes is told of."""
+_LEFT_S = 10.0
+"""After which a server that sent images and left does not come back; PLUS is started again in less."""
+_LAST_LOOK_S = 1.0
+"""For pages to show the end."""
 _SWITCH_S = 5e-4
 """For which one thread keeps the interpreter at most; Python's 5 ms a frame would wait for many times."""
 _NEEDS = {
@@ -76,6 +81,7 @@ def live(
     orientation: MaybeText = None,
     calibration: Paths = None,
     imported: Annotated[dict[str, Any], Fields("speckle3d.io.import_settings:ImportSettings", _IMPORTED)],
+    view: bool = False,
     serve: Annotated[int | None, typer.Option(min=0, max=65535)] = None,
     volume: bool = True,
     check: bool = False,
@@ -89,8 +95,8 @@ def live(
     """Reconstruct a sweep while it is made: receive, record, place each frame, send its pose back.
 
     The pose is a TRANSFORM, ImageToReference, from the received image's pixels to mm; the growing volume an
-    IMAGE, Volume_Reference; words of --check a STRING and a STATUS, SweepAdvice. Ctrl-C ends the sweep, which
-    is then reconstructed as `speckle3d reconstruct` does it.
+    IMAGE, Volume_Reference; words of --check a STRING and a STATUS, SweepAdvice. Ctrl-C ends the sweep, or
+    the server that is gone for ten seconds; it is then reconstructed as `speckle3d reconstruct` does it.
 
     Parameters
     ----------
@@ -109,6 +115,8 @@ def live(
         Mode at the end beside image; may be repeated.
     check
         Say what to do: too fast, lifted, not overlapping, turn more.
+    view
+        Show the picture, the length so far, the path and the growing volume in the browser.
     volume
         Send the growing volume about once a second.
 
@@ -133,6 +141,9 @@ def live(
     $ speckle3d live localhost:18944 -o out --curves curves.h5 --check
     """
     require_extra("live", "live", "pyigtl", "fastcrc")
+    if view:
+        require_extra("app", "live --view", "panel")
+        from speckle3d.app.live import LivePage, watched
     from speckle3d.io.curves import read_curves
     from speckle3d.io.igtl.link import Connection, Server
     from speckle3d.io.import_settings import ImportSettings
@@ -161,35 +172,43 @@ def live(
     if crossing_file is not None:
         with progress_bar(f"tracking {crossing_file.name}") as progress:
             first = CrossingCheck.of(load_sweep(crossing_file), curves, config, progress)
-    with ExitStack() as open_:
-        served = None if serve is None else open_.enter_context(Server(serve))
+    with ExitStack() as pages, ExitStack() as links:
+        served = None if serve is None else links.enter_context(Server(serve))
         if served is not None:
             note(f"poses and volume at 127.0.0.1:{served.port}")
-        connection = open_.enter_context(Connection(host.strip("[]"), int(port)))
+        connection = links.enter_context(Connection(host.strip("[]"), int(port)))
         outlets = [connection.send] if served is None else [connection.send, served.send]
         note(f"listening to {server}")
-        session = Session(connection, outlets, curves, settings, first)
-        _run(session, duration_s, _Line(lambda: _trouble(connection.state, server)))
-        done = session.progress
+        session, sender = Session(connection, outlets, curves, settings, first), _Sender(connection, server)
+        if view:
+            address, address_for_once = pages.enter_context(watched(LivePage(session, lambda: sender.words)))
+            note(address)
+            webbrowser.open(address_for_once)
+        _run(session, duration_s, sender)
+        done, sender.words = session.progress, f"the sweep has ended; reconstructing it into {out} ..."
         if not done.recorded:
-            reasons = filter(None, (done.missing, _trouble(connection.state, server)))
+            reasons = filter(None, (done.missing, sender.trouble()))
             raise InvalidInputError(f"{server}: no images came: {'; '.join(reasons) or 'none was sent'}")
-    if done.recorded < 2:
-        raise InvalidInputError(f"{recorded}: expected two images to reconstruct, got {done.recorded}")
-    left = f"; {done.left} were left for now" if done.left else ""
-    note(f"{done.recorded} frames in {recorded}, {done.matched} placed as they came{left}")
-    if done.missing:
-        note(done.missing)
-    reconstruct(
-        recorded,
-        out,
-        curves_file,
-        drift,
-        crossing_file,
-        region=region,
-        calibration=calibration,
-        config_file=config_file,
-    )
+        links.close()
+        if done.recorded < 2:
+            raise InvalidInputError(f"{recorded}: expected two images to reconstruct, got {done.recorded}")
+        left = f"; {done.left} were left for now" if done.left else ""
+        note(f"{done.recorded} frames in {recorded}, {done.matched} placed as they came{left}")
+        if done.missing:
+            note(done.missing)
+        reconstruct(
+            recorded,
+            out,
+            curves_file,
+            drift,
+            crossing_file,
+            region=region,
+            calibration=calibration,
+            config_file=config_file,
+        )
+        sender.words = f"the sweep has ended; its results: speckle3d view {out}"
+        if view:
+            time.sleep(_LAST_LOOK_S)
     if session.failure is not None:
         raise session.failure
 
@@ -206,21 +225,54 @@ def _require_possible(drift: Sequence[str], calibrations: Sequence[Path], **sour
             raise InvalidInputError(f"{what}: expected {flags} beside it, got none")
 
 
-def _trouble(state: LinkState, server: str) -> str:
-    """What is wrong with a connection; empty if nothing is."""
-    told = []
-    if not state.connected:
-        told.append(f"waiting for {server}" + (f" ({state.last_failure})" if state.last_failure else ""))
-    elif state.silent_s > _SILENT_S:
-        told.append(f"nothing comes from {server}")
-    if state.refused:
-        told.append(f"{state.refused} messages refused ({state.last_refused})")
-    return ", ".join(told)
+class _Sender:
+    """The server of a session: what is wrong with it, and whether it has gone for good.
+
+    Attributes
+    ----------
+    words : str
+        Of the last `trouble`, or what comes after it.
+    """
+
+    def __init__(self, connection: Connection, name: str) -> None:
+        self._connection, self._name = connection, name
+        self._left_s: float | None = None
+        self.words = ""
+
+    def trouble(self) -> str:
+        """What is wrong; empty if nothing is."""
+        state, words = self._connection.state, []
+        if not state.connected:
+            why = f" ({state.last_failure})" if state.last_failure else ""
+            words.append(f"waiting for {self._name}{why}")
+        elif state.silent_s > _SILENT_S:
+            words.append(f"nothing comes from {self._name}")
+        if state.refused:
+            words.append(f"{state.refused} messages refused ({state.last_refused})")
+        self.words = ", ".join(words)
+        return self.words
+
+    def has_left(self) -> bool:
+        """Whether it has been away for as long as one that does not come back."""
+        if self._connection.state.connected:
+            self._left_s = None
+        elif self._left_s is None:
+            self._left_s = time.monotonic()
+        return self._left_s is not None and time.monotonic() - self._left_s > _LEFT_S
 
 
-def _run(session: Session, duration_s: float | None, line: _Line) -> None:
-    """Run until Ctrl-C, or for so long; other signals that ask for the end are heard once all is recorded."""
-    heard: list[int] = []
+def _run(session: Session, duration_s: float | None, sender: _Sender) -> None:
+    """Run until Ctrl-C, for so long, or until the sender has left.
+
+    Other signals that ask for the end are heard once all is recorded.
+    """
+    heard, line = list[int](), _Line()
+
+    def show(progress: Progress) -> None:
+        line.show(" | ".join(filter(None, (progress.line, sender.trouble()))), progress.words)
+        if progress.recorded and sender.has_left():
+            note(f"{sender.trouble()}: taken for the end of the sweep")
+            session.end()
 
     def end(number: int, _frame: FrameType | None) -> None:
         heard.append(number)
@@ -230,7 +282,7 @@ def _run(session: Session, duration_s: float | None, line: _Line) -> None:
     sys.setswitchinterval(_SWITCH_S)
     with handled(end, *ENDS):
         try:
-            session.run(duration_s, line.show)
+            session.run(duration_s, show)
         finally:
             sys.setswitchinterval(interval_s)
             line.end()
@@ -240,28 +292,21 @@ def _run(session: Session, duration_s: float | None, line: _Line) -> None:
 
 
 class _Line:
-    """The line that is looked at: in place on a terminal, in a log now and then and with other words.
+    """The line that is looked at: in place on a terminal, in a log now and then and with other words."""
 
-    Parameters
-    ----------
-    trouble : callable
-        Says what is wrong with the connection; empty if nothing is.
-    """
-
-    def __init__(self, trouble: Callable[[], str]) -> None:
-        self._trouble, self._is_terminal = trouble, sys.stderr.isatty()
+    def __init__(self) -> None:
+        self._is_terminal = sys.stderr.isatty()
         self._told_s, self._words, self._last = 0.0, "", ""
 
-    def show(self, progress: Progress) -> None:
-        """Show how it goes."""
-        text = " | ".join(filter(None, (progress.line, self._trouble())))
+    def show(self, text: str, words: str) -> None:
+        """Show how it goes; `words` are those of it that a log has at once."""
         now = time.monotonic()
         if self._is_terminal:
             sys.stderr.write(f"\r\x1b[K{printable(text)[: shutil.get_terminal_size().columns - 1]}")
             sys.stderr.flush()
-        elif progress.words != self._words or (now - self._told_s > _LOG_EVERY_S and text != self._last):
+        elif words != self._words or (now - self._told_s > _LOG_EVERY_S and text != self._last):
             note(text)
-            self._told_s, self._words, self._last = now, progress.words, text
+            self._told_s, self._words, self._last = now, words, text
 
     def end(self) -> None:
         """Leave the line."""
