@@ -33,23 +33,24 @@ from speckle3d.io.recordings import Recording, Row, Value, differs
 FORMAT = "DICOM"
 
 _MARK, _MARK_BYTE = b"DICM", 128
-_TISSUE, _CM = (1, 1), (3.0, 3.0)
+_TISSUE, _CM = [1, 1], [3, 3]
 """Region Spatial Format and Data Type of 2-D tissue, and Physical Units of both directions."""
 _LOSSY_SPREAD = 12
 """Levels by which the colours of a grey pixel may differ after lossy packing; the tint of a colour map is
 more."""
+_MACHINE = ("Manufacturer", "ManufacturerModelName", "TransducerType", "TransducerData")
 _RATES = ("FrameTime", "CineRate", "RecommendedDisplayFrameRate")
-_EIGHT_BITS = {"BitsAllocated": 8, "BitsStored": 8, "PixelRepresentation": 0}
-_GREYS = {
-    1: ("MONOCHROME1", "MONOCHROME2"),
-    3: ("RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT"),
-}
-"""Photometric interpretations that are read, by samples a pixel."""
+_EXPECTED = {
+    "Modality": ("US",),
+    "PhotometricInterpretation": (
+        "MONOCHROME1", "MONOCHROME2", "RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT",
+    ),
+    "BitsAllocated": (8,),
+    "PixelRepresentation": (0,),
+}  # fmt: skip
 _TAGS = (
-    "SOPClassUID", "Modality", "Manufacturer", "ManufacturerModelName", "TransducerData", "TransducerType",
-    "NumberOfFrames", "FrameTimeVector", *_RATES, "SamplesPerPixel", "PhotometricInterpretation", "Rows",
-    "Columns", "PlanarConfiguration", *_EIGHT_BITS, "PixelSpacing", "LossyImageCompression",
-    "SequenceOfUltrasoundRegions",
+    *_MACHINE, *_RATES, *_EXPECTED, "NumberOfFrames", "FrameTimeVector", "Rows", "Columns", "PixelSpacing",
+    "LossyImageCompression", "SequenceOfUltrasoundRegions",
 )  # fmt: skip
 """All that is loaded."""
 
@@ -60,8 +61,8 @@ class DicomFile:
 
     Attributes
     ----------
-    rows, columns : slice
-        Of the region.
+    part : pair of slice
+        Rows and columns of the region.
     inverted : bool
         Whether black is the highest level.
     spread : int
@@ -69,8 +70,7 @@ class DicomFile:
     """
 
     path: Path
-    rows: slice
-    columns: slice
+    part: tuple[slice, slice]
     inverted: bool
     spread: int
 
@@ -80,46 +80,51 @@ class DicomFile:
 
     def read(self, i: int) -> npt.NDArray[Any]:
         """Decode frame i, shape (column, row)."""
-        grey = _grey(_decoded(self.path, i)[self.rows, self.columns], self.spread).T
-        return 255 - grey if self.inverted else grey
+        image = _decoded(self.path, i)[self.part]
+        if image.ndim == 3:
+            coloured = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > self.spread)
+            if len(coloured):
+                raise InvalidInputError(
+                    f"expected grey, got {len(coloured)} pixels of a colour, the first at row, column "
+                    f"{coloured[0].tolist()} of the region: colour Doppler or an overlay"
+                )
+            image = np.rint(image.mean(axis=2)).astype(np.uint8)
+        return 255 - image.T if self.inverted else image.T
 
 
 def open_dicom(path: Path, settings: ImportSettings) -> Recording:
     """Read grey images of eight bits; they stay in the file until they are asked for."""
-    header, rows = _header(path)
+    pydicom = extra_module("pydicom", "dicom", f"{path}: DICOM")
+    with _reading(str(path)), open_regular(path) as stream:
+        header = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=list(_TAGS))
+        syntax = header.file_meta.TransferSyntaxUID.name
+        for _ in header.iterall():  # elements are read from their bytes when first asked for
+            pass
+    machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
+    rows: list[Row] = [("scanner", printable(machine), "")] if machine else []
+    rows.append(("transfer syntax", printable(syntax), ""))
+    if header.get("LossyImageCompression") == "01":
+        rows.append(("pixels", "packed with loss, which smooths speckle", ""))
     return Recording.of(path, settings, rows, lambda: _recording(path, settings, header, rows))
 
 
 def _recording(path: Path, settings: ImportSettings, header: Any, rows: list[Row]) -> Recording:
-    count = _require_grey(path, header)
+    for name, expected in _EXPECTED.items():
+        if (got := header.get(name)) not in expected:
+            listed = " or ".join(map(str, expected))
+            raise InvalidInputError(f"{path}: {name}: expected {listed}, got {printable(str(got))}")
+    count = int(_numbers(path, header, "NumberOfFrames")[0]) if "NumberOfFrames" in header else 1
+    kind = header.PhotometricInterpretation
+    if count < 2:
+        raise InvalidInputError(f"{path}: NumberOfFrames: expected several frames, got a single image")
     part, values = _place(path, header, rows)
-    kind = _text(header, "PhotometricInterpretation")
-    is_lossy = _text(header, "LossyImageCompression") == "01" or "YBR" in kind
-    source = DicomFile(path, *part, kind == "MONOCHROME1", _LOSSY_SPREAD if is_lossy else 0)
+    is_lossy = header.get("LossyImageCompression") == "01" or "YBR" in kind
+    source = DicomFile(path, part, kind == "MONOCHROME1", _LOSSY_SPREAD if is_lossy else 0)
     _require_all_frames(path, count)
     shape = (count, *source.read(count // 2).shape)  # colour is told before a reconstruction begins
     times, values["frame_rate_hz"], remarks = _clock(header, count)
     frames = FileFrames(path, source, shape, np.uint8)
     return Recording(path, settings, frames, values, time_s=times, remarks=remarks)
-
-
-def _header(path: Path) -> tuple[Any, list[Row]]:
-    """Elements beside the pixels, and what they say of the machine."""
-    pydicom = extra_module("pydicom", "dicom", f"{path}: DICOM")
-    with _reading(str(path)), open_regular(path) as stream:
-        syntax = pydicom.filereader.read_file_meta_info(path)["TransferSyntaxUID"].value.name
-        header = pydicom.dcmread(stream, stop_before_pixels=True, specific_tags=list(_TAGS))
-        for name in _TAGS:  # elements are read from their bytes when first asked for
-            header.get(name)
-    scanner, transducer = (
-        f"{_text(header, first)} {_text(header, second)}".strip()
-        for first, second in (("Manufacturer", "ManufacturerModelName"), ("TransducerType", "TransducerData"))
-    )
-    rows = [row for row in (("scanner", scanner, ""), ("transducer", transducer, "")) if row[1]]
-    rows.append(("transfer syntax", printable(syntax), ""))
-    if _text(header, "LossyImageCompression") == "01":
-        rows.append(("pixels", "packed with loss, which smooths speckle", ""))
-    return header, rows
 
 
 @contextmanager
@@ -155,47 +160,42 @@ def _require_all_frames(path: Path, count: int) -> None:
         raise FileError(f"{path}: ends early: {whole} of {count} frames")
 
 
-def _require_grey(path: Path, header: Any) -> int:
-    """Refuse what is no sequence of grey images of eight bits; returns the number of frames."""
-    greys = _GREYS.get(int(_number(path, header, "SamplesPerPixel", 1)), ())
-    for name, expected in (("Modality", ("US",)), ("PhotometricInterpretation", greys)):
-        if (kind := _text(header, name)) not in expected:
-            raise InvalidInputError(f"{path}: {name}: expected {' or '.join(expected)}, got {kind or 'none'}")
-    for name, bits in _EIGHT_BITS.items():
-        if (got := _number(path, header, name, bits)) != bits:
-            raise InvalidInputError(f"{path}: {name}: expected {bits}, got {got:g}")
-    count = int(_number(path, header, "NumberOfFrames", 1))
-    if count < 2:
-        raise InvalidInputError(f"{path}: NumberOfFrames: expected several frames, got a single image")
-    return count
-
-
 def _place(path: Path, header: Any, rows: list[Row]) -> tuple[tuple[slice, slice], dict[str, Value]]:
     """Rows and columns of the image to take, and the size of its pixels; facts tell of it."""
     regions = header.get("SequenceOfUltrasoundRegions") or ()
     if not regions:
         rows.append(("region read", "the whole image, taken for Cartesian tissue: the file names none", ""))
-        spacing = [float(value) for value in header.get("PixelSpacing") or ()]
-        is_sized = len(spacing) == 2 and min(spacing) > 0 and np.isfinite(spacing).all()
-        names = ("row_spacing_mm", "column_pitch_mm") if is_sized else ()
-        values = {name: Value(mm, "PixelSpacing") for name, mm in zip(names, spacing, strict=False)}
+        spacing = _numbers(path, header, "PixelSpacing") if header.get("PixelSpacing") else []
+        sizes = zip(("row_spacing_mm", "column_pitch_mm"), spacing, strict=False)
+        values = {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
         return (slice(None), slice(None)), values
-    descriptions = [_region_words(path, region) for region in regions]
-    tissue = [i for i, region in enumerate(regions) if _kind(path, region) == _TISSUE]
-    if len(tissue) != 1:
-        listed = "; ".join(descriptions)
-        raise InvalidInputError(f"{path}: expected one region of 2-D tissue, got {len(tissue)} of {listed}")
-    (i,) = tissue
-    left, top, right, bottom = _corners(path, regions[i])
-    width, height = (int(_number(path, header, name)) for name in ("Columns", "Rows"))
+    kinds = [_numbers(path, one, "RegionSpatialFormat", "RegionDataType") for one in regions]
+    corners = [
+        [
+            int(_numbers(path, one, f"RegionLocation{name}")[0])
+            for name in ("MinX0", "MinY0", "MaxX1", "MaxY1")
+        ]
+        for one in regions
+    ]
+    words = [
+        ("2-D tissue" if kind == _TISSUE else "RegionSpatialFormat {:g}, RegionDataType {:g}".format(*kind))
+        + " (columns {0} to {2}, rows {1} to {3})".format(*corner)
+        for kind, corner in zip(kinds, corners, strict=True)
+    ]
+    if kinds.count(_TISSUE) != 1:
+        listed = "; ".join(words)
+        raise InvalidInputError(
+            f"{path}: expected one region of 2-D tissue, got {kinds.count(_TISSUE)} of {listed}"
+        )
+    i = kinds.index(_TISSUE)
+    left, top, right, bottom = corners[i]
+    width, height = _numbers(path, header, "Columns", "Rows")
     if not (0 <= left < right < width and 0 <= top < bottom < height):
         raise InvalidInputError(
-            f"{path}: expected a region within {width} x {height} pixels, got {descriptions[i]}"
+            f"{path}: expected a region within {width:g} x {height:g} pixels, got {words[i]}"
         )
-    units, (x_cm, y_cm) = (
-        tuple(_number(path, regions[i], name.format(axis)) for axis in "XY")
-        for name in ("PhysicalUnits{}Direction", "PhysicalDelta{}")
-    )
+    units = _numbers(path, regions[i], "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
+    x_cm, y_cm = _numbers(path, regions[i], "PhysicalDeltaX", "PhysicalDeltaY")
     if units != _CM or not x_cm * y_cm:
         raise InvalidInputError(
             f"{path}: PhysicalUnits and PhysicalDelta of X and Y: expected units 3 and 3 (cm) and steps "
@@ -206,43 +206,26 @@ def _place(path: Path, header: Any, rows: list[Row]) -> tuple[tuple[slice, slice
         "row_spacing_mm": Value(10.0 * abs(y_cm), "PhysicalDeltaY"),
     }
     reference = ("ReferencePixelY0", "ReferencePixelPhysicalValueY")
-    if None not in map(regions[i].get, reference):
-        pixel, value_cm = (_number(path, regions[i], name) for name in reference)
+    if all(name in regions[i] for name in reference):
+        pixel, value_cm = _numbers(path, regions[i], *reference)
         # The first row taken is the region's last where y falls.
         depth_mm = 10.0 * (value_cm + ((bottom - top if y_cm < 0 else 0) - pixel) * y_cm)
         values["first_sample_depth_mm"] = Value(depth_mm, "ReferencePixelY0 and its physical value")
-    rows.append(("region read", descriptions[i], ""))
-    rows += [("region left out", other, "") for k, other in enumerate(descriptions) if k != i]
+    rows.append(("region read", words[i], ""))
+    rows += [("region left out", other, "") for k, other in enumerate(words) if k != i]
     if x_cm < 0:
         rows.append(("columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""))
+    depths = slice(top, bottom + 1)
     if y_cm < 0:
         rows.append(("rows", "turned over: the file's y falls (PhysicalDeltaY below 0)", ""))
-        return (slice(bottom, top - 1 if top else None, -1), slice(left, right + 1)), values
-    return (slice(top, bottom + 1), slice(left, right + 1)), values
-
-
-def _corners(path: Path, region: Any) -> list[int]:
-    """First column and row, last column and row."""
-    names = ("MinX0", "MinY0", "MaxX1", "MaxY1")
-    return [int(_number(path, region, f"RegionLocation{name}")) for name in names]
-
-
-def _kind(path: Path, region: Any) -> tuple[int, int]:
-    spatial, data = (_number(path, region, name) for name in ("RegionSpatialFormat", "RegionDataType"))
-    return int(spatial), int(data)
-
-
-def _region_words(path: Path, region: Any) -> str:
-    (left, top, right, bottom), kind = _corners(path, region), _kind(path, region)
-    what = "2-D tissue" if kind == _TISSUE else "RegionSpatialFormat {}, RegionDataType {}".format(*kind)
-    return f"{what} (columns {left} to {right}, rows {top} to {bottom})"
+        depths = slice(bottom, top - 1 if top else None, -1)
+    return (depths, slice(left, right + 1)), values
 
 
 def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str, ...]]:
     """Times of the frames where each has its own, else their rate; and what contradicts."""
     with _reading("frame times"):
-        vector = header.get("FrameTimeVector")
-        steps = np.atleast_1d(np.asarray([] if vector is None else vector, dtype=float))
+        steps = np.ravel(np.asarray(header.get("FrameTimeVector") or [], dtype=float))
         numbers = {name: float(header.get(name) or 0.0) for name in _RATES}
     numbers["FrameTime"] = 1e3 / numbers["FrameTime"] if numbers["FrameTime"] else 0.0
     said = [(name, rate) for name, rate in numbers.items() if 0 < rate < np.inf]
@@ -257,37 +240,19 @@ def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str
     return np.cumsum([0.0, *steps]) / 1e3, rate, ()
 
 
-def _grey(image: npt.NDArray[Any], spread: int) -> npt.NDArray[np.uint8]:
-    """Grey levels of an image, refused where a pixel has a colour."""
-    if image.ndim == 2:
-        return image
-    coloured = np.ptp(image.astype(np.int16), axis=2) > spread
-    if coloured.any():
-        row, column = np.argwhere(coloured)[0]
-        raise InvalidInputError(
-            f"expected grey, got {int(coloured.sum())} pixels of a colour, the first at column {column}, "
-            f"row {row} of the region: colour Doppler or an overlay"
-        )
-    return np.asarray(np.rint(image.mean(axis=2)), dtype=np.uint8)
-
-
-def _text(header: Any, name: str) -> str:
-    """Words of an element, as they may be shown; none where there is no such element."""
-    value = header.get(name)
-    words = [value] if value is None or isinstance(value, str) else np.ravel(value)
-    return printable(" ".join(str(word) for word in words if word is not None)).strip()
-
-
-def _number(where: object, item: Any, name: str, default: float | None = None) -> float:
-    """Number of an element; `default` where there is no such element, unless that is None."""
-    value = item.get(name)
-    try:
-        number = float(value) if value is not None or default is None else default
-    except (TypeError, ValueError):
-        number = np.nan
-    if not np.isfinite(number):
-        raise InvalidInputError(f"{where}: {name}: expected a number, got {printable(str(value))}")
-    return number
+def _numbers(where: object, item: Any, *names: str) -> list[float]:
+    """Finite numbers of elements, or of the one element named, as many as it has."""
+    found = list[float]()
+    for name in names:
+        try:
+            found += np.ravel(np.asarray(item.get(name), dtype=float)).tolist()
+        except (TypeError, ValueError):
+            found.append(np.nan)
+        if not np.isfinite(found).all():
+            raise InvalidInputError(
+                f"{where}: {name}: expected numbers, got {printable(str(item.get(name)))}"
+            )
+    return found
 
 
 READER = Reader(FORMAT, lambda _, start: start[_MARK_BYTE:].startswith(_MARK), open_dicom)
