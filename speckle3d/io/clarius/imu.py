@@ -31,6 +31,7 @@ References
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -116,20 +117,15 @@ class SensorSamples:
 
     def rows(self) -> list[Row]:
         """Tell what the sensor recorded, and whether its quaternion agrees with gravity."""
-        fit = self.fit
-        rows = [
-            ("sensor samples", str(self.time_s.size), ""),
-            ("sensor, longest pause", f"{np.diff(self.time_s).max(initial=0.0):.3f}", "s"),
-            ("accelerometer, median norm", f"{_norm(self.accelerometer_g):.3f}", "g"),
-        ]
-        if fit is None:
+        rows = [("sensor, longest pause", f"{np.diff(self.time_s).max(initial=0.0):.3f}", "s")]
+        if self.fit is None:
             words = "none in the file" if self.quaternion is None else "none that agrees with gravity"
             return [*rows, ("quaternion", f"{words}: see `speckle3d imu orient`", "")]
-        sign = "specific force" if fit.vertical > 0 else "gravity (against the world's z): negated"
+        sign = "specific force" if self.fit.vertical > 0 else "gravity (against the world's z): negated"
         return [
             *rows,
             ("quaternion", f"{MEANING} (checked against the accelerometer)", ""),
-            ("quaternion, off the vertical", f"{fit.off_vertical_deg:.2f}", "deg RMS"),
+            ("quaternion, off the vertical", f"{self.fit.off_vertical_deg:.2f}", "deg RMS"),
             ("accelerometer taken as", sign, ""),
         ]
 
@@ -163,38 +159,31 @@ def read_samples(member: Member) -> SensorSamples:
     """
     documents = [text for text in re.split(r"^---.*$", member.text(), flags=re.MULTILINE) if text.strip()]
     table, stamps = np.full((len(documents), 13), np.nan), np.full(len(documents), np.nan)
-    faults, before = [""] * len(documents), np.zeros(13)
     for i, text in enumerate(documents):
-        try:
+        # What cannot be read stays without a time or a value.
+        with suppress(InvalidInputError, ValueError, TypeError, LookupError, AttributeError):
             fields = parsed(text, member.where)
             turn = fields.get("orientation") or {}
             values = [fields.get(name) for name in _NAMES] + [turn.get(f"q{k}") for k in range(4)]
             table[i] = [float(value or "nan") for value in values]
             stamps[i] = int(fields["timestamp"]) / 1e9
-        except (InvalidInputError, ValueError, TypeError, LookupError, AttributeError):
-            faults[i] = "that cannot be read"
     wanted = np.isfinite(table).mean(axis=0) > 0.5  # a magnetometer and a quaternion are in some files alone
     table[:, ~wanted] = 0.0
     sound = np.isfinite(table).all(axis=1)
     if wanted[9:].all():
         sound &= np.abs(np.linalg.norm(table[:, 9:], axis=1) - 1.0) < RIGID_TOLERANCE
-    for i in [i for i, fault in enumerate(faults) if not fault]:
-        if not sound[i]:
-            faults[i] = "without a value, or a quaternion of unit length"
-        elif np.array_equal(table[i], before):
-            faults[i] = "with the values of the one before"
-        else:
-            before = table[i]
-    rows, remarks = usable("samples of the sensor", stamps, faults)
+    faults = np.where(sound, "", "without a value, or a quaternion of unit length").astype(object)
+    repeats = np.flatnonzero(sound)[1:][(np.diff(table[sound], axis=0) == 0).all(axis=1)]
+    faults[repeats] = "with the values of the one before"
+    rows, remarks = usable("samples of the sensor", stamps, faults.tolist())
     if not rows.size or not wanted[:6].all():
         raise InvalidInputError(f"{member.where}: expected samples of the sensor, got none of use")
     accelerometer, gyroscope, magnetometer, quaternion = np.split(table[rows], [3, 6, 9], axis=1)
-    norm_g = _norm(accelerometer)
+    norm_g = float(np.median(np.linalg.norm(accelerometer, axis=1)))
     if not _LEAST_G <= norm_g <= _MOST_G:
-        guess = " (in m/s^2?)" if _LEAST_G <= norm_g / G_M_S2 <= _MOST_G else ""
         remarks.append(
             f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale "
-            f"is another than assumed{guess}"
+            "is another than assumed"
         )
     return SensorSamples(
         stamps[rows],
@@ -204,7 +193,3 @@ def read_samples(member: Member) -> SensorSamples:
         quaternion if wanted[9:].all() else None,
         tuple(remarks),
     )
-
-
-def _norm(vectors: FloatArray) -> float:
-    return float(np.median(np.linalg.norm(vectors, axis=1)))

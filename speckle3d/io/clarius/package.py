@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 import tarfile
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,16 +18,14 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import open_regular
 from speckle3d.io.hdf5 import reading
 
-_NAME = re.compile(
-    r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<what>raw|tgc|ya?ml)(?:(?<=raw)\.lzo|(?<=tgc)\.yml)?"
-)
-_FIELD = re.compile(rb"^(?:# raw data parameters|# tgc curves|sampling rate:|size:|timestamp:)", re.MULTILINE)
+_NAME = re.compile(r"(?!\.)(?:(?P<name>.*)_)?(?P<kind>rf|iq|env|imu)\.(?P<what>raw|ya?ml)(?:(?<=raw)\.lzo)?")
+_FIELD = re.compile(rb"^(?:# raw data parameters|sampling rate:|size:|timestamp:)", re.MULTILINE)
 _START_BYTES = 4096
 
 
 @dataclass(frozen=True)
 class Member:
-    """A run of bytes in a file: all of it, or a member of a tar file.
+    """A file of a package: a file on disk, or a run of bytes of a tar file.
 
     Attributes
     ----------
@@ -42,8 +39,8 @@ class Member:
         Folder and name of the recording that it is of.
     kind : str
         rf, iq, env or imu.
-    what : str
-        raw, yml or tgc.
+    is_raw : bool
+        Whether it holds samples, and no description (yml).
     """
 
     path: Path
@@ -52,7 +49,7 @@ class Member:
     size: int
     recording: tuple[str, str] = ("", "")
     kind: str = ""
-    what: str = ""
+    is_raw: bool = False
 
     @property
     def where(self) -> str:
@@ -62,14 +59,13 @@ class Member:
     @property
     def is_own(self) -> bool:
         """Whether the scanner wrote it, unlike others' ``my_env.yml``."""
-        return self.what == "raw" or _FIELD.search(self.read(0, _START_BYTES)) is not None
+        return self.is_raw or _FIELD.search(self.read(_START_BYTES)) is not None
 
-    def read(self, start: int = 0, size: int | None = None) -> bytes:
-        """Read bytes from `start` on, all by default; fewer where the member ends."""
-        left = max(self.size - start, 0)
+    def read(self, most: int | None = None) -> bytes:
+        """Read all bytes, or the first ones."""
         with open_regular(self.path) as stream:
-            stream.seek(self.start + start)
-            return stream.read(left if size is None else min(size, left))
+            stream.seek(self.start)
+            return stream.read(self.size if most is None else min(self.size, most))
 
     def text(self) -> str:
         """All of it as text in UTF-8."""
@@ -79,7 +75,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Files:
-    """Files of one recording.
+    """Files of one recording: raw samples and descriptions by their kind.
 
     Attributes
     ----------
@@ -87,17 +83,12 @@ class Files:
         As it was given.
     name : str
         What the names of all its files begin with; a time stamp.
-    members : mapping of (str, str) to Member
-        By kind and content.
     """
 
     path: Path
     name: str
-    members: Mapping[tuple[str, str], Member]
-
-    def of(self, what: str) -> dict[str, Member]:
-        """Files of raw samples, descriptions (yml) or gains (tgc) by kind."""
-        return {kind: member for (kind, held), member in self.members.items() if held == what}
+    raw: dict[str, Member]
+    yml: dict[str, Member]
 
 
 def is_package(path: Path, start: bytes) -> bool:
@@ -105,10 +96,8 @@ def is_package(path: Path, start: bytes) -> bool:
     try:
         if path.is_file() and (match := _NAME.fullmatch(path.name)):
             members = _members(path)
-            described = any((one.kind, one.what) == (match["kind"], "yml") for one in members)
-            return any(one.path == path and one.is_own for one in members) and (
-                match["what"] != "raw" or described
-            )
+            is_described = any(one.kind == match["kind"] and not one.is_raw for one in members)
+            return is_described and any(one.path == path and one.is_own for one in members)
         if path.is_dir() or path.suffix.lower() == ".tar" or start[257:262] == b"ustar":
             return any(member.is_own for member in _members(path))
     except (OSError, ValueError):
@@ -122,7 +111,7 @@ def find_files(path: Path) -> Files:
     Parameters
     ----------
     path : path
-        A tar file, a folder, or a raw file or sidecar: then that kind alone, with all gains and the sensor's.
+        A tar file, a folder, or a raw file or sidecar: then that kind alone, and the sensor's.
 
     Raises
     ------
@@ -140,38 +129,36 @@ def find_files(path: Path) -> Files:
             f"{len(own)}: {names}: give the raw file of one (of a tar file: unpack it first)"
         )
     (recording,) = own
-    roles = {(one.kind, one.what): one for one in members if one.recording == recording}
-    return Files(path, recording[1], roles)
+    raw, yml = (
+        {one.kind: one for one in members if one.recording == recording and one.is_raw == is_raw}
+        for is_raw in (True, False)
+    )
+    return Files(path, recording[1], raw, yml)
 
 
 def _members(path: Path) -> list[Member]:
-    if path.is_dir():
-        with reading(path):
-            return _named((file, file.name, 0, file.stat().st_size) for file in sorted(path.iterdir()))
-    if (match := _NAME.fullmatch(path.name)) is None:
-        return _named((path, *entry) for entry in _tar_entries(path))
-    kinds = {"rf", "iq", "env", "imu"} if match["kind"] == "imu" else {match["kind"], "imu"}
-    return [
-        member
-        for member in _members(path.parent)
-        if member.recording[1] == (match["name"] or "") and (member.kind in kinds or member.what == "tgc")
-    ]
-
-
-def _named(places: Iterable[tuple[Path, str, int, int]]) -> list[Member]:
-    """Members of the places whose names are those of a package."""
+    """Files of a folder or a tar file with the names of a package's; of a file, those of its recording."""
+    match = None if path.is_dir() else _NAME.fullmatch(path.name)
+    if match is not None:
+        kinds = {"rf", "iq", "env", "imu"} if match["kind"] == "imu" else {match["kind"], "imu"}
+        siblings = _members(path.parent)
+        return [one for one in siblings if one.recording[1] == (match["name"] or "") and one.kind in kinds]
     members = []
-    for path, name, start, size in places:
+    with reading(path):
+        if path.is_dir():
+            places = [(file, file.name, 0, file.stat().st_size) for file in sorted(path.iterdir())]
+        else:
+            places = [(path, *entry) for entry in _tar_entries(path)]
+    for file, name, start, size in places:
         if match := _NAME.fullmatch(Path(name).name):
             recording = str(Path(name).parent), match["name"] or ""
-            what = match["what"].replace("yaml", "yml")
-            members.append(Member(path, name, start, size, recording, match["kind"], what))
+            members.append(Member(file, name, start, size, recording, match["kind"], match["what"] == "raw"))
     return members
 
 
 def _tar_entries(path: Path) -> list[tuple[str, int, int]]:
     """Name, first byte and size of each file in a tar file."""
-    with reading(path), open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
+    with open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
         entries = [(one.name, one.offset_data, one.size) for one in archive if one.isfile()]
         length = stream.seek(0, 2)
     for name, start, size in entries:

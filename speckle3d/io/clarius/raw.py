@@ -2,7 +2,7 @@
 
 Header: five uint32 (id, frames, lines, samples of a line, bytes of a sample); then, by frame, a uint64 time
 in nanoseconds and its samples, line by line; all little-endian [1]_. They may be packed by the program lzop,
-whose blocks are unpacked by lzallright when they are asked for [2]_.
+whose blocks lzallright unpacks [2]_: a packed file is held unpacked in memory while its frames are read.
 
 References
 ----------
@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from bisect import bisect
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -32,12 +30,9 @@ from speckle3d.io.frames import ReadFrame
 from speckle3d.io.hdf5 import reading
 
 HEADER = struct.Struct("<5I")
-_TIME_BYTES = 8
 _MAGIC = b"\x89LZO\x00\r\n\x1a\n"
-_KEPT_BLOCKS = 8
-
-_SAMPLES = {"RF": ("<i2", 1), "IQ": ("<i2", 2), "envelope": ("u1", 1)}
-"""By kind: type of the numbers in the file, and how many make a sample."""
+_SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelope": ("u1", 1, np.uint8)}
+"""By kind: type of the numbers in the file, how many make a sample, and type of the samples."""
 
 
 @dataclass(frozen=True)
@@ -62,16 +57,6 @@ class ClariusFile:
     turns: ComplexArray | None = None
 
     @property
-    def sample_bytes(self) -> int:
-        """Bytes of a sample."""
-        dtype, parts = _SAMPLES[self.kind]
-        return np.dtype(dtype).itemsize * parts
-
-    def place(self, i: int) -> int:
-        """Byte at which frame i, its time first, begins."""
-        return HEADER.size + i * (_TIME_BYTES + self.lines * self.samples * self.sample_bytes)
-
-    @property
     def shape(self) -> tuple[int, int, int]:
         """Shape (frame, vector, sample)."""
         lines, samples = self.kept
@@ -80,102 +65,89 @@ class ClariusFile:
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the frames."""
-        if self.kind == "IQ":
-            return np.dtype(np.complex64)
-        return np.dtype(np.uint8 if self.kind == "envelope" else np.int16)
+        return np.dtype(_SAMPLES[self.kind][2])
+
+    def records(self) -> npt.NDArray[Any]:
+        """Frames as they lie in the file: ``time`` in ns and ``samples``, shape (line, sample, part).
+
+        Raises
+        ------
+        FileError
+            If the file ends early.
+        """
+        dtype, parts, _ = _SAMPLES[self.kind]
+        member, packed = self.member, unpacked(self.member)
+        with reading(member.where):  # of more samples than memory has places for
+            record = np.dtype([("time", "<u8"), ("samples", dtype, (self.lines, self.samples, parts))])
+        size = member.size if packed is None else len(packed)
+        whole = (size - HEADER.size) // record.itemsize
+        if whole < self.frames:
+            raise FileError(f"{member.where}: ends early: {whole} of {self.frames} frames")
+        if packed is not None:
+            return np.frombuffer(packed, record, self.frames, HEADER.size)
+        return np.memmap(member.path, record, "r", member.start + HEADER.size, (self.frames,))
 
     def __call__(self) -> ReadFrame:
-        """Open the file."""
-        read = open_bytes(self.member)
-        dtype, parts = _SAMPLES[self.kind]
+        """Map or unpack the file."""
+        samples = self.records()["samples"]
 
         def frame(i: int) -> npt.NDArray[Any]:
-            start = self.place(i) + _TIME_BYTES
-            content = read(start, self.place(i + 1) - start)
-            kept: Any = np.frombuffer(content, dtype).reshape(self.lines, self.samples, parts)[self.kept]
-            kept = kept.astype(np.float32).view(np.complex64)[..., 0] if parts == 2 else kept[..., 0]
-            return np.asarray(kept if self.turns is None else kept * self.turns)
+            part: Any = samples[i][self.kept]
+            pairs = part.astype(np.float32).view(np.complex64) if self.kind == "IQ" else part
+            return np.asarray(pairs[..., 0] if self.turns is None else pairs[..., 0] * self.turns)
 
         return frame
 
 
-def open_bytes(member: Member) -> Callable[[int, int], bytes]:
-    """Open a raw file, packed or not; the function reads bytes from a place on, fewer where they end."""
-    return _Unpacker(member).read if member.name.endswith(".lzo") else member.read
-
-
-def read_header(member: Member, said: Description) -> tuple[ClariusFile, npt.NDArray[np.int64]]:
-    """Read the header and the time of every frame, nanoseconds of the scanner's clock.
+def read_header(member: Member, said: Description) -> ClariusFile:
+    """Read the header of a raw file.
 
     Raises
     ------
-    FileError
-        If the file ends early.
     InvalidInputError
-        If the header contradicts the yml.
+        If it contradicts the yml.
     """
-    read, where = open_bytes(member), member.where
-    head = read(0, HEADER.size)
-    if len(head) < HEADER.size:
-        raise FileError(f"{where}: expected a header of {HEADER.size} bytes, got {len(head)}")
-    file = ClariusFile(member, said.kind, said.whole("frames"), said.lines, said.samples)
-    size_bytes = said.below("size").whole("sample size", "bytes")
-    expected = (file.frames, file.lines, file.samples, size_bytes)
+    packed = unpacked(member)
+    head = (member.read(HEADER.size) if packed is None else packed[: HEADER.size]).ljust(HEADER.size, b"\0")
+    dtype, parts, _ = _SAMPLES[said.kind]
+    expected = (int(said.number("frames")), said.lines, said.samples, parts * np.dtype(dtype).itemsize)
     got = HEADER.unpack(head)[1:]
-    if got != expected or size_bytes != file.sample_bytes or 0 in got:
+    if got != expected or 0 in got:
         raise InvalidInputError(
-            f"{where}: header: expected frames, lines, samples and bytes of a sample of {said.kind} "
-            f"({file.sample_bytes}) as in the yml, {expected}, got {got}"
+            f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {said.kind} "
+            f"as in the yml, {expected}, got {got}"
         )
-    whole = sum(len(read(file.place(i + 1) - 1, 1)) for i in range(file.frames))
-    if whole < file.frames:
-        raise FileError(f"{where}: ends early: {whole} of {file.frames} frames")
-    stamps = b"".join(read(file.place(i), _TIME_BYTES) for i in range(file.frames))
-    return file, np.frombuffer(stamps, dtype="<u8").astype(np.int64)
+    return ClariusFile(member, said.kind, *got[:3])
 
 
-class _Unpacker:
-    """Reads runs of bytes of a file of lzop; the blocks last used are kept."""
+def unpacked(member: Member) -> bytes | None:
+    """Content of a file packed by lzop; None of another."""
+    if not member.name.endswith(".lzo"):
+        return None
+    with reading(member.where):
+        return _unpacked(member, member.path.stat().st_mtime_ns)
 
-    def __init__(self, member: Member) -> None:
-        self._member = member
-        self._lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)").LZOCompressor
-        head, at = member.read(0, 1024), len(_MAGIC)
-        if not head.startswith(_MAGIC):
-            raise FileError(f"{member.where}: expected a file of lzop (.lzo), got another")
-        with reading(member.where):
-            is_newer = struct.unpack_from(">H", head, at)[0] >= 0x0940
-            at += 8 if is_newer else 5
-            (flags,) = struct.unpack_from(">I", head, at)
-            at += 4 + (4 if flags & 0x800 else 0) + (12 if is_newer else 8)
-            at += 1 + head[at] + 4
-        plain, packs = (sum(bool(flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
-        self._check = zlib.adler32 if flags & 0x1 else zlib.crc32 if flags & 0x100 else None
-        self._firsts, self._blocks, first = list[int](), list[tuple[int, int, int, int]](), 0
-        while any((lengths := member.read(at, 12).ljust(12, b"\0"))[:4]):
-            unpacked, packed, check = struct.unpack(">III", lengths)
-            at += 8 + 4 * (plain + (packs if packed < unpacked else 0))  # behind the check sums
-            self._firsts.append(first)
-            self._blocks.append((at, packed, unpacked, check))
-            first, at = first + unpacked, at + packed
-        self._block = lru_cache(_KEPT_BLOCKS)(self._unpacked)
 
-    def read(self, start: int, size: int) -> bytes:
-        """Unpack bytes from `start` on, fewer where they end."""
-        parts, at = [], start
-        for k in range(max(bisect(self._firsts, start) - 1, 0), len(self._blocks)):
-            first = self._firsts[k]
-            if first >= start + size:
-                break
-            parts.append(self._block(k)[at - first : start + size - first])
-            at += len(parts[-1])
-        return b"".join(parts)
-
-    def _unpacked(self, k: int) -> bytes:
-        place, packed, unpacked, check = self._blocks[k]
-        content = self._member.read(place, packed)
-        with reading(f"{self._member.where}: block {k}", Exception):
-            plain = content if packed == unpacked else bytes(self._lzo.decompress(content, unpacked))
-            if self._check is not None and self._check(plain) != check:
+@lru_cache(1)
+def _unpacked(member: Member, _: int) -> bytes:
+    lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)").LZOCompressor
+    content, at, parts = member.read(), len(_MAGIC), list[bytes]()
+    if not content.startswith(_MAGIC):
+        raise FileError(f"{member.where}: expected a file of lzop (.lzo), got another")
+    is_newer = struct.unpack_from(">H", content, at)[0] >= 0x0940
+    at += 8 if is_newer else 5
+    (flags,) = struct.unpack_from(">I", content, at)
+    at += 4 + (4 if flags & 0x800 else 0) + (12 if is_newer else 8)
+    at += 1 + content[at] + 4
+    plain, packs = (sum(bool(flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
+    check = zlib.adler32 if flags & 0x1 else zlib.crc32
+    while any((lengths := content[at : at + 12].ljust(12, b"\0"))[:4]):
+        unpacked_size, size, said = struct.unpack(">III", lengths)
+        at += 8 + 4 * (plain + (packs if size < unpacked_size else 0))  # behind the check sums
+        with reading(f"{member.where}: block {len(parts)}", Exception):
+            part = content[at : at + size]
+            parts.append(part if size == unpacked_size else bytes(lzo.decompress(part, unpacked_size)))
+            if plain and check(parts[-1]) != said:
                 raise ValueError("damaged: its check sum is another")
-        return plain
+        at += size
+    return b"".join(parts)

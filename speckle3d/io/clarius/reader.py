@@ -27,11 +27,10 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+from scipy.integrate import cumulative_trapezoid
 
 from speckle3d.core.arrays import ComplexArray, FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -39,7 +38,7 @@ from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import Files, find_files
 from speckle3d.io.clarius.raw import ClariusFile, read_header
-from speckle3d.io.clarius.sidecars import Description, read_gains
+from speckle3d.io.clarius.sidecars import Description
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
@@ -66,8 +65,19 @@ _OWN = "its yml"
 
 def open_package(path: Path, settings: ImportSettings) -> Recording:
     """Read a package: RF is preferred, else I/Q, else the envelope. Times are of the scanner's clock."""
-    package = Package(find_files(path), settings)
-    return Recording.of(path, settings, package.rows(), package.recording)
+    files = find_files(path)
+    rows: list[Row] = [("recording", printable(files.name) or "without a name", "")]
+    sensor, lost = None, list[str]()
+    try:
+        sensor = _sensor(files)
+        rows += [] if sensor is None else sensor.rows()
+    except (InvalidInputError, FileError) as error:
+        lost.append(f"the sensor is left out: {error}")
+    for kind, member in files.yml.items():
+        with suppress(InvalidInputError, FileError):  # which is told where the sweep is
+            said = Description(member)
+            rows += [(f"{kind}: {name}", said.text(name), "") for name in _SAID if said.text(name)]
+    return Recording.of(path, settings, rows, lambda: _recording(files, settings, sensor, lost, rows))
 
 
 def sensor_of(path: Path) -> SensorSamples:
@@ -78,307 +88,217 @@ def sensor_of(path: Path) -> SensorSamples:
     InvalidInputError
         If the package has no sensor, or its samples make no sense.
     """
-    sensor = Package(find_files(path), ImportSettings()).sensor
+    sensor = _sensor(find_files(path))
     if sensor is None:
         raise InvalidInputError(f"{path}: expected the sensor's samples (_imu.yml), got none")
     return sensor
 
 
+def _sensor(files: Files) -> SensorSamples | None:
+    return read_samples(files.yml["imu"]) if "imu" in files.yml else None
+
+
 def package_files(path: Path) -> Sequence[Path]:
     """Other files on disk that the sweep's content depends on."""
-    return sorted({member.path for member in find_files(path).members.values()} - {path})
+    files = find_files(path)
+    return sorted({member.path for member in (*files.raw.values(), *files.yml.values())} - {path})
 
 
-class Package:
-    """A package and the settings over it; each of its files is read once, when it is needed."""
+def _recording(
+    files: Files, settings: ImportSettings, sensor: SensorSamples | None, remarks: list[str], rows: list[Row]
+) -> Recording:
+    """What a package holds, as a recording."""
+    said, kind = _chosen(files)
+    rows.append(("sweep is made from", kind, ""))
+    others = [member.name for other, member in files.raw.items() if other != kind]
+    file = read_header(files.raw[kind], said)
+    file = replace(file, kept=_kept(file, said))
+    element, per_line = _place(said, file, others)
+    rows.append(("first line at element", f"{element:g}, taken as the image's left", ""))
+    probe = settings.probe or said.probe
+    pitch = _pitch(said, per_line, settings)
+    spreading = _spreading(said, file, element, per_line, pitch, probe)
 
-    def __init__(self, files: Files, settings: ImportSettings) -> None:
-        self.files, self.settings, self.raw = files, settings, files.of("raw")
-
-    @cached_property
-    def descriptions(self) -> dict[str, Description]:
-        """What the yml files say, by kind."""
-        members = self.files.of("yml")
-        return {kind: Description.of(member) for kind, member in members.items() if kind != "imu"}
-
-    @cached_property
-    def chosen(self) -> str:
-        """Kind of the raw file that becomes the sweep."""
-        if not self.raw:
-            raise InvalidInputError(
-                f"{self.files.path}: expected a raw file (as {self.files.name}_rf.raw), got sidecars alone: "
-                "they describe frames that are not there"
+    own_rate_hz = said.number("sampling rate", unit="Hz")
+    own_speed = said.optional("vsound", unit="m/s") or said.optional("speed of sound", unit="m/s")
+    rate_hz = settings.sampling_rate_hz or own_rate_hz
+    spacing_mm = 1e3 * (settings.speed_of_sound_m_s or own_speed or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
+    own_first_mm = _first_mm(said, file, rate_hz, spacing_mm)
+    first_mm = settings.first_sample_depth_mm if own_first_mm is None else own_first_mm
+    depths_mm = (first_mm or 0.0) + spacing_mm * np.arange(file.shape[2])
+    centre_hz = said.optional("transmit frequency", unit="Hz")
+    values = {
+        "first_sample_depth_mm": Value(
+            own_first_mm, "delay samples, less 1 us before depth 0 (assumed)", _OWN
+        ),
+        "vector_pitch_mm": pitch,
+        "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz", _OWN),
+        "sampling_rate_hz": Value(own_rate_hz, "", _OWN),
+        "centre_frequency_hz": Value(centre_hz, "transmit frequency", _OWN),
+        **spreading,
+    }
+    if own_speed is not None:
+        values["speed_of_sound_m_s"] = Value(own_speed, "", _OWN)
+    shift_hz, given_hz = None, settings.demodulation_frequency_hz
+    if said.kind == "IQ" and (receive := said.receive) is not None:
+        shallow_hz, deep_hz, filter_mm = receive
+        slid_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
+        shift_hz = float(np.interp(depths_mm[[0, -1]].mean(), [0.0, filter_mm], [shallow_hz, deep_hz]))
+        if shallow_hz != deep_hz and given_hz is None:
+            file = replace(file, turns=_turns(slid_hz - shift_hz, rate_hz))
+            remarks.append(
+                f"demodulation frequency from its yml: {shallow_hz / 1e6:g} to {deep_hz / 1e6:g} MHz over "
+                f"{filter_mm:g} mm, turned to that of the line's middle"
             )
-        for kind, member in self.raw.items():
-            if kind not in self.descriptions:
-                raise InvalidInputError(f"{member.where}: expected its yml beside it, got none")
-        return min(self.raw, key=lambda kind: _ORDER.index(self.descriptions[kind].kind))
-
-    @cached_property
-    def said(self) -> Description:
-        """What the yml of the sweep's raw file says."""
-        return self.descriptions[self.chosen]
-
-    @cached_property
-    def header(self) -> tuple[ClariusFile, npt.NDArray[np.int64]]:
-        """The raw file, and times of its frames in nanoseconds."""
-        return read_header(self.raw[self.chosen], self.said)
-
-    @cached_property
-    def sensor(self) -> SensorSamples | None:
-        """The sensor's samples."""
-        member = self.files.members.get(("imu", "yml"))
-        return None if member is None else read_samples(member)
-
-    @cached_property
-    def kept(self) -> tuple[slice, slice]:
-        """Lines and samples kept: the region of interest, if there is nothing beside it in three frames."""
-        whole, region = (slice(0, self.said.lines), slice(0, self.said.samples)), self.said.region
-        if region is None:
-            return whole
-        file = self.header[0]
-        for i in {0, file.frames // 2, file.frames - 1}:
-            frame = np.array(file()(i))
-            frame[region] = 0
-            if frame.any():
-                return whole
-        return region
-
-    @cached_property
-    def place(self) -> tuple[float, float]:
-        """Place of the first kept line in the array, and the distance between lines, in elements.
-
-        Raises
-        ------
-        InvalidInputError
-            Naming the line that is steered, unevenly spaced or repeated.
-        """
-        said = self.said
-        others = [member.name for kind, member in self.raw.items() if kind != self.chosen]
-        advice = f"; or give another of its raw files: {', '.join(others)}" if others else ""
-        elements, angle_deg = said.places.T
-        if (steered := np.flatnonzero(angle_deg)).size:
-            i = int(steered[0])
-            raise InvalidInputError(
-                f"{said.where}: lines[{i}]: angle: expected 0 (lines that are not steered), got "
-                f"{angle_deg[i]:g} deg, and {steered.size} of {said.lines} lines steered: record without "
-                f"steering and Doppler{advice}"
+    values["demodulation_frequency_hz"] = Value(shift_hz, "of the lines' middle", _OWN)
+    if sensor is not None:
+        remarks += sensor.remarks
+        if sensor.fit is None:
+            why = "is missing" if sensor.quaternion is None else "does not agree with gravity"
+            remarks.append(
+                f"the sensor's quaternion {why}: the sweep has no orientation, "
+                f"which `speckle3d imu orient {files.path} --into SWEEP.h5` finds"
             )
-        elements = elements[self.kept[0]]
-        try:
-            return float(elements[0]), step_of(elements, f"{said.where}: lines, rx element")
-        except InvalidInputError as error:
-            raise InvalidInputError(f"{error}: packets of a Doppler mode are no image{advice}") from error
-
-    @cached_property
-    def pitch(self) -> Value:
-        """Distance between lines at the array, mm: of the elements' as given, by the yml, or a table's."""
-        per_line, model = self.place[1], _model(self.settings.probe or self.said.probe)
-        pitches = {
-            "as given": self.settings.element_pitch_mm,
-            _OWN: self.said.of_probe("pitch"),
-            f"the maker's table, {model}": ELEMENT_PITCH_MM.get(model),
-        }
-        for source, element_mm in pitches.items():
-            if element_mm is not None:
-                words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
-                return Value(element_mm * per_line, words, _OWN)
-        return Value(self.settings.vector_pitch_mm, "--vector-pitch-mm")
-
-    @cached_property
-    def spreading(self) -> dict[str, Value]:
-        """Where the lines of a curved array lie; of a curved model without its radius, that it is lacking."""
-        radius_mm, named = self.said.of_probe("radius"), self.settings.probe or self.said.probe
-        if not radius_mm and not _model(named).startswith(CONVEX):
-            return {}
-        step_mm, lines = self.pitch.value, self.kept[0]
-        values = {"array_radius_mm": Value(radius_mm, "", _OWN), "line_angles_deg": Value()}
-        if radius_mm and step_mm is not None:
-            elements = self.said.below("probe").optional("elements")
-            first = -(len(self.said.places[lines]) - 1) / 2 * step_mm
-            if elements:
-                first = (self.place[0] - (elements - 1) / 2) * step_mm / self.place[1]
-            last = first + (len(self.said.places[lines]) - 1) * step_mm
-            angles = tuple(np.rad2deg([first / radius_mm, last / radius_mm]).tolist())
-            values["line_angles_deg"] = Value(angles, f"of lines {self.pitch.source}", _OWN)
-        return values
-
-    @cached_property
-    def file(self) -> ClariusFile:
-        """The kept part of the raw file."""
-        return replace(self.header[0], kept=self.kept, turns=self.turns)
-
-    @cached_property
-    def rate_hz(self) -> float:
-        """Sampling rate."""
-        return self.settings.sampling_rate_hz or self.said.number("sampling rate", "Hz", 1.0)
-
-    @cached_property
-    def speed_m_s(self) -> float | None:
-        """Speed of sound that the yml says."""
-        return self.said.optional("vsound", "m/s") or self.said.optional("speed of sound", "m/s")
-
-    @cached_property
-    def spacing_mm(self) -> float:
-        """Distance between samples."""
-        speed = self.settings.speed_of_sound_m_s or self.speed_m_s or SPEED_OF_SOUND_M_S
-        return 1e3 * speed / (2.0 * self.rate_hz)
-
-    @cached_property
-    def first_mm(self) -> float | None:
-        """Depth of the first kept sample as the scanner counts it; None where it is not said, or above 0.
-
-        Less than a sample above is 0: the delay is a whole number of samples.
-        """
-        if (delay := self.said.optional("delay samples")) is None:
-            return None
-        after = delay + self.kept[1].start - BEFORE_DEPTH_S * self.rate_hz
-        return max(after, 0.0) * self.spacing_mm if after > -1.0 else None
-
-    @cached_property
-    def depths_mm(self) -> FloatArray:
-        """Depth of each kept sample as the scanner counts it, or else as it is given."""
-        most_mm, first_mm = self.said.optional("imaging depth", "mm") or np.inf, self.first_mm
-        if first_mm is None or first_mm > most_mm:
-            first_mm = self.settings.first_sample_depth_mm or 0.0
-        count = self.kept[1].stop - self.kept[1].start
-        return np.asarray(first_mm + np.arange(count) * self.spacing_mm)
-
-    @cached_property
-    def shift_hz(self) -> float | None:
-        """Frequency that I/Q were shifted down by in the lines' middle; None of RF, or where not said."""
-        if self.said.kind != "IQ" or self.said.receive is None:
-            return None
-        return float(self.said.receive.at_hz(float(self.depths_mm[0] + self.depths_mm[-1]) / 2))
-
-    @cached_property
-    def turns(self) -> ComplexArray | None:
-        """Factors that make I/Q as if shifted down by one frequency, shape (sample,); None where they are.
-
-        The scanner's demodulation frequency falls along a straight line with depth, as from 11 to 8 MHz; a
-        sweep has one. Samples are turned as if the oscillator had stayed at that of the line's middle, which
-        takes the oscillator's phase to be the integral of its frequency: so it is where a frequency is swept,
-        but it is not documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths 10 %
-        off, and turned back 0.001 % from those of RF.
-        """
-        receive, shift = self.said.receive, self.shift_hz
-        if receive is None or shift is None or receive.shallow_hz == receive.deep_hz:
-            return None
-        if self.settings.demodulation_frequency_hz is not None:
-            return None
-        apart = receive.at_hz(self.depths_mm) - shift
-        cycles = np.concatenate([[0.0], np.cumsum((apart[1:] + apart[:-1]) / 2)]) / self.rate_hz
-        return np.asarray(np.exp(2j * np.pi * cycles))
-
-    @cached_property
-    def band_hz(self) -> tuple[float, float] | None:
-        """Band of the echoes; None of an envelope, where frequencies are not known, or if it is not clear."""
-        given, is_iq = self.settings, self.said.kind == "IQ"
-        centre = given.centre_frequency_hz or self.said.optional("transmit frequency", "Hz")
-        shift = self.shift_hz if given.demodulation_frequency_hz is None else given.demodulation_frequency_hz
-        if self.said.kind == "envelope" or not centre or (is_iq and shift is None):
-            return None
-        frames = FileFrames(self.files.path, self.file, self.file.shape, self.file.dtype)
-        return band_hz(frames, self.rate_hz, centre, shift if is_iq else None)
-
-    @cached_property
-    def gain_words(self) -> str:
-        """Whether all frames have one gain, by the files that tell: kinds see the same analogue gain."""
-        gains = {tuple(read_gains(member)) for member in self.files.of("tgc").values()}
-        if len({gain for of_frames in gains for gain in of_frames}) > 1:
-            return "gain differs between frames: left as it is, as patches are compared whatever their gain"
-        return "gain the same in all frames" if any(gains) else "gain not told: taken as the same"
-
-    def recording(self) -> Recording:
-        """What the package holds, as a recording."""
-        said, pitch, file = self.said, self.pitch, self.file
-        delay = "delay samples, less 1 us before depth 0 (assumed)"
-        centre_hz = said.optional("transmit frequency", "Hz")
-        values = {
-            "first_sample_depth_mm": Value(self.first_mm, delay, _OWN),
-            "vector_pitch_mm": pitch,
-            "row_spacing_mm": Value(self.spacing_mm, f"of {self.rate_hz / 1e6:g} MHz", _OWN),
-            "sampling_rate_hz": Value(said.number("sampling rate", "Hz", 1.0), "", _OWN),
-            "centre_frequency_hz": Value(centre_hz, "transmit frequency", _OWN),
-            "demodulation_frequency_hz": Value(self.shift_hz, "of the lines' middle", _OWN),
-        }
-        values |= self.spreading
-        if self.speed_m_s is not None:
-            values["speed_of_sound_m_s"] = Value(self.speed_m_s, "", _OWN)
-        remarks = self._remarks()
-        if self.settings.bandwidth_hz is None and (band := self.band_hz) is not None:
-            words = "measured at -6 dB in this recording"
-            values["bandwidth_hz"] = Value(band, words, "the spectrum")
+    narrow = np.int16 if said.kind == "IQ" and file.turns is None else None
+    frames = FileFrames(file.member.path, file, file.shape, file.dtype, narrow)
+    shift_hz = shift_hz if given_hz is None else given_hz
+    sent_hz = settings.centre_frequency_hz or centre_hz
+    is_known = said.kind == "RF" or (said.kind == "IQ" and shift_hz is not None)
+    if settings.bandwidth_hz is None and sent_hz and is_known:
+        band = band_hz(frames, rate_hz, sent_hz, shift_hz if said.kind == "IQ" else None)
+        if band is not None:
+            values["bandwidth_hz"] = Value(band, "measured at -6 dB in this recording", "the spectrum")
             remarks.append(
                 "the band is measured in this recording: recordings that share curves need "
                 f"--bandwidth-hz {band[0]:.4g} {band[1]:.4g}"
             )
-        narrow = np.int16 if said.kind == "IQ" and file.turns is None else None
-        asked = "element_pitch_mm" if self.settings.probe or said.probe else "probe"
-        return Recording(
-            self.files.path,
-            self.settings,
-            FileFrames(self.raw[self.chosen].path, file, file.shape, file.dtype, narrow),
-            values,
-            time_s=self.header[1] / 1e9,
-            orientation=None if self.sensor is None else self.sensor.orientation,
-            probe=_probe_name(self.settings.probe or said.probe),
-            name=self.files.name or self.files.path.stem,
-            asked=dict.fromkeys(("vector_pitch_mm", "column_pitch_mm"), asked),
-            assumptions=() if self.spreading else ("parallel lines of a linear array",),
-            remarks=tuple(remarks),
+    return Recording(
+        files.path,
+        settings,
+        frames,
+        values,
+        time_s=file.records()["time"] / 1e9,
+        orientation=None if sensor is None else sensor.orientation,
+        # In one spelling, so that curves and calibrations of a probe are found to be of it.
+        probe=f"Clarius {_model(probe)}" if _model(probe) in ELEMENT_PITCH_MM else probe,
+        name=files.name or files.path.stem,
+        asked=dict.fromkeys(("vector_pitch_mm", "column_pitch_mm"), "element_pitch_mm" if probe else "probe"),
+        assumptions=() if spreading else ("parallel lines of a linear array",),
+        remarks=tuple(remarks),
+    )
+
+
+def _chosen(files: Files) -> tuple[Description, str]:
+    """What the yml of the raw file says that becomes the sweep, and which that is."""
+    for member in files.raw.values():
+        if member.kind not in files.yml:
+            raise InvalidInputError(f"{member.where}: expected its yml beside it, got none")
+    if not files.raw:
+        raise InvalidInputError(
+            f"{files.path}: expected a raw file (as {files.name}_rf.raw), got sidecars alone: they describe "
+            "frames that are not there"
         )
+    said = {kind: Description(files.yml[kind]) for kind in files.raw}
+    kind = min(said, key=lambda kind: _ORDER.index(said[kind].kind))
+    return said[kind], kind
 
-    def _remarks(self) -> list[str]:
-        """What was turned, undone or is odd where the sweep is made."""
-        said, notes = self.said, list[str]()
-        if (receive := said.receive) is not None and self.turns is not None:
-            notes.append(
-                f"demodulation frequency from its yml: {receive.shallow_hz / 1e6:g} to "
-                f"{receive.deep_hz / 1e6:g} MHz over {receive.filter_depth_mm:g} mm, turned to that of the "
-                "line's middle"
-            )
-        if "differs" in self.gain_words:
-            notes.append(self.gain_words)
-        if self.sensor is not None:
-            notes += self.sensor.remarks
-            if self.sensor.fit is None:
-                why = "is missing" if self.sensor.quaternion is None else "does not agree with gravity"
-                notes.append(
-                    f"the sensor's quaternion {why}: the sweep has no orientation, "
-                    f"which `speckle3d imu orient {self.files.path} --into SWEEP.h5` finds"
-                )
-        return notes
 
-    def rows(self) -> list[Row]:
-        """Facts of the package, as far as they can be read."""
-        rows: list[Row] = [("recording", printable(self.files.name) or "without a name", "")]
-        with suppress(InvalidInputError, FileError):  # which is told where the sweep is
-            for kind, said in self.descriptions.items():
-                rows.append((f"{kind}: raw file", "yes" if kind in self.raw else "none", ""))
-                held = [name for name in _SAID if name in said.values]
-                rows += [(f"{kind}: {name}", printable(str(said.values[name]))[:60], "") for name in held]
-                rows.append((f"{kind}: lines x samples", f"{said.lines} x {said.samples}", ""))
-            rows.append(("sweep is made from", self.chosen, ""))
-            if (region := self.said.region) is not None:
-                outside = "empty, left out" if self.kept == region else "not empty, kept"
-                rows.append(("outside the region of interest", outside, ""))
-            rows += [
-                ("elements per line", f"{self.place[1]:.6g}", ""),
-                ("first line at element", f"{self.place[0]:g}, taken as the image's left", ""),
-                ("gain by frame", self.gain_words, ""),
-            ]
-        try:
-            rows += [] if self.sensor is None else self.sensor.rows()
-        except (InvalidInputError, FileError) as error:
-            rows.append(("sensor", f"cannot be told: {error}", ""))
-        return rows
+def _kept(file: ClariusFile, said: Description) -> tuple[slice, slice]:
+    """Lines and samples kept: the region of interest, if there is nothing beside it in three frames."""
+    whole, region = (slice(0, said.lines), slice(0, said.samples)), said.region
+    read = file()
+    for i in {0, file.frames // 2, file.frames - 1} if region is not None else ():
+        frame = np.array(read(i))
+        frame[region] = 0
+        if frame.any():
+            return whole
+    return region or whole
+
+
+def _place(said: Description, file: ClariusFile, others: list[str]) -> tuple[float, float]:
+    """Place of the first kept line in the array, and the distance between lines, in elements.
+
+    Raises
+    ------
+    InvalidInputError
+        Naming the line that is steered, unevenly spaced or repeated.
+    """
+    advice = f"; or give another of its raw files: {', '.join(others)}" if others else ""
+    elements, angle_deg = said.places.T
+    if (steered := np.flatnonzero(angle_deg)).size:
+        i = int(steered[0])
+        raise InvalidInputError(
+            f"{said.where}: lines[{i}]: angle: expected 0 (lines that are not steered), got "
+            f"{angle_deg[i]:g} deg, and {steered.size} of {said.lines} lines steered: record without "
+            f"steering and Doppler{advice}"
+        )
+    elements = elements[file.kept[0]]
+    try:
+        return float(elements[0]), step_of(elements, f"{said.where}: lines, rx element")
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{error}: packets of a Doppler mode are no image{advice}") from error
+
+
+def _pitch(said: Description, per_line: float, settings: ImportSettings) -> Value:
+    """Distance between lines at the array, mm: of the elements' as given, by the yml, or a table's."""
+    model = _model(settings.probe or said.probe)
+    pitches = {
+        "as given": settings.element_pitch_mm,
+        _OWN: _measure(said, "pitch"),
+        f"the maker's table, {model}": ELEMENT_PITCH_MM.get(model),
+    }
+    for source, element_mm in pitches.items():
+        if element_mm is not None:
+            words = f"{per_line:g} elements a line (yml) x {element_mm:g} mm ({source})"
+            return Value(element_mm * per_line, words, _OWN)
+    return Value(settings.vector_pitch_mm, "--vector-pitch-mm")
+
+
+def _spreading(
+    said: Description, file: ClariusFile, element: float, per_line: float, pitch: Value, probe: str
+) -> dict[str, Value]:
+    """Where the lines of a curved array lie; of a curved model without its radius, that it is lacking."""
+    radius_mm = _measure(said, "radius")
+    if not radius_mm and not _model(probe).startswith(CONVEX):
+        return {}
+    values = {"array_radius_mm": Value(radius_mm, "", _OWN), "line_angles_deg": Value()}
+    if radius_mm and pitch.value is not None:
+        last = element + (file.shape[1] - 1) * per_line
+        elements = said.optional("probe", "elements")
+        middle = (elements - 1) / 2 if elements else (element + last) / 2
+        angles = np.rad2deg((np.array([element, last]) - middle) * pitch.value / per_line / radius_mm)
+        values["line_angles_deg"] = Value(tuple(angles.tolist()), f"of lines {pitch.source}", _OWN)
+    return values
+
+
+def _measure(said: Description, name: str) -> float | None:
+    """A measure of the probe in mm, where its yml describes it and does not name it."""
+    return None if said.probe else said.optional("probe", name, unit="mm")
+
+
+def _first_mm(said: Description, file: ClariusFile, rate_hz: float, spacing_mm: float) -> float | None:
+    """Depth of the first kept sample as the scanner counts it; None where it is not said, or above 0.
+
+    Less than a sample above is 0: the delay is a whole number of samples.
+    """
+    if (delay := said.optional("delay samples")) is None:
+        return None
+    after = delay + (file.kept[1].start or 0) - BEFORE_DEPTH_S * rate_hz
+    return max(after, 0.0) * spacing_mm if after > -1.0 else None
+
+
+def _turns(apart_hz: FloatArray, rate_hz: float) -> ComplexArray:
+    """Factors that make I/Q as if shifted down by one frequency, shape (sample,).
+
+    The scanner's demodulation frequency falls along a straight line with depth, as from 11 to 8 MHz; a sweep
+    has one. Samples are turned as if the oscillator had stayed at that of the line's middle, which takes the
+    oscillator's phase to be the integral of its frequency: so it is where a frequency is swept, but it is not
+    documented. Left as they are, simulated I/Q shifted down by 9 to 6 MHz gave lengths 10 % off, and turned
+    back 0.001 % from those of RF.
+    """
+    cycles = cumulative_trapezoid(apart_hz, initial=0) / rate_hz
+    return np.asarray(np.exp(2j * np.pi * cycles))
 
 
 def _model(named: str) -> str:
     return re.sub(r"[^A-Z0-9]", "", named.upper()).removeprefix("CLARIUS")
-
-
-def _probe_name(named: str) -> str:
-    """Name a probe in one spelling, so that curves and calibrations of it are found to be of it."""
-    return f"Clarius {_model(named)}" if _model(named) in ELEMENT_PITCH_MM else named

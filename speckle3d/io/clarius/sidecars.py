@@ -1,4 +1,4 @@
-"""Descriptions of raw files (yml) and their gain by frame (tgc).
+"""Descriptions of raw files (yml).
 
 The yml is YAML but for its gain curve, ``tgc: { 0.00mm, 23.00dB }{ 40.00mm, 26.00dB }``, which is left out.
 Scalars stay the text that is in the file, so that ``010`` is ten, and every number is read with its unit.
@@ -12,10 +12,8 @@ References
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -34,11 +32,8 @@ _UNITS = {
     "Hz": {"hz": 1.0, "khz": 1e3, "mhz": 1e6},
     "mm": {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3},
     "m/s": {"m/s": 1.0},
-    "bytes": {"bytes": 1.0, "byte": 1.0},
     "deg": {"°": 1.0, "deg": 1.0},
 }
-_LONGEST = 60
-"""Letters of a value that a message shows."""
 
 
 def parsed(text: str, where: str) -> dict[str, Any]:
@@ -56,163 +51,127 @@ def parsed(text: str, where: str) -> dict[str, Any]:
         words = " ".join(str(error).split())[:200]
         raise InvalidInputError(f"{where}: expected YAML, got an error: {words}") from error
     if not isinstance(document, dict):
-        raise InvalidInputError(f"{where}: expected fields, got {_shown(document)}")
+        raise InvalidInputError(f"{where}: expected fields, got a {type(document).__name__}")
     return document
 
 
-@dataclass(frozen=True)
-class Fields:
-    """Fields of a mapping, read with their units; errors name the file and the field."""
-
-    values: Mapping[str, Any]
-    where: str
-
-    def below(self, name: str) -> Fields:
-        """Fields of a field; none where it is missing."""
-        return self._fields(self.values.get(name) or {}, name)
-
-    def listed(self, name: str) -> list[Fields]:
-        """Fields of each entry of a list; none where it is missing."""
-        entries = self.values.get(name)
-        listed = entries if isinstance(entries, list) else []
-        return [self._fields(entry, f"{name}[{i}]") for i, entry in enumerate(listed)]
-
-    def _fields(self, inner: Any, name: str) -> Fields:
-        if not isinstance(inner, dict):
-            raise InvalidInputError(f"{self.where}: {name}: expected fields, got {_shown(inner)}")
-        return Fields(inner, f"{self.where}: {name}")
-
-    def number(self, name: str, unit: str = "", least: float = -math.inf) -> float:
-        """A number with its unit, as ``"60 MHz"``, in the base unit `unit`."""
-        value = self.values.get(name)
-        parts = _NUMBER.fullmatch(value) if isinstance(value, str) else None
-        factor = None if parts is None else _UNITS[unit].get(parts[2].lower())
-        if parts is None or factor is None or not least <= float(parts[1]) < math.inf:
-            above = f" from {least:g}" if least > -math.inf else ""
-            expected = f"a number{f' of {unit}' if unit else ''}{above}"
-            raise InvalidInputError(f"{self.where}: {name}: expected {expected}, got {_shown(value)}")
-        return float(parts[1]) * factor
-
-    def optional(self, name: str, unit: str = "") -> float | None:
-        """A number, or None where there is none."""
-        return None if self.values.get(name) in (None, "", "~") else self.number(name, unit)
-
-    def whole(self, name: str, unit: str = "") -> int:
-        """A whole number from 0."""
-        value = self.number(name, unit, 0.0)
-        if value != int(value):
-            raise InvalidInputError(f"{self.where}: {name}: expected a whole number, got {value:g}")
-        return int(value)
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, str):
-        return repr(printable(value[:_LONGEST])) + ("..." if len(value) > _LONGEST else "")
-    return "nothing" if value is None else f"a {type(value).__name__}"
-
-
-@dataclass(frozen=True)
-class Receive:
-    """Demodulation frequency at depth 0, at `filter_depth_mm`, and on a straight line between [2]_."""
-
-    shallow_hz: float
-    deep_hz: float
-    filter_depth_mm: float
-
-    def at_hz(self, depth_mm: FloatArray | float) -> FloatArray:
-        """Demodulation frequency at depths."""
-        return np.asarray(np.interp(depth_mm, [0.0, self.filter_depth_mm], [self.shallow_hz, self.deep_hz]))
-
-
-@dataclass(frozen=True)
-class Description(Fields):
-    """The yml of a raw file.
+class Description:
+    """The yml of a raw file, asked for its fields by the names that lead to them.
 
     Attributes
     ----------
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
+
+    Raises
+    ------
+    FileError
+        If it cannot be read.
+    InvalidInputError
+        If it describes no raw file.
     """
 
-    kind: str
-    lines: int
-    samples: int
+    def __init__(self, member: Member) -> None:
+        self.where = member.where
+        self.values = parsed(_GAIN_LINE.sub("", member.text()), self.where)
+        self.kind = _KINDS.get(self.text("type").strip().lower(), "")
+        if not self.kind or self.text("compression").lower() not in ("", "none"):
+            raise InvalidInputError(
+                f"{self.where}: type, compression: expected RF, IQ or B pre-scan, and none, got "
+                f"{self.text('type')} and {self.text('compression')}"
+            )
+        self.lines = int(self.number("size", "number of lines"))
+        self.samples = int(self.number("size", "samples per line"))
 
-    @classmethod
-    def of(cls, member: Member) -> Description:
-        """Read the yml of a raw file.
+    def field(self, *names: str | int) -> Any:
+        """Value of a field; None where there is none."""
+        value: Any = self.values
+        for name in names:
+            is_inside = name in value if isinstance(value, dict) else isinstance(value, list)
+            value = value[name] if is_inside else None
+        return value
+
+    def text(self, *names: str | int) -> str:
+        """Text of a field as it may be shown; empty where there is none."""
+        value = self.field(*names)
+        return printable(value[:60]) if isinstance(value, str) else ""
+
+    def count(self, *names: str | int) -> int:
+        """Length of a list; 0 where there is none."""
+        value = self.field(*names)
+        return len(value) if isinstance(value, list) else 0
+
+    def number(self, *names: str | int, unit: str = "") -> float:
+        """A number with its unit, as ``"60 MHz"``, in the base unit `unit`.
 
         Raises
         ------
-        FileError
-            If it cannot be read.
         InvalidInputError
             Naming the field that is missing or has another unit.
         """
-        where, text = member.where, member.text()
-        fields = Fields(parsed(_GAIN_LINE.sub("", text), where), where)
-        kind = _KINDS.get(str(fields.values.get("type")).strip().lower())
-        packing = fields.values.get("compression", "none")
-        if kind is None or str(packing).lower() != "none":
-            raise InvalidInputError(
-                f"{where}: type, compression: expected RF, IQ or B pre-scan, and none, got "
-                f"{_shown(fields.values.get('type'))} and {_shown(packing)}"
-            )
-        size = fields.below("size")
-        return cls(fields.values, where, kind, size.whole("number of lines"), size.whole("samples per line"))
+        parts = _NUMBER.fullmatch(self.text(*names))
+        factor = None if parts is None else _UNITS[unit].get(parts[2].lower())
+        value = np.nan if parts is None or factor is None else float(parts[1]) * factor
+        if not np.isfinite(value) or (unit == "Hz" and value <= 0):
+            got = self.text(*names) or f"a {type(self.field(*names)).__name__}"
+            expected = f"a number of {unit}" if unit else "a number"
+            place = ": ".join(map(str, names))
+            raise InvalidInputError(f"{self.where}: {place}: expected {expected}, got {got}")
+        return value
+
+    def optional(self, *names: str | int, unit: str = "") -> float | None:
+        """A number, or None where there is none."""
+        return None if self.field(*names) in (None, "", "~") else self.number(*names, unit=unit)
 
     @property
     def probe(self) -> str:
         """Model of the probe; empty where only its measures, or nothing, is said."""
-        named = self.values.get("probe")
-        return named if isinstance(named, str) else ""
+        return self.text("probe")
 
-    def of_probe(self, name: str) -> float | None:
-        """A measure of the probe in mm."""
-        return None if self.probe else self.below("probe").optional(name, "mm")
-
-    @property
+    @cached_property
     def places(self) -> FloatArray:
         """Element where each line is received and its angle in degrees, shape (line, 2).
 
         Files may give the first and the last alone.
         """
-        rows = np.array(
-            [(line.number("rx element"), line.number("angle", "deg")) for line in self.listed("lines")]
-        )
-        if len(rows) not in (2, self.lines) or not self.lines:
+        rows = [
+            (self.number("lines", i, "rx element"), self.number("lines", i, "angle", unit="deg"))
+            for i in range(self.count("lines"))
+        ]
+        if len(rows) not in (2, self.lines) or not rows:
             raise InvalidInputError(f"{self.where}: lines: expected {self.lines} lines, got {len(rows)}")
         if len(rows) == self.lines:
-            return rows
-        return np.asarray(rows[0] + np.linspace(0.0, 1.0, self.lines)[:, None] * (rows[1] - rows[0]))
+            return np.array(rows)
+        return np.asarray(np.linspace(np.array(rows[0]), np.array(rows[1]), self.lines))
 
     @property
     def region(self) -> tuple[slice, slice] | None:
         """Lines and samples of the region of interest."""
-        if not self.values.get("roi"):
+        if not self.field("roi"):
             return None
-        roi, parts = self.below("roi"), []
+        parts = []
         for name, length in (("line", self.lines), ("sample", self.samples)):
-            start, end = roi.whole(f"start {name}"), roi.whole(f"end {name}")
-            if not start < end < length:
-                got = f"{start} to {end}"
-                raise InvalidInputError(f"{roi.where}: expected {name}s within {length}, got {got}")
+            start, end = (int(self.number("roi", f"{side} {name}")) for side in ("start", "end"))
+            if not 0 <= start < end < length:
+                raise InvalidInputError(
+                    f"{self.where}: roi: expected {name}s within {length}, got {start} to {end}"
+                )
             parts.append(slice(start, end + 1))
         return parts[0], parts[1]
 
     @property
-    def receive(self) -> Receive | None:
-        """Demodulation; None in older files, and where it differs between foci or filters."""
-        names = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
+    def receive(self) -> tuple[float, float, float] | None:
+        """Demodulation frequency at depth 0, Hz, at a depth, and that depth, mm; linear between [2]_.
+
+        None in older files, and where it differs between foci or filters.
+        """
+        fields = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
         ends = {
-            Receive(*(part.number(name, unit, 1e-6) for name, unit in names))
-            for focus in self.listed("focus")
-            for part in focus.listed("receive")
+            tuple(self.number("focus", i, "receive", k, name, unit=unit) for name, unit in fields)
+            for i in range(self.count("focus"))
+            for k in range(self.count("focus", i, "receive"))
         }
-        return ends.pop() if len(ends) == 1 else None
-
-
-def read_gains(member: Member) -> list[str]:
-    """Gain curves of the frames that a file tells of, as text; empty where it was not changed."""
-    parts = re.split(r"timestamp:\s*\d+", member.text())[1:]
-    return [" ".join(re.findall(r"\{.*?\}", part)) for part in parts]
+        if len(ends) != 1:
+            return None
+        shallow_hz, deep_hz, depth_mm = ends.pop()
+        return shallow_hz, deep_hz, depth_mm

@@ -10,8 +10,8 @@ RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise; at -10 dB no ba
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.sweep import Frames
 
 _PAIRS = 48
@@ -42,21 +42,23 @@ def band_hz(
     """
     length = max(2 ** round(np.log2(sampling_rate_hz / _RESOLUTION_HZ)), 16)
     count, vectors, samples = frames.shape
-    window = np.hanning(length + 1)[:-1]
+    if vectors < 2 or samples < length:
+        return None
     shared, power, spectra = np.zeros(length), np.zeros(length), 0
-    first = np.unique(np.linspace(0, vectors - 2, _PAIRS if vectors > 1 else 0).astype(int))
+    first = np.unique(np.linspace(0, vectors - 2, _PAIRS).astype(int))
     for i in sorted({0, count // 2, count - 1}):
-        frame = frames[i]
-        for start in range(0, samples - length + 1, length // 2):
-            part = slice(start, start + length)
-            pair = [_spectrum(frame[lines, part], window) for lines in (first, first + 1)]
-            scale = np.sqrt([np.sum(np.abs(lines) ** 2, axis=1) for lines in pair]).prod(axis=0)
-            used = scale > 0
-            one, other = (lines[used] / np.sqrt(scale[used, None]) for lines in pair)
-            shared += (one * other.conj()).real.sum(axis=0)
-            power += 0.5 * (np.abs(one) ** 2 + np.abs(other) ** 2).sum(axis=0)
-            spectra += int(np.count_nonzero(used))
-    frequency = np.fft.fftfreq(length, 1 / sampling_rate_hz).astype(np.float64) + (shift_hz or 0.0)
+        segments = sliding_window_view(frames[i], length, axis=1)[:, :: length // 2]
+        if shift_hz is None:  # what is constant in RF is of the electronics
+            segments = segments - segments.mean(axis=2, keepdims=True)
+        pair = np.fft.fft(segments * np.hanning(length + 1)[:-1])
+        one, other = pair[first], pair[first + 1]
+        scale = np.linalg.norm(one, axis=2) * np.linalg.norm(other, axis=2)
+        used = scale > 0
+        one, other = (lines[used] / np.sqrt(scale[used, None]) for lines in (one, other))
+        shared += (one * other.conj()).real.sum(axis=0)
+        power += 0.5 * (np.abs(one) ** 2 + np.abs(other) ** 2).sum(axis=0)
+        spectra += int(np.count_nonzero(used))
+    frequency = np.fft.fftfreq(length, 1 / sampling_rate_hz) + (shift_hz or 0.0)
     # Real samples have each frequency twice.
     order = np.argsort(frequency[: length // 2] if shift_hz is None else frequency)
     frequency, shared, power = frequency[order], shared[order], power[order]
@@ -72,9 +74,3 @@ def band_hz(
     edges = (np.interp(level, shared[edge], frequency[edge]) for edge in (rise, fall))
     low, high = (_STEP_HZ * round(float(edge) / _STEP_HZ) for edge in edges)
     return (low, high) if low > 0 else None
-
-
-def _spectrum(part: np.ndarray, window: FloatArray) -> np.ndarray:
-    """Spectra of a segment of some lines; what is constant in RF, of the electronics, is left out."""
-    plain = part if np.iscomplexobj(part) else part - part.mean(axis=1, keepdims=True)
-    return np.asarray(np.fft.fft(plain * window, axis=1))

@@ -33,7 +33,7 @@ from speckle3d.io.recordings import Recording, Row, Value, differs
 FORMAT = "DICOM"
 
 _MARK, _MARK_BYTE = b"DICM", 128
-_TISSUE, _CM = [1, 1], [3, 3]
+_TISSUE, _CM = [1.0, 1.0], [3.0, 3.0]
 """Region Spatial Format and Data Type of 2-D tissue, and Physical Units of both directions."""
 _LOSSY_SPREAD = 12
 """Levels by which the colours of a grey pixel may differ after lossy packing; the tint of a colour map is
