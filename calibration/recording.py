@@ -44,8 +44,8 @@ class Recording:
         Grey levels.
     pixel_mm : ndarray, shape (2,)
         Distance between columns and between rows; rough where it is to be estimated.
-    first_row : float
-        Depth of row 0 below the image's origin, in rows.
+    first_px : ndarray, shape (2,)
+        Place of the first column and of the first row, from the image's origin, in columns and rows.
     frame_time_s : ndarray, shape (n,)
     readings : TimedPoses or TimedRotations
     time_offset_s : float
@@ -54,7 +54,7 @@ class Recording:
 
     images: Frames
     pixel_mm: FloatArray
-    first_row: float
+    first_px: FloatArray
     frame_time_s: FloatArray
     readings: TimedPoses | TimedRotations
     time_offset_s: float = 0.0
@@ -148,7 +148,7 @@ def paired(recording: Recording, seen: Seen, offset_s: float) -> tuple[ImagePoin
     missing = dict.fromkeys((int(n) for n in np.unique(seen.frame[~with_reading])), _UNREAD)
     read: RigidTransform | Rotation = recording.readings.at(times[with_reading] - offset_s)
     poses = RigidTransform.from_rotation(read) if isinstance(read, Rotation) else read
-    below_origin = replace(seen, pixels=seen.pixels + np.array([0.0, recording.first_row]))
+    below_origin = replace(seen, pixels=seen.pixels + recording.first_px)
     return below_origin[with_reading].points(poses, times[with_reading]), {**seen.dropped, **missing}
 
 

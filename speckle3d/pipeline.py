@@ -21,12 +21,13 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_table import plot_poses, pose_columns, pose_table
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import Sweep
 from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_images
 from speckle3d.examine.recording import examine_recording

@@ -15,8 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from sweep_examples import rf_sweep
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedRotations
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings
+from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings
 from speckle3d.io.import_settings import ImportSettings
 
 NAME = "2024-05-01T10-00-00+0000"

@@ -11,8 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.stacks import TrackedImages
 from speckle3d.core.geometry import rotation_from_fixed_angles
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import ImageGrid
 
 LENGTH_MM, FAN_DEG, VOXEL_MM = 24.0, 40.0, 0.5
 MOUNTING = RigidTransform.from_components([12.0, -85.0, 23.0], rotation_from_fixed_angles(1.9, -0.8, 0.35))

@@ -14,7 +14,7 @@ from numba import njit
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, zoom
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.simulation.movement import HandMotion, hand_sweep, turned_about

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import rotation_from_fixed_angles
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 
 OUTSIDE, INSIDE = 40.0, 200.0
 LEVEL = (OUTSIDE + INSIDE) / 2

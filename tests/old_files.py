@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, Source
 from speckle3d.core.curves import CurveKey, DecorrelationCurves, NominalProbe, SpeckleSize, TiltResponse
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import (
     CalibrationFile,
     FramePairs,
@@ -23,7 +24,7 @@ from speckle3d.core.reconstruction import (
     Trust,
 )
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
 
 FOLDER = Path(__file__).parent / "io" / "files_of_0_1"
 N = 4

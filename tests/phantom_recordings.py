@@ -5,8 +5,9 @@ from calibration_examples import COLUMNS, PIXEL_MM, scan_plane
 from wire_scenes import PIXEL_MM as WIRE_PIXEL_MM
 from wire_scenes import picture, scene
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
 from speckle3d.io.sweep_writer import write_sweep
 
 MEMBRANE_MM = 6.0

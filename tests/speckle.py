@@ -8,7 +8,8 @@ import numpy as np
 from scipy import fft, ndimage
 
 from speckle3d.core.curves import CurveKey, DecorrelationCurves
-from speckle3d.core.sweep import ImageGrid, RFSettings
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import RFSettings
 
 LATERAL_MM, AXIAL_MM = 0.35, 0.12
 GRID = ImageGrid(

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
 
 RF = RFSettings(
     sampling_rate_hz=40e6, speed_of_sound_m_s=1540.0, centre_frequency_hz=6e6, bandwidth_hz=(4e6, 8e6)

@@ -27,7 +27,7 @@ from calibration.images.similarity import LEAST_OVERLAP, Comparison, Estimate, w
 from calibration.images.stacks import TrackedImages, read_stack
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 
 STEP_S = 0.01
 

@@ -18,8 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
 from speckle3d.core.extras import extra_module
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
 from speckle3d.imaging.images import Images, PosedImages
 
@@ -234,5 +234,5 @@ def read_stack(
             f"{tracked.name}: expected images that change, got the same in all frames"
         )
     images[:, still & ~np.isnan(images).any(axis=0)] = np.nan
-    first = size * (bins - 1) / 2.0 + [0.0, grid.first_sample_depth_mm]
+    first = size * (bins - 1) / 2.0 + [grid.first_vector_mm, grid.first_sample_depth_mm]
     return Stack(images, np.concatenate([size * bins, first]), tracked.world_from_sensor(frames)), frames

@@ -14,8 +14,9 @@ from scipy.spatial.transform import RigidTransform
 from calibration.images.stacks import TrackedImages
 from calibration.recording import Recording
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import BModeSettings, Frames, ImageGrid, Sweep
+from speckle3d.core.sweep import BModeSettings, Frames, Sweep
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
 from speckle3d.io.load import IMAGE, SIZED, kind_of, load_sweep
@@ -50,9 +51,9 @@ def open_recording(
     """
     sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, sensor, transform)
     size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    first_row = grid.first_sample_depth_mm / size[1]
+    first_px = np.array([grid.first_vector_mm, grid.first_sample_depth_mm]) / size
     pictures = pictures if sweep.grid.fan is None else _BlackOutside(pictures)
-    return Recording(pictures, size, first_row, sweep.frame_time_s, readings, offset_s)
+    return Recording(pictures, size, first_px, sweep.frame_time_s, readings, offset_s)
 
 
 def open_tracked(

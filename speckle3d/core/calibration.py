@@ -11,8 +11,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import Sweep
 
 SENSORS = ("tracker", "orientation")
 

@@ -12,9 +12,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_table import plot_poses, pose_columns, pose_table
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import ImageGrid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,7 +16,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_finite
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 
 REGION_HELP = "'rectangle x0,y0 x1,y1', 'fan x,y angle,angle radius,radius' or 'polygon x,y x,y x,y ...'"
 """How a region is written: mm in the image, degrees from straight down, several joined by ' and '."""

@@ -10,11 +10,18 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 
 from speckle3d.core.arrays import Float32Array, FloatArray
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 
 _PIXELS_PER_PITCH = 4
 """Of the picture in the distance of neighbouring vectors at the middle depth: linear interpolation between
 vectors then shows nothing of the pixels."""
+
+
+def box_grid(fan: ImageGrid, pixel_mm: float) -> ImageGrid:
+    """Grid of square pixels over the smallest box around a fan."""
+    left, top = fan.extent_mm[0].tolist()
+    columns, rows = (int(count) + 1 for count in np.ceil(np.ptp(fan.extent_mm, axis=0) / pixel_mm - 1e-6))
+    return ImageGrid(columns, rows, pixel_mm, pixel_mm, top, first_vector_mm=left)
 
 
 class ScanConversion:
@@ -25,24 +32,18 @@ class ScanConversion:
     fan : ImageGrid
         Of the images.
     grid : ImageGrid, optional
-        Of the pictures; by default with square pixels, a quarter of the vectors' pitch or a sample wide.
-    left_mm : float
-        Where the first column lies in the image frame P.
+        Of the pictures; by default the box of the fan in square pixels, a quarter of the pitch of vectors or
+        a sample wide.
 
     Attributes
     ----------
     grid : ImageGrid
-        In the same image frame P, `left_mm` to the side.
+        In the same image frame P.
     """
 
-    def __init__(self, fan: ImageGrid, grid: ImageGrid | None = None, left_mm: float = 0.0) -> None:
-        self._fan, self._left_mm = fan, left_mm
-        if grid is None:
-            side = max(fan.vector_pitch_mm / _PIXELS_PER_PITCH, fan.sample_spacing_mm)
-            low, high = fan.corners_mm[0, :2], fan.corners_mm[2, :2]
-            columns, rows = (int(count) + 1 for count in np.ceil((high - low) / side - 1e-6))
-            grid = ImageGrid(columns, rows, side, side, float(low[1]))
-        self.grid = grid
+    def __init__(self, fan: ImageGrid, grid: ImageGrid | None = None) -> None:
+        self._fan = fan
+        self.grid = grid or box_grid(fan, max(fan.vector_pitch_mm / _PIXELS_PER_PITCH, fan.sample_spacing_mm))
 
     def __call__(self, image: npt.NDArray[Any]) -> Float32Array:
         """Picture of an image, shape (column, row), by linear interpolation; NaN outside the fan.
@@ -58,8 +59,7 @@ class ScanConversion:
     def _sample(self) -> FloatArray:
         """Vector and sample of each pixel, shape (2, column, row)."""
         column, row = np.arange(self.grid.vectors)[:, None], np.arange(self.grid.samples)
-        place = self.grid.mm(column, row) + np.array([self._left_mm, 0.0])
-        sample = np.moveaxis(self._fan.sample_at(place), -1, 0)
+        sample = np.moveaxis(self._fan.sample_at(self.grid.mm(column, row)), -1, 0)
         # Places on the fan's edge are inside it whatever rounding does.
         last = np.array([self._fan.vectors - 1, self._fan.samples - 1])[:, None, None]
         near = (sample > -1e-6) & (sample < last + 1e-6)

@@ -13,9 +13,10 @@ from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
-from speckle3d.core.sweep import ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
+from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.import_settings import settings_for

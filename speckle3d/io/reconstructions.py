@@ -13,6 +13,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import (
     MODES,
     CalibrationFile,
@@ -25,7 +26,6 @@ from speckle3d.core.reconstruction import (
     SourceFile,
     Trust,
 )
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.hdf5 import (
     PathLike,
     has_member,

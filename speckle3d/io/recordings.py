@@ -18,8 +18,9 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.printable import printable
-from speckle3d.core.sweep import BModeSettings, ImageGrid, OrientationSensor, RFSettings, Sweep, Tracker
+from speckle3d.core.sweep import BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.io.import_settings import (
     SPEED_OF_SOUND_M_S,
     ImportSettings,

@@ -23,12 +23,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.parts import cannot_write
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import (
     INERTIAL,
     BModeSettings,
-    ImageGrid,
     OrientationSensor,
     RFSettings,
     Sweep,

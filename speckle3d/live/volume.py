@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float16Array, Float32Array, IntArray
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.imaging.voxels.grid import spacing_within
 from speckle3d.imaging.voxels.volume import CompoundedVolume, compound
@@ -44,11 +44,6 @@ class GrowingVolume:
         """Of the small images."""
         return self._pooled.grid
 
-    @property
-    def image_from_small(self) -> RigidTransform:
-        """Where the small images' first vector lies in the whole image."""
-        return RigidTransform.from_translation([self._pooled.left_mm, 0.0, 0.0])
-
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep a frame's image, unless those of its neighbours are enough."""
         self._pooled.keep(0, intensity)
@@ -81,9 +76,8 @@ class GrowingVolume:
         """
         numbers, images = self.kept()
         numbers, images = numbers[numbers < len(poses)], images[: int((numbers < len(poses)).sum())]
-        world_from_small = poses[numbers] * self.image_from_small
-        voxel_mm = max(spacing_within(self.grid, world_from_small, VOXELS_GB), self.grid.vector_pitch_mm)
-        return compound(grey_levels(images), self.grid, world_from_small, voxel_mm, voxel_type="uint8")
+        voxel_mm = max(spacing_within(self.grid, poses[numbers], VOXELS_GB), self.grid.vector_pitch_mm)
+        return compound(grey_levels(images), self.grid, poses[numbers], voxel_mm, voxel_type="uint8")
 
 
 def grey_levels(images: Float16Array) -> Float32Array:

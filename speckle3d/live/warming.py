@@ -8,7 +8,8 @@ from scipy.signal import lfilter
 from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.live.tracking import ANEW, EVERY, LiveTracker
 from speckle3d.live.volume import GrowingVolume
 

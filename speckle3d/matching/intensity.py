@@ -18,7 +18,8 @@ from scipy import fft
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep
 from speckle3d.kernels.box_means import box_means, squared_magnitude
 
 _RATE_OVER_BAND = 100 / 27

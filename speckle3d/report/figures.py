@@ -14,8 +14,8 @@ from plotly.subplots import make_subplots
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.report.data import Record
 from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import CURVE_LABELS, colour_of, label_of, new_figure, spread_frames

@@ -16,9 +16,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import relative_poses
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.io import load
 from speckle3d.io.challenge import Landmarks
 from speckle3d.io.load import load_landmarks, load_sweep, recording_sha256

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.simulation.bath import crossed_threads, water_bath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
 from speckle3d.simulation.medium import Medium, fully_developed, phantom, tissue

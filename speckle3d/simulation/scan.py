@@ -12,7 +12,7 @@ from scipy.fft import fft, irfft, next_fast_len
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Complex64Array, Float32Array, FloatArray, IntArray
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.scatter import (
     EchoGrid,
     Fan,

@@ -13,9 +13,10 @@ import numpy.typing as npt
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.scan_conversion import ScanConversion
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, read_frame
+from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
 from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations
@@ -242,8 +243,6 @@ class Strip:
     ----------
     stack : ImageStack
         Of the strip's images.
-    left_mm : float
-        Where its first vector lies in the whole image.
     """
 
     def __init__(self, sweep: Sweep, config: Config) -> None:
@@ -252,16 +251,16 @@ class Strip:
         if grid.fan is not None:
             middle = (grid.vectors - 1) / 2
             (x, top), (_, bottom) = grid.mm([middle, middle], [0, grid.samples - 1])
-            rows, left_mm = int((bottom - top) / PIXEL_MM) + 1, float(x) - STRIP_MM / 2
-            strip = ImageGrid(round(STRIP_MM / PIXEL_MM) + 1, rows, PIXEL_MM, PIXEL_MM, float(top))
-            self._convert = ScanConversion(grid, strip, left_mm)
-            self._vectors, self.left_mm = slice(None), left_mm
+            columns, rows = round(STRIP_MM / PIXEL_MM) + 1, int((bottom - top) / PIXEL_MM) + 1
+            left = float(x) - STRIP_MM / 2
+            strip = ImageGrid(columns, rows, PIXEL_MM, PIXEL_MM, float(top), first_vector_mm=left)
+            self._convert, self._vectors = ScanConversion(grid, strip), slice(None)
             self.stack = ImageStack(strip, PIXEL_MM)
             return
         width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
         first = (grid.vectors - width) // 2
-        self._vectors, self.left_mm = slice(first, first + width), first * grid.vector_pitch_mm
-        self.stack = ImageStack(replace(grid, vectors=width), PIXEL_MM)
+        self._vectors, left = slice(first, first + width), first * grid.vector_pitch_mm
+        self.stack = ImageStack(replace(grid, vectors=width, first_vector_mm=left), PIXEL_MM)
 
     def keep(self, index: int, intensity: Float32Array) -> None:
         """Keep the strip of a frame."""

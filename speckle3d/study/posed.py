@@ -12,9 +12,10 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import Sweep
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.voxels.settings import Levels

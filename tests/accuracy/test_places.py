@@ -9,7 +9,7 @@ from wire_scenes import candidates, scene
 
 from calibration.nwires import label_by_wires
 from calibration.plane import calibrate_plane
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.voxels.volume import compound
 from speckle3d.io.load import load_sweep
 

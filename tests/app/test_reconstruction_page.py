@@ -12,8 +12,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d import cli
 from speckle3d.app.folder import Folder
 from speckle3d.app.reconstruction.page import ReconstructionPage, _Viewer
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Provenance, Trust
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.load import recording_sha256
 from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep

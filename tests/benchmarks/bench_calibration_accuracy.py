@@ -31,7 +31,7 @@ def recording_of(sweep, sensor):
     return Recording(
         images,
         size,
-        images.grid.first_sample_depth_mm / size[1],
+        np.array([0.0, images.grid.first_sample_depth_mm]) / size,
         sweep.frame_time_s,
         sensor.readings,
         sensor.time_offset_s,

@@ -21,7 +21,8 @@ import numpy as np
 from commands import command
 from sweep_examples import RF
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.igtl.link import Connection
 from speckle3d.io.igtl.messages import ImageReceived
 from speckle3d.io.load import load_sweep

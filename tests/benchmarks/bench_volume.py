@@ -28,8 +28,8 @@ import SimpleITK as sitk
 from scipy.spatial.transform import RigidTransform, Rotation
 from speed.rows import Row, print_table, timed
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import MEASURED
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import cores, on_one_thread
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.holes import fill_holes

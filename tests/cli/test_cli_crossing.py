@@ -8,7 +8,7 @@ import pytest
 from image_examples import write_mha
 
 from speckle3d.core.geometry import roll_yaw_tilt
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.io.calibrations import read_calibration
 
 GRID = ImageGrid(64, 90, 0.45, 0.4)

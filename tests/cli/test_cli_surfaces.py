@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Provenance, SharedErrors, Trust
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.io.reconstructions import ReconstructionWriter
 from speckle3d.io.shapes.surfaces import read_surface

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.calibration import FramesUsed, calibrated, mounting_difference, pixel_difference
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 
 
 def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():

@@ -1,13 +1,16 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.calibrating.recordings import open_recording
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.region import Region
 from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
 from speckle3d.imaging.cuts.planes import lateral_line
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.io.plus.write import write_sequence
@@ -50,7 +53,11 @@ def test_lines_beyond_the_horizon_are_refused():
         ImageGrid.of_fan(10, 100, 0.1, 10.0, (-1.6, 1.6))
 
 
-@pytest.mark.parametrize("grid", [CURVED, PHASED])
+ASIDE = replace(PHASED, fan=replace(PHASED.fan, apex_mm=(20.0, -5.0)))
+"""A fan whose picture does not begin at the origin of its image."""
+
+
+@pytest.mark.parametrize("grid", [CURVED, PHASED, ASIDE])
 def test_a_disc_is_drawn_where_it_is(grid):
     v, s = np.indices((grid.vectors, grid.samples))
     place = grid.mm(v, s)

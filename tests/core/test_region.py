@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.region import Region
-from speckle3d.core.sweep import ImageGrid
 
 GRID = ImageGrid(
     vectors=31, samples=57, vector_pitch_mm=0.3, sample_spacing_mm=0.1, first_sample_depth_mm=0.7

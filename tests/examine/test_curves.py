@@ -9,7 +9,7 @@ import speckle
 from speckle3d.core.curves import SpeckleSize, TiltResponse
 from speckle3d.core.doubts import Doubt, unrefuted
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.examine.curves import (
     doubt_bend,
     doubt_curves,

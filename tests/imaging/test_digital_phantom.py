@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Phantom, curved_path
 
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.measures.surface import largest_part, measures_of, surface_of
 from speckle3d.imaging.voxels.volume import compound
 

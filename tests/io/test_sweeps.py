@@ -6,7 +6,8 @@ import pytest
 import sweep_examples
 
 from speckle3d.core.errors import FileError
-from speckle3d.core.sweep import ImageGrid, stored_dtype
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
 

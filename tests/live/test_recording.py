@@ -7,7 +7,8 @@ import pytest
 from sweep_examples import RF
 
 import speckle3d as s3
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import Sweep
 from speckle3d.live import recording
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.progress import Progress

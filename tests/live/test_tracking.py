@@ -6,7 +6,8 @@ import pytest
 import speckle3d as s3
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.live import tracking
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.matching.quality import FrameFlag

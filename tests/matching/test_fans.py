@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
 from speckle3d.matching.patches import PatchSettings

@@ -9,7 +9,8 @@ import pytest
 import speckle
 
 from speckle3d.core.errors import MismatchError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.matching.intensity import IntensitySettings, two_way_wavenumber
 from speckle3d.matching.matcher import (
     Echo,

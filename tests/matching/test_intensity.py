@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy import fft
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
 
 RF = RFSettings(66.67e6, 1540.0, 7e6, (5e6, 10e6))

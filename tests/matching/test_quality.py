@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from speckle import GRID, Speckle, intensity
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.intensity import IntensityExtractor

@@ -8,7 +8,7 @@ import speckle
 from pair_planes import problem_of, table_of
 
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.matching.patches import PatchSettings, lay_patches
 from speckle3d.motion.coherence import estimate_coherence
 

@@ -77,7 +77,8 @@ def test_without_a_sweep_the_sheet_alone_is_as_far_off_as_it_says(curves):
 @pytest.mark.slow
 @pytest.mark.parametrize(("aperture_mm", "focus_mm", "attenuation"), [(4.0, 26.0, 0.7), (5.5, 15.0, 0.3)])
 def test_other_lenses_agree_with_phantoms_simulated_in_three_dimensions(aperture_mm, focus_mm, attenuation):
-    from speckle3d.core.sweep import ImageGrid, Sweep
+    from speckle3d.core.grid import ImageGrid
+    from speckle3d.core.sweep import Sweep
     from speckle3d.phantom_curves import calibrate_curves
 
     probe = Probe(elevation_aperture_mm=aperture_mm, elevation_focus_mm=focus_mm)

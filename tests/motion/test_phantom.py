@@ -8,8 +8,9 @@ import speckle
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep, Tracker
+from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
 from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.intensity import IntensitySettings
 from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings

@@ -8,7 +8,7 @@ import speckle
 from pair_planes import fit, fit_many, problem_of
 
 from speckle3d.core.curves import TiltResponse
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.patches import lay_patches
 

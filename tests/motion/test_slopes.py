@@ -8,7 +8,7 @@ import pytest
 import speckle
 
 from speckle3d.core.curves import TiltResponse
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.planes import PlaneSettings

@@ -4,7 +4,7 @@ import numpy as np
 import oracles
 import pytest
 
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.subset import consistent_subset
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Reconstruction, Trust
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.scoring.modes import default_mode
 
 GRID = ImageGrid(8, 40, 0.3, 0.1)

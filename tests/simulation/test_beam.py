@@ -7,7 +7,7 @@ from points import PointMedium
 from scipy.signal import hilbert
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.simulation.beam import Probe, tabulate_beam
 from speckle3d.simulation.medium import TiledMedium, tissue
 from speckle3d.simulation.movement import stepped_poses

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import signal as filters
 
-from speckle3d.core.sweep import ImageGrid, RFSettings, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.simulation.receiver import received_as_bmode, received_as_iq
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 

@@ -6,7 +6,7 @@ from points import PointMedium
 from scipy.signal import hilbert
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.simulation.beam import tabulate_beam
 from speckle3d.simulation.medium import fully_developed, tissue
 from speckle3d.simulation.scan import SimulatedFrames

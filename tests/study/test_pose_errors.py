@@ -6,8 +6,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import ModeErrors, Provenance, Reconstruction, SharedErrors, Trust
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.motion.uncertainty import shared_covariance
 from speckle3d.study.pose_errors import caution, errors_of, measure
 

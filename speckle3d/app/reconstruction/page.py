@@ -18,8 +18,9 @@ from speckle3d.app.reconstruction.commands import code, measure_command, reslice
 from speckle3d.app.reconstruction.cut_plot import CutPlot
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import Speckle3DError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.sweep import Sweep
 from speckle3d.imaging.images import Images
 from speckle3d.report.figures import plot_curves, plot_outlines
 from speckle3d.scoring.references import find_reference, sweep_curves
@@ -265,12 +266,8 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         away[self.frame] -= 1e-6  # of frames that lie as near, the one that is shown
         frame = int(np.argmin(away))
         lateral, depth, _ = np.round(inside[frame], 2).tolist()
-        low, high = self.param.depth_mm.bounds
-        if (
-            0.0 <= lateral <= self._grid.width_mm
-            and low <= depth <= high
-            and away[frame] <= self._page.reach_mm
-        ):
+        (left, top), (right, bottom) = self._grid.extent_mm
+        if left <= lateral <= right and top <= depth <= bottom and away[frame] <= self._page.reach_mm:
             self.param.update(frame=frame, lateral_mm=lateral, depth_mm=depth)
 
     @batched

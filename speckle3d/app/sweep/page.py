@@ -21,8 +21,9 @@ from speckle3d.app.sweep.plots import FLAGGED, ImagePlot, TimePlots
 from speckle3d.config import Config, stored_config
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.doubts import Doubt
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
-from speckle3d.core.sweep import ImageGrid, OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.study.images import GreyImages
 
 MOST_ROWS = 640

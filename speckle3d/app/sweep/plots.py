@@ -16,7 +16,8 @@ from speckle3d.app.sweep.findings import NAMES
 from speckle3d.app.sweep.pairs import PatchValues
 from speckle3d.core.arrays import ByteArray, FloatArray, IntArray
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import Sweep
 
 FLAGGED, DOUBTED = "#d55e00", "#7b3fa0"
 _REJECTED = "#ff4d4d"

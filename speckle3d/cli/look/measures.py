@@ -12,9 +12,9 @@ from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from speckle3d.core.grid import ImageGrid
     from speckle3d.core.pose_errors import PosedErrors
     from speckle3d.core.surface import Surface
-    from speckle3d.core.sweep import ImageGrid
     from speckle3d.core.volume import Volume
     from speckle3d.imaging.measures.measure import Measurement
 

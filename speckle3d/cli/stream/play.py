@@ -14,7 +14,8 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import require_extra
 
 if TYPE_CHECKING:
-    from speckle3d.core.sweep import Frames, ImageGrid, Sweep
+    from speckle3d.core.grid import ImageGrid
+    from speckle3d.core.sweep import Frames, Sweep
 
 Kind = Literal["rf", "bmode"]
 

@@ -122,8 +122,8 @@ def straightened(sweep: CrossingSweep, nearest_mm: float = 0.0) -> StraightSweep
     planes, base = (_smoothed(travel[good], frames[good], each) for each in (at, travel))
     away = base.inv() * frames
     travel = travel + away.translation[:, 2]
-    left_mm, top_mm = sweep.stack.left_mm, grid.first_sample_depth_mm
-    pixels = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm, left_mm, top_mm])
+    top_mm = grid.first_sample_depth_mm
+    pixels = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_vector_mm, top_mm])
     pixels[2:] -= sweep.centre_mm[:2]
     # Within a plane frames roll too little about the smooth path to matter.
     shifts = away.translation[:, :2] / pixels[:2]

@@ -6,8 +6,8 @@ import numpy as np
 
 from speckle3d.core.arrays import Float16Array, Float32Array
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.scan_conversion import ScanConversion
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.scan_conversion import ScanConversion, box_grid
 
 PIXEL_MM = 0.35
 """About the finest blur at which sweeps are compared: finer pixels show only speckle that the other sweep's
@@ -31,17 +31,13 @@ class ImageStack:
     Attributes
     ----------
     grid : ImageGrid
-        Of the pooled images.
-    left_mm : float
-        Where the first pooled vector's centre lies in the whole image.
+        Of the pooled images, in the frame of the whole ones.
     """
 
     def __init__(self, grid: ImageGrid, pixel_mm: float = PIXEL_MM) -> None:
         self._convert = None
         if grid.fan is not None:
-            low, high = grid.corners_mm[0, :2], grid.corners_mm[2, :2]
-            columns, rows = (int(count) + 1 for count in (high - low) / pixel_mm)
-            self._convert = ScanConversion(grid, ImageGrid(columns, rows, pixel_mm, pixel_mm, float(low[1])))
+            self._convert = ScanConversion(grid, box_grid(grid, pixel_mm))
             grid = self._convert.grid
         across = max(1, min(grid.vectors, round(pixel_mm / grid.vector_pitch_mm)))
         deep = max(1, min(grid.samples, round(pixel_mm / grid.sample_spacing_mm)))
@@ -52,8 +48,8 @@ class ImageStack:
             grid.vector_pitch_mm * across,
             grid.sample_spacing_mm * deep,
             grid.first_sample_depth_mm + (deep - 1) / 2 * grid.sample_spacing_mm,
+            first_vector_mm=grid.first_vector_mm + (across - 1) / 2 * grid.vector_pitch_mm,
         )
-        self.left_mm = (across - 1) / 2 * grid.vector_pitch_mm
         self._images: dict[int, Float16Array] = {}
 
     def keep(self, index: int, intensity: Float32Array) -> None:

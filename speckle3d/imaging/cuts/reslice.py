@@ -16,8 +16,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
 from speckle3d.core.errors import MismatchError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import EMPTY
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.planes import Cut, image_plane
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages

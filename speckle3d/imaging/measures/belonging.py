@@ -7,8 +7,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_errors import Belonging
-from speckle3d.core.sweep import ImageGrid
 
 REACH_MM = 0.5
 """Points no farther from the sweep than this are taken to be in it."""

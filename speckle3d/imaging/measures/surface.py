@@ -12,9 +12,9 @@ from scipy.sparse import coo_array, diags_array
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.surface import Surface
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.measures.belonging import belonging_of
 

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import zoom
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_errors import PosedErrors
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.voxels.grid import VoxelGrid
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.images import image_corners
 from speckle3d.imaging.voxels.settings import VoxelType
 

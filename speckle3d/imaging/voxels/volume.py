@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.threads import in_parallel
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import Images, PosedImages
@@ -127,7 +127,7 @@ def compound(
 
     >>> import numpy as np
     >>> from scipy.spatial.transform import RigidTransform
-    >>> from speckle3d.core.sweep import ImageGrid
+    >>> from speckle3d.core.grid import ImageGrid
     >>> grid = ImageGrid(vectors=4, samples=5, vector_pitch_mm=1.0, sample_spacing_mm=1.0)
     >>> poses = RigidTransform.from_translation([[0.0, 0.0, z] for z in range(4)])
     >>> volume = compound([np.full((4, 5), level) for level in range(4)], grid, poses, voxel_mm=1.0)

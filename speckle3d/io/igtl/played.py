@@ -18,7 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.sweep import Frames, ImageGrid, OrientationSensor, Sweep, Tracker
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import Frames, OrientationSensor, Sweep, Tracker
 from speckle3d.io.igtl.messages import packed_image, packed_transform
 
 _SLICE_MM = 1.0

@@ -21,7 +21,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike, open_regular
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import Names, pixel_axes

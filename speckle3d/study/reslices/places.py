@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet, curved_sheet
 from speckle3d.imaging.cuts.oblique import (
@@ -175,7 +175,7 @@ class Place:
         return "middle plane of i and j" if grid is None else f"at lateral {self._lateral(grid):.4g} mm"
 
     def _lateral(self, grid: ImageGrid) -> float:
-        return grid.width_mm / 2 if self.lateral_mm is None else self.lateral_mm
+        return float(grid.extent_mm[:, 0].mean()) if self.lateral_mm is None else self.lateral_mm
 
     def _in_world(self, grid: ImageGrid, there: RigidTransform) -> AnyCut:
         if self.curve_mm is not None:

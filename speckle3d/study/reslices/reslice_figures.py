@@ -81,22 +81,21 @@ def draw_strip(
     shown, last = dict(poses), "image"
     if reference is not None and reference.covered.all():
         shown[reference.name], last = reference.world_from_image, reference.name
-    left, grid = RigidTransform.from_translation([strip.left_mm, 0.0, 0.0]), strip.stack.grid
+    grid, lateral_mm = strip.stack.grid, float(strip.stack.grid.centre_mm[0])
     kept = strip.stack.images(len(poses["image"]))
-    placed = {mode: each * left for mode, each in shown.items()}
-    planes = planes_from_first_frame(placed, lateral_line(grid, grid.width_mm / 2), PIXEL_MM, _LARGEST_MM)
+    planes = planes_from_first_frame(shown, lateral_line(grid, lateral_mm), PIXEL_MM, _LARGEST_MM)
     levels = []
-    for mode, each in placed.items():
+    for mode, each in shown.items():
         # A reach of two of the longest steps, so that no gaps show between frames.
         steps = np.diff((each[0].inv() * each).translation[:, 2])
         reach_mm = max(0.3, 2.0 * float(np.percentile(np.abs(steps), 99)))
         levels.append(reslice_frames(kept, grid, each, planes[mode], reach_mm))
     seen = np.concatenate([each[np.isfinite(each)] for each in levels])
     maximum = np.float32(np.percentile(seen, _BRIGHTEST_PERCENTILE)) if seen.size else np.float32(0.0)
-    images = {mode: each - maximum for mode, each in zip(placed, levels, strict=True)}
-    where = f"at lateral {strip.left_mm + grid.width_mm / 2:.4g} mm", view_of(planes[last], placed[last])
+    images = {mode: each - maximum for mode, each in zip(shown, levels, strict=True)}
+    where = f"at lateral {lateral_mm:.4g} mm", view_of(planes[last], shown[last])
     picture = CutPicture(
-        drawn_cuts(images, planes, grid, placed),
+        drawn_cuts(images, planes, grid, shown),
         place=", ".join(filter(None, where)),
         levels=(-RANGE_DB, 0.0),
         name=name,

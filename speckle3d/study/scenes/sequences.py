@@ -11,7 +11,6 @@ import numpy.typing as npt
 from speckle3d.core.arrays import ByteArray, FloatArray
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.images import PosedImages
-from speckle3d.io.plus.transforms import image_matrix
 from speckle3d.study.posed import USUAL_RANGE_DB, PosedSweep
 
 _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -59,6 +58,7 @@ def slicer_sequence(
     signal = own if isinstance(own, BModeSettings) else BModeSettings(dynamic_range_db)
     times, name = posed.sweep.frame_time_s[posed.frames], posed.sweep.name
     sweep = Sweep(_Bytes(source), grid, signal, times, name=name, probe=posed.sweep.probe)
-    sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm, grid.skew_rad
-    lps_from_pixels = np.stack([image_matrix(pose, *sizes) for pose in posed.world_from_image])
+    thick_mm = (grid.vector_pitch_mm + grid.sample_spacing_mm) / 2
+    image_from_pixels = np.insert(grid.image_from_sample, 2, [0.0, 0.0, thick_mm, 0.0], axis=1)
+    lps_from_pixels = posed.world_from_image.as_matrix() @ image_from_pixels
     return sweep, {"ImageToWorld": np.asarray(_RAS_FROM_LPS @ lps_from_pixels)}

@@ -13,11 +13,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, LabelMap
 from speckle3d.core.pose_errors import PosedErrors
 from speckle3d.core.progress import Progress
 from speckle3d.core.region import Region
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.measures.uncertainty import deviation_volume

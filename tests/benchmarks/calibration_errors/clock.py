@@ -36,7 +36,7 @@ def recorded(seed):
         sensor_s = sensor_s[rng.random(sensor_s.size) > 0.05]
     readings = TimedPoses(sensor_s - offset_s, floor.readings(sensor_s, drifts=bool(seed % 2)))
     images, given_mm = np.zeros((len(frame_s), 2, 2), np.uint8), floor.pixel_mm * rng.uniform(0.99, 1.01, 2)
-    recording = Recording(images, given_mm, 0.0, frame_s, readings)
+    recording = Recording(images, given_mm, np.zeros(2), frame_s, readings)
     return recording, Seen(np.arange(len(frame_s)), floor.lines(frame_s)), offset_s
 
 

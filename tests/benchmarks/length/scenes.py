@@ -5,7 +5,8 @@ from pathlib import Path
 from cache import DEFAULT, key_of
 
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.sweep import ImageGrid, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import Sweep
 from speckle3d.io.curves import read_curves, write_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep

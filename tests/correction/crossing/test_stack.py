@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.correction.crossing.stack import ImageStack
 
 GRID = ImageGrid(8, 64, 0.3, 0.0115, 0.5)

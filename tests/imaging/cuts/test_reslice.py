@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.planes import ReslicePlane, lateral_line, planes_from_first_frame
 from speckle3d.imaging.cuts.reslice import reslice_frames
 

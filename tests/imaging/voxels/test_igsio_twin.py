@@ -6,7 +6,7 @@ import pytest
 from igsio_twin import Clip
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.voxels.grid import VoxelGrid
 from speckle3d.imaging.voxels.volume import compound
 

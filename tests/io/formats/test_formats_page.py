@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from format_examples import rf
 
-from speckle3d.core.sweep import ImageGrid, RFSettings
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import RFSettings
 from speckle3d.io import readers
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, recording_files

@@ -5,7 +5,8 @@ from format_examples import FRAMES, SAMPLES, VECTORS, grey, iq, matlab_order, rf
 from sweep_examples import frames_of, sizes_of
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 

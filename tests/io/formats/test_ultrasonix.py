@@ -3,7 +3,8 @@ import pytest
 from format_examples import FRAMES, SAMPLES, VECTORS, grey, rf, write_ultrasonix
 from sweep_examples import frames_of
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from sweep_examples import frames_of, sizes_of
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import BModeSettings, ImageGrid, RFSettings
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, RFSettings
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep, open_recording
 

@@ -8,9 +8,9 @@ from igsio_twin import Clip
 from image_examples import grey, tracked, write_mha
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.region import Region
 from speckle3d.core.scan_conversion import ScanConversion
-from speckle3d.core.sweep import ImageGrid
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
 from speckle3d.io.load import load_sweep
 from speckle3d.io.plus.device_set import read_device_set

@@ -8,7 +8,8 @@ import SimpleITK
 import slicerio
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.sweep import BModeSettings, ImageGrid, Sweep
+from speckle3d.core.grid import ImageGrid
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.study.posed import PosedSweep
 from speckle3d.study.scenes.scene import SceneRequest, write_scene
