@@ -24,7 +24,7 @@ from speckle3d.config import Config
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
-from speckle3d.core.sweep import ImageGrid
+from speckle3d.core.grid import ImageGrid
 from speckle3d.core.threads import on_one_thread
 from speckle3d.imaging.voxels.volume import CompoundedVolume
 from speckle3d.io.igtl.messages import ImageReceived, Received, TransformReceived
