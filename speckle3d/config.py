@@ -12,7 +12,6 @@ from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.units import unit_of
 from speckle3d.correction.crossing.sweep import CrossingSettings
 from speckle3d.correction.drift import DriftSettings
 from speckle3d.correction.settings import FusedSettings
@@ -29,6 +28,21 @@ from speckle3d.motion.phantom import CurveSettings
 from speckle3d.motion.planes import PlaneSettings
 
 _COMMENT_WIDTH = 100
+_UNITS = {
+    "_mm": "mm",
+    "_rad": "rad",
+    "_deg": "degrees",
+    "_s": "s",
+    "_hz": "Hz",
+    "_db": "dB",
+    "_gb": "GB",
+    "_m_s": "m/s",
+    "_m_s2": "m/s^2",
+    "_deg_s": "degrees/s",
+    "_rad_s": "rad/s",
+    "_deg_per_mm": "degrees/mm",
+}
+"""Units of quantities, by how their names end."""
 REMOVED_SETTINGS = {
     "curves.straighten": "measured curves stay as they are, and a data sheet's lens is always fitted",
     "coherence.block_frames": "patches are fitted over at least 10 mm of travel",
@@ -174,3 +188,15 @@ def load_config(path: Path) -> Config:
         Naming the setting that is unknown or out of range.
     """
     return config_from_toml(read_toml(path), str(path))
+
+
+def unit_of(name: str) -> str:
+    """Unit of a quantity that carries it at the end of its name; empty for a pure number.
+
+    Examples
+    --------
+    >>> unit_of("voxel_mm"), unit_of("speed_of_sound_m_s"), unit_of("frames")
+    ('mm', 'm/s', '')
+    """
+    fits = [end for end in _UNITS if name.endswith(end)]
+    return _UNITS[max(fits, key=len)] if fits else ""

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 from speckle3d.config import Config
 from speckle3d.core.errors import naming
-from speckle3d.core.expected import require_kind
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import PUBLISHED, correct_mode, require_modes, sensor_of
 from speckle3d.correction.scale import FusedPoses, ScaledPoses
 from speckle3d.examine.sensors import believed, cleaned_readings, require_believed
-from speckle3d.pipeline import Tracked
+from speckle3d.pipeline import Tracked, require_kind
 
 Correction = DriftCorrection | ScaledPoses | FusedPoses
 

@@ -19,10 +19,9 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
-from speckle3d.core.expected import require_kind
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_table import plot_poses, pose_columns, pose_table
+from speckle3d.core.pose_table import plot_poses, pose_table
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
@@ -131,9 +130,9 @@ class Tracked:
         return plot_poses(poses, self._centre_mm, self.covariance)
 
     def to_dataframe(self) -> Any:
-        """Poses in mode `image` as a `pandas.DataFrame`, a row for each frame; see `pose_columns`."""
-        columns = pose_columns(self.image, self._centre_mm, self.covariance)
-        return pose_table({"time_s": self.frame_time_s, **columns, "flags": self.flags})
+        """Poses in mode `image` as a `pandas.DataFrame`, a row for each frame; see `pose_table`."""
+        others = {"time_s": self.frame_time_s, "flags": self.flags}
+        return pose_table(self.image, self._centre_mm, self.covariance, **others)
 
     @property
     def _centre_mm(self) -> FloatArray:
@@ -249,6 +248,29 @@ def track(
         sensors.trusted, tracked.image, tracked.covariance, tracked.scale_sigma
     )
     return replace(tracked, doubts=doubts, grid=sweep.grid, frame_time_s=sweep.frame_time_s)
+
+
+def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
+    """Raise unless an argument is of a kind.
+
+    Parameters
+    ----------
+    value : object
+        The argument.
+    kind : type
+    name : str
+        Of the argument.
+    made_by : str
+        What makes such an object, as ``load_sweep(path)``.
+
+    Raises
+    ------
+    InvalidInputError
+        If it is something else.
+    """
+    if not isinstance(value, kind):
+        got = type(value).__name__
+        raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")
 
 
 def _curves_beside(sweep: Sweep) -> DecorrelationCurves:

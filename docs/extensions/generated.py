@@ -14,7 +14,7 @@ from pydantic_core import PydanticUndefined
 from sphinx.application import Sphinx
 from sphinx.util import logging
 
-from speckle3d.core.units import unit_of
+from speckle3d.config import unit_of
 
 LOG = logging.getLogger(__name__)
 

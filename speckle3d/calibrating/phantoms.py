@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import numpy.typing as npt
 
 from calibration.beam import predict_bias
@@ -45,7 +46,7 @@ from speckle3d.core.calibration import readable
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
 from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedPoses
-from speckle3d.core.wires import WirePhantom, three_wires
+from speckle3d.core.wires import WirePhantom
 from speckle3d.io.plus_config import read_wire_phantom
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
@@ -292,3 +293,18 @@ def _nwire_notes(outcome: Outcome, points: ImagePoints) -> list[str]:
     matrix = outcome.calibration.pixel_matrix()
     mean, sd = trimmed_mean_mm(nwire_errors_mm(points, phantom.geometry, matrix, place))
     return [f"3-D error of the middle wires {mean:.3f} mm, SD {sd:.3f} mm (the least 95 %, as PLUS has it)"]
+
+
+_LONG_MM = 500.0
+"""Half the length of wires whose ends are not known: more than any bath holds."""
+
+
+def three_wires() -> WirePhantom:
+    """Three wires that meet at right angles, along the axes of the phantom's frame: ``x``, ``y`` and ``z``.
+
+    References
+    ----------
+    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, section 3.2.
+    """
+    ends_mm = _LONG_MM * np.stack([-np.eye(3), np.eye(3)], axis=1)
+    return WirePhantom(("x", "y", "z"), ends_mm)

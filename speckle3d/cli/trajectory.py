@@ -127,8 +127,8 @@ def score(
 
 
 def _table(found: dict[str, Any]) -> str:
+    from speckle3d.config import unit_of
     from speckle3d.core.tables import text_rows
-    from speckle3d.core.units import unit_of
     from speckle3d.scoring.displacements import MEANINGS
 
     rows = [(name, str(found[name]), "") for name in ("estimate", "poses", "association", "alignment")]

@@ -154,6 +154,11 @@ class Calibration:
             )
         return RigidTransform.from_components(self.translation_mm, self.rotation)
 
+    @property
+    def mounting(self) -> RigidTransform | Rotation:
+        """What of the image's pose in its sensor is known."""
+        return self.sensor_from_image if self.sensor == "tracker" else self.rotation
+
     def pixel_matrix(self) -> FloatArray:
         """Affine matrix from pixels (column, row, slice, 1) to the sensor's frame in mm, shape (4, 4).
 
@@ -201,31 +206,27 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     0.02
     """
     name, known_s = calibration.sensor, calibration.time_offset_s
-    held = sweep.tracker if name == "tracker" else sweep.orientation
+    held: Any = getattr(sweep, name)
     if held is None:
         raise MismatchError(f"{sweep.name}: expected the calibration's sensor, {name}, got none")
-    mounting = calibration.sensor_from_image if name == "tracker" else calibration.rotation
     offset_s = held.time_offset_s if known_s is None else known_s
     square = {"image_skew_rad": 0.0} if name == "tracker" else {}
-    mounted: Any = replace(held, sensor_from_image=mounting, time_offset_s=offset_s, **square)  # type: ignore[arg-type]
+    mounted = replace(held, sensor_from_image=calibration.mounting, time_offset_s=offset_s, **square)
     return replace(sweep, **{name: mounted})
 
 
 def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
     """Return the larger relative difference of a calibration's pixel sizes from a grid's; zero if unknown."""
-    if calibration.pixel_mm is None:
-        return 0.0
     size_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    return float(np.abs(calibration.pixel_mm / size_mm - 1.0).max())
+    return 0.0 if calibration.pixel_mm is None else float(np.abs(calibration.pixel_mm / size_mm - 1.0).max())
 
 
 def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, float]:
     """Return how far a calibration's mounting is from the sweep's own, in degrees and mm; zero if unknown."""
-    sensor = sweep.tracker if calibration.sensor == "tracker" else sweep.orientation
-    held = None if sensor is None else sensor.sensor_from_image
+    held: Any = getattr(getattr(sweep, calibration.sensor), "sensor_from_image", None)
     if held is None:
         return 0.0, 0.0
-    if isinstance(held, Rotation):
-        return float(np.rad2deg((held.inv() * calibration.rotation).magnitude())), 0.0
-    step = held.inv() * calibration.sensor_from_image
+    step = held.inv() * calibration.mounting
+    if isinstance(step, Rotation):
+        return float(np.rad2deg(step.magnitude())), 0.0
     return float(np.rad2deg(step.rotation.magnitude())), float(np.linalg.norm(step.translation))

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-
-import numpy as np
-
-from speckle3d.core.arrays import IntArray
-from speckle3d.core.errors import Speckle3DError
 
 
 @dataclass(frozen=True)
@@ -48,30 +42,3 @@ class Doubt:
     def consequence(self) -> str:
         """The doubt as a line, which says so where what is doubted is not used."""
         return f"{self}; refused" if self.refuted else str(self)
-
-
-def runs_of(frames: IntArray) -> tuple[tuple[int, int], ...]:
-    """First and last of every run of consecutive frames.
-
-    Parameters
-    ----------
-    frames : ndarray of int
-        In any order; any number of times each.
-
-    Examples
-    --------
-    >>> runs_of(np.array([7, 3, 4, 4]))
-    ((3, 4), (7, 7))
-    """
-    ordered = np.unique(frames)
-    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
-    return tuple((int(run[0]), int(run[-1])) for run in runs if run.size)
-
-
-def unrefuted(doubts: Iterable[Doubt | None], where: str, error: type[Speckle3DError]) -> tuple[Doubt, ...]:
-    """Return doubts that leave what is doubted usable; raise `error` with the first that does not."""
-    found = tuple(doubt for doubt in doubts if doubt is not None)
-    for doubt in found:
-        if doubt.refuted:
-            raise error(f"{where}: {doubt}")
-    return found

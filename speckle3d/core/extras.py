@@ -26,16 +26,9 @@ def require_extra(extra: str, what: str, *packages: str) -> None:
     InvalidInputError
         If one is missing.
     """
-    missing = [name for name in packages if not _is_there(name)]
+    missing = [name for name in packages if find_spec(name) is None]
     if missing:
         raise InvalidInputError(f'{what} needs {", ".join(missing)}: pip install "speckle3d[{extra}]"')
-
-
-def _is_there(name: str) -> bool:
-    try:
-        return find_spec(name) is not None
-    except ValueError:  # a module without its description, as a placeholder for one that must not be loaded
-        return False
 
 
 def extra_module(name: str, extra: str, what: str) -> Any:

@@ -11,9 +11,6 @@ from speckle3d.core.errors import FileError
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
-_NO_WAIT = getattr(os, "O_NONBLOCK", 0)
-"""A pipe is opened without waiting for its writer; where there is no such flag, there are no such pipes."""
-
 
 def open_regular(path: PathLike) -> BufferedReader:
     """Open an ordinary file for reading bytes; a link is followed.
@@ -24,10 +21,11 @@ def open_regular(path: PathLike) -> BufferedReader:
         If there is none, it cannot be read, or it is a folder, a pipe, a socket or a device.
     """
     try:
-        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | _NO_WAIT))  # noqa: SIM115
+        # A pipe without a writer would wait.
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise FileError(f"{path}: expected a file, got a folder, pipe or device")
+        return open(path, "rb")
+    except FileError:
+        raise
     except (OSError, ValueError) as error:
         raise FileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
-        raise FileError(f"{path}: expected a file, got a folder, pipe or device")
-    return file

@@ -102,8 +102,10 @@ class PosedErrors:
         points_mm, directions : ndarray, shape (k, 3)
             In the world; directions of length one.
         """
-        moved = self._wrenches(points_mm, directions, belonging) @ self._factors.T
-        return np.asarray((moved**2).sum(axis=1))
+        moved = self._shares(belonging) @ self._screws.reshape(len(self.errors), -1)
+        moments = np.hstack([directions, np.cross(points_mm, directions)])
+        along = np.einsum("ka,kam->km", moments, moved.reshape(*moments.shape, -1))
+        return np.asarray((along**2).sum(axis=1))
 
     def of_gradient(self, points_mm: FloatArray, gradient: FloatArray, belonging: Belonging) -> FloatArray:
         """What a quantity changes by for one deviation of each variable, shape (m,).
@@ -113,22 +115,22 @@ class PosedErrors:
         points_mm, gradient : ndarray, shape (k, 3)
             Points in the world, and the quantity's derivative with respect to each.
         """
-        return np.asarray(self._factors @ self._wrenches(points_mm, gradient, belonging).sum(axis=0))
+        moments = np.hstack([gradient, np.cross(points_mm, gradient)])
+        return np.asarray(np.einsum("na,nam->m", self._shares(belonging).T @ moments, self._screws))
 
     @property
-    def _factors(self) -> FloatArray:
-        return self.errors.factors.reshape(len(self.errors.factors), -1)
+    def _screws(self) -> FloatArray:
+        """What each variable moves and turns each frame by, about the world's origin, shape (n, 6, m).
 
-    def _wrenches(self, points_mm: FloatArray, forces: FloatArray, belonging: Belonging) -> csr_array:
-        """Force and torque that a force on each point exerts on each frame's pose, shape (k, 6 n).
-
-        What the poses' errors displace a point by along the force is their product with this.
+        What it displaces a point by along a force is the product with the force and its moment.
         """
-        along = self.world_from_image[0].rotation.inv()
-        centres = along.apply(self.world_from_image.apply(self.centre_mm))
-        arms = along.apply(points_mm)[:, None] - centres[belonging.frames]
-        pull = belonging.weights[..., None] * along.apply(forces)[:, None]
-        wrenches = np.concatenate([pull, np.cross(arms, pull)], axis=-1)
-        columns = 6 * belonging.frames[..., None] + np.arange(6)
-        rows = np.arange(len(arms) + 1) * wrenches[:1].size
-        return csr_array((wrenches.ravel(), columns.ravel(), rows), (len(arms), 6 * len(self.errors)))
+        along = self.world_from_image[0].rotation.as_matrix().T
+        shift, turn = self.errors.factors[..., :3] @ along, self.errors.factors[..., 3:] @ along
+        centres = self.world_from_image.apply(self.centre_mm)
+        return np.concatenate([shift - np.cross(turn, centres), turn], axis=-1).transpose(1, 2, 0)
+
+    def _shares(self, belonging: Belonging) -> csr_array:
+        """Weight of each frame at each point, shape (k, n)."""
+        k = len(belonging.weights)
+        rows = 2 * np.arange(k + 1)
+        return csr_array((belonging.weights.ravel(), belonging.frames.ravel(), rows), (k, len(self.errors)))

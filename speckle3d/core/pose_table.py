@@ -1,4 +1,4 @@
-"""Poses of frames as columns of numbers, as a table of pandas and as curves: places, angles, length."""
+"""Poses of frames as a table of pandas and as curves: places, angles, length."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ _WITHIN = 1.96
 """Standard deviations to either side that hold 95 %."""
 
 
-def pose_columns(
-    world_from_image: RigidTransform, centre_mm: FloatArray, covariance: FloatArray | None = None
-) -> dict[str, FloatArray]:
-    """Columns of numbers that poses are told by, each of shape (n,), units at the end of their names.
+def pose_table(
+    world_from_image: RigidTransform,
+    centre_mm: FloatArray,
+    covariance: FloatArray | None = None,
+    **others: FloatArray | IntArray | None,
+) -> Any:
+    """Poses as a `pandas.DataFrame` indexed by frame, from 0, units at the end of the columns' names.
 
     Parameters
     ----------
@@ -39,23 +42,27 @@ def pose_columns(
         Angles are those of the turn from the first frame.
     covariance : ndarray, shape (n, 6, 6), optional
         Of x, y, z (mm), tilt, yaw, roll (rad); its standard deviations become columns ``sigma_...``.
+    **others : ndarray, shape (n,), or None
+        Further columns.
     """
+    pandas = extra_module("pandas", "notebook", "a table of poses")
+    columns = {**others, **_columns(world_from_image, centre_mm, covariance)}
+    table = pandas.DataFrame({name: values for name, values in columns.items() if values is not None})
+    return table.rename_axis(index="frame")
+
+
+def _columns(
+    world_from_image: RigidTransform, centre_mm: FloatArray, covariance: FloatArray | None
+) -> dict[str, FloatArray]:
     turned = roll_yaw_tilt(world_from_image[0].rotation.inv() * world_from_image.rotation)
     values = [*world_from_image.apply(centre_mm).T, *np.rad2deg(turned).T[::-1]]
     columns = dict(zip(_NAMES, values, strict=True))
-    columns["length_mm"] = np.concatenate([[0.0], np.cumsum(elevational_steps(world_from_image, centre_mm))])
+    columns["length_mm"] = np.append(0.0, np.cumsum(elevational_steps(world_from_image, centre_mm)))
     if covariance is not None:
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0))
         sigma[:, 3:] = np.rad2deg(sigma[:, 3:])
         columns |= {f"sigma_{name}": column for name, column in zip(_NAMES, sigma.T, strict=True)}
     return columns
-
-
-def pose_table(columns: Mapping[str, FloatArray | IntArray | None]) -> Any:
-    """Columns as a `pandas.DataFrame` indexed by frame, from 0; without those that are None."""
-    pandas = extra_module("pandas", "notebook", "a table of poses")
-    table = pandas.DataFrame({name: values for name, values in columns.items() if values is not None})
-    return table.rename_axis(index="frame")
 
 
 def plot_poses(
@@ -77,16 +84,16 @@ def plot_poses(
     figure, axes = pyplot.subplots(1, 4, figsize=(13.0, 3.2), layout="constrained")
     pyplot.close(figure)  # it is shown by whom it is returned to, once
     for mode, world_from_image in poses.items():
-        columns = pose_columns(world_from_image, centre_mm, covariance if mode == "image" else None)
+        columns = _columns(world_from_image, centre_mm, covariance if mode == "image" else None)
         for panel, (label, (name, sigma)) in zip(axes, _PANELS.items(), strict=True):
             values = columns[name]
             (line,) = panel.plot(values, label=f"mode {mode}")
             panel.set(xlabel="frame", ylabel=label)
             if sigma in columns:
-                low, high = (values + side * _WITHIN * columns[sigma] for side in (-1, 1))
-                style = {"color": line.get_color(), "alpha": 0.15, "linewidth": 0}
+                half = _WITHIN * columns[sigma]
+                frame, label = np.arange(values.size), f"95 % interval of mode {mode}"
                 panel.fill_between(
-                    np.arange(values.size), low, high, label=f"95 % interval of mode {mode}", **style
+                    frame, values - half, values + half, label=label, color=line.get_color(), alpha=0.15, lw=0
                 )
     axes[0].legend(fontsize="small", frameon=False)
     return figure

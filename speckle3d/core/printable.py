@@ -23,19 +23,14 @@ def printable(text: str, kept: str = "") -> str:
     >>> printable("a\x1b[31m\nb"), printable("Größe 3 µm"), printable("a\nb", kept="\n")
     ('a\\x1b[31m\\nb', 'Größe 3 µm', 'a\nb')
     """
-    if text.isprintable():
-        return text
-    return "".join(c if _is_shown(c) or c in kept else _escaped(c) for c in text)
+    return "".join(
+        c
+        if c.isprintable() or unicodedata.category(c) == "Zs" or c in kept
+        else c.encode("unicode_escape").decode("ascii")
+        for c in text
+    )
 
 
 def written_path(path: str | os.PathLike[str]) -> str:
     """Path as text that every file can hold: bytes of a name that are no Unicode are escaped."""
     return os.fsencode(path).decode("utf-8", "backslashreplace")
-
-
-def _is_shown(character: str) -> bool:
-    return character.isprintable() or unicodedata.category(character) == "Zs"
-
-
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")

@@ -13,7 +13,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_table import plot_poses, pose_columns, pose_table
+from speckle3d.core.pose_table import plot_poses, pose_table
 from speckle3d.core.shown import shown
 
 if TYPE_CHECKING:
@@ -217,12 +217,12 @@ class Reconstruction:
         return plot_poses(self.poses, self.grid.centre_mm, covariance)
 
     def to_dataframe(self, mode: str = "image") -> Any:
-        """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `pose_columns`."""
+        """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `pose_table`."""
         poses, trust = self._of(mode), self.trust
         errors = None if trust is None else trust if mode == "image" else trust.modes.get(mode)
-        columns = pose_columns(poses, self.grid.centre_mm, None if errors is None else errors.covariance)
+        covariance = None if errors is None else errors.covariance
         flags = None if trust is None else trust.flags
-        return pose_table({"time_s": self.frame_time_s, **columns, "flags": flags})
+        return pose_table(poses, self.grid.centre_mm, covariance, time_s=self.frame_time_s, flags=flags)
 
     def to_pyvista(self, mode: str = "image") -> Any:
         """Outlines of the frames at the poses of a mode as a `pyvista.PolyData`, mm (extra ``pyvista``)."""
@@ -236,19 +236,6 @@ class Reconstruction:
         if mode not in self.poses:
             raise InvalidInputError(f"mode: expected one of {', '.join(self.poses)}, got {mode!r}")
         return self.poses[mode]
-
-    def facts(self) -> list[tuple[str, object]]:
-        """What the reconstruction shows of itself."""
-        flagged = 0 if self.trust is None else int(np.count_nonzero(self.trust.flags))
-        return [
-            ("frames", f"{self.frame_time_s.size}, {flagged} of them flagged"),
-            ("modes", ", ".join(self.poses)),
-            ("image", f"{self.grid.width_mm:.4g} x {self.grid.depth_mm:.4g} mm"),
-            ("input", self.provenance.input_path),
-            ("made by", f"speckle3d {self.provenance.package_version}"),
-            ("pairs", "not read" if self.pairs is None else len(self.pairs)),
-            ("errors", "none" if self.trust is None else "covariance of every frame's pose"),
-        ]
 
     def __post_init__(self) -> None:
         if "image" not in self.poses:

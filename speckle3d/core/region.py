@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -71,10 +70,10 @@ class Region:
             )
         return inside
 
-    def part(self, grid: ImageGrid, world_from_image: RigidTransform) -> tuple[ImageGrid, RigidTransform]:
-        """Smallest rectangles of the images that hold the region: their grid, and the poses of each.
+    def part(self, grid: ImageGrid) -> ImageGrid:
+        """Smallest rectangle of an image of parallel vectors that holds the region.
 
-        A grid of voxels around them has no room for what does not count.
+        A grid of voxels around it has no room for what does not count.
 
         Raises
         ------
@@ -83,10 +82,9 @@ class Region:
         """
         inside = self.mask(grid)
         vector, sample = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-        moved_mm = np.append(grid.mm(vector[0], sample[0]) - grid.mm(0, 0), 0.0)
-        sides = int(vector[-1] - vector[0] + 1), int(sample[-1] - sample[0] + 1)
-        within = replace(grid, vectors=sides[0], samples=sides[1])
-        return within, world_from_image * RigidTransform.from_translation(moved_mm)
+        wide, high = int(np.ptp(vector)) + 1, int(np.ptp(sample)) + 1
+        left, top = grid.mm(vector[0], sample[0]).tolist()
+        return replace(grid, vectors=wide, samples=high, first_vector_mm=left, first_sample_depth_mm=top)
 
     def _inside(self, grid: ImageGrid) -> BoolArray:
         inside = np.ones((grid.vectors, grid.samples), dtype=bool)
@@ -134,10 +132,8 @@ def polygon_mask(shape: tuple[int, ...], corners: npt.ArrayLike, name: str = "po
 
 
 def _rectangle(grid: ImageGrid, low: Pair, high: Pair) -> BoolArray:
-    if not (np.isfinite([low, high]).all() and np.less(low, high).all()):
-        raise InvalidInputError(
-            f"rectangle: expected two finite corners, the lower values first, got {low} and {high} mm"
-        )
+    if not np.less(low, high).all():
+        raise ValueError
     x, y, hair = _positions_mm(grid)
     across = (x >= low[0] - hair) & (x <= high[0] + hair)
     return np.asarray(across & (y >= low[1] - hair) & (y <= high[1] + hair))
@@ -145,11 +141,8 @@ def _rectangle(grid: ImageGrid, low: Pair, high: Pair) -> BoolArray:
 
 def _fan(grid: ImageGrid, apex: Pair, angles_deg: Pair, radii: Pair) -> BoolArray:
     (left, right), (near, far) = angles_deg, radii
-    if not (np.isfinite(apex).all() and -90 <= left < right <= 90 and 0 <= near < far < np.inf):
-        raise InvalidInputError(
-            "fan: expected a finite apex, two angles of -90 to 90 degrees and two radii of zero or more, "
-            f"the smaller first, got {apex} {angles_deg} {radii}"
-        )
+    if not (-90 <= left < right <= 90 and 0 <= near < far):
+        raise ValueError
     x, y, hair = _positions_mm(grid)
     x, y = x - apex[0], y - apex[1]
     radius = np.hypot(x, y)

@@ -352,25 +352,6 @@ class Sweep:
         grid = ImageGrid(columns, rows, across, down, first_row_depth_mm)
         return cls(read, grid, kind, np.asarray(frame_time_s), **others)
 
-    def facts(self) -> list[tuple[str, object]]:
-        """What the sweep shows of itself."""
-        n, vectors, samples = self.frames.shape
-        time_s, grid = self.frame_time_s, self.grid
-        kind = "B-mode"
-        if isinstance(self.signal, RFSettings):
-            kind = "I/Q" if self.signal.are_complex else "RF"
-        rate = f", {(n - 1) / (time_s[-1] - time_s[0]):.4g} frames/s" if n > 1 else ""
-        return [
-            ("name", self.name),
-            ("frames", f"{n} of {vectors} vectors x {samples} samples, {kind}, {self.frames.dtype}"),
-            ("time", f"{time_s[0]:.3f} to {time_s[-1]:.3f} s{rate}"),
-            ("image", f"{grid.width_mm:.4g} x {grid.depth_mm:.4g} mm"),
-            ("orientation readings", self.orientation and len(self.orientation.readings)),
-            ("tracker readings", self.tracker and len(self.tracker.readings)),
-            ("truth", None if self.truth is None else f"{n} poses"),
-            ("probe", self.probe or "not named"),
-        ]
-
     def to_xarray(self) -> Any:
         """All frames as an `xarray.DataArray` over frame, lateral_mm and depth_mm; read into memory.
 

@@ -75,7 +75,7 @@ def _submitted(work: Callable[[], Result]) -> Future[Result]:
 def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1) -> None:
     """Call a function with the first and the end of slices of ``range(count)``, until all are done.
 
-    The calling thread works, too, and does what no other thread has begun, so that calls may be nested.
+    The calling thread does what no other has begun, so that calls may be nested.
 
     Parameters
     ----------
@@ -92,25 +92,8 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
             function(0, count)
         return
     size = max(grain, -(-count // (_SLICES_PER_CORE * threads)))
-    # An iterator gives each start once, whichever thread asks.
-    starts = iter(range(0, count, size))
-
-    def work() -> None:
-        try:
-            for first in starts:
-                function(first, min(first + size, count))
-        finally:
-            # After an error no thread begins another slice.
-            deque(starts, maxlen=0)
-
-    others = [_submitted(work) for _ in range(threads - 1)]
-    try:
-        work()
-    finally:
-        begun = [other for other in others if not other.cancel()]
-        wait(begun)
-    for other in begun:
-        other.result()
+    starts = range(0, count, size)
+    deque(ahead(lambda first: function(first, min(first + size, count)), starts, len(starts)), maxlen=0)
 
 
 def ahead(function: Callable[[Item], Result], items: Iterable[Item], most: int = 3) -> Generator[Result]:

@@ -17,8 +17,6 @@ _PARALLEL_SINE = 0.02
 over tens of millimetres, a quarter of that."""
 _FLAT_MM = 0.5
 """Largest distance at which two wires of one layer still cross: about half a wire's thickness."""
-_LONG_MM = 500.0
-"""Half the length of wires whose ends are not known: more than any bath holds."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +51,16 @@ class WirePhantom:
 
     def __post_init__(self) -> None:
         k = len(self.names)
-        if k == 0:
-            raise InvalidInputError("wires: expected at least one, got none")
+        if not 0 < len(set(self.names)) == k:
+            raise InvalidInputError(f"wires: expected different names, got {', '.join(self.names) or 'none'}")
         if self.ends_mm.shape != (k, 2, 3):
             raise MismatchError(f"ends_mm: expected shape {(k, 2, 3)}, got {self.ends_mm.shape}")
         require_finite(self.ends_mm, "ends_mm")
-        if len(set(self.names)) < k:
-            raise InvalidInputError(f"names: expected different ones, got {', '.join(self.names)}")
-        for name, (start, end) in zip(self.names, self.ends_mm, strict=True):
-            if (start == end).all():
-                raise InvalidInputError(f"wire {name}: expected two different ends, got the same twice")
+        short = np.flatnonzero((self.ends_mm[:, 0] == self.ends_mm[:, 1]).all(axis=1))
+        if short.size:
+            raise InvalidInputError(f"wire {self.names[short[0]]}: expected two different ends, got one")
         for number, pattern in enumerate(self.patterns):
-            if not pattern or len(set(pattern)) < len(pattern) or not set(pattern) <= set(range(k)):
+            if not 0 < len(set(pattern) & set(range(k))) == len(pattern):
                 raise InvalidInputError(
                     f"patterns[{number}]: expected different wires from 0 to {k - 1}, got {pattern}"
                 )
@@ -130,14 +126,3 @@ class WirePhantom:
         """
         rows = self.normals[wire]
         return rows, np.asarray(np.einsum("...ri,...i->...r", rows, self.points_mm[wire]))
-
-
-def three_wires(world_from_phantom: RigidTransform | None = None) -> WirePhantom:
-    """Three wires that meet at right angles, along the axes of the phantom's frame: ``x``, ``y`` and ``z``.
-
-    References
-    ----------
-    .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, section 3.2.
-    """
-    ends_mm = _LONG_MM * np.stack([-np.eye(3), np.eye(3)], axis=1)
-    return WirePhantom(("x", "y", "z"), ends_mm, world_from_phantom=world_from_phantom)

@@ -14,9 +14,10 @@ from scipy.optimize import least_squares
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.curves import DecorrelationCurves, EchoSpectra, SpeckleSize
-from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.examine.recording import unrefuted
 from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.texture import Texture
 from speckle3d.motion.coherence import NOISY_GAIN, RowScales

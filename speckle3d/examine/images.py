@@ -13,10 +13,11 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Sweep
 from speckle3d.examine.curves import examine_curves
+from speckle3d.examine.recording import unrefuted
 from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.table import CorrelationTable

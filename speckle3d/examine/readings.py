@@ -10,7 +10,6 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
-from speckle3d.core.doubts import runs_of
 from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import OrientationSensor, Tracker
@@ -102,3 +101,21 @@ def standstill(sensor: OrientationSensor | Tracker) -> tuple[float, float]:
     runs = runs_of(np.flatnonzero(still))
     spans = [(float(time_s[first]), float(time_s[last + 1])) for first, last in runs]
     return max(spans, key=lambda span: span[1] - span[0], default=(float(time_s[0]),) * 2)
+
+
+def runs_of(frames: IntArray) -> tuple[tuple[int, int], ...]:
+    """First and last of every run of consecutive frames.
+
+    Parameters
+    ----------
+    frames : ndarray of int
+        In any order; any number of times each.
+
+    Examples
+    --------
+    >>> runs_of(np.array([7, 3, 4, 4]))
+    ((3, 4), (7, 7))
+    """
+    ordered = np.unique(frames)
+    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
+    return tuple((int(run[0]), int(run[-1])) for run in runs if run.size)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from scipy.signal import welch
 
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.doubts import Doubt, unrefuted
-from speckle3d.core.errors import MismatchError
+from speckle3d.core.doubts import Doubt
+from speckle3d.core.errors import MismatchError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.matcher import FrameMatcher
@@ -120,3 +120,12 @@ def doubt_white(sweep: Sweep) -> Doubt | None:
         return None
     evidence = f"expected at most {MOST_WHITE:.0%} of what is not black at full white, got {share:.1%}"
     return Doubt("images", "gain", evidence, False)
+
+
+def unrefuted(doubts: Iterable[Doubt | None], where: str, error: type[Speckle3DError]) -> tuple[Doubt, ...]:
+    """Return doubts that leave what is doubted usable; raise `error` with the first that does not."""
+    found = tuple(doubt for doubt in doubts if doubt is not None)
+    for doubt in found:
+        if doubt.refuted:
+            raise error(f"{where}: {doubt}")
+    return found

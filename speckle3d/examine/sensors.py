@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.doubts import Doubt, runs_of
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
 from speckle3d.examine.conventions import doubts_of_gravity, doubts_of_gyroscope, turns_confirmed
@@ -21,6 +21,7 @@ from speckle3d.examine.readings import (
     frames_at,
     jitter,
     rigid,
+    runs_of,
     slips,
     spikes,
     standstill,

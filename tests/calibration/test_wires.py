@@ -10,8 +10,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from calibration.points import ImagePoints
 from calibration.settings import WireFit
 from calibration.wires import calibrate_cross_wire, calibrate_wires
+from speckle3d.calibrating.phantoms import three_wires
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.wires import WirePhantom, three_wires
+from speckle3d.core.wires import WirePhantom
 
 CROSSING_MM = np.array([10.0, -20.0, 30.0])
 PLACE = RigidTransform.from_components([100.0, -50.0, 200.0], Rotation.from_euler("xyz", [0.3, -0.2, 1.0]))

@@ -7,7 +7,7 @@ import pytest
 import speckle
 
 from speckle3d.core.curves import SpeckleSize, TiltResponse
-from speckle3d.core.doubts import Doubt, unrefuted
+from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.examine.curves import (
@@ -15,7 +15,7 @@ from speckle3d.examine.curves import (
     doubt_curves,
     doubt_size,
 )
-from speckle3d.examine.recording import doubt_depths, doubt_widths
+from speckle3d.examine.recording import doubt_depths, doubt_widths, unrefuted
 from speckle3d.matching.intensity import two_way_wavenumber
 from speckle3d.matching.patches import lay_patches
 from speckle3d.motion.coherence import RowScales

@@ -198,8 +198,8 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     began, settings = time.perf_counter(), request.settings
     levels = None if settings.levels == "auto" else settings.levels
     source, meaning = posed.source(levels, settings.dynamic_range_db)
-    images = source.grid, source.world_from_image
-    grid = request.grid.grid(*(request.region.part(*images) if request.region else images), settings)
+    part = request.region.part(source.grid) if request.region else source.grid
+    grid = request.grid.grid(part, source.world_from_image, settings)
     mask = None if request.region is None else request.region.mask(source.grid)
     weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
     fields = fields_of(posed, request, meaning)
