@@ -14,7 +14,7 @@ extensions = [
     "myst_nb",  # Markdown pages, and notebooks executed at each build
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",  # docstrings in numpydoc's form
-    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # equations without a network
     "sphinx_copybutton",
 ]
 html_theme = "furo"

@@ -122,11 +122,23 @@ class Tracked:
     grid: ImageGrid | None = None
     frame_time_s: FloatArray | None = None
 
-    def plot(self) -> Figure:
-        """Draw length, tilt, yaw and roll against the frame, with their 95 % intervals."""
+    def plot(self, sweep: Sweep | None = None) -> Figure:
+        """Draw length, tilt, yaw and roll against the frame, with their 95 % intervals.
+
+        Parameters
+        ----------
+        sweep : Sweep, optional
+            From which it was made: its tracker alone and its truth are drawn, where it has them.
+        """
         poses = {"image": self.image}
         if self.subset is not None:
             poses["consistent-subset"] = self.subset
+        if sweep is not None:
+            tracker, times = sweep.tracker, sweep.frame_time_s
+            if tracker is not None and tracker.sensor_from_image is not None and tracker.covers(times).all():
+                poses["tracker"] = tracker.world_from_image(times)
+            if sweep.truth is not None:
+                poses["truth"] = sweep.truth
         return plot_poses(poses, self._centre_mm, self.covariance)
 
     def to_dataframe(self) -> Any:

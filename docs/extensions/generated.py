@@ -116,31 +116,47 @@ def _escaped(text: str) -> str:
     return text.replace("<", "&lt;").replace("*", "\\*")
 
 
-def api_pages() -> dict[str, str]:
-    """One page for each public name, `package.name`."""
+def api_pages(groups: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """One page for each public name, `package.name`; with its group's example if it has none of its own."""
     pages: dict[str, str] = {}
-    for package in PUBLIC:
-        module = importlib.import_module(package)
-        for name in sorted(n for n in dir(module) if not n.startswith("_")):
-            public = getattr(module, name)
-            if isinstance(public, type(module)):
-                continue
-            kind = (
-                "autoclass"
-                if isinstance(public, type)
-                else "autofunction"
-                if callable(public)
-                else "autodata"
-            )
-            more = (
-                "\n   :members:"
-                if kind == "autoclass" and not issubclass(public, (BaseModel, Exception))
-                else ""
-            )
-            pages[f"{package}.{name}"] = (
-                f"# `{package}.{name}`\n\n```{{eval-rst}}\n.. {kind}:: {package}.{name}{more}\n```\n"
-            )
+    for name in (name for group in groups.values() for name in group["names"]):
+        public = _public(name)
+        kind = {True: "autoclass", False: "autofunction"}[isinstance(public, type)]
+        is_plain = kind == "autoclass" and not issubclass(public, (BaseModel, Exception))
+        more = "\n   :members:" if is_plain else ""
+        pages[name] = f"# `{name}`\n\n```{{eval-rst}}\n.. {kind}:: {name}{more}\n```\n"
+        if ">>>" not in (public.__doc__ or ""):
+            (example,) = (group["example"] for group in groups.values() if name in group["names"])
+            pages[name] += f"\nFor example:\n\n```python\n{example.strip()}\n```\n"
+    every = {f"{package}.{name}" for package in PUBLIC for name in _names(importlib.import_module(package))}
+    if every != set(pages):
+        LOG.warning("reference/api.toml: has not %s", ", ".join(sorted(every ^ set(pages))))
     return pages
+
+
+def api_index(groups: dict[str, dict[str, Any]]) -> str:
+    """Public names by task, with the first sentence of each."""
+    lines = ["# Python", "", "Public names of `speckle3d` and `xsens` by task.", ""]
+    for title, group in groups.items():
+        lines += [f"## {title}", "", "| name | what it is |", "|---|---|"]
+        for name in group["names"]:
+            lines.append(
+                f"| [`{name}`]({name}.md) | {_cell((_public(name).__doc__ or '').split(chr(10))[0])} |"
+            )
+        lines.append("")
+    names = [name for group in groups.values() for name in group["names"]]
+    return "\n".join([*lines, "```{toctree}", ":hidden:", "", *names, "```"])
+
+
+def _public(name: str) -> Any:
+    package, _, inside = name.partition(".")
+    return getattr(importlib.import_module(package), inside)
+
+
+def _names(module: Any) -> list[str]:
+    return [
+        n for n in dir(module) if not n.startswith("_") and not isinstance(getattr(module, n), type(module))
+    ]
 
 
 def write(app: Sphinx) -> None:
@@ -156,11 +172,12 @@ def write(app: Sphinx) -> None:
         "settings": settings_page("Settings", groups, when),
         "import-settings": settings_page("What a recording does not say", {"import": ImportSettings}, when),
     }
-    commands, api = command_pages(), api_pages()
+    tasks = tomllib.loads((here.parent / "api.toml").read_text())
+    commands, api = command_pages(), api_pages(tasks)
     pages |= {f"commands/{name}": text for name, text in commands.items()}
     pages |= {f"api/{name}": text for name, text in api.items()}
     pages["commands/index"] = _index("Commands", "`speckle3d COMMAND --help` says the same.", commands)
-    pages["api/index"] = _index("Python", "Public names of `speckle3d` and `xsens`.", api)
+    pages["api/index"] = api_index(tasks)
     for name, text in pages.items():
         path = here / f"{name}.md"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -128,6 +128,7 @@ def command_of(name: str, function: Command) -> TyperCommand:
         }
         for flag, option in given.items():
             _require_fit(flag, option, values[option.name], given)
+            values[option.name] = _opened(option, values[option.name])
         for group, names in groups.items():
             picked = {name: values.pop(name) for name in names}
             values[group] = {name: value for name, value in picked.items() if value is not None}
@@ -165,6 +166,13 @@ def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mappin
             is_server = re.fullmatch(r"[^/]+:[0-9]+", str(path))
             live = f"; a server's sweep: speckle3d live {path} --view" if is_server else ""
             raise FileError(f"{where}{path}: expected a file, got none{live}")
+
+
+def _opened(option: inspect.Parameter, value: Any) -> Any:
+    """The reconstruction that stands for a results folder; any other value as it is."""
+    if not isinstance(value, Path) or option.annotation.__metadata__[0].writable:
+        return value
+    return inside if (inside := value / "reconstruction.h5").is_file() else value
 
 
 def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> inspect.Parameter:

@@ -63,9 +63,9 @@ def shared() -> None:
     images
         Recording: a sweep file, an image sequence, a scanner's package.
     input_file
-        reconstruction.h5 of a results folder, or a recording with a calibrated tracker or true poses.
+        A results folder or its reconstruction.h5, or a recording with a calibrated tracker or true poses.
     reconstruction_file
-        reconstruction.h5 of a results folder.
+        A results folder, or its reconstruction.h5.
     log_file
         A log of the sensor, of any kind that is known, or a sweep with one. A plain CSV has the columns
         time_s, accelerometer_x_m_s2, gyroscope_x_rad_s, magnetometer_x_au (y and z likewise), quaternion_w to

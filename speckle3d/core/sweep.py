@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,15 @@ from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_increasing
 from speckle3d.core.grid import ImageGrid, require_positive
 from speckle3d.core.images import ImageFrames
+from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import Samples, TimedPoses, TimedRotations, TimedSamples
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SHOWN_DB = 60.0
+"""Range of echoes that are drawn."""
 
 INERTIAL = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
 """Vectors that an orientation sensor may measure beside its orientation, each of shape (m, 3)."""
@@ -374,6 +381,28 @@ class Sweep:
             dims=("frame", lateral, "depth_mm"),
             name=self.name,
         )
+
+    def plot(self, frame: int | None = None) -> Figure:
+        """Draw a frame, by default the middle one: echoes in dB, B-mode as it is, a fan scan converted."""
+        from matplotlib import pyplot
+        from scipy.signal import hilbert
+
+        number, grid = len(self) // 2 if frame is None else range(len(self))[frame], self.grid
+        image, label = np.asarray(self.frames[number]), "grey level"
+        if not isinstance(self.signal, BModeSettings):
+            echo = np.abs(image if np.iscomplexobj(image) else hilbert(image.astype(np.float32)))
+            below = np.maximum(echo / max(float(echo.max()), 1e-9), 10 ** (-_SHOWN_DB / 20))
+            image, label = 20 * np.log10(below), "dB below the maximum"
+        if grid.fan is not None:
+            picture = ScanConversion(grid)
+            image, grid = picture(image), picture.grid
+        figure, axes = pyplot.subplots(figsize=(5.0, 5.0), layout="constrained")
+        pyplot.close(figure)  # it is shown by whom it is returned to, once
+        (left, top), (right, bottom) = grid.extent_mm
+        drawn = axes.imshow(image.T, cmap="gray", extent=(left, right, bottom, top))
+        axes.set(xlabel="lateral / mm", ylabel="depth / mm", title=f"{self.name}, frame {number}")
+        figure.colorbar(drawn, label=label, shrink=0.7)
+        return figure
 
     def part(self, first: int, stop: int) -> Sweep:
         """The frames from `first` to before `stop` as a sweep of their own, with all sensors' readings.

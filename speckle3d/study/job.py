@@ -80,9 +80,9 @@ RESULTS = FileSet("reconstruction.h5", (*SUMMARY_FILES, *PICTURES))
 
 def run_job(
     sweep: Sweep,
-    source: Path,
+    source: PathLike,
     curves: DecorrelationCurves,
-    directory: Path,
+    directory: PathLike,
     drift: Sequence[str] = (),
     reference: str | None = None,
     config: Config | None = None,
@@ -130,6 +130,7 @@ def run_job(
         If the folder cannot be written, or another run is at work in it.
     """
     began, settings = time.perf_counter(), config or Config()
+    source, directory = Path(source), Path(directory)
     require_own_results(directory)
     sweep, mounted = apply_calibrations(sweep, calibrations)
     compared = require_possible(sweep, drift, reference, settings, crossing is not None)

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import tomllib
 
 import pytest
 from pages import ROOT, shown_commands
@@ -15,6 +16,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("**/*.md")),
 ]
 PAGES = [page for page in PAGES if "generated" not in page.parts]
+TASKS = tomllib.loads((ROOT / "docs" / "reference" / "api.toml").read_text())
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 
 _LINK = re.compile(r"\]\(([^)\s]+)\)")
@@ -70,3 +72,10 @@ def test_pages_are_within_the_line():
         if "methods" not in page.parts:
             for line in page.read_text().splitlines():
                 assert len(line) <= 230 or line.startswith("|"), f"{page.name}: {line[:80]}"
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_example_of_a_task_runs(task, tmp_path, monkeypatch):
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    exec(TASKS[task]["example"], {})
