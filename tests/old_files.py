@@ -162,7 +162,7 @@ def write_all(folder):
     """Write the set."""
     from speckle3d.io.calibrations import write_calibration
     from speckle3d.io.curves import write_curves
-    from speckle3d.io.reconstructions import ReconstructionWriter
+    from speckle3d.io.reconstructions import write_reconstruction
     from speckle3d.io.sweep_writer import GrowingSweep, write_sweep
 
     for name, (content, compression) in sweeps().items():
@@ -173,10 +173,7 @@ def write_all(folder):
     for name, content in calibrations().items():
         write_calibration(folder / f"{name}.h5", content)
     for name, content in reconstructions().items():
-        with ReconstructionWriter(folder / f"{name}.h5", content.frame_time_s, content.grid) as writer:
-            if content.pairs is not None:
-                writer.append_pairs(content.pairs)
-            writer.finish(content.poses, content.provenance, content.config_toml, content.trust)
+        write_reconstruction(folder / f"{name}.h5", content)
     content = sweeps()["rf"][0]
     for name, compression in (("growing", None), ("growing_gzip", "gzip")):
         with GrowingSweep(folder / f"{name}.h5", GRID, RF, compression=compression, probe="L14") as target:

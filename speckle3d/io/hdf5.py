@@ -196,17 +196,16 @@ def find_member(group: h5py.Group, name: str) -> Any:
     Raises
     ------
     InvalidInputError
-        If the name leads to another file, or to nothing.
+        If the name leads to nothing or to another file, or data are in another file.
     """
     where = locate(group, name)
     with reading(where):
         if not isinstance(group, h5py.Group) or group.get(name, getlink=True) is None:
             return None
         node = group.get(name)
-        if node is None or node.file.filename != group.file.filename:
-            raise InvalidInputError(
-                f"{where}: expected a member of the file itself, got a link to nothing or to another file"
-            )
+        is_own = node is not None and node.file.filename == group.file.filename
+        if not is_own or (isinstance(node, h5py.Dataset) and (node.is_virtual or node.external)):
+            raise InvalidInputError(f"{where}: expected data in the file itself, got a link to none")
         return node
 
 
@@ -217,22 +216,19 @@ def has_member(group: h5py.Group, name: str) -> bool:
 
 def require_group(group: h5py.Group, name: str) -> h5py.Group:
     """Return a group inside `group`, or raise `InvalidInputError` naming what is there instead."""
-    return _require_kind(group, name, h5py.Group, "a group")
+    return _require_kind(group, name, h5py.Group)
 
 
 def require_dataset(group: h5py.Group, name: str) -> h5py.Dataset:
     """Return a data set of `group`, or raise `InvalidInputError` if it is none or its data are elsewhere."""
-    node = _require_kind(group, name, h5py.Dataset, "a data set")
-    if node.is_virtual or node.external:
-        raise InvalidInputError(f"{locate(group, name)}: expected its data in the file, got them in others")
-    return node
+    return _require_kind(group, name, h5py.Dataset)
 
 
-def _require_kind(group: h5py.Group, name: str, kind: type[Node], words: str) -> Any:
+def _require_kind(group: h5py.Group, name: str, kind: type[Node]) -> Any:
     node = find_member(group, name)
     if not isinstance(node, kind):
-        got = "none" if node is None else type(node).__name__.lower()
-        raise InvalidInputError(f"{locate(group, name)}: expected {words}, got {got}")
+        expected, got = kind.__name__.lower(), "none" if node is None else type(node).__name__.lower()
+        raise InvalidInputError(f"{locate(group, name)}: expected a {expected}, got {got}")
     return node
 
 
@@ -259,12 +255,13 @@ def read_checked(
     if node.dtype.kind not in _ACCEPTED_KINDS[wanted.kind]:
         raise InvalidInputError(f"{where}: expected numbers of type {wanted}, got {node.dtype}")
     if shape is not None:
-        _require_shape(node, shape, where)
+        require_shape(node, shape, where)
     with reading(where):
         return np.asarray(node[()], dtype=wanted)
 
 
-def _require_shape(node: h5py.Dataset, shape: tuple[int | str, ...], where: str) -> None:
+def require_shape(node: h5py.Dataset, shape: tuple[int | str, ...], where: str) -> None:
+    """Raise `InvalidInputError` unless a data set is of a shape; a word stands for a length that is free."""
     got = node.shape or ()
     lengths = tuple(n if isinstance(wanted, str) else wanted for n, wanted in zip(got, shape, strict=False))
     if len(got) != len(shape) or got != lengths:
@@ -284,7 +281,7 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
     node, where = require_dataset(group, name), locate(group, name)
     if h5py.check_string_dtype(node.dtype) is None:
         raise InvalidInputError(f"{where}: expected texts, got {node.dtype}")
-    _require_shape(node, shape, where)
+    require_shape(node, shape, where)
     with reading(where):
         return np.asarray(node.asstr(errors="replace")[()], dtype=object).tolist()
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import TracebackType
-from typing import Self
+from collections.abc import Sequence
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
@@ -44,64 +41,28 @@ from speckle3d.io.records import put, put_fields, put_text, read_record, written
 
 FORMAT = "speckle3d.reconstruction"
 
-_PAIR_ROWS = ("first", "second", "first_from_second", "covariance", "distance_mm", "sigma_mm", "used")
-"""Data sets of /pairs with a row for each pair."""
 
-
-class ReconstructionWriter:
-    """Write a reconstruction file: open it before the work, append pairs as they come, finish it.
-
-    It appears whole when the block ends, or not at all. Opening it first shows an unwritable place before
-    the work instead of after.
+def write_reconstruction(path: PathLike, result: Reconstruction, pairs: Sequence[FramePairs] = ()) -> None:
+    """Write a reconstruction; the file appears whole or not at all.
 
     Parameters
     ----------
     path : path
-    frame_time_s : ndarray, shape (n,)
-    grid : ImageGrid
-        Of the sweep's images, so that a volume can be made from the file and the sweep.
+    result : Reconstruction
+    pairs : sequence of FramePairs
+        The frame pairs in parts, in place of those of `result`.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be written.
     """
-
-    def __init__(self, path: PathLike, frame_time_s: npt.ArrayLike, grid: ImageGrid) -> None:
-        self._path, self._grid, self._whole = path, grid, written(path, FORMAT)
-        self._times = require_increasing(frame_time_s, f"{path}: /frame_time_s")
-        self._pairs: list[FramePairs] = []
-
-    def __enter__(self) -> Self:
-        self._file = self._whole.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._whole.__exit__(kind, error, trace)
-
-    def append_pairs(self, pairs: FramePairs) -> None:
-        """Append frame pairs; their patches must be those of the pairs before.
-
-        Raises
-        ------
-        InvalidInputError
-            If a frame index is out of range.
-        """
-        _check_pairs(pairs, self._times.size, f"{self._path}: /pairs")
-        self._pairs.append(pairs)
-
-    def finish(
-        self,
-        poses: Mapping[str, RigidTransform],
-        provenance: Provenance,
-        config_toml: str = "",
-        trust: Trust | None = None,
-    ) -> None:
-        """Write the poses by mode, where they came from, the configuration and how far to trust them."""
-        file = self._file
-        with naming(str(self._path)):
-            # Checked by the container before anything is written.
-            Reconstruction(self._times, self._grid, dict(poses), provenance, config_toml, None, trust)
-        put(file, "frame_time_s", self._times)
-        put_fields(file, self._grid)
-        put(file, "poses", poses)
+    made, trust = result.provenance, result.trust
+    parts = pairs or ([] if result.pairs is None else [result.pairs])
+    with written(path, FORMAT) as file:
+        put(file, "frame_time_s", result.frame_time_s)
+        put_fields(file, result.grid)
+        put(file, "poses", result.poses)
         if trust is not None:
             modes = {"image": trust.covariance} | {mode: of.covariance for mode, of in trust.modes.items()}
             put(file, "pose_covariance", modes)
@@ -110,18 +71,16 @@ class ReconstructionWriter:
                 file["pose_covariance/image"].attrs.update(vars(trust.shared))
             for mode, errors in trust.modes.items():
                 file[f"pose_covariance/{mode}"].attrs["length_sigma"] = errors.length_sigma
-        put_fields(file, provenance, skip=["calibrations", "imported"])
-        for used in provenance.calibrations:
+        put_fields(file, made, skip=["calibrations", "imported"])
+        for used in made.calibrations:
             put(file, f"calibrations/{used.sensor}", SourceFile(used.path, used.sha256))
-        if provenance.imported is not None:
-            put(file, "import", {"name": provenance.imported.name})
-            put_text(file["import"], "settings_json", provenance.imported.settings_json)
-        put_text(file, "config_toml", config_toml)
-        if self._pairs:
-            put(file, "pairs", {"patch_centre_mm": self._pairs[0].patch_centre_mm})
-            for name in _PAIR_ROWS:
-                rows = np.concatenate([getattr(pairs, name) for pairs in self._pairs])
-                put(file["pairs"], name, rows, compression="lzf", shuffle=True)
+        if made.imported is not None:
+            put(file, "import", {"name": made.imported.name})
+            put_text(file["import"], "settings_json", made.imported.settings_json)
+        put_text(file, "config_toml", result.config_toml)
+        if parts:
+            rows = {name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+            put(file, "pairs", rows | {"patch_centre_mm": parts[0].patch_centre_mm})
 
 
 def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstruction:
@@ -161,19 +120,6 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
 
 load_reconstruction = read_reconstruction
 """Its public name, `speckle3d.load_reconstruction`."""
-
-
-def _check_pairs(pairs: FramePairs, frames: int, where: str) -> None:
-    lengths = {name: len(getattr(pairs, name)) for name in _PAIR_ROWS}
-    if len({*lengths.values()}) > 1:
-        raise InvalidInputError(f"{where}: expected equally many rows, got {lengths}")
-    bad = np.flatnonzero((pairs.first < 0) | (pairs.second <= pairs.first) | (pairs.second >= frames))
-    if bad.size:
-        i = int(bad[0])
-        raise InvalidInputError(
-            f"{where}[{i}]: expected frames 0 <= first < second < {frames}, "
-            f"got {pairs.first[i]} and {pairs.second[i]}"
-        )
 
 
 def _read_provenance(file: h5py.File) -> Provenance:
@@ -217,7 +163,15 @@ def _read_pairs(file: h5py.File, frames: int) -> FramePairs | None:
     if not has_member(file, "pairs"):
         return None
     group = require_group(file, "pairs")
-    pairs = read_record(group, FramePairs)
-    _check_pairs(pairs, frames, locate(group))
+    pairs, where = read_record(group, FramePairs), locate(group)
+    if len({len(rows) for name, rows in vars(pairs).items() if name != "patch_centre_mm"}) > 1:
+        raise InvalidInputError(f"{where}: expected equally many rows in each data set, got others")
+    bad = np.flatnonzero((pairs.first < 0) | (pairs.second <= pairs.first) | (pairs.second >= frames))
+    if bad.size:
+        i = int(bad[0])
+        raise InvalidInputError(
+            f"{where}[{i}]: expected frames 0 <= first < second < {frames}, "
+            f"got {pairs.first[i]} and {pairs.second[i]}"
+        )
     transforms_from_matrices(pairs.first_from_second, locate(group, "first_from_second"))
     return pairs

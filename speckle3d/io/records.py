@@ -81,8 +81,8 @@ def put_text(group: h5py.Group, name: str, text: str | Sequence[str]) -> None:
     group.create_dataset(name, data=plain, dtype=h5py.string_dtype())
 
 
-def put(group: h5py.Group, name: str, value: Any, **layout: Any) -> None:
-    """Write a value under a name by its type; `layout` is of a data set, as h5py has it.
+def put(group: h5py.Group, name: str, value: Any) -> None:
+    """Write a value under a name by its type.
 
     Numbers, texts and tuples of numbers become attributes, arrays and rigid transforms data sets, rotations
     a data set of quaternions with ``_wxyz`` behind its name, dataclasses and mappings groups. None is not
@@ -105,7 +105,7 @@ def put(group: h5py.Group, name: str, value: Any, **layout: Any) -> None:
     else:
         values = np.asarray(value.as_matrix() if isinstance(value, RigidTransform) else value)
         reserve(group.file.id, values.nbytes)
-        group.create_dataset(name, data=values, **layout)
+        group.create_dataset(name, data=values)
 
 
 def _unicode(text: str) -> str:

@@ -8,10 +8,9 @@ either as there are times.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -68,110 +67,66 @@ _GZIP_LEVEL = 1
 """Higher ones take several times as long for echoes and save no more than 2 %."""
 
 
-class FrameSet:
-    """The data set ``/rf``, ``/iq`` or ``/bmode`` of a sweep file that is being written.
-
-    Parameters
-    ----------
-    path : path
-        For messages.
-    grid : ImageGrid
-    signal : RFSettings or BModeSettings
-        Decides which of them.
-    dtype : dtype, optional
-        int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
-    compression : {None, "gzip", "lzf"}
-        HDF5 filter, with byte shuffling. None is as fast as the disk; gzip saves a third of echoes and takes
-        some 16 ms for a frame of 1 MB; lzf saves a fifth in 10 ms.
-    """
+class _FrameSet:
+    """The data set ``/rf``, ``/iq`` or ``/bmode`` of a file that is being written, and what describes it."""
 
     def __init__(
         self,
+        file: h5py.File,
         path: PathLike,
         grid: ImageGrid,
         signal: RFSettings | BModeSettings,
-        dtype: npt.DTypeLike | None = None,
-        compression: Compression = None,
+        dtype: npt.DTypeLike | None,
+        compression: Compression,
     ) -> None:
-        self.name = "bmode"
+        name, version = "bmode", VERSION
+        sizes = {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
         if isinstance(signal, RFSettings):
-            self.name = "iq" if signal.are_complex else "rf"
-        self.version = IQ_VERSION if self.name == "iq" else VERSION
-        self.version = self.version if grid.fan is None else FAN_VERSION
-        self._where, self._grid, self._signal = f"{path}: /{self.name}", grid, signal
-        self._dtype: np.dtype[Any] = SAMPLE_TYPES[self.name][0] if dtype is None else np.dtype(dtype)
-        require_sample_type(self.name, self._dtype, self._where)
-        self._in_pairs = self.name == "iq" and self._dtype == np.int16
-        self._compression = compression
-        self.count = 0
-
-    def create(self, file: h5py.File) -> None:
-        """Make the data set, without frames."""
-        grid = self._grid
-        shape = (grid.vectors, grid.samples, *((2,) if self._in_pairs else ()))
-        node = file.create_dataset(
-            self.name,
-            (0, *shape),
-            self._dtype,
-            maxshape=(None, *shape),
-            chunks=(1, *shape),
-            compression=self._compression,
-            compression_opts=_GZIP_LEVEL if self._compression == "gzip" else None,
-            shuffle=self._compression is not None,
-        )
-        sizes = {"vector_pitch_mm": grid.vector_pitch_mm}
-        if isinstance(self._signal, BModeSettings):
-            sizes = {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
-        values = {**vars(self._signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
-        node.attrs.update({name: value for name, value in values.items() if value is not None})
-        if grid.fan is not None:
-            file.create_group("fan").attrs.update(vars(grid.fan))
-        # h5py frees a handle in a callback, where Python drops a Ctrl-C: none is freed from frame to frame.
-        self._file, self._node, self._memory = file.id, node.id, h5py.h5s.create_simple(shape)
-        self._kind = h5py.h5t.py_create(self._dtype)
+            name, version = ("iq", IQ_VERSION) if signal.are_complex else ("rf", VERSION)
+            sizes = {"vector_pitch_mm": grid.vector_pitch_mm}
+        kind, self._where = SAMPLE_TYPES[name][0] if dtype is None else np.dtype(dtype), f"{path}: /{name}"
+        require_sample_type(name, kind, self._where)
+        self._shape, self._are_complex, self.count = (grid.vectors, grid.samples), name == "iq", 0
+        shape = (*self._shape, *((2,) if self._are_complex and kind == np.int16 else ()))
+        self.node = file.create_dataset(
+            name, (0, *shape), kind, maxshape=(None, *shape), chunks=(1, *shape), compression=compression,
+            compression_opts=_GZIP_LEVEL if compression == "gzip" else None, shuffle=compression is not None,
+        )  # fmt: skip
+        values = {**vars(signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
+        self.node.attrs.update({name: value for name, value in values.items() if value is not None})
+        put(file, "fan", grid.fan)
+        file.attrs["version"] = version if grid.fan is None else FAN_VERSION
 
     def append(self, frame: npt.NDArray[Any]) -> None:
-        """Write the next frame, shape (vector, sample).
+        """Write the next frame, shape (vector, sample), and hand it to the operating system.
 
         Raises
         ------
         InvalidInputError
             If its shape or type is another, or it holds NaN.
         """
-        stored = self._stored(frame)
-        reserve(self._file, stored.nbytes)
-        start = (self.count, *(0,) * stored.ndim)
-        self._node.set_extent((self.count + 1, *stored.shape))
-        if self._compression is None:
-            self._node.write_direct_chunk(start, stored)
-        else:
-            self._disk = self._node.get_space()
-            self._disk.select_hyperslab(start, (1, *stored.shape))
-            self._node.write(self._memory, self._disk, stored, self._kind)
-        self.count += 1
-
-    def flush(self) -> None:
-        """Hand what was appended to the operating system."""
-        self._node.flush()
-
-    def _stored(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """A frame as it is stored: contiguous, I/Q of int16 in pairs."""
-        where, expected = f"{self._where}[{self.count}]", (self._grid.vectors, self._grid.samples)
-        wanted: np.dtype[Any] = np.dtype(np.complex64) if self.name == "iq" else self._dtype
-        is_of_kind = self.name != "iq" or frame.dtype.kind == "c"
-        if frame.shape != expected or not (is_of_kind and np.can_cast(frame.dtype, wanted, "same_kind")):
-            raise InvalidInputError(
-                f"{where}: expected a frame of {wanted}, shape {expected}, got {frame.dtype}, {frame.shape}"
-            )
+        node, where = self.node, f"{self._where}[{self.count}]"
+        wanted = np.dtype(np.complex64) if self._are_complex else node.dtype
+        is_of_kind = (frame.dtype.kind == "c") == self._are_complex
+        if frame.shape != self._shape or not is_of_kind or not np.can_cast(frame.dtype, wanted, "same_kind"):
+            got = f"{frame.dtype}, {frame.shape}"
+            raise InvalidInputError(f"{where}: expected a frame of {wanted}, shape {self._shape}, got {got}")
         if frame.dtype.kind in "fc":
             require_finite(frame, where)
-        if self._in_pairs:
-            parts = np.ascontiguousarray(frame, np.complex64).view(np.float32).reshape(*frame.shape, 2)
+        stored = np.ascontiguousarray(frame, wanted)
+        if node.ndim == 4:
+            pairs = stored.view(np.float32).reshape(*frame.shape, 2)
             with np.errstate(invalid="ignore"):  # what int16 does not hold is refused below
-                frame = parts.astype(np.int16)
-            if not np.array_equal(frame, parts):
+                stored = pairs.astype(np.int16)
+            if not np.array_equal(stored, pairs):
                 raise InvalidInputError(f"{where}: expected I and Q that int16 holds, got others")
-        return np.ascontiguousarray(frame, self._dtype)
+        reserve(node.file.id, stored.nbytes)
+        node.resize(self.count + 1, axis=0)
+        if node.compression is None:
+            node.id.write_direct_chunk((self.count, *(0,) * stored.ndim), stored)
+        else:
+            node[self.count] = stored
+        self.count += 1
 
 
 def write_sweep(
@@ -193,7 +148,8 @@ def write_sweep(
         HDF5 file to write.
     sweep : Sweep
     compression : {None, "gzip", "lzf"}
-        As of `FrameSet`.
+        HDF5 filter, with byte shuffling. None is as fast as the disk; gzip saves a third of echoes and takes
+        some 16 ms for a frame of 1 MB; lzf saves a fifth in 10 ms.
 
     Raises
     ------
@@ -213,11 +169,10 @@ def write_sweep(
     3
     """
     frames = sweep.frames
-    images = FrameSet(path, sweep.grid, sweep.signal, stored_dtype(frames), compression)
     # Frames that are computed when they are read are made on all cores.
     made = (ahead if getattr(frames, "computed", False) else map)(frames.__getitem__, range(len(sweep)))
-    with written(path, FORMAT, images.version) as file:
-        images.create(file)
+    with written(path, FORMAT) as file:
+        images = _FrameSet(file, path, sweep.grid, sweep.signal, stored_dtype(frames), compression)
         for i, frame in enumerate(made):
             images.append(frame)
             if progress is not None:
@@ -239,12 +194,10 @@ def write_sweep(
 def _copy_unknown(source: PathLike, file: h5py.File) -> None:
     """Copy what another sweep file holds beyond this version of the format."""
     with reading(source), naming(str(source)), open_hdf5(source) as other:
-        for name in other:
-            if name not in KNOWN and name not in file:
-                other.copy(find_member(other, name), file, name)
-        for name, value in other.attrs.items():
-            if name not in file.attrs:
-                file.attrs[name] = value
+        for name in {*other} - KNOWN - {*file}:
+            other.copy(find_member(other, name), file, name)
+        for name in {*other.attrs} - {*file.attrs}:
+            file.attrs[name] = other.attrs[name]
 
 
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
@@ -272,7 +225,7 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
 
 
 def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
-    readings, mounting = sensor.readings, sensor.sensor_from_image
+    readings = sensor.readings
     values: dict[str, Any] = {"time_s": readings.time_s, "time_offset_s": sensor.time_offset_s}
     if isinstance(sensor, Tracker):
         values["world_from_sensor"] = readings.world_from_sensor
@@ -283,15 +236,15 @@ def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
         values |= {name: getattr(sensor, name) for name in INERTIAL}
     name = "tracker" if isinstance(sensor, Tracker) else "orientation"
     put(file, name, values)
-    if mounting is not None:
-        file[name].attrs.update(mounting_attribute(mounting))
+    _put_mounting(file[name], sensor.sensor_from_image)
 
 
-def mounting_attribute(mounting: RigidTransform | Rotation) -> dict[str, Any]:
-    """Attribute of a sensor's group that tells its calibration."""
+def _put_mounting(group: h5py.Group, mounting: RigidTransform | Rotation | None) -> None:
+    """Write where the image is on a sensor."""
     if isinstance(mounting, RigidTransform):
-        return {"sensor_from_image": mounting.as_matrix()}
-    return {"sensor_from_image_wxyz": mounting.as_quat(scalar_first=True)}
+        group.attrs["sensor_from_image"] = mounting.as_matrix()
+    elif mounting is not None:
+        group.attrs["sensor_from_image_wxyz"] = mounting.as_quat(scalar_first=True)
 
 
 _ROWS_PER_CHUNK = 128
@@ -312,8 +265,9 @@ class GrowingSweep:
     signal : RFSettings or BModeSettings
         Decides whether frames become ``/rf``, ``/iq`` or ``/bmode``.
     dtype : dtype, optional
+        int16 or float32 for RF, complex64 or int16 (pairs) for I/Q, uint8 for B-mode; by default the first.
     compression : {None, "gzip", "lzf"}
-        As for `FrameSet`.
+        As for `write_sweep`.
     probe : str
         Name of probe and preset.
     sensor_from_image : RigidTransform or Rotation, optional
@@ -354,8 +308,7 @@ class GrowingSweep:
         sensor_from_image: RigidTransform | Rotation | None = None,
         time_offset_s: float = 0.0,
     ) -> None:
-        self.path = Path(path)
-        self._frames = FrameSet(path, grid, signal, dtype, compression)
+        self.path, self._images = Path(path), (grid, signal, dtype, compression)
         self._probe, self._mounting, self._offset_s = probe, sensor_from_image, time_offset_s
         self._file: h5py.File | None = None
 
@@ -363,19 +316,15 @@ class GrowingSweep:
         target = require_target(self.path)
         with self._writing():
             try:
-                # Made here, so that a file that is there is never opened.
-                os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+                file = h5py.File(target, "x", libver="latest")
             except FileExistsError as error:
                 raise FileError(f"{self.path}: there already; expected a new file") from error
             try:
-                file = h5py.File(target, "w", libver="latest")
-                with ExitStack() as undo:
-                    undo.callback(file.close)
-                    reserve(file.id)
-                    self._begin(file)
-                    file.swmr_mode = True
-                    undo.pop_all()
+                reserve(file.id)
+                self._begin(file)
+                file.swmr_mode = True
             except BaseException:
+                file.close()
                 target.unlink(missing_ok=True)
                 raise
             self._file = file
@@ -404,7 +353,7 @@ class GrowingSweep:
         self._clock.require_after(time_s)
         with self._writing():
             self._frames.append(frame)
-            self._frames.flush()
+            self._frames.node.flush()
             self._clock.append(time_s)
 
     def append_pose(self, time_s: float, matrix: npt.ArrayLike, valid: bool = True) -> None:
@@ -451,20 +400,17 @@ class GrowingSweep:
                 self.path.unlink(missing_ok=True)
 
     def _begin(self, file: h5py.File) -> None:
-        file.attrs.update({"format": FORMAT, "version": self._frames.version})
-        if self._probe:
-            file.attrs["probe"] = self._probe
-        self._frames.create(file)
+        file.attrs["format"] = FORMAT
+        put(file, "probe", self._probe or None)
+        self._frames = _FrameSet(file, self.path, *self._images)
+        # Times last: what has a time is whole.
         self._clock = _Stream(file, {"frame_time_s": ()})
         tracker, orientation = (file.create_group(name) for name in ("tracker", "orientation"))
-        # Times last: what has a time is whole.
         self._tracker = _Stream(tracker, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
         self._orientation = _Stream(orientation, {"quaternion_wxyz": (4,), "time_s": ()})
         for group in (tracker, orientation):
             group.attrs["time_offset_s"] = self._offset_s
-        if self._mounting is not None:
-            group = tracker if isinstance(self._mounting, RigidTransform) else orientation
-            group.attrs.update(mounting_attribute(self._mounting))
+        _put_mounting(tracker if isinstance(self._mounting, RigidTransform) else orientation, self._mounting)
         file[GROWING] = np.uint8(1)
         label(file)
 
@@ -484,7 +430,7 @@ class _Stream:
 
     def __init__(self, group: h5py.Group, shapes: dict[str, tuple[int, ...]]) -> None:
         self._where, self._file = f"{group.file.filename}: {group.name}", group.file.id
-        self._nodes = [
+        self.nodes = [
             group.create_dataset(
                 name, (0, *shape), "?" if name == "valid" else "f8", maxshape=(None, *shape),
                 chunks=(_ROWS_PER_CHUNK, *shape), fillvalue=None if name == "valid" else np.nan,
@@ -502,7 +448,7 @@ class _Stream:
         """Write a row, its time last, and hand it to the operating system."""
         self.require_after(values[-1])
         reserve(self._file)
-        for node, value in zip(self._nodes, values, strict=True):
+        for node, value in zip(self.nodes, values, strict=True):
             node.resize(len(node) + 1, axis=0)
             node[-1] = value
             node.id.flush()

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,7 @@ from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFS
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     file_format,
+    find_member,
     has_member,
     locate,
     opened,
@@ -34,6 +38,7 @@ from speckle3d.io.hdf5 import (
     read_vector_attribute,
     require_dataset,
     require_group,
+    require_shape,
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
@@ -77,70 +82,73 @@ def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
 def _open(path: Path, _: ImportSettings) -> Recording:
     """Read a sweep file; its frames stay on disk until they are asked for."""
     with opened(path, FORMAT, (VERSION, IQ_VERSION, FAN_VERSION)) as file:
-        times = _read_times(file, "frame_time_s")
-        if not times.size:
+        clock = _Clock.of(file, "frame_time_s")
+        count = clock.time_s.size
+        if not count:
             raise InvalidInputError(f"{locate(file)}: expected a frame, got none so far")
-        frames, grid, signal = _read_image(file, times.size)
-        truth = require_group(file, "truth") if has_member(file, "truth") else None
+        frames, grid, signal = _read_image(clock)
+        truth = find_member(file, "truth")
         sweep = Sweep(
             frames=frames,
             grid=grid,
             signal=signal,
-            frame_time_s=times,
+            frame_time_s=clock.time_s,
             orientation=_read_orientation(file),
             tracker=_read_tracker(file),
-            truth=None if truth is None else read_transforms(truth, "world_from_image", times.size),
+            truth=None if truth is None else read_transforms(truth, "world_from_image", count),
             name=printable(path.stem),
             probe=read_text(file, "probe") if "probe" in file.attrs else "",
         )
-        if not _is_growing(file):
-            return Recording(path, ready=sweep)
+    if not clock.is_growing:
+        return Recording(path, ready=sweep)
     words = "goes on, or was ended without being closed"
     note = (
-        f"{path}: the recording {words}: {times.size} frames so far, of which speckle3d convert makes a "
-        "whole file"
+        f"{path}: the recording {words}: {count} frames so far, of which speckle3d convert makes a whole file"
     )
     return Recording(path, ready=sweep, rows=(("recording", words, ""),), remarks=(note,))
 
 
-def _is_growing(file: h5py.File) -> bool:
-    """Whether an open file's recording goes on, or has ended without being closed."""
-    return file.swmr_mode or (has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_)))
+@dataclass(frozen=True)
+class _Clock:
+    """Times of the rows of a group, shape (n,); of a file that grows, other data may have more rows."""
+
+    group: h5py.Group
+    time_s: FloatArray
+    is_growing: bool
+
+    @classmethod
+    def of(cls, group: h5py.Group, name: str = "time_s") -> _Clock:
+        file, times = group.file, read_checked(group, name, ("row",))
+        is_growing = file.swmr_mode or (
+            has_member(file, GROWING) and bool(read_checked(file, GROWING, (), np.bool_))
+        )
+        if is_growing and np.isnan(times).any():  # of rows that are being written
+            times = times[: np.argmax(np.isnan(times))]
+        return cls(group, require_increasing(times, locate(group, name)), is_growing)
+
+    def shape(self, *row: int | str) -> tuple[int | str, ...]:
+        """Shape of a data set with a row of a shape for each time."""
+        return ("row" if self.is_growing else self.time_s.size, *row)
+
+    def rows(self, name: str, *row: int, dtype: npt.DTypeLike = np.float64) -> npt.NDArray[Any]:
+        """Read the rows that have a time of a data set."""
+        return read_checked(self.group, name, self.shape(*row), dtype)[: self.time_s.size]
 
 
-def _read_times(group: h5py.Group, name: str = "time_s") -> FloatArray:
-    """Read times that increase; of a file that grows those before NaN, as many as there are whole rows."""
-    times = read_checked(group, name, ("row",))
-    if _is_growing(group.file) and np.isnan(times).any():
-        times = times[: np.argmax(np.isnan(times))]
-    return require_increasing(times, locate(group, name))
-
-
-def _read_rows(
-    group: h5py.Group, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64
-) -> npt.NDArray[Any]:
-    """Read a data set of a shape; a file that grows may have more rows, which are left out."""
-    is_growing = _is_growing(group.file)
-    return read_checked(group, name, ("row", *shape[1:]) if is_growing else shape, dtype)[: shape[0]]
-
-
-def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:
+def _read_image(clock: _Clock) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:
     """Frames of a file, as many as it has times for."""
+    file = clock.group
     name = next((name for name in SIGNALS if has_member(file, name)), None)
     if name is None:
         raise InvalidInputError(f"{locate(file)}: expected a data set rf, iq or bmode, got none of them")
     node, where = require_dataset(file, name), locate(file, name)
-    dtype, is_growing = node.dtype.newbyteorder("="), _is_growing(file)
+    dtype = node.dtype.newbyteorder("=")
     require_sample_type(name, dtype, where)
     in_pairs = name == "iq" and dtype == np.int16
-    is_shaped = node.ndim == 3 + in_pairs and node.shape[3:] in ((), (2,)) and 0 not in node.shape
-    if not is_shaped or node.shape[0] < count or (node.shape[0] > count and not is_growing):
-        expected = f"({count}, vector, sample{', 2' if in_pairs else ''})"
-        raise InvalidInputError(f"{where}: expected shape {expected}, one frame a time, got {node.shape}")
+    require_shape(node, clock.shape("vector", "sample", *((2,) if in_pairs else ())), where)
     vectors, samples = node.shape[1:3]
     slices = SweepSlices(Path(file.filename).absolute(), (name,), from_pairs if in_pairs else np.asarray)
-    kind = np.complex64 if in_pairs else dtype
-    frames = slices.frames((count, vectors, samples), kind, stored_dtype=dtype)
+    shape, kind = (clock.time_s.size, vectors, samples), np.complex64 if in_pairs else dtype
     with naming(where):
         if name == "iq":
             read_attribute(node, "demodulation_frequency_hz")
@@ -151,7 +159,8 @@ def _read_image(file: h5py.File, count: int) -> tuple[FileFrames, ImageGrid, RFS
         else:
             sizes = read_attribute(node, "column_pitch_mm"), read_attribute(node, "row_spacing_mm")
         fan = read_record(require_group(file, "fan"), FanLines) if has_member(file, "fan") else None
-        return frames, ImageGrid(vectors, samples, *sizes, first_mm, fan=fan), signal
+        grid = ImageGrid(vectors, samples, *sizes, first_mm, fan=fan)
+        return slices.frames(shape, kind, stored_dtype=dtype), grid, signal
 
 
 def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
@@ -162,46 +171,51 @@ def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
 
 
 def _read_orientation(file: h5py.File) -> OrientationSensor | None:
-    group = require_group(file, "orientation") if has_member(file, "orientation") else None
-    if group is None or not (time_s := _read_times(group)).size:
+    if not has_member(file, "orientation"):
         return None
-    quaternions = _read_rows(group, "quaternion_wxyz", (time_s.size, 4))
-    rotations = rotations_from_quaternions(quaternions, locate(group, "quaternion_wxyz"))
-    vectors = {
-        name: _read_rows(group, name, (time_s.size, 3)) for name in INERTIAL if has_member(group, name)
-    }
+    group = require_group(file, "orientation")
+    clock = _Clock.of(group)
+    if not clock.time_s.size:
+        return None
+    where = locate(group, "quaternion_wxyz")
+    rotations = rotations_from_quaternions(clock.rows("quaternion_wxyz", 4), where)
+    vectors = {name: clock.rows(name, 3) for name in INERTIAL if has_member(group, name)}
     for vector, values in vectors.items():
         require_finite(values, locate(group, vector))
-    mounting, name = None, "sensor_from_image_wxyz"
-    if name in group.attrs:
-        wxyz = read_vector_attribute(group, name, 4)
-        mounting = rotations_from_quaternions(wxyz[None], f"{locate(group)} attribute {name}")[0]
+    mounting = _read_mounting(group, "sensor_from_image_wxyz", (4,), rotations_from_quaternions)
     offset_s = read_attribute(group, "time_offset_s", default=0.0)
     with naming(locate(group)):
-        return OrientationSensor(TimedRotations(time_s, rotations), mounting, offset_s, **vectors)
+        return OrientationSensor(TimedRotations(clock.time_s, rotations), mounting, offset_s, **vectors)
 
 
 def _read_tracker(file: h5py.File) -> Tracker | None:
     if not has_member(file, "tracker"):
         return None
     group = require_group(file, "tracker")
-    time_s = _read_times(group)
-    valid = np.ones(time_s.size, dtype=bool)
+    clock = _Clock.of(group)
+    valid = np.ones(clock.time_s.size, dtype=bool)
     if has_member(group, "valid"):
-        valid = _read_rows(group, "valid", (time_s.size,), np.bool_)
+        valid = clock.rows("valid", dtype=np.bool_)
     if not valid.any():
         return None
-    matrices = _read_rows(group, "world_from_sensor", (time_s.size, 4, 4))
+    matrices = clock.rows("world_from_sensor", 4, 4)
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
     matrices[~valid] = np.eye(4)
     poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
-    mounting, name = None, "sensor_from_image"
-    if name in group.attrs:
-        matrix = read_vector_attribute(group, name, 16).reshape(1, 4, 4)
-        mounting = transforms_from_matrices(matrix, f"{locate(group)} attribute {name}")[0]
+    mounting = _read_mounting(group, "sensor_from_image", (4, 4), transforms_from_matrices)
     offset_s, skew_rad = (read_attribute(group, name, 0.0) for name in ("time_offset_s", "image_skew_rad"))
     with naming(locate(group)):
-        return Tracker(TimedPoses(time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
+        return Tracker(TimedPoses(clock.time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
+
+
+def _read_mounting(
+    group: h5py.Group, name: str, shape: tuple[int, ...], check: Callable[[FloatArray, str], Any]
+) -> Any:
+    """Where the image is on a sensor, by an attribute; None if it has none."""
+    if name not in group.attrs:
+        return None
+    numbers = read_vector_attribute(group, name, math.prod(shape))
+    return check(numbers.reshape(1, *shape), f"{locate(group)} attribute {name}")[0]
 
 
 READER = Reader(

@@ -18,7 +18,7 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.progress import Progress, after
-from speckle3d.core.reconstruction import Provenance, SourceFile
+from speckle3d.core.reconstruction import FramePairs, Provenance, Reconstruction, SourceFile
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
@@ -33,7 +33,7 @@ from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
 from speckle3d.io.load import import_record, kind_of, load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
-from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.reconstructions import write_reconstruction
 from speckle3d.pipeline import Tracked, track
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
@@ -142,31 +142,34 @@ def run_job(
     stacks = [] if crossing is None else [stack_for(each, settings) for each in sweeps]
     pair, corrected, refusal = None, None, ""
     with RESULTS.replaced(directory) as part:
-        with ReconstructionWriter(part / RESULTS.primary, sweep.frame_time_s, sweep.grid) as writer:
+        pairs = list[FramePairs]()
 
-            def keep(index: int, intensity: Float32Array) -> None:
-                strip.keep(index, intensity)
-                if stacks:
-                    stacks[0].keep(index, intensity)
-
-            report = after(progress, 0, sum(map(len, sweeps)))
-            tracked = track(sweep, curves, settings, report, writer.append_pairs, keep)
+        def keep(index: int, intensity: Float32Array) -> None:
+            strip.keep(index, intensity)
             if stacks:
-                try:
-                    pair, corrected = _crossed(sweeps, stacks, tracked, curves, settings, progress)
-                except (InsufficientDataError, MismatchError) as error:
-                    refusal = f"{sweep.name}: drift mode crossed: {error}"
-            poses, corrections, left_out = _corrected(tracked, sweep, drift, settings, pair, refusal)
-            provenance = Provenance(
-                written_path(source),
-                recording_sha256(source),
-                version("speckle3d"),
-                mounted,
-                second_file,
-                import_record(source),
-            )
-            trust = trust_of(tracked, corrections)
-            writer.finish(poses, provenance, settings.to_toml(), trust)
+                stacks[0].keep(index, intensity)
+
+        report = after(progress, 0, sum(map(len, sweeps)))
+        tracked = track(sweep, curves, settings, report, pairs.append, keep)
+        if stacks:
+            try:
+                pair, corrected = _crossed(sweeps, stacks, tracked, curves, settings, progress)
+            except (InsufficientDataError, MismatchError) as error:
+                refusal = f"{sweep.name}: drift mode crossed: {error}"
+        poses, corrections, left_out = _corrected(tracked, sweep, drift, settings, pair, refusal)
+        provenance = Provenance(
+            written_path(source),
+            recording_sha256(source),
+            version("speckle3d"),
+            mounted,
+            second_file,
+            import_record(source),
+        )
+        trust = trust_of(tracked, corrections)
+        made = Reconstruction(
+            sweep.frame_time_s, sweep.grid, poses, provenance, settings.to_toml(), trust=trust
+        )
+        write_reconstruction(part / RESULTS.primary, made, pairs)
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
         alone = tracker_alone(believed(sweep, tracked.doubts))
         if reference is None and compared is not None and compared.name == TRACKER:

@@ -13,10 +13,10 @@ from speckle3d import cli
 from speckle3d.app.folder import Folder
 from speckle3d.app.reconstruction.page import ReconstructionPage, _Viewer
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.reconstruction import Provenance, Trust
+from speckle3d.core.reconstruction import Provenance, Reconstruction, Trust
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.load import recording_sha256
-from speckle3d.io.reconstructions import ReconstructionWriter, read_reconstruction
+from speckle3d.io.reconstructions import read_reconstruction, write_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.voxels.volumes import read_volume
 
@@ -41,8 +41,8 @@ def page(tmp_path_factory):
     }
     covariance = np.array([np.diag([0.01, 0.02, 0.05 * k + 1e-3, 1e-5, 1e-5, 1e-5]) for k in range(FRAMES)])
     trust = Trust(covariance, np.zeros(FRAMES, dtype=np.int64))
-    with ReconstructionWriter(folder / "r.h5", sweep.frame_time_s, GRID) as writer:
-        writer.finish(poses, Provenance("s.h5", recording_sha256(folder / "s.h5"), ""), trust=trust)
+    made = Provenance("s.h5", recording_sha256(folder / "s.h5"), "")
+    write_reconstruction(folder / "r.h5", Reconstruction(sweep.frame_time_s, GRID, poses, made, trust=trust))
     return ReconstructionPage(read_reconstruction(folder / "r.h5"), sweep, Folder(folder / "r.h5"))
 
 

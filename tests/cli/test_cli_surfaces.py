@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.reconstruction import Provenance, SharedErrors, Trust
+from speckle3d.core.reconstruction import Provenance, Reconstruction, SharedErrors, Trust
 from speckle3d.core.volume import Volume
-from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.reconstructions import write_reconstruction
 from speckle3d.io.shapes.surfaces import read_surface
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.motion.uncertainty import shared_covariance
@@ -27,9 +27,9 @@ def rec(tmp_path):
     """A reconstruction whose scale is known to 5 %."""
     path = tmp_path / "reconstruction.h5"
     covariance = shared_covariance(POSES, GRID.centre_mm, SCALE)
-    with ReconstructionWriter(path, 0.04 * np.arange(N), GRID) as writer:
-        trust = Trust(covariance, np.zeros(N, dtype=np.int64), SCALE)
-        writer.finish({"image": POSES}, Provenance("sweep.h5", "", ""), "", trust)
+    trust, made = Trust(covariance, np.zeros(N, dtype=np.int64), SCALE), Provenance("sweep.h5", "", "")
+    held = Reconstruction(0.04 * np.arange(N), GRID, {"image": POSES}, made, trust=trust)
+    write_reconstruction(path, held)
     return path
 
 

@@ -7,8 +7,8 @@ from drifting import drifted, hand_sweep
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.reconstruction import Provenance
-from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.core.reconstruction import Provenance, Reconstruction
+from speckle3d.io.reconstructions import write_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.io.tum import write_tum
 from speckle3d.scoring.displacements import score_row
@@ -57,8 +57,8 @@ def test_a_reconstruction_is_scored_against_a_sweep(tmp_path):
     write_sweep(tmp_path / "s.h5", sweep)
     rng = np.random.default_rng(2)
     poses = {"image": drifted(sweep.truth, rng), "pose": sweep.truth}
-    with ReconstructionWriter(tmp_path / "r.h5", sweep.frame_time_s, sweep.grid) as writer:
-        writer.finish(poses, Provenance("s.h5", "ab", "0.1.0"))
+    made = Provenance("s.h5", "ab", "0.1.0")
+    write_reconstruction(tmp_path / "r.h5", Reconstruction(sweep.frame_time_s, sweep.grid, poses, made))
     reference = load_reference(tmp_path / "s.h5")
     found = compare_trajectories(load_estimate(tmp_path / "r.h5"), reference)
     expected = score_row(poses["image"], sweep.truth, sweep.grid)

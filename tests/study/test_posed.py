@@ -11,7 +11,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.reconstruction import CalibrationFile, Provenance, Reconstruction
 from speckle3d.io.calibrations import write_calibration
 from speckle3d.io.load import recording_sha256
-from speckle3d.io.reconstructions import ReconstructionWriter
+from speckle3d.io.reconstructions import write_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.study.images import open_reconstruction, sweep_of
 from speckle3d.study.posed import open_posed
@@ -75,8 +75,8 @@ def test_a_sweep_given_by_a_relative_path_is_found_from_elsewhere(tmp_path, monk
     sweep = sweep_examples.rf_sweep()
     write_sweep(tmp_path / stored, sweep)
     made = Provenance(stored, recording_sha256(tmp_path / stored), "1")
-    with ReconstructionWriter(tmp_path / "mine" / "r.h5", sweep.frame_time_s, sweep.grid) as writer:
-        writer.finish({"image": sweep.truth}, made)
+    held = Reconstruction(sweep.frame_time_s, sweep.grid, {"image": sweep.truth}, made)
+    write_reconstruction(tmp_path / "mine" / "r.h5", held)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert len(open_reconstruction(tmp_path / "mine" / "r.h5")[1]) == len(sweep)
