@@ -47,11 +47,6 @@ def packer(window: int) -> Any:
     return _library.compressobj(1, zlib.DEFLATED, window)
 
 
-def unpacker() -> Any:
-    """Unpacker of zlib's or gzip's stream."""
-    return _library.decompressobj(EITHER)
-
-
 _FRAME_FIELD = re.compile(r"Seq_Frame0*(\d{1,7})_(\w+)")
 _MM_PER = {
     "": 1.0, "?": 1.0, "none": 1.0, "unknown": 1.0, "mm": 1.0, "millimeter": 1.0, "millimeters": 1.0,
@@ -60,8 +55,8 @@ _MM_PER = {
 }  # fmt: skip
 _S_PER = {"s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6}
 _SPACE, _TIME = ("domain", "space", "", "???", "none", "?"), ("list", "time")
-_PACKINGS = {"raw": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "as": "text"}
-"""By how NRRD's words for them begin, as bzip2 or bz2; raw is whole."""
+_PACKINGS = {"raw": "raw", "gz": "deflate", "bz": "bzip2", "tx": "text", "te": "text", "as": "text"}
+"""By how NRRD's words for them begin, as bzip2 or bz2."""
 _TYPES = {
     "i1": "char int8",
     "u1": "uchar uint8",
@@ -92,24 +87,29 @@ class SequenceHeader:
 
     Attributes
     ----------
+    fields : dict
+        Fields of the whole file.
+    frames : tuple of dict
+        Fields of each frame, without the ``Seq_FrameNNNN_`` before their names; empty for a plain image.
     size : tuple of int
         Lengths of the image's axes, fastest first, and the number of frames if there is an axis for them.
     spacing_mm : tuple of float, or None
         Of the first two axes; None where the header holds the pixel unit 1 that stands for "unknown".
-    fields : dict
-        Fields of the whole file.
-    said : dict
-        What they say in NRRD's words, whatever the format.
-    frames : tuple of dict
-        Fields of each frame, without the ``Seq_FrameNNNN_`` before their names; empty for a plain image.
     stored : tuple of int
         Lengths of all axes in the file, fastest first.
     frame_axis : int, optional
         Of `stored`.
+    are_spatial : bool
+        Whether the header says that all axes are of space.
     channels : int
         Numbers a pixel.
     index_s : ndarray, shape (n,), optional
         Times of the frames by their axis.
+    axes_mm : ndarray, shape (axis, coordinate), optional
+        Step along each axis, in a space whose axes lead left, posterior and superior; NaN of an axis that
+        has none.
+    origin_mm : ndarray, shape (coordinate,), optional
+        Centre of the first pixel.
     dtype : dtype
         Of the numbers in the file.
     data : path
@@ -121,15 +121,17 @@ class SequenceHeader:
     """
 
     path: str
+    fields: dict[str, str]
+    frames: tuple[dict[str, str], ...]
     size: tuple[int, ...]
     spacing_mm: tuple[float, ...] | None
-    fields: dict[str, str]
-    said: dict[str, str]
-    frames: tuple[dict[str, str], ...]
     stored: tuple[int, ...]
     frame_axis: int | None
+    are_spatial: bool
     channels: int
     index_s: FloatArray | None
+    axes_mm: FloatArray | None
+    origin_mm: FloatArray | None
     dtype: np.dtype[Any]
     data: Path
     start: int
@@ -144,8 +146,7 @@ class SequenceHeader:
     @property
     def is_volume(self) -> bool:
         """Whether all three axes are of space, as they say and frames' fields do not contradict."""
-        kinds = self.said.get("kinds", "").lower().split()
-        is_spatial = len(kinds) == 3 and {*kinds} <= {"domain", "space"}
+        is_spatial = self.are_spatial and len(self.stored) == 3
         return is_spatial and (not self.frames or self.frame_count > len(self.frames))
 
     @property
@@ -180,7 +181,7 @@ class SequenceHeader:
         FileError
             If the file cannot be read, is damaged, or holds fewer.
         """
-        count = math.prod(self.stored) * int(self.said.get("channels", "1"))
+        count = math.prod(self.size) * self.channels
         size_bytes = count * self.dtype.itemsize
         with reading(self.path, _library.error), open_regular(self.data) as stream:
             length = stream.seek(0, 2)
@@ -204,7 +205,7 @@ def _unpacked(packed: bytes, packing: str) -> bytes:
     """Unpack all; members of gzip that follow one another are one stream."""
     content = bytearray()
     while packed:
-        stream = bz2.BZ2Decompressor() if packing == "bzip2" else unpacker()
+        stream = bz2.BZ2Decompressor() if packing == "bzip2" else _library.decompressobj(EITHER)
         content += stream.decompress(packed)
         packed = stream.unused_data if stream.unused_data[:2] == b"\x1f\x8b" else b""
     return bytes(content)
@@ -230,15 +231,10 @@ def _number_type(word: str, is_big: bool, where: str) -> np.dtype[Any]:
     raise InvalidInputError(f"{where}: expected a type of numbers as uint8 or MET_UCHAR, got {word!r}")
 
 
-def is_metaimage(start: bytes) -> bool:
-    """Whether a file's first bytes are those of a MetaImage header."""
-    first = start.split(b"\n", 1)[0].split(b"=")[0].strip()
-    return first in (b"ObjectType", b"NDims", b"Comment", b"ObjectSubType") and b"=" in start
-
-
-def is_nrrd(start: bytes) -> bool:
-    """Whether a file's first bytes are those of an NRRD header."""
-    return start.startswith(b"NRRD000")
+def is_image(start: bytes) -> bool:
+    """Whether a file's first bytes are those of a MetaImage or NRRD header."""
+    first = start.split(b"\n", 1)[0].partition(b"=")[0].strip()
+    return start.startswith(b"NRRD000") or first in (b"ObjectType", b"NDims", b"Comment", b"ObjectSubType")
 
 
 def read_header(path: PathLike) -> SequenceHeader:
@@ -253,14 +249,12 @@ def read_header(path: PathLike) -> SequenceHeader:
     """
     with reading(path), open_regular(path) as stream:
         start = stream.read(512)
+        if not is_image(start):
+            raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
         stream.seek(0)
-        if is_nrrd(start):
-            fields = _nrrd_fields(path, stream)
-            return _header(Path(path), fields, fields, stream.tell())
-        if is_metaimage(start):
-            fields = _meta_fields(path, stream)
-            return _header(Path(path), fields, _in_words_of_nrrd(fields), stream.tell())
-    raise InvalidInputError(f"{path}: expected a MetaImage or NRRD header, got something else")
+        is_nrrd = start.startswith(b"NRRD")
+        fields = (_nrrd_fields if is_nrrd else _meta_fields)(path, stream)
+        return _header(Path(path), fields, fields if is_nrrd else _in_words_of_nrrd(fields), stream.tell())
 
 
 def mm_per(unit: str, where: str) -> float:
@@ -277,7 +271,7 @@ def mm_per(unit: str, where: str) -> float:
 
 
 def _lines(stream: BinaryIO) -> Iterator[str]:
-    while line := stream.readline():
+    for line in stream:
         try:
             yield line.decode("utf-8").rstrip("\r\n")
         except UnicodeDecodeError:
@@ -301,8 +295,8 @@ def _nrrd_fields(path: PathLike, stream: BinaryIO) -> dict[str, str]:
             return fields
         if line.startswith(("#", "NRRD")):
             continue
-        if ":=" in line:
-            name, _, value = line.partition(":=")
+        name, sign, value = line.partition(":=")
+        if sign:
             fields[NRRD_NAMES.get(name.strip(), name.strip())] = value.strip()
         else:
             # Fields of the format itself, unlike those of its users, may be in letters of any size.
@@ -316,22 +310,26 @@ def _nrrd_fields(path: PathLike, stream: BinaryIO) -> dict[str, str]:
 def _in_words_of_nrrd(fields: dict[str, str]) -> dict[str, str]:
     """What the fields of a MetaImage say."""
 
-    def is_set(name: str, default: str = "False") -> bool:
-        return fields.get(name, default)[:1] in ("T", "t", "1")
+    def first(*names: str) -> str:
+        return next((fields[name] for name in names if fields.get(name)), "")
 
-    packing = "gzip" if is_set("CompressedData") else "raw"
-    is_big = is_set("BinaryDataByteOrderMSB") or is_set("ElementByteOrderMSB")
+    def is_set(*names: str) -> bool:
+        return first(*names)[:1] in ("T", "t", "1")
+
+    is_text = "BinaryData" in fields and not is_set("BinaryData")
     said = {
-        "sizes": fields.get("DimSize", ""),
-        "kinds": fields.get("Kinds", ""),
-        "type": fields.get("ElementType", ""),
-        "endian": "big" if is_big else "little",
-        "encoding": packing if is_set("BinaryData", "True") else "text",
-        "spacings": fields.get("ElementSpacing") or fields.get("ElementSize", ""),
-        "units": len(fields.get("DimSize", "").split()) * f'"{fields.get("DistanceUnits", "")}" ',
-        "channels": fields.get("ElementNumberOfChannels", "1"),
+        "sizes": first("DimSize"),
+        "kinds": first("Kinds"),
+        "type": first("ElementType"),
+        "endian": "big" if is_set("BinaryDataByteOrderMSB", "ElementByteOrderMSB") else "little",
+        "encoding": "text" if is_text else "gzip" if is_set("CompressedData") else "raw",
+        "spacings": first("ElementSpacing", "ElementSize"),
+        "units": len(first("DimSize").split()) * f'"{first("DistanceUnits")}" ',
+        "channels": first("ElementNumberOfChannels"),
+        "turn": first("TransformMatrix", "Rotation", "Orientation"),
+        "space origin": first("Offset", "Position", "Origin"),
     }
-    data, skipped = fields["ElementDataFile"], fields.get("HeaderSize") or "0"
+    data, skipped = fields["ElementDataFile"], first("HeaderSize") or "0"
     if data.upper() != "LOCAL":
         said["data file"] = data
     if data.upper() != "LOCAL" or skipped.startswith("-"):
@@ -342,14 +340,11 @@ def _in_words_of_nrrd(fields: dict[str, str]) -> dict[str, str]:
 def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int) -> SequenceHeader:
     """Tell axes of the image, of frames and of colours by their kinds; without, as PLUS orders them."""
     stored = tuple(map(int, said.get("sizes", "").split()))
-    colours = int(said.get("channels", "1"))
-    kinds = said.get("kinds", "").lower().split()
-    if len(kinds) != len(stored):
-        kinds = ["domain"] * len(stored)
+    told = said.get("kinds", "").lower().split()
+    kinds = told if len(told) == len(stored) else ["domain"] * len(stored)
     spatial = [i for i, kind in enumerate(kinds) if kind in _SPACE]
     frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
-    for i in {*range(len(stored))} - {*spatial, frame_axis}:
-        colours *= stored[i]
+    colours = {*range(len(stored))} - {*spatial, frame_axis}
     if frame_axis is None and len(spatial) == 3:
         frame_axis = spatial.pop()
     if len(spatial) == 3:  # images of 3D Slicer are a pixel thick
@@ -360,70 +355,70 @@ def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int
             f"{path}: sizes: expected images on two axes and at most one of frames, got lengths "
             f"{' '.join(map(str, stored))} of kinds {' '.join(kinds)}"
         )
-    axes = axes_mm(path, said, len(stored))
+    size = tuple(stored[i] for i in (*spatial, frame_axis) if i is not None)
+    axes, origin = _placed(path, said, len(stored))
     spacing = None if axes is None else (*np.linalg.norm(axes, axis=1)[spatial].tolist(),)
     if spacing is not None and (not all(map(math.isfinite, spacing)) or spacing == (1.0, 1.0)):
         spacing = None  # PLUS and ITK write 1 where nobody told them
     own, frames = _split(fields)
-    times, size = None, tuple(stored[i] for i in spatial)
-    if frame_axis is not None:
-        size, times = (*size, stored[frame_axis]), _frame_times(said, frame_axis, stored)
-        if len(frames) == stored[frame_axis] + 1 and not frames[0]:
-            frames = frames[1:]  # of a writer that counts from 1
-    word = said.get("type", "") if math.prod(stored) else "uchar"  # a tracker's recording may name no type
-    dtype = _number_type(word, said.get("endian", "").lower() == "big", f"{path}: type")
+    if len(frames) == (*size, 0)[2] + 1 and not frames[0]:
+        frames = frames[1:]  # of a writer that counts from 1
+    word = said.get("type", "") if 0 not in stored else "uchar"  # a tracker's recording may name no type
     encoding = said.get("encoding", "").lower()
     packing = _PACKINGS.get(encoding if encoding == "raw" else encoding[:2])
     if packing is None:
         raise InvalidInputError(f"{path}: encoding: expected raw, gzip, bzip2 or text, got {encoding!r}")
-    data = path
-    if "data file" in said:
-        data, start = _beside(path, said["data file"]), 0
     lines, skipped = (
         int(said.get(f"{what} skip", said.get(f"{what}skip", "0"))) for what in ("line", "byte")
     )
+    data, start = (_beside(path, said["data file"]), 0) if "data file" in said else (path, start)
+    number_type = _number_type(word, said.get("endian", "").lower() == "big", f"{path}: type")
+    channels = math.prod(stored[i] for i in colours if i is not None) * int(said.get("channels") or "1")
     return SequenceHeader(
-        str(path), size, spacing, own, said, frames, stored, frame_axis,
-        colours, times, dtype, data,
-        -1 if skipped < 0 else start + skipped, packing, lines,
+        str(path), own, frames, size, spacing, stored, frame_axis,
+        kinds is told and {*told} <= {"domain", "space"}, channels,
+        None if frame_axis is None else _frame_times(said, frame_axis, stored), axes, origin, number_type,
+        data, -1 if skipped < 0 else start + skipped, packing, lines,
     )  # fmt: skip
 
 
-def axes_mm(path: PathLike, said: dict[str, str], count: int) -> FloatArray | None:
-    """Step along each axis, shape (axis, coordinate of space); NaN of an axis that has none.
+def _placed(path: Path, said: dict[str, str], count: int) -> tuple[FloatArray | None, FloatArray | None]:
+    """Steps along the axes and the place of the first pixel, where they are said; see `SequenceHeader`.
 
     Raises
     ------
     InvalidInputError
-        If there is another number of them than of axes, or a unit is not known.
+        If there is another number of steps than of axes, or a unit is not known.
     """
+    axes, units = None, _quoted(said.get("units", ""))
     if said.get("spacings"):
         steps = [float(word) for word in said["spacings"].split()]
-        for i, unit in enumerate(_quoted(said.get("units", ""))[: len(steps)]):
+        for i, unit in enumerate(units[: len(steps)]):
             steps[i] *= 1.0 if unit in _S_PER else mm_per(unit, f"{path}: units")
         axes = np.diag(steps)
-    elif "space directions" in said:
+        if said.get("turn"):
+            axes = axes @ np.reshape(numbers(said["turn"], axes.size, f"{path}: TransformMatrix"), axes.shape)
+    lengths = (unit for unit in _quoted(said.get("space units", "")) or units if unit not in _S_PER)
+    scale = np.full(max(count, 3), mm_per(next(lengths, ""), f"{path}: space units"))
+    space = said.get("space", "").lower()
+    letters = "".join(word[0] for word in space.split("-")) if "-" in space else space
+    scale[:2] *= [-1.0 if letters[:1] == "r" else 1.0, -1.0 if letters[1:2] == "a" else 1.0]
+    if axes is None and "space directions" in said:
         rows = re.findall(r"\(([^)]*)\)|none", said["space directions"].lower())
         vectors = [_vector(row, f"{path}: space directions") if row else [] for row in rows]
         axes = np.full((len(rows), max(map(len, vectors), default=0)), np.nan)
         for axis, vector in zip(axes, vectors, strict=True):
-            axis[: len(vector)] = vector
-        axes *= space_unit_mm(path, said)
-    else:
-        return None
-    if len(axes) != count:
+            axis[: len(vector)] = vector * scale[: len(vector)]
+    if axes is not None and len(axes) != count:
         raise InvalidInputError(f"{path}: expected a spacing for each of {count} axes, got {len(axes)}")
-    return axes
+    if not said.get("space origin"):
+        return axes, None
+    origin = _vector(said["space origin"].strip("() "), f"{path}: space origin")
+    return axes, origin * scale[: len(origin)]
 
 
-def space_unit_mm(path: PathLike, said: dict[str, str]) -> float:
-    """Millimetres of the unit of directions and origin."""
-    units = _quoted(said.get("space units", said.get("units", "")))
-    return mm_per(next((unit for unit in units if unit not in _S_PER), ""), f"{path}: space units")
-
-
-def _vector(text: str, where: str) -> list[float]:
-    return [*numbers(text.replace(",", " "), None, where)]
+def _vector(text: str, where: str) -> FloatArray:
+    return np.array(numbers(text.replace(",", " "), None, where))
 
 
 def _frame_times(said: dict[str, str], axis: int, stored: tuple[int, ...]) -> FloatArray | None:
@@ -434,7 +429,7 @@ def _frame_times(said: dict[str, str], axis: int, stored: tuple[int, ...]) -> Fl
     if said.get(f"axis {axis} index type", "numeric") == "numeric" and len(values) == stored[axis]:
         return np.array(values, dtype=float) * _S_PER.get(unit, 1.0)
     if unit in _S_PER and len(steps) == len(stored) and float(steps[axis]) > 0:
-        return np.arange(float(stored[axis])) * float(steps[axis]) * _S_PER[unit]
+        return np.arange(stored[axis]) * float(steps[axis]) * _S_PER[unit]
     return None
 
 
@@ -456,15 +451,13 @@ def _split(lines: dict[str, str]) -> tuple[dict[str, str], tuple[dict[str, str],
 
 def _beside(path: Path, name: str) -> Path:
     """Path of a data file, which lies in the header's folder: a stranger's header names no other."""
-    if name.split()[:1] == ["LIST"] or ("%" in name and len(name.split()) > 1):
-        raise InvalidInputError(
-            f"{path}: expected pixels in one file, got a list of files ({name!r}), which is not read: write "
-            "the images into one file"
-        )
-    folder = path.parent.resolve()
+    folder, words = path.parent.resolve(), name.split()
     data = (folder / name).resolve()
-    if not name or Path(name).is_absolute() or not data.is_relative_to(folder):
-        raise InvalidInputError(f"{path}: expected pixels in a file in the header's own folder, got {name!r}")
+    is_list = words[:1] == ["LIST"] or ("%" in name and len(words) > 1)
+    if is_list or not name or not data.is_relative_to(folder):
+        raise InvalidInputError(
+            f"{path}: expected pixels in one file in the header's own folder, got {name!r}"
+        )
     return data
 
 

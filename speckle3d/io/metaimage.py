@@ -18,7 +18,7 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.io.carrier import CARRIED, carried_share
 from speckle3d.io.frames import FileFrames, ReadFrame
-from speckle3d.io.headers import SequenceHeader, is_metaimage, is_nrrd, read_header
+from speckle3d.io.headers import SequenceHeader, is_image, read_header
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.device_set import DeviceSet, read_device_set
 from speckle3d.io.plus.layout import Layout
@@ -420,6 +420,4 @@ def _companions(path: Path) -> Sequence[Path]:
     return () if data == path else (data,)
 
 
-READER = Reader(
-    "image", lambda _, start: is_metaimage(start) or is_nrrd(start), open_sequence, companions=_companions
-)
+READER = Reader("image", lambda _, start: is_image(start), open_sequence, companions=_companions)

@@ -6,7 +6,6 @@ origin.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from contextlib import suppress
@@ -18,9 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.volume import Volume
-from speckle3d.io.hdf5 import one_line
+from speckle3d.io.hdf5 import reading
 from speckle3d.io.headers import mm_per
 
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
@@ -29,6 +27,8 @@ _RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 _LABELS = "label"
 """Intent of an image of labels."""
 _OWN = "speckle3d"
+_LONGEST = 2**15
+"""Voxels along an axis that NIfTI-1 does not count."""
 
 
 def is_nifti(path: Path, start: bytes) -> bool:
@@ -36,33 +36,19 @@ def is_nifti(path: Path, start: bytes) -> bool:
     return start[:4] in _SIZES or (start.startswith(b"\x1f\x8b") and path.name.lower().endswith(".nii.gz"))
 
 
-def nifti_header(volume: Volume, fields: Mapping[str, str], is_labels: bool) -> bytes:
-    """Header of a NIfTI-1 file up to its voxels.
-
-    Raises
-    ------
-    InvalidInputError
-        If an axis is longer than the 32,767 voxels that the format counts.
-    """
-    if max(volume.shape) >= 2**15:
-        raise InvalidInputError(
-            f"NIfTI: expected at most 32767 voxels along an axis, got {max(volume.shape)}: take .nrrd"
-        )
-    header = nibabel.Nifti1Header()
-    header.set_data_dtype(volume.voxels.dtype.newbyteorder("<"))
-    header.set_data_shape(volume.shape)
-    header.set_xyzt_units("mm")
-    header.set_sform(_RAS_FROM_LPS @ volume.world_from_index, 1)
-    header.set_qform(_RAS_FROM_LPS @ volume.world_from_index, 1)
-    header.set_slope_inter(1, 0)
+def write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
+    """Write an image of NIfTI-1, or of NIfTI-2 where it is longer than that counts."""
+    kind = nibabel.Nifti2Image if max(volume.shape) >= _LONGEST else nibabel.Nifti1Image
+    image = kind(volume.voxels, _RAS_FROM_LPS @ volume.world_from_index)
+    image.set_qform(image.affine, 1)
+    image.set_sform(image.affine, 1)
+    image.header.set_xyzt_units("mm")
     if is_labels:
-        header.set_intent(_LABELS)
+        image.header.set_intent(_LABELS)
     if fields:
         text = json.dumps({_OWN: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")
-        header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", text))
-    room = io.BytesIO()
-    header.write_to(room)
-    return room.getvalue().ljust(int(header["vox_offset"]), b"\0")
+        image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", text))
+    nibabel.save(image, path)
 
 
 def read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str], bool]:
@@ -82,14 +68,11 @@ def read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str]
     FileError
         In nibabel's words, if it is truncated or damaged.
     """
-    try:
+    with reading(path, Exception):  # a damaged file shows in whatever nibabel happens to stumble over
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
         factor = mm_per(image.header.get_xyzt_units()[0], str(path))
         is_labels = image.header.get_intent()[0] == _LABELS
-    # A damaged file shows in whatever nibabel happens to stumble over.
-    except Exception as error:
-        raise FileError(f"{path}: cannot be read as NIfTI: {one_line(error)}") from error
     while voxels.ndim > 3 and voxels.shape[-1] == 1:
         voxels = voxels[..., 0]
     affine = np.diag([factor, factor, factor, 1.0]) @ _RAS_FROM_LPS @ image.affine

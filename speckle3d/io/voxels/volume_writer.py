@@ -10,8 +10,7 @@ References
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,24 +18,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.errors import InvalidInputError, MismatchError, naming
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.files import PathLike
 from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.headers import (
-    GZIP,
-    ZLIB,
-    header_bytes,
-    meta_start,
-    meta_type,
-    nrrd_type,
-    packer,
-    put_packed_size,
-)
+from speckle3d.io.headers import GZIP, ZLIB, header_bytes, meta_start, meta_type, nrrd_type, packer
 from speckle3d.io.text import unescaped
-from speckle3d.io.voxels.nifti import nifti_header
+from speckle3d.io.voxels.nifti import write_nifti
 from speckle3d.io.voxels.segments import segment_fields
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
@@ -46,8 +36,6 @@ LABELS_ALONE = ".seg.nrrd"
 
 PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
-
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -81,21 +69,23 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     ...     read_volume(f"{folder}/v.nrrd").shape
     (4, 3, 2)
     """
-    suffix = require_suffix(Path(path), isinstance(volume, LabelMap))
-    is_packed = suffix == ".nii.gz" or (compress and suffix != ".nii")
-    with naming(str(path)):
-        header = _header(suffix, volume, is_packed)
-    dtype = volume.voxels.dtype.newbyteorder("<")
-    pack = packer(ZLIB if suffix == ".mha" else GZIP) if is_packed else None
-    with atomic_path(path) as part, part.open("wb") as file:
-        file.write(header if pack is None or suffix != ".nii.gz" else pack.compress(header))
-        for plane in volume.voxels.T:
-            content = np.ascontiguousarray(plane, dtype).data.cast("B")
-            file.write(content if pack is None else pack.compress(content))
-        if pack is not None:
-            file.write(pack.flush())
-            if suffix == ".mha":
-                put_packed_size(file, header, file.tell() - len(header))
+    is_labels = isinstance(volume, LabelMap)
+    suffix = require_suffix(Path(path), is_labels)
+    plain = segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
+    with atomic_path(path) as part:
+        if ".nii" in suffix:
+            write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
+            return
+        raw = volume.voxels.T.astype(volume.voxels.dtype.newbyteorder("<"), order="C", copy=False)
+        content = raw.data.cast("B")
+        if compress:
+            pack = packer(GZIP if suffix == ".nrrd" else ZLIB)
+            content = pack.compress(content) + pack.flush()
+        fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
+        head = _nrrd_header if suffix == ".nrrd" else _meta_header
+        with part.open("wb") as file:
+            file.write(head(volume, fields, len(content) if compress else None))
+            file.write(content)
 
 
 class VolumeWriter:
@@ -182,50 +172,44 @@ class VolumeWriter:
         self._planes += len(planes)
 
 
-def _header(suffix: str, volume: Volume, is_packed: bool) -> bytes:
-    """Header of a file up to its voxels."""
-    for name in volume.fields:
-        if not _NAME.fullmatch(name):
-            raise InvalidInputError(
-                f"fields: expected names of letters, digits and '_.-' after a letter, got {name!r}"
-            )
-    plain = segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
-    if ".nii" in suffix:
-        return nifti_header(volume, {**volume.fields, **plain}, isinstance(volume, LabelMap))
-    matrix, shape, dtype = volume.world_from_index + 0.0, volume.shape, volume.voxels.dtype  # no -0.0
-    fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
-    if suffix == ".nrrd":
-        *steps, origin = (f"({_texts(column, ',')})" for column in matrix[:3].T)
-        lines = [
+def _nrrd_header(volume: Volume, fields: Mapping[str, str], packed_size: int | None) -> bytes:
+    *steps, origin = (f"({_texts(column, ',')})" for column in volume.world_from_index[:3].T)
+    return header_bytes(
+        [
             "NRRD0005",
-            f"type: {nrrd_type(dtype)}",
+            f"type: {nrrd_type(volume.voxels.dtype)}",
             "dimension: 3",
             "space: left-posterior-superior",
-            f"sizes: {_texts(shape)}",
+            f"sizes: {_texts(volume.shape)}",
             f"space directions: {' '.join(steps)}",
             "kinds: domain domain domain",
             "endian: little",
-            f"encoding: {'gzip' if is_packed else 'raw'}",
+            f"encoding: {'raw' if packed_size is None else 'gzip'}",
             'space units: "mm" "mm" "mm"',
             f"space origin: {origin}",
             *(f"{name}:={_escaped(value)}" for name, value in fields.items()),
             "",
         ]
-        return header_bytes(lines)
-    lines = [
-        *meta_start(0 if is_packed else None),
-        f"TransformMatrix = {_texts((matrix[:3, :3] / volume.spacing_mm).T.ravel())}",
-        f"Offset = {_texts(matrix[:3, 3])}",
-        "CenterOfRotation = 0 0 0",
-        f"ElementSpacing = {_texts(volume.spacing_mm)}",
-        f"DimSize = {_texts(shape)}",
-        # As PLUS tells a volume from a sequence of frames.
-        "Kinds = domain domain domain",
-        *(f"{name} = {_escaped(value)}" for name, value in fields.items()),
-        f"ElementType = MET_{meta_type(dtype)}",
-        "ElementDataFile = LOCAL",
-    ]
-    return header_bytes(lines)
+    )
+
+
+def _meta_header(volume: Volume, fields: Mapping[str, str], packed_size: int | None) -> bytes:
+    pose = volume.world_from_grid
+    return header_bytes(
+        [
+            *meta_start(packed_size),
+            f"TransformMatrix = {_texts(pose.rotation.as_matrix().T.ravel())}",
+            f"Offset = {_texts(pose.translation)}",
+            "CenterOfRotation = 0 0 0",
+            f"ElementSpacing = {_texts(volume.spacing_mm)}",
+            f"DimSize = {_texts(volume.shape)}",
+            # As PLUS tells a volume from a sequence of frames.
+            "Kinds = domain domain domain",
+            *(f"{name} = {_escaped(value)}" for name, value in fields.items()),
+            f"ElementType = MET_{meta_type(volume.voxels.dtype)}",
+            "ElementDataFile = LOCAL",
+        ]
+    )
 
 
 def require_suffix(path: Path, is_labels: bool = False) -> str:
@@ -265,5 +249,5 @@ def _escaped(text: str) -> str:
     return shown.replace("\\", "\\\\").replace("\n", "\\n")
 
 
-def _texts(values: Iterable[float], between: str = " ") -> str:
-    return between.join(str(value) if isinstance(value, int) else repr(float(value)) for value in values)
+def _texts(values: npt.ArrayLike, between: str = " ") -> str:
+    return between.join(map(repr, (np.asarray(values) + 0).tolist()))  # no -0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +15,8 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
-from speckle3d.io.headers import (
-    SequenceHeader,
-    axes_mm,
-    is_metaimage,
-    is_nrrd,
-    read_header,
-    space_unit_mm,
-)
+from speckle3d.io.headers import is_image, read_header
 from speckle3d.io.readers import first_bytes
-from speckle3d.io.text import numbers
 from speckle3d.io.voxels.nifti import is_nifti, read_nifti
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
 from speckle3d.io.voxels.volume_writer import own_fields
@@ -43,7 +34,7 @@ def is_volume(path: PathLike) -> bool:
         If it cannot be read, or its header does not make sense.
     """
     start = first_bytes(path)
-    if is_metaimage(start) or is_nrrd(start):
+    if is_image(start):
         return read_header(path).is_volume
     return is_nifti(Path(path), start)
 
@@ -59,7 +50,7 @@ def may_be_volume(path: PathLike) -> bool:
         If it cannot be read.
     """
     start = first_bytes(path)
-    if is_metaimage(start) or is_nrrd(start):
+    if is_image(start):
         return b"Seq_Frame" not in start
     return is_nifti(Path(path), start)
 
@@ -90,15 +81,16 @@ def read_volume(path: PathLike) -> Volume:
     if is_nifti(Path(path), start):
         voxels, matrix, fields, is_labels = read_nifti(Path(path))
         own = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
-    elif is_metaimage(start) or is_nrrd(start):
+    elif is_image(start):
         header = read_header(path)
         fields, own, is_labels = header.fields, own_fields(header.fields), is_segmentation(header.fields)
-        if header.channels > 1 or len(header.size) != 3:
-            got = f"{len(header.size)} axes, {header.channels} number(s) a pixel"
-            raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
+        axes = np.eye(3) if header.axes_mm is None else header.axes_mm
+        if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3):
+            got = f"axes {header.stored}, {header.channels} number(s) a pixel"
+            raise InvalidInputError(f"{path}: expected a grey image of three axes in space, got {got}")
         # The first axis runs fastest in a file; a mapped file may be replaced while voxels are used.
-        voxels = np.array(header.numbers()).reshape(header.size[::-1]).T
-        matrix = _world_from_index(header)
+        voxels, matrix = np.array(header.numbers()).reshape(header.size[::-1]).T, np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = axes.T, 0.0 if header.origin_mm is None else header.origin_mm
     else:
         raise InvalidInputError(
             f"{path}: expected NRRD, MetaImage or NIfTI (.nii.gz, .nii, .hdr), got something else"
@@ -106,9 +98,8 @@ def read_volume(path: PathLike) -> Volume:
     if voxels.ndim != 3 or not voxels.size or voxels.dtype.kind not in "iuf":
         got = f"shape {voxels.shape} of {voxels.dtype}"
         raise InvalidInputError(f"{path}: expected a grey image of three axes, got {got}")
-    voxels = voxels.astype(voxels.dtype.newbyteorder("="), copy=False)
     with naming(str(path)):
-        voxels, spacing, pose = _placed(voxels, matrix)
+        voxels, spacing, pose = _placed(voxels.astype(voxels.dtype.newbyteorder("="), copy=False), matrix)
         if is_labels:
             return LabelMap(_labels(voxels), spacing, pose, own, read_segments(fields, str(path)))
         kept = voxels if voxels.dtype.name in VOXEL_TYPES else voxels.astype(np.float32)
@@ -173,31 +164,3 @@ def _labels(voxels: npt.NDArray[Any]) -> npt.NDArray[Any]:
     if not np.array_equal(labels, voxels):
         raise InvalidInputError("labels: expected whole numbers from 0 to 65535, got others")
     return labels
-
-
-def _world_from_index(header: SequenceHeader) -> FloatArray:
-    """World (LPS, mm) from index of a MetaImage or NRRD file."""
-    fields, said, matrix = header.fields, header.said, np.eye(4)
-
-    def numbers_of(count: int, *names: str) -> FloatArray | None:
-        name = next((name for name in names if name in fields), None)
-        text = None if name is None else re.sub("[(),]", " ", fields[name])
-        return None if text is None else np.array(numbers(text, count, f"{header.path}: {name}"))
-
-    axes = axes_mm(header.path, said, 3)
-    if axes is not None:
-        if axes.shape != (3, 3):
-            raise InvalidInputError(f"{header.path}: expected steps in three dimensions, got {axes.shape}")
-        matrix[:3, :3] = axes.T
-    turn = numbers_of(9, "TransformMatrix", "Rotation", "Orientation")
-    if turn is not None:
-        matrix[:3, :3] = turn.reshape(3, 3).T @ matrix[:3, :3]
-    origin = numbers_of(3, "space origin", "Offset", "Position", "Origin")
-    if origin is not None:
-        matrix[:3, 3] = origin * space_unit_mm(header.path, said)
-    space = fields.get("space", "").lower()
-    if space in ("right-anterior-superior", "ras"):
-        matrix[0] *= -1.0
-    if space in ("right-anterior-superior", "ras", "left-anterior-superior", "las"):
-        matrix[1] *= -1.0
-    return matrix
