@@ -358,7 +358,7 @@ def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int
     size = tuple(stored[i] for i in (*spatial, frame_axis) if i is not None)
     axes, origin = _placed(path, said, len(stored))
     spacing = None if axes is None else (*np.linalg.norm(axes, axis=1)[spatial].tolist(),)
-    if spacing is not None and (not all(map(math.isfinite, spacing)) or spacing == (1.0, 1.0)):
+    if spacing is not None and (not all(0 < step < math.inf for step in spacing) or spacing == (1.0, 1.0)):
         spacing = None  # PLUS and ITK write 1 where nobody told them
     own, frames = _split(fields)
     if len(frames) == (*size, 0)[2] + 1 and not frames[0]:

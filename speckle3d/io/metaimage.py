@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -36,13 +35,11 @@ from speckle3d.io.plus.transforms import (
 from speckle3d.io.plus.write import own_values
 from speckle3d.io.pose_paths import timed_poses, usable
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, differs, rate_of
+from speckle3d.io.recordings import Recording, Value, differs, rate_of
 
-_SIZE_TOLERANCE = 0.1
-"""How far the pixel of a header and that of its image calibration may differ; a nominal size and a measured
-one were seen to differ by 8 %."""
 _DEVICE = "the device set"
 _OWN, _NO_VALUES = "as this package wrote it", ("probe", "full_scale")
+_CARRIER = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
 
 
 @dataclass(frozen=True)
@@ -66,15 +63,16 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
     InvalidInputError
         If the header names no such transform, or no sample of it is valid.
     """
-    sequence = _Sequence.open(Path(path), settings or ImportSettings())
-    tracker = sequence.tracker(0.0)
-    if tracker is None:
+    header, given = read_header(path), settings or ImportSettings()
+    poses, times = _poses(header, given, _device(given)), _times(header, given)
+    readings, notes = _timed(poses, times)
+    if readings is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
         )
-    for note in sequence.readings(sequence.poses)[1]:
+    for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=2)
-    return tracker
+    return Tracker(readings)
 
 
 def lacking_poses(path: PathLike) -> str:
@@ -95,324 +93,246 @@ def open_sequence(path: Path, settings: ImportSettings) -> Recording:
     FileError, InvalidInputError
         If it, or the device set beside it, cannot be read or does not make sense.
     """
-    sequence = _Sequence.open(path, settings)
-    return Recording.of(path, settings, sequence.rows(), sequence.recording)
+    header, device = read_header(path), _device(settings)
+    layout = Layout.of(header, device.image_orientation)
+    kinds = {"UltrasoundImageType": layout.kind, "UltrasoundImageOrientation": layout.orientation}
+    kind, orientation = (
+        word if name in header.fields else f"{word} (assumed)" for name, word in kinds.items()
+    )
+    rows = [
+        ("container", "NrrdImage" if header.is_nrrd else "MetaImage", ""),
+        ("size", _shown(header.size), ""),
+        ("images not valid", str(len([*filter(None, _faults(header))])), ""),
+        ("spacing", _shown(header.spacing_mm or ()) or "unknown", "mm" if header.spacing_mm else ""),
+        ("image type", kind, ""),
+        ("image orientation", orientation, ""),
+        ("transforms", ", ".join(header.transforms) or "none", ""),
+    ]
+    if settings.plus_config is not None:
+        rows.append(("device set", settings.plus_config, ""))
+    return Recording.of(path, settings, rows, lambda: _recording(header, settings, device, layout))
 
 
-@dataclass(frozen=True)
-class _Sequence:
-    """A header, and what else says how its images are to be read."""
-
-    header: SequenceHeader
-    settings: ImportSettings
-    device: DeviceSet
-    own: dict[str, Any]
-    layout: Layout
-
-    @classmethod
-    def open(cls, path: Path, settings: ImportSettings) -> _Sequence:
-        header = read_header(path)
-        device = DeviceSet() if settings.plus_config is None else read_device_set(settings.plus_config)
-        own = own_values(str(path), header.fields)
-        return cls(header, settings, device, own, Layout.of(header, device.image_orientation))
-
-    def recording(self) -> Recording:
-        images, first_mm, remarks = self._images(), self.settings.first_sample_depth_mm, self._remarks()
-        frames, values = self._frames(images, self.layout), self._values()
-        if self.layout.is_complex and self._is_reversed(frames, values):
-            frames = self._frames(images, replace(self.layout, conjugated=True))
-            remarks.append("Q has the other sign in the file, as its phase tells: turned")
-        tracker = self.tracker(self.own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm)
-        return Recording(
-            Path(self.header.path),
-            self.settings,
-            frames,
-            values,
-            time_s=None if self.times is None else self.times[images],
-            tracker=tracker,
-            orientation=self._orientation(),
-            chain="" if tracker is None else " * ".join(self._chain()),
-            probe=self.settings.probe or self.own.get("probe") or self.device.probe,
-            full_scale=self.own.get("full_scale", 255.0),
-            assumptions=("parallel lines",) if self.layout.is_rf and not self.own else (),
-            remarks=tuple(remarks),
+def _recording(
+    header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout
+) -> Recording:
+    path, own = header.path, own_values(header.path, header.fields)
+    _require_images(header, layout, settings)
+    times, faults = _times(header, settings), _faults(header)
+    images, remarks = np.flatnonzero(~np.array(faults, dtype=bool)), list[str]()
+    if times is not None:
+        images, remarks = usable("images", times[: len(faults)], faults)
+    if not images.size:
+        raise InvalidInputError(f"{path}: ImageStatus: expected a valid frame with a time, got none")
+    poses = _poses(header, settings, device)
+    pixels = _image_to_probe(header, settings, device, layout, poses)
+    measured, where = Value(), path
+    if pixels is not None:
+        where = f"{device.path if pixels.said_by == _DEVICE else path}: {pixels.source}"
+        measured = replace(pixels, value=pixel_axes(pixels.value, where))
+    spacing = header.spacing_mm
+    spacing = None if spacing is None else spacing[::-1] if layout.has_lines_in_rows else spacing
+    if measured.value and spacing and not own and differs(measured.value, spacing):
+        text = f"pixels of {_shown(measured.value)} mm, {measured.source}: the file says {_shown(spacing)}"
+        remarks.append(text)
+    # The sampling rate of RF is known better than by a calibration.
+    sizes = [Value(spacing, "ElementSpacing" if spacing else "")]
+    if not layout.is_rf:
+        sizes = [measured, *sizes, Value(device.pixel_mm(header.size), "device set", _DEVICE)]
+    pixel = next((size for size in sizes if size.value is not None), Value())
+    values = _values(header, layout, device, pixel) | {
+        name: Value(value, "as this package wrote it")
+        for name, value in own.items()
+        if name not in _NO_VALUES
+    }
+    frames = _frames(header, layout, images)
+    if layout.is_complex:
+        demodulation, centre, rate = (
+            getattr(settings, name) or values.get(name, Value()).value for name in _CARRIER
         )
+        # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
+        share = None if demodulation or not (centre and rate) else carried_share(frames, centre, rate)
+        if share is not None and share <= -CARRIED[0]:
+            frames = _frames(header, replace(layout, conjugated=True), images)
+            remarks.append("Q has the other sign in the file, as its phase tells: turned")
+    readings, lost = _timed(poses, times)
+    tracker, chain = None, [*poses.chain] if poses is not None else []
+    if poses is not None and poses.pixels is None and pixels is not None:
+        chain.insert(0, f"{device.names.image}To{poses.tool}")
+    if readings is not None and pixels is not None:
+        first_mm = settings.first_sample_depth_mm
+        first_mm = own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm
+        mounting = sensor_from_image(pixels.value, first_mm, where)
+        tracker = Tracker(readings, mounting, image_skew_rad=image_skew_rad(pixels.value, where))
+    elif readings is not None:
+        tracker = Tracker(readings)
+    return Recording(
+        Path(path),
+        settings,
+        frames,
+        values,
+        time_s=None if times is None else times[images],
+        tracker=tracker,
+        orientation=_orientation(header, times),
+        chain=" * ".join(chain),
+        probe=settings.probe or own.get("probe") or device.probe,
+        full_scale=own.get("full_scale", 255.0),
+        assumptions=("parallel lines",) if layout.is_rf and not own else (),
+        rows=(("tracker of", " * ".join(chain) or "none", ""),),
+        remarks=(*remarks, *lost, *_remarks(header, settings, device, layout, poses)),
+    )
 
-    @cached_property
-    def poses(self) -> Poses | None:
-        asked, reference = self.settings.tracker_transform, self.settings.reference_transform
-        return tracked_poses(self.header.path, self.header.frames, asked, reference, self.device.names)
 
-    @cached_property
-    def stamps(self) -> FloatArray | None:
-        """Time of every frame by its stamp or its axis, NaN where it has none.
+def _require_images(header: SequenceHeader, layout: Layout, settings: ImportSettings) -> None:
+    """Refuse what is no sequence of images of lines."""
+    if 0 in header.size or max(header.size[:2]) == 1:
+        what = ": the recording of a tracker, for --poses" if header.transforms else ""
+        raise InvalidInputError(
+            f"{header.path}: expected pixels of images, got images of size {_shown(header.size[:2])}{what}"
+        )
+    if header.is_volume and not settings.frame_rate_hz:
+        raise InvalidInputError(
+            f"{header.path}: expected a sequence of images, got a volume, whose third axis is in space "
+            "by its Kinds; if it is time, say so by --frame-rate-hz"
+        )
+    layout.require_lines(header)
+    if header.packing == "raw":
+        header.images()  # maps them, and refuses a file that ends early
 
-        Stamps that are all the same are none.
-        """
-        stamps = [_number(frame.get("Timestamp")) for frame in self.header.frames]
-        if len({*filter(np.isfinite, stamps)}) < min(2, self._count):
-            return self.header.index_s
-        return np.array(stamps + [np.nan] * (self._count - len(stamps)))
 
-    @property
-    def _count(self) -> int:
-        images = self.header.frame_count if 0 not in self.header.stored else 0
-        return max(images, len(self.header.frames))
+def _device(settings: ImportSettings) -> DeviceSet:
+    return DeviceSet() if settings.plus_config is None else read_device_set(settings.plus_config)
 
-    @cached_property
-    def times(self) -> FloatArray | None:
-        """Time of every frame: of a rate that is given, or `stamps`."""
-        rate = self.settings.frame_rate_hz
-        return self.stamps if rate is None else np.arange(self._count) / rate
 
-    def _images(self) -> IntArray:
-        """Numbers of the frames that are images with a time."""
-        header, size = self.header, self.header.size
-        if 0 in size or max(size[:2]) == 1:
-            what = ": the recording of a tracker, for --poses" if header.transforms else ""
-            raise InvalidInputError(
-                f"{header.path}: expected pixels of images, got images of size {size[0]} x {size[1]}{what}"
-            )
-        if header.is_volume and not self.settings.frame_rate_hz:
-            raise InvalidInputError(
-                f"{header.path}: expected a sequence of images, got a volume, whose third axis is in space "
-                "by its Kinds; if it is time, say so by --frame-rate-hz"
-            )
-        self.layout.require_lines(header)
-        if header.packing == "raw":
-            header.images()  # maps them, and refuses a file that ends early
-        if not (images := self._chosen[0]).size:
-            raise InvalidInputError(
-                f"{header.path}: ImageStatus: expected a valid frame with a time, got none"
-            )
-        return images
+def _poses(header: SequenceHeader, settings: ImportSettings, device: DeviceSet) -> Poses | None:
+    asked, reference = settings.tracker_transform, settings.reference_transform
+    return tracked_poses(header.path, header.frames, asked, reference, device.names)
 
-    @cached_property
-    def _chosen(self) -> tuple[IntArray, list[str]]:
-        """Numbers of the frames that are images with a time, and a line of those left out."""
-        if self.times is None:
-            return np.flatnonzero(self._valid), []
-        faults = np.where(self._valid, "", "not valid by their status").tolist()
-        return usable("images", self.times[: len(faults)], faults)
 
-    @property
-    def _valid(self) -> BoolArray:
-        """Frames whose image is valid; older files of PLUS say so in Status alone."""
-        valid = np.ones(self.header.frame_count, dtype=bool)
-        for i, frame in enumerate(self.header.frames[: valid.size]):
-            valid[i] = {frame.get("ImageStatus", "OK"), frame.get("Status", "OK")} == {"OK"}
-        return valid
+def _timed(poses: Poses | None, times: FloatArray | None) -> tuple[TimedPoses | None, list[str]]:
+    """Poses that have a time, and a line of those left out."""
+    if poses is None or times is None:
+        return None, []
+    return timed_poses(times[: len(poses.faults)], poses.matrices, poses.faults)
 
-    def _is_reversed(self, frames: FileFrames, values: dict[str, Value]) -> bool:
-        """Whether I/Q that are said to carry their frequency turn backwards.
 
-        In lines that are stored from the far end on, depth runs backwards and so does the phase, unless the
-        writer thought of it.
-        """
-        names = "demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz"
-        said = {name: one.value for name, one in values.items()}
-        demodulation, centre, rate = (getattr(self.settings, name) or said.get(name) for name in names)
-        if demodulation or not (centre and rate):
-            return False
-        return (carried_share(frames, centre, rate) or 0.0) <= -CARRIED[0]
+def _times(header: SequenceHeader, settings: ImportSettings) -> FloatArray | None:
+    """Time of every frame: of a rate that is given, or as the file has it."""
+    rate, count = settings.frame_rate_hz, _count(header)
+    return _stamps(header) if rate is None else np.arange(count) / rate
 
-    def _frames(self, images: IntArray, layout: Layout) -> FileFrames:
-        """Frames of the pixels' type; wider whole numbers as int16 where it holds them, else float32."""
-        header = self.header
-        dtype, stored = header.dtype.newbyteorder("="), None
-        if layout.is_complex:
-            fits = dtype == np.int16 and not layout.conjugated  # the opposite of -32768 is none
-            dtype, stored = np.dtype(np.complex64), dtype if fits else None
-        elif layout.is_rf and dtype != np.int16:
-            limits = np.iinfo(np.int16)
-            fits = dtype.kind in "iu" and all(
-                limits.min <= image.min() and image.max() <= limits.max for image in header.images()[images]
-            )
-            dtype = np.dtype(np.int16 if fits else np.float32)
-        shape = (header.frame_count, *layout.shape(header.size))
-        return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, stored, images.tolist())
 
-    def _values(self) -> dict[str, Value]:
-        """What a sweep of this kind needs, and where file or device set have it."""
-        own = {name: Value(value, _OWN) for name, value in self.own.items() if name not in _NO_VALUES}
-        values, sizes, device = dict[str, Value](), self._pixel_mm(), self.device
-        if self.stamps is not None and (rate := rate_of(self.stamps[np.isfinite(self.stamps)])):
-            values["frame_rate_hz"] = Value(rate, "of its time stamps")
-        across, down = (replace(sizes, value=size) for size in sizes.value or (None, None))
-        if device.is_curved and (self.layout.is_rf or self.layout.has_lines_in_rows):
-            return values | self._spreading_lines() | own
-        if not self.layout.is_rf:
-            return values | {"column_pitch_mm": across, "row_spacing_mm": down} | own
-        if down.value is not None:
-            values["row_spacing_mm"] = down
-        elif device.width_mm is not None:
-            vectors, _ = self.layout.shape(self.header.size)
-            across = Value(device.width_mm / vectors, "ScanConversion of the device set", _DEVICE)
-        return values | {"vector_pitch_mm": across} | own
+def _stamps(header: SequenceHeader) -> FloatArray | None:
+    """Time of every frame by its stamp or its axis, NaN where it has none; stamps all the same are none."""
+    stamps = np.full(_count(header), np.nan)
+    for i, frame in enumerate(header.frames):
+        with suppress(ValueError):
+            stamps[i] = float(frame.get("Timestamp", "nan"))
+    different = np.unique(stamps[np.isfinite(stamps)]).size
+    return header.index_s if different < min(2, stamps.size) else stamps
 
-    def _spreading_lines(self) -> dict[str, Value]:
-        """Where the device set has the lines of a curved array, and the samples on them."""
-        device, (_, samples) = self.device, self.layout.shape(self.header.size)
-        angles = Value(device.angles_deg, "ScanConversion of the device set", _DEVICE)
-        radii = device.radii_mm or (None, None)
-        values = {"line_angles_deg": angles, "array_radius_mm": replace(angles, value=radii[0])}
+
+def _count(header: SequenceHeader) -> int:
+    return max(header.frame_count if 0 not in header.stored else 0, len(header.frames))
+
+
+def _faults(header: SequenceHeader) -> list[str]:
+    """Why each image is not valid, empty where it is; older files of PLUS say so in Status alone."""
+    count = header.frame_count
+    statuses = [{frame.get("ImageStatus"), frame.get("Status")} for frame in header.frames[:count]]
+    faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
+    return faults + [""] * (count - len(faults))
+
+
+def _frames(header: SequenceHeader, layout: Layout, images: IntArray) -> FileFrames:
+    """Frames of the pixels' type; RF of wider numbers than int16 as float32."""
+    dtype, stored = header.dtype.newbyteorder("="), None
+    if layout.is_complex:
+        is_narrow = dtype == np.int16 and not layout.conjugated  # the opposite of -32768 is none
+        dtype, stored = np.dtype(np.complex64), dtype if is_narrow else None
+    elif layout.is_rf and dtype != np.int16:
+        dtype = np.dtype(np.float32)
+    shape = (header.frame_count, *layout.shape(header.size))
+    return FileFrames(header.path, SequenceFile(header, layout), shape, dtype, stored, images.tolist())
+
+
+def _values(header: SequenceHeader, layout: Layout, device: DeviceSet, pixel: Value) -> dict[str, Value]:
+    """What a sweep of this kind needs, and where file or device set have it."""
+    values, stamps = dict[str, Value](), _stamps(header)
+    if stamps is not None and (rate := rate_of(stamps[np.isfinite(stamps)])):
+        values["frame_rate_hz"] = Value(rate, "of its time stamps")
+    across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
+    vectors, samples = layout.shape(header.size)
+    scan = Value(None, "ScanConversion of the device set", _DEVICE)
+    if device.is_curved and (layout.is_rf or layout.has_lines_in_rows):
+        values["line_angles_deg"] = replace(scan, value=device.angles_deg)
+        values["array_radius_mm"] = scan
         if device.radii_mm is not None and samples > 1:
             near, far = device.radii_mm
-            values["row_spacing_mm"] = replace(angles, value=(far - near) / (samples - 1))
-        return values
+            values["array_radius_mm"] = replace(scan, value=near)
+            values["row_spacing_mm"] = replace(scan, value=(far - near) / (samples - 1))
+    elif not layout.is_rf:
+        values |= {"column_pitch_mm": across, "row_spacing_mm": down}
+    elif down.value is not None:
+        values |= {"vector_pitch_mm": across, "row_spacing_mm": down}
+    elif device.width_mm is not None:
+        values["vector_pitch_mm"] = replace(scan, value=device.width_mm / vectors)
+    return values
 
-    def _pixel_mm(self) -> Value:
-        """Lateral and axial distance of samples, mm: calibrated, spaced, or of the device set."""
-        spaced, calibrated, given = self._spaced_mm(), Value(), self.settings.image_to_probe
-        if (calibration := self.image_to_probe()) is not None:
-            calibrated = replace(calibration, value=pixel_axes(calibration.value, self._where(calibration)))
-        both = spaced.value is not None and calibrated.value is not None and not self.own and given is None
-        if both and not np.allclose(spaced.value, calibrated.value, rtol=_SIZE_TOLERANCE, atol=0):
-            raise InvalidInputError(
-                f"{self.header.path}: expected an image calibration for pixels of {_shown(spaced.value)} mm, "
-                f"as ElementSpacing says, got one for {_shown(calibrated.value)} mm"
-            )
-        if self.layout.is_rf:  # whose sampling rate is known better than by a calibration
-            return spaced
-        by_device = Value(self.device.pixel_mm(self.header.size), "device set", _DEVICE)
-        return next((one for one in (calibrated, spaced, by_device) if one.value is not None), Value())
 
-    def _spaced_mm(self) -> Value:
-        spacing = self.header.spacing_mm
-        if spacing is None:
-            return Value()
-        if not min(spacing) > 0:
-            raise InvalidInputError(
-                f"{self.header.path}: spacing of pixels: expected above zero, got {spacing}"
-            )
-        return Value(spacing[::-1] if self.layout.has_lines_in_rows else spacing, "ElementSpacing")
+def _image_to_probe(
+    header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout, poses: Poses | None
+) -> Value | None:
+    """Transform of this image's pixels to mm on the tracked tool."""
+    names = device.names
+    if settings.image_to_probe is not None:
+        return Value(np.asarray(settings.image_to_probe, dtype=float), "image_to_probe", "image_to_probe")
+    if poses is not None and poses.pixels is not None:
+        return Value(poses.pixels, f"{poses.chain[0]}Transform")
+    tool = names.probe if poses is None else poses.tool
+    for name in (f"{names.image}To{tool}", "Calibration"):  # the second is of Ibis
+        matrix = fixed_transform(header.path, header.fields, header.frames, name)
+        if matrix is not None:
+            return Value(matrix, f"{name}Transform")
+    # The device set's is for the image that the machine shows, not for the lines it was made of.
+    matrix = None if layout.is_rf else device.transform(names.image, tool)
+    return None if matrix is None else Value(matrix, f"{names.image}To{tool}", _DEVICE)
 
-    def image_to_probe(self) -> Value | None:
-        """Transform of this image's pixels to mm on the tracked tool."""
-        path, names = self.header.path, self.device.names
-        if self.settings.image_to_probe is not None:
-            given = np.asarray(self.settings.image_to_probe, dtype=float)
-            return Value(given, "image_to_probe", "image_to_probe")
-        if self.poses is not None and self.poses.pixels is not None:
-            return Value(self.poses.pixels, f"{self.poses.chain[0]}Transform")
-        tool = names.probe if self.poses is None else self.poses.tool
-        for name in (f"{names.image}To{tool}", "Calibration"):  # the second is of Ibis
-            matrix = fixed_transform(path, self.header.fields, self.header.frames, name)
-            if matrix is not None:
-                return Value(matrix, f"{name}Transform")
-        # The device set's is for the image that the machine shows, not for the lines it was made of.
-        matrix = None if self.layout.is_rf else self.device.transform(names.image, tool)
-        return None if matrix is None else Value(matrix, f"{names.image}To{tool}", _DEVICE)
 
-    def _where(self, calibration: Value) -> str:
-        path = self.device.path if calibration.said_by == _DEVICE else self.header.path
-        return f"{path}: {calibration.source}"
+def _orientation(header: SequenceHeader, times: FloatArray | None) -> OrientationSensor | None:
+    """The orientation sensor that this package wrote; None where there is none."""
+    readings, _ = _timed(tracked_orientation(header.path, header.frames), times)
+    if readings is None:
+        return None
+    name = f"{IMAGE}To{ORIENTATION}"
+    matrix = fixed_transform(header.path, header.fields, header.frames, name)
+    mounting = None if matrix is None else sensor_from_image(matrix, 0.0, header.path).rotation
+    turned = TimedRotations(readings.time_s, readings.world_from_sensor.rotation)
+    return OrientationSensor(turned, mounting)
 
-    def _chain(self) -> list[str]:
-        if self.poses is None:
-            return []
-        is_calibrated = self.poses.pixels is None and self.image_to_probe() is not None
-        first = [f"{self.device.names.image}To{self.poses.tool}"] if is_calibrated else []
-        return [*first, *self.poses.chain]
 
-    def tracker(self, first_sample_depth_mm: float) -> Tracker | None:
-        """The tracker, with the image on it if that is known; None without a pose that has a time."""
-        readings, _ = self.readings(self.poses)
-        if readings is None:
-            return None
-        calibration = self.image_to_probe()
-        if calibration is None:
-            return Tracker(readings)
-        matrix, where = calibration.value, self._where(calibration)
-        mounting = sensor_from_image(matrix, first_sample_depth_mm, where)
-        return Tracker(readings, mounting, image_skew_rad=image_skew_rad(matrix, where))
-
-    def readings(self, poses: Poses | None) -> tuple[TimedPoses | None, list[str]]:
-        """Poses that have a time, and a line of those left out."""
-        if poses is None or self.times is None:
-            return None, []
-        return timed_poses(self.times[: len(poses.faults)], poses.matrices, poses.faults)
-
-    def _orientation(self) -> OrientationSensor | None:
-        """The orientation sensor that this package wrote; None where there is none."""
-        path, header = self.header.path, self.header
-        readings, _ = self.readings(tracked_orientation(path, header.frames))
-        if readings is None:
-            return None
-        matrix = fixed_transform(path, header.fields, header.frames, f"{IMAGE}To{ORIENTATION}")
-        mounting = None if matrix is None else sensor_from_image(matrix, 0.0, path).rotation
-        turned = TimedRotations(readings.time_s, readings.world_from_sensor.rotation)
-        return OrientationSensor(turned, mounting)
-
-    def _remarks(self) -> list[str]:
-        """Tell what is left out, what contradicts, and which poses were not used."""
-        header, device, count = self.header, self.device, self.header.frame_count
-        notes = [*self._chosen[1], *self.readings(self.poses)[1]]
-        if self.poses is None and header.transforms and self.settings.tracker_transform is None:
-            notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
-        if len(header.frames) not in (0, count):
-            notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")
-        if device.is_curved:
-            is_picture = not (self.layout.is_rf or self.layout.has_lines_in_rows)
-            what = "images are taken for scan-converted" if is_picture else "its lines spread"
-            notes.append(f"the device set calls the transducer {device.geometry}: {what}")
-        if device.clip is not None and device.clip.is_part_of(header.size):
-            notes.append(
-                f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}"
-            )
-        if header.is_volume:
-            notes.append(
-                "third axis is time, as the frame rate that is given says: by its Kinds it is in space"
-            )
-        given, spaced = self.settings.image_to_probe, self._spaced_mm().value
-        if spaced is not None and given is not None:
-            sizes = pixel_axes(np.asarray(given, dtype=float), "image_to_probe")
-            if differs(sizes, spaced):
-                notes.append(
-                    f"pixels of {_shown(sizes)} mm, given by image_to_probe: the file says {_shown(spaced)}"
-                )
-        return notes
-
-    def rows(self) -> list[Row]:
-        """Facts of the header."""
-        header, layout = self.header, self.layout
-        kinds = {"UltrasoundImageType": layout.kind, "UltrasoundImageOrientation": layout.orientation}
-        kind, orientation = (
-            used if name in header.fields else f"{used} (assumed)" for name, used in kinds.items()
-        )
-        rows = [
-            ("container", "NrrdImage" if header.is_nrrd else "MetaImage", ""),
-            ("size", _shown(header.size), ""),
-            ("images", str(header.frame_count), ""),
-            ("images not valid", str(np.count_nonzero(~self._valid)), ""),
-            ("spacing", _shown(header.spacing_mm or ()) or "unknown", "mm" if header.spacing_mm else ""),
-            ("image type", kind, ""),
-            ("image orientation", orientation, ""),
-            ("pixel type", header.dtype.name, ""),
-            ("packing", header.packing, ""),
-            ("transforms", ", ".join(header.transforms) or "none", ""),
-            ("time stamps", "yes" if any("Timestamp" in frame for frame in header.frames) else "no", ""),
-        ]
-        try:
-            calibration = self.image_to_probe()
-        except InvalidInputError as error:
-            return [*rows, ("poses", f"none: {error}", "")]
-        rows.append(("tracker of", " * ".join(self.poses.chain) if self.poses is not None else "none", ""))
-        rows.append(("image calibration", "none" if calibration is None else self._where(calibration), ""))
-        if self.settings.plus_config is not None:
-            rows.append(("device set", self.settings.plus_config, ""))
-        return rows
+def _remarks(
+    header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout, poses: Poses | None
+) -> list[str]:
+    """Tell what contradicts, and which poses were not used."""
+    count, notes = header.frame_count, list[str]()
+    if poses is None and header.transforms and settings.tracker_transform is None:
+        notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
+    if len(header.frames) not in (0, count):
+        notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")
+    if device.is_curved:
+        is_picture = not (layout.is_rf or layout.has_lines_in_rows)
+        what = "images are taken for scan-converted" if is_picture else "its lines spread"
+        notes.append(f"the device set calls the transducer {device.geometry}: {what}")
+    if device.clip is not None and device.clip.is_part_of(header.size):
+        notes.append(f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}")
+    if header.is_volume:
+        notes.append("third axis is time, as the frame rate that is given says: by its Kinds it is in space")
+    return notes
 
 
 def _shown(lengths: Sequence[float]) -> str:
     return " x ".join(f"{length:g}" for length in lengths)
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        return np.nan
 
 
 def _companions(path: Path) -> Sequence[Path]:
