@@ -390,7 +390,8 @@ def _placed(path: Path, said: dict[str, str], count: int) -> tuple[FloatArray | 
     InvalidInputError
         If there is another number of steps than of axes, or a unit is not known.
     """
-    axes, units = None, _quoted(said.get("units", ""))
+    axes: FloatArray | None = None
+    units = _quoted(said.get("units", ""))
     if said.get("spacings"):
         steps = [float(word) for word in said["spacings"].split()]
         for i, unit in enumerate(units[: len(steps)]):
@@ -399,13 +400,13 @@ def _placed(path: Path, said: dict[str, str], count: int) -> tuple[FloatArray | 
         if said.get("turn"):
             axes = axes @ np.reshape(numbers(said["turn"], axes.size, f"{path}: TransformMatrix"), axes.shape)
     lengths = (unit for unit in _quoted(said.get("space units", "")) or units if unit not in _S_PER)
-    scale = np.full(max(count, 3), mm_per(next(lengths, ""), f"{path}: space units"))
+    scale: FloatArray = mm_per(next(lengths, ""), f"{path}: space units") * np.ones(max(count, 3))
     space = said.get("space", "").lower()
     letters = "".join(word[0] for word in space.split("-")) if "-" in space else space
     scale[:2] *= [-1.0 if letters[:1] == "r" else 1.0, -1.0 if letters[1:2] == "a" else 1.0]
     if axes is None and "space directions" in said:
         rows = re.findall(r"\(([^)]*)\)|none", said["space directions"].lower())
-        vectors = [_vector(row, f"{path}: space directions") if row else [] for row in rows]
+        vectors = [_vector(row, f"{path}: space directions") if row else np.empty(0) for row in rows]
         axes = np.full((len(rows), max(map(len, vectors), default=0)), np.nan)
         for axis, vector in zip(axes, vectors, strict=True):
             axis[: len(vector)] = vector * scale[: len(vector)]
@@ -414,7 +415,8 @@ def _placed(path: Path, said: dict[str, str], count: int) -> tuple[FloatArray | 
     if not said.get("space origin"):
         return axes, None
     origin = _vector(said["space origin"].strip("() "), f"{path}: space origin")
-    return axes, origin * scale[: len(origin)]
+    origin *= scale[: len(origin)]
+    return axes, origin
 
 
 def _vector(text: str, where: str) -> FloatArray:

@@ -38,7 +38,7 @@ def is_nifti(path: Path, start: bytes) -> bool:
 
 def write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
     """Write an image of NIfTI-1, or of NIfTI-2 where it is longer than that counts."""
-    kind = nibabel.Nifti2Image if max(volume.shape) >= _LONGEST else nibabel.Nifti1Image
+    kind: Any = nibabel.Nifti2Image if max(volume.shape) >= _LONGEST else nibabel.Nifti1Image
     image = kind(volume.voxels, _RAS_FROM_LPS @ volume.world_from_index)
     image.set_qform(image.affine, 1)
     image.set_sform(image.affine, 1)
