@@ -431,7 +431,7 @@ def _frame_times(said: dict[str, str], axis: int, stored: tuple[int, ...]) -> Fl
     if said.get(f"axis {axis} index type", "numeric") == "numeric" and len(values) == stored[axis]:
         return np.array(values, dtype=float) * _S_PER.get(unit, 1.0)
     if unit in _S_PER and len(steps) == len(stored) and float(steps[axis]) > 0:
-        return np.arange(stored[axis]) * float(steps[axis]) * _S_PER[unit]
+        return np.arange(float(stored[axis])) * float(steps[axis]) * _S_PER[unit]
     return None
 
 
