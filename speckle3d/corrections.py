@@ -99,7 +99,7 @@ def _fused(tracked: Tracked, sweep: Sweep, config: Config, crossed: CrossedPair 
         return fuse(
             tracked.edges,
             tracked.image,
-            0.0 if tracked.coherence is None else float(tracked.coherence.share.mean()),
+            float(tracked.coherence.share.mean()),
             tracked.scale_sigma,
             tracked.curves_sigma,
             tracked.shared.turn_sigma_per_mm,

@@ -17,8 +17,8 @@ from speckle3d.correction.crossing.sweep import CrossingSweep
 from speckle3d.examine.sensors import believed
 from speckle3d.matching.intensity import IntensityExtractor
 from speckle3d.motion.direction import sensed_orientation
-from speckle3d.motion.lens import Length, corrected_curves
 from speckle3d.pipeline import Tracked, track
+from speckle3d.tracked_curves import Length, corrected_curves
 
 
 def cross_sweeps(

@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
-from speckle3d.core.geometry import mirrored
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_table import plot_poses, pose_table
 from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
-from speckle3d.core.relative import MIRROR, RelativePoses
+from speckle3d.core.relative import RelativePoses
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.examine.disagreements import disagreements
@@ -36,16 +35,12 @@ from speckle3d.matching.frames import ImageSink, MatchedSweep, match_sweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.quality import FrameFlag, describe, flag_frames
 from speckle3d.matching.schedule import PairSchedule
-from speckle3d.motion.attenuation import Attenuation
-from speckle3d.motion.coherence import Coherence, RowScales
+from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
+from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import (
-    ImageMotion,
-    consistent_poses,
-    estimate_image_motion,
-    frame_pairs,
-)
+from speckle3d.motion.estimate import estimate_motion, frame_pairs
 from speckle3d.motion.planes import MotionProblem
+from speckle3d.motion.subset import consistent_poses
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,23 +71,16 @@ class Tracked:
     edges : RelativePoses
         The frame pairs that the trajectory was solved from, in the sense of motion of `image`; their
         covariances are those of pairs independent of each other.
-    scale_sigma : float
-        Relative standard deviation of the scale of distances, which all pairs share: that of the images' own
-        adaptation and `curves_sigma`, the root of the sum of squares.
-    curves_sigma : float
-        The part of it that is the curves' mismatch with this probe and tissue.
     direction : int
         Sign of the elevational motion, +1 or -1.
     direction_from : str
         What settled the sign.
     attenuation : Attenuation
         Of the tissue over the curves' phantom, by the echoes' spectrum.
-    coherence : Coherence or None
-        How the patches' echoes depart from a phantom's; None if not adapted to.
+    coherence : Coherence
+        How the patches' echoes depart from a phantom's, and the scales that rows of patches ask for.
     curves : DecorrelationCurves
         With which the images were read.
-    rows : RowScales or None
-        Scales that rows of patches ask for, over that of all; None if not adapted to.
     shared : SharedErrors
         What `covariance` has all frames have wrong together.
     doubts : tuple of Doubt
@@ -109,14 +97,11 @@ class Tracked:
     rejected_share: float
     flags: IntArray
     edges: RelativePoses
-    scale_sigma: float
-    curves_sigma: float
     direction: int
     direction_from: str
     attenuation: Attenuation
-    coherence: Coherence | None
+    coherence: Coherence
     curves: DecorrelationCurves
-    rows: RowScales | None
     shared: SharedErrors
     doubts: tuple[Doubt, ...] = ()
     grid: ImageGrid | None = None
@@ -167,6 +152,16 @@ class Tracked:
                 "; ".join(f"{each.about}: {each.suspect or each.evidence}" for each in self.doubts) or "none",
             ),
         ]
+
+    @property
+    def scale_sigma(self) -> float:
+        """Relative standard deviation of the scale of distances, which all pairs share."""
+        return self.shared.length_sigma
+
+    @property
+    def curves_sigma(self) -> float:
+        """The part of it that is the curves' mismatch with this probe and tissue."""
+        return self.shared.curves_sigma
 
     @property
     def pairs(self) -> int:
@@ -232,34 +227,53 @@ def track(
     matcher = matcher_for(sweep, curves, settings)
     doubts = examine_recording(sweep, matcher, curves)
 
-    schedule = PairSchedule(settings.trajectory)
-    matches = match_sweep(sweep, matcher, schedule, settings.quality, progress, images)
+    matches = match_sweep(
+        sweep, matcher, PairSchedule(settings.trajectory), settings.quality, progress, images
+    )
     flags = frame_flags(matches, settings)
     require_placed(flags, sweep.name)
 
-    problem = motion_problem(curves, matcher, len(sweep), settings)
+    attenuation = estimate_attenuation(curves, matches.texture.spectra(flags == 0))
+    problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
-    spectra = matches.texture.spectra(flags == 0)
-    motion = estimate_image_motion(problem, matches.table, spectra, bad, settings.curves.same_probe)
+    motion = estimate_motion(problem, matches.table, ~bad[matches.table.first] & ~bad[matches.table.second])
     flags[motion.unplaced & (flags == 0)] = int(FrameFlag.UNMATCHED)
     require_placed(flags, sweep.name)
-    doubts += motion.attenuation.doubts
-    doubts += examine_images(sweep, matcher, matches, motion, curves, flags == 0)
 
     sensors = examined_sensors(sweep, motion.poses, settings.sensors.examine)
     direction, source = settle_direction(
         sensors.trusted, motion.poses, settings.sensors, sensors.turn_confirmed
     )
+    motion = motion.mirrored() if direction < 0 else motion
+    mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
+    shared, covariance = motion.claims(mismatch)
+    doubts += attenuation.doubts
+    doubts += examine_images(sweep, matcher, matches, motion, covariance, curves, flags == 0)
+    doubts += sensors.doubts
+    doubts += disagreements(sensors.trusted, motion.poses, covariance, shared.length_sigma)
+
     sensed = sensed_orientation(sensors.trusted, settings.sensors)
-    subset, used = consistent_poses(motion, sensed, direction)
+    subset, used = (None, motion.pairs.used) if sensed is None else consistent_poses(motion, sensed)
     if sink:
-        for pairs in frame_pairs(motion, used, direction):
+        for pairs in frame_pairs(motion, used, shared.length_sigma):
             sink(pairs)
-    tracked = _tracked(motion, subset, used, flags, direction, source)
-    doubts += sensors.doubts + disagreements(
-        sensors.trusted, tracked.image, tracked.covariance, tracked.scale_sigma
+    return Tracked(
+        image=motion.poses,
+        covariance=covariance,
+        subset=subset,
+        rejected_share=float("nan") if subset is None else 1.0 - float(used[motion.pairs.used].mean()),
+        flags=flags,
+        edges=motion.edges,
+        direction=direction,
+        direction_from=source,
+        attenuation=attenuation,
+        coherence=motion.coherence,
+        curves=motion.problem.curves,
+        shared=shared,
+        doubts=doubts,
+        grid=sweep.grid,
+        frame_time_s=sweep.frame_time_s,
     )
-    return replace(tracked, doubts=doubts, grid=sweep.grid, frame_time_s=sweep.frame_time_s)
 
 
 def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
@@ -334,36 +348,3 @@ def require_placed(flags: IntArray, name: str) -> None:
             f"{name}: expected frames with speckle in common, got {lost} of {len(flags)} that cannot "
             f"be placed: {'; '.join(describe(flags))}"
         )
-
-
-def _tracked(
-    solution: ImageMotion,
-    subset: RigidTransform | None,
-    used: BoolArray,
-    flags: IntArray,
-    direction: int,
-    source: str,
-) -> Tracked:
-    """Seen from the side on which the elevational motion has its sign."""
-    motion, taken = solution.motion, solution.motion.pairs.used
-    image, covariance, edges = solution.poses, solution.covariance, solution.edges
-    if direction < 0:
-        image, covariance, edges = mirrored(image), MIRROR @ covariance @ MIRROR, edges.mirrored()
-        subset = None if subset is None else mirrored(subset)
-    return Tracked(
-        image=image,
-        covariance=covariance,
-        subset=subset,
-        rejected_share=float("nan") if subset is None else float((taken & ~used).sum() / taken.sum()),
-        flags=flags,
-        edges=edges,
-        scale_sigma=solution.length_sigma,
-        curves_sigma=solution.shared.curves_sigma,
-        direction=direction,
-        direction_from=source,
-        attenuation=solution.attenuation,
-        coherence=motion.coherence,
-        curves=motion.problem.curves,
-        rows=motion.rows,
-        shared=solution.shared,
-    )

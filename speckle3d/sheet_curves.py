@@ -1,17 +1,102 @@
-"""Decorrelation curves from a probe's data sheet, made for a sweep or for settings of their own."""
+"""Decorrelation curves of a probe of which nothing was measured but what its data sheet says."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from speckle3d.config import Config
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, NominalProbe, TiltResponse, curve_widths
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.matching.intensity import band_weights, two_way_wavenumber
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.texture import measured_texture
-from speckle3d.motion.data_sheet import ProbeSheet, sheet_curves
+from speckle3d.motion.diffraction import (
+    BACKSCATTER_EXPONENT,
+    SPEED_M_S,
+    SUB_DEPTHS,
+    band_nodes,
+    log_width,
+    sheet_spectrum,
+    speckle_correlation,
+    tilt_pivot,
+)
+
+MODEL_SIGMA = 0.025
+"""Relative error of all distances by the model itself: its distances are 0.8 % longer to 2.5 % shorter than
+those measured on phantoms and tissue that were simulated with a field in three dimensions."""
+UNIFORM = 1.0 / np.sqrt(3.0)
+"""Standard deviation over half the width of what lies anywhere between two bounds."""
+LATERAL_CELL = 1.5
+"""Width of a cell of speckle over wavelength times f-number: 0.9 for an even aperture, more for tapered
+ones."""
+GRID_MM = 0.01
+LEAST_AMPLITUDE = 1e-4
+
+
+class ProbeSheet(BaseModel):
+    """A probe as its data sheet and the scanner's settings have it (``probe.toml``)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    elevation_aperture_mm: float = Field(gt=0.5, le=40, description="Height of the elements.")
+    elevation_focus_mm: float = Field(gt=2, le=300, description="Depth at which the lens focuses.")
+    band_mhz: tuple[float, float] = Field(
+        description="Where the pulse-echo spectrum of a reflector on the axis is at -6 dB, low and high."
+    )
+    attenuation_db_cm_mhz: float = Field(0.5, ge=0, le=3, description="Of the tissue, one way.")
+    backscatter_exponent: float = Field(
+        BACKSCATTER_EXPONENT,
+        ge=-1,
+        le=4,
+        description="Of scattered power over frequency: soft tissue 0.6 to 1.6.",
+    )
+    transmit_aperture_mm: float | None = Field(
+        None,
+        ge=0,
+        le=60,
+        description="Width of the transmit aperture, which matters near the probe; by default what the "
+        "f-number asks for at the lens's focus.",
+    )
+    f_number: float = Field(2.0, gt=0.5, le=20, description="Of the apertures.")
+    focus_tolerance: float = Field(0.15, ge=0, lt=0.5, description="Either way, as a share.")
+    aperture_tolerance: float = Field(0.10, ge=0, lt=0.5, description="Either way, as a share.")
+    frequency_tolerance: float = Field(
+        0.08,
+        ge=0,
+        lt=0.3,
+        description="Of the echo's frequency, either way, as a share; for want of a sweep.",
+    )
+    attenuation_tolerance: float = Field(0.2, ge=0, le=2, description="Either way, dB/cm/MHz.")
+    depth_mm: float = Field(40.0, gt=5, le=300, description="Depth of the images.")
+    sampling_rate_mhz: float | None = Field(None, gt=0, le=1000, description="Of the RF.")
+    vector_pitch_mm: float | None = Field(None, gt=0, le=5, description="Distance of vectors.")
+    speed_of_sound_m_s: float = Field(SPEED_M_S, gt=300, le=4000)
+    probe: str = Field("", description="Name of probe and preset as recordings have it.")
+
+    @field_validator("band_mhz")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not 0.1 < value[0] < value[1] < 100:
+            raise ValueError("expected 0.1 < low < high < 100")
+        return value
+
+    @property
+    def nominal(self) -> NominalProbe:
+        """Probe and tissue that the elevational field is calculated for."""
+        transmit = self.transmit_aperture_mm
+        return NominalProbe(
+            self.elevation_aperture_mm,
+            self.elevation_focus_mm,
+            self.elevation_focus_mm / self.f_number if transmit is None else transmit,
+            1e6 * self.band_mhz[0],
+            1e6 * self.band_mhz[1],
+            self.attenuation_db_cm_mhz,
+        )
 
 
 def data_sheet_curves(
@@ -34,20 +119,65 @@ def data_sheet_curves(
     InvalidInputError
         If the sheet lacks what no sweep tells.
     """
-    settings = config or Config()
+    settings, probe, speed = config or Config(), sheet.nominal, sheet.speed_of_sound_m_s
+    seen, area, band = None, np.full(1, np.nan), (probe.low_hz, probe.high_hz)
     if like is None:
-        key = _key(sheet, settings)
-        first = settings.patches.top_mm + settings.patches.height_mm / 2.0
-        rows = np.arange(first, sheet.depth_mm - settings.patches.height_mm / 2.0 + 1e-9, 1.5)
+        key, patches = _key(sheet, settings), settings.patches
+        first = patches.top_mm + patches.height_mm / 2.0
+        rows = np.arange(first, sheet.depth_mm - patches.height_mm / 2.0 + 1e-9, 1.5)
         if rows.size < 2:
             raise InvalidInputError(f"depth_mm: expected room for two patches, got {sheet.depth_mm:g} mm")
-        return sheet_curves(sheet, key, rows, largest_mm=settings.curves.largest_mm)
-    matcher = FrameMatcher(like, settings.intensity, settings.patches, settings.inplane, settings.matching)
-    rows, texture = matcher.patches.row_depth_mm, measured_texture(like, matcher)
-    size, seen = texture.speckle_size(), texture.spectra()
-    area = 2.0 * np.pi * _filled(rows, size.lateral_mm) * _filled(rows, size.axial_mm)
-    known = bool(np.isfinite(area).all())
-    return sheet_curves(sheet, matcher.key, rows, seen, area if known else None, settings.curves.largest_mm)
+    else:
+        matcher = FrameMatcher(
+            like, settings.intensity, settings.patches, settings.inplane, settings.matching
+        )
+        key, rows, texture = matcher.key, matcher.patches.row_depth_mm, measured_texture(like, matcher)
+        size, seen = texture.speckle_size(), texture.spectra()
+        area = 2.0 * np.pi * _filled(rows, size.lateral_mm) * _filled(rows, size.axial_mm)
+    if isinstance(key.signal, RFSettings):
+        band = key.signal.bandwidth_hz
+    frequency = band_nodes(band, key.edge_fraction)
+    inside = key.patch_height_mm * ((np.arange(SUB_DEPTHS) + 0.5) / SUB_DEPTHS - 0.5)
+    depths = np.maximum(rows[:, None] + inside, 1.0)
+    if seen is None:
+        exponents = sheet.attenuation_db_cm_mhz, sheet.backscatter_exponent
+        sent = sheet_spectrum(frequency, (probe.low_hz, probe.high_hz), *exponents, depths)
+    else:
+        sent = seen.at(depths, frequency)
+    weight = sent * band_weights(frequency, *band, key.edge_fraction * (band[1] - band[0])) ** 2
+    area = area if np.isfinite(area).all() else _speckle_area(sheet, frequency, weight.mean(axis=1))
+    cells = key.patch_width_mm * key.patch_height_mm / area
+    grid = GRID_MM * np.arange(round(settings.curves.largest_mm / GRID_MM) + 1, dtype=float)
+    rho = speckle_correlation(probe, depths, frequency, weight, grid, speed)
+    if key.correlation_of == "echo":
+        rho += (1.0 - rho) ** 2 / cells[:, None]
+    rho, tilt = np.minimum.accumulate(np.clip(rho, LEAST_AMPLITUDE, 1.0), axis=1), None
+    if isinstance(key.signal, RFSettings):
+        pivot = tilt_pivot(probe, rows, frequency, weight.mean(axis=1), speed)
+        tilt = TiltResponse(pivot, two_way_wavenumber(key.signal) * curve_widths(grid, rho) ** 2)
+    sigma = sheet_sigma(sheet, rows, seen is not None)
+    return DecorrelationCurves(
+        key, rows, grid, rho, cells, tilt=tilt, scale_sigma=sigma, origin="data sheet", nominal=probe
+    )
+
+
+def _key(sheet: ProbeSheet, settings: Config) -> CurveKey:
+    """What curves are for that are made like no sweep."""
+    for name in ("vector_pitch_mm", "sampling_rate_mhz"):
+        if getattr(sheet, name) is None:
+            raise InvalidInputError(f"{name}: expected in the probe's settings, or a sweep, got none")
+    low, high = sheet.nominal.low_hz, sheet.nominal.high_hz
+    rate, speed = 1e6 * (sheet.sampling_rate_mhz or 0.0), sheet.speed_of_sound_m_s
+    return CurveKey(
+        RFSettings(rate, speed, (low + high) / 2.0, (low, high)),
+        sheet.vector_pitch_mm or 0.0,
+        settings.patches.width_mm,
+        settings.patches.height_mm,
+        settings.intensity.equalise_mm,
+        settings.matching.correlate,
+        settings.intensity.edge_fraction,
+        sheet.probe,
+    )
 
 
 def _filled(depth_mm: FloatArray, values: FloatArray) -> FloatArray:
@@ -56,16 +186,35 @@ def _filled(depth_mm: FloatArray, values: FloatArray) -> FloatArray:
     return np.interp(depth_mm, depth_mm[known], values[known]) if known.any() else values
 
 
-def _key(sheet: ProbeSheet, settings: Config) -> CurveKey:
-    if sheet.vector_pitch_mm is None:
-        raise InvalidInputError("vector_pitch_mm: expected in the probe's settings, or a sweep, got none")
-    return CurveKey(
-        sheet.signal,
-        sheet.vector_pitch_mm,
-        settings.patches.width_mm,
-        settings.patches.height_mm,
-        settings.intensity.equalise_mm,
-        settings.matching.correlate,
-        settings.intensity.edge_fraction,
-        sheet.probe,
-    )
+def sheet_sigma(sheet: ProbeSheet, depth_mm: FloatArray, spectrum_known: bool) -> float:
+    """Relative standard deviation that the sheet's tolerances and the model leave in all distances.
+
+    Tissue is within the attenuation's tolerance. With the echo's spectrum known, neither attenuation nor
+    frequency matters any more.
+    """
+    probe = sheet.nominal
+
+    def widths(side: float) -> FloatArray:
+        """Mean logarithm of the curves' widths with one number at a time at the end of its tolerance."""
+        pitch = 1.0 + side * sheet.frequency_tolerance
+        attenuation = max(probe.attenuation_db_cm_mhz + side * sheet.attenuation_tolerance, 0.0)
+        varied = [
+            replace(probe, focus_mm=probe.focus_mm * (1.0 + side * sheet.focus_tolerance)),
+            replace(probe, aperture_mm=probe.aperture_mm * (1.0 + side * sheet.aperture_tolerance)),
+            replace(probe, attenuation_db_cm_mhz=attenuation),
+            replace(probe, low_hz=pitch * probe.low_hz, high_hz=pitch * probe.high_hz),
+        ]
+        some = varied[:2] if spectrum_known else varied
+        return np.array([log_width(one, depth_mm, sheet.backscatter_exponent).mean() for one in some])
+
+    sigma = UNIFORM * (widths(1.0) - widths(-1.0)) / 2.0
+    return float(np.sqrt((sigma**2).sum() + MODEL_SIGMA**2))
+
+
+def _speckle_area(sheet: ProbeSheet, frequency_hz: FloatArray, power: FloatArray) -> FloatArray:
+    """Area of one independent cell of the echo, integral of its squared coherence, by depth, mm^2."""
+    step = frequency_hz[1] - frequency_hz[0]
+    total = power.sum(axis=1)
+    axial = 0.5e3 * sheet.speed_of_sound_m_s * (power**2).sum(axis=1) / (total**2 * step)
+    wavelength = 1e3 * sheet.speed_of_sound_m_s / ((power * frequency_hz).sum(axis=1) / total)
+    return np.asarray(axial * LATERAL_CELL * wavelength * sheet.f_number)

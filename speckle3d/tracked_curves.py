@@ -1,4 +1,4 @@
-"""Decorrelation curves from sweeps with a tracker: images know the steps, the tracker the length.
+"""Decorrelation curves from sweeps whose length a tracker or a crossing sweep tells, and images the steps.
 
 A tracker's jitter is a good part of the steps between frames, and smoothing it away takes the hand's pauses
 and tremor with it: curves fitted to smoothed positions come out 8 % too narrow. The images' own steps are far
@@ -9,17 +9,17 @@ corrected until the images' length is the tracker's, over which jitter counts on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from speckle3d.config import Config
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import ATTENUATION_SIGMA, DecorrelationCurves, curve_widths
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
-from speckle3d.motion.lens import Length, corrected_curves
+from speckle3d.motion.lens import stretched
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.pipeline import Tracked, track
 
@@ -115,3 +115,55 @@ def tracker_scale(sweep: Sweep, tracked: Tracked) -> Length:
             f"{np.ptp(z):.1f} mm to {100 * sigma:.1f} %: a longer sweep would help"
         )
     return Length(float(np.log(scale)), sigma)
+
+
+@dataclass(frozen=True)
+class Length:
+    """Logarithm of a sweep's true elevational length over the images', and its standard deviation."""
+
+    log_scale: float
+    sigma: float
+
+
+def corrected_curves(
+    curves: DecorrelationCurves, read_with: Sequence[DecorrelationCurves], lengths: Sequence[Length]
+) -> DecorrelationCurves:
+    """Correct the curves of a probe by sweeps whose true length is known from a crossing or a tracker.
+
+    All distances are multiplied by one factor; where the sweeps were read with another lens than `curves`
+    have, its factors by depth go before it. Tissue whose structure reads short is corrected with it: curves
+    learnt over tissue are right over tissue.
+
+    Parameters
+    ----------
+    curves : DecorrelationCurves
+    read_with : sequence of DecorrelationCurves
+        With which each sweep was read in the end.
+    lengths : sequence of Length
+
+    Returns
+    -------
+    DecorrelationCurves
+        Of origin "crossing"; their `scale_sigma` is that of the lengths and of tissue that attenuates
+        otherwise.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there is no sweep, or none whose length is known.
+    """
+    scale, sigma = (np.array([getattr(each, name) for each in lengths]) for name in ("log_scale", "sigma"))
+    if not read_with or scale.size != len(read_with) or not (np.isfinite(scale) & (sigma > 0)).all():
+        raise InsufficientDataError(
+            "corrected curves: expected for every sweep a finite log scale with a deviation above zero, got "
+            f"{scale.tolist()} and {sigma.tolist()} for {len(read_with)} sweeps"
+        )
+    information = sigma**-2.0
+    weight = information / information.sum()
+    widths = [np.log(curve_widths(own.distance_mm, own.correlation)) for own in (curves, *read_with)]
+    lens = np.mean(widths[1:], axis=0) - widths[0]
+    scatter = (weight * (scale - weight @ scale) ** 2).sum() / scale.size
+    left = float(np.sqrt(scatter + 1.0 / information.sum() + ATTENUATION_SIGMA**2))
+    # Widened for the attenuation of these sweeps, the curves go with a spectrum that has it.
+    better = replace(stretched(curves, lens + weight @ scale), spectrum=read_with[0].spectrum)
+    return replace(better, scale_sigma=left, origin="crossing")

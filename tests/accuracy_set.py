@@ -20,11 +20,10 @@ from speckle3d.corrections import correct
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.motion.data_sheet import ProbeSheet
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import compare_modes
-from speckle3d.sheet_curves import data_sheet_curves
+from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 from speckle3d.simulation.beam import tabulate_beam
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.receiver import received_as_bmode

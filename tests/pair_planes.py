@@ -7,7 +7,7 @@ import numpy as np
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.matching.schedule import TrajectorySettings
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.planes import MotionProblem, PairPlanes, PlaneSettings, pair_planes
+from speckle3d.motion.planes import MotionProblem, PairPlanes, PlaneSettings, fully_developed, pair_planes
 
 
 def problem_of(curves, patches, grid, frames=2, **settings):
@@ -25,9 +25,10 @@ def table_of(rho, moved_mm=(0.0, 0.0), first=None, second=None):
     return CorrelationTable(first, second, rho, *motion)
 
 
-def fit_many(problem, rho, moved_mm=(0.0, 0.0), **known):
+def fit_many(problem, rho, moved_mm=(0.0, 0.0), models=None, **known):
     """Planes of pairs from correlations of shape (e, p), and which are determined."""
-    return pair_planes(problem, table_of(rho, moved_mm), np.arange(len(rho)), **known)
+    models = models or fully_developed(rho.shape[1])
+    return pair_planes(problem, table_of(rho, moved_mm), np.arange(len(rho)), models, **known)
 
 
 def fit(problem, rho, moved_mm=(0.0, 0.0), share=None, gain=None, **known):

@@ -278,6 +278,11 @@ class DecorrelationCurves:
         return float(np.sqrt(max(lens, 0.0) + attenuation_sigma**2))
 
 
+def curve_widths(distance_mm: FloatArray, correlation: FloatArray) -> FloatArray:
+    """Distance at which each curve, shape (r, k), has fallen to exp(-1/2), shape (r,), mm."""
+    return np.array([np.interp(0.5, -np.log(row), distance_mm) for row in correlation])
+
+
 def _settings(key: CurveKey) -> dict[str, Any]:
     kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
     numbers = {name: getattr(key, name) for name in (*PATCH_NUMBERS, "edge_fraction")}

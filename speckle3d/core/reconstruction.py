@@ -130,6 +130,11 @@ class SharedErrors:
     curves_sigma: float
     turn_sigma_per_mm: FloatArray
 
+    @property
+    def length_sigma(self) -> float:
+        """Relative standard deviation of the length, of both scales together."""
+        return float(np.hypot(self.scale_sigma, self.curves_sigma))
+
 
 @shown
 @dataclass(frozen=True)

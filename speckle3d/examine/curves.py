@@ -58,7 +58,7 @@ def examine_curves(sweep: Sweep, texture: Texture, motion: Motion, usable: BoolA
 
 def rows_without_tilt(motion: Motion) -> RowScales | None:
     """Scales of rows over the centre's distance alone: what tilt explains may be wrong curves."""
-    rows, problem = motion.rows, motion.problem
+    rows, problem = motion.coherence.rows, motion.problem
     if rows is None:
         return None
     steps = np.diff(motion.path, axis=0)

@@ -22,7 +22,7 @@ from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.matcher import FrameMatcher
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.matching.texture import standing_share
-from speckle3d.motion.estimate import ImageMotion
+from speckle3d.motion.estimate import Motion
 from speckle3d.motion.planes import LEAST_CORRELATION
 from speckle3d.motion.trajectory import HELD_MM
 
@@ -78,7 +78,8 @@ def examine_images(
     sweep: Sweep,
     matcher: FrameMatcher,
     matches: MatchedSweep,
-    motion: ImageMotion,
+    motion: Motion,
+    covariance: FloatArray,
     curves: DecorrelationCurves,
     usable: BoolArray,
 ) -> tuple[Doubt, ...]:
@@ -86,6 +87,8 @@ def examine_images(
 
     Parameters
     ----------
+    covariance : ndarray, shape (n, 6, 6)
+        Claimed for its poses.
     curves : DecorrelationCurves
         As measured.
     usable : ndarray of bool, shape (n,)
@@ -98,23 +101,23 @@ def examine_images(
         If so much stands still that distances mean nothing, the images do not determine the length, or they
         cannot be those of one probe that moves.
     """
-    pairs, inside = motion.motion.pairs, matcher.patches.inside
-    frames = far_apart(motion.motion.path[:, 0], usable, curves).tolist()
+    pairs, inside = motion.pairs, matcher.patches.inside
+    z_mm = motion.path[:, 0]
+    frames = far_apart(z_mm, usable, curves).tolist()
     share = standing_share(sweep, matcher, frames) if len(frames) > 1 else np.full(inside.size, np.nan)
     share[~inside | (matches.left_out > 0.5)] = np.nan
     doubts = unrefuted(
         [
             shadowed(matches.left_out[inside]),
-            interleaved(matches.table, len(sweep), motion.motion.problem.trajectory.least_correlation),
+            interleaved(matches.table, len(sweep), motion.problem.trajectory.least_correlation),
             standing(share, len(frames), float(np.median(curves.cells)), matcher.of_echo),
         ],
         sweep.name,
         InsufficientDataError,
     )
-    doubts += examine_curves(sweep, matches.texture, motion.motion, usable)
-    z_mm = motion.poses.apply(sweep.grid.centre_mm)[:, 2]
+    doubts += examine_curves(sweep, matches.texture, motion, usable)
     path = (
-        undetermined(z_mm, np.sqrt(motion.covariance[:, 2, 2]), float(curves.distance_mm[-1])),
+        undetermined(z_mm, np.sqrt(covariance[:, 2, 2]), float(curves.distance_mm[-1])),
         severed(pairs.first, pairs.second, usable),
         folded(matches.table, motion.poses, matcher.patches.centre_mm, usable),
     )

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from scipy.signal import welch
 
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.curves import DecorrelationCurves, curve_widths
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError, Speckle3DError
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
@@ -62,7 +62,7 @@ def doubt_depths(curves: DecorrelationCurves, laid: PatchGrid, used: PatchGrid) 
 
 def doubt_widths(curves: DecorrelationCurves) -> Iterator[Doubt]:
     """Doubt curves that no beam has."""
-    width = np.array([np.interp(0.5, -np.log(row), curves.distance_mm) for row in curves.correlation])
+    width = curve_widths(curves.distance_mm, curves.correlation)
     if curves.tilt is not None and isinstance(curves.key.signal, RFSettings):
         ratio = float(np.median(curves.tilt.spread_mm / (two_way_wavenumber(curves.key.signal) * width**2)))
         if abs(np.log(ratio)) > np.log(TILT_FACTOR):

@@ -34,7 +34,7 @@ from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.estimate import Motion, alike_pairs, elevation_of, estimate_motion, strangers
 from speckle3d.motion.planes import pair_planes
-from speckle3d.motion.signs import ADAPTED_ERROR, likeliest_path, on_path
+from speckle3d.motion.signs import likeliest_path, on_path
 from speckle3d.motion.trajectory import edges_of, solve_trajectory
 from speckle3d.pipeline import matcher_for, motion_problem
 
@@ -244,14 +244,14 @@ class LiveTracker:
         )
         problem, known = replace(motion.problem, frames=frames.size), self._poses[frames[:-1]]
         rows = alike_pairs(problem, table)
-        models = motion.models(np.full(rows.size, LAST))
+        models = motion.coherence.models(np.full(rows.size, LAST))
         pairs, determined = pair_planes(problem, table, rows, models)
-        pairs = pairs[determined].scaled(motion.scale)
+        pairs = pairs[determined].scaled(motion.coherence.scale)
         if not len(pairs):
             return
         earlier = elevation_of(known, problem.centre_mm)[:, :2]
         apart = strangers(problem, table)
-        pairs = on_path(pairs, likeliest_path(pairs, frames.size, ADAPTED_ERROR, apart, earlier))
+        pairs = on_path(pairs, likeliest_path(pairs, frames.size, apart, earlier))
         edges = edges_of(table, motion.slopes.applied(pairs))
         # Earlier frames stay: every edge then starts at the first of them.
         centre, start = RigidTransform.from_translation(problem.centre_mm), np.zeros_like(edges.first)
@@ -283,14 +283,12 @@ class LiveTracker:
         problem = replace(self._problem, frames=count - begin)
         try:
             motion = estimate_motion(problem, table, sound)
-            edges = edges_of(table, motion.slopes.applied(motion.pairs))
-            poses = solve_trajectory(edges, problem.frames, problem.centre_mm, problem.trajectory.huber).poses
         except (InsufficientDataError, np.linalg.LinAlgError):
             # Frames that come later may tell.
             return
         # The first of them stay: what is seen of structure ends there, and what was told of them before
         # holds.
-        stay = latest // 3 if begin else 0
+        poses, stay = motion.poses, latest // 3 if begin else 0
         if begin and _against(poses, before[begin:], problem.centre_mm):
             poses = mirrored(poses)
         with self._lock:

@@ -177,7 +177,7 @@ def _plan_resampling(signal: RFSettings, samples: int, edge_fraction: float) -> 
     ratio = signal.sampling_rate_hz / (_RATE_OVER_BAND * (high - low + 2 * edge))
     length, out_length = _transform_lengths(samples + padding, ratio)
     frequency = signal.bin_frequency_hz(length)
-    weights = _band_weights(frequency, low, high, edge)
+    weights = band_weights(frequency, low, high, edge)
     bins = np.flatnonzero(weights)
     bins = bins[np.argsort(frequency[bins])][:out_length]
     destination = (np.arange(bins.size) - bins.size // 2) % out_length
@@ -204,7 +204,7 @@ def _transform_lengths(samples: int, ratio: float) -> tuple[int, int]:
     return 2 * round(least * ratio / 2), least
 
 
-def _band_weights(frequency: FloatArray, low: float, high: float, edge: float) -> FloatArray:
+def band_weights(frequency: FloatArray, low: float, high: float, edge: float) -> FloatArray:
     """One inside the band, raised-cosine edges outside it; the lower edge ends before zero frequency."""
     outside = np.maximum((low - frequency) / min(edge, low), (frequency - high) / edge)
     return np.asarray(np.where(outside < 1, np.cos(np.pi / 2 * np.clip(outside, 0, 1)) ** 2, 0.0))

@@ -25,6 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.special import log_ndtr, logsumexp
 
 from speckle3d.core.arrays import FloatArray
@@ -59,10 +60,10 @@ OTHER_BAND = 6.0
 """Gain in the log-likelihood by one exponent in all rows, from skin to bottom, from which another transmit
 band or filter is told. Twenty-one sweeps of two simulators gain 0.3 to 4.3; with the band 0.3 MHz off they
 gain 8.5 to 34."""
-_NOISES = np.append(0.0, np.exp(np.arange(-8.0, 2.1, 0.25)))
-"""Noise over the mean power of a row, tried one after another."""
-_ROUNDS, _BINS_PER_SAMPLE = 5, 1.5
-"""Gauss-Newton steps; bins over which a Hann window correlates neighbouring ones."""
+LITTLE_NOISE, NOISE_SIGMA = -4.0, 50.0
+"""Prior of the logarithm of noise over a row's mean power, which keeps fits of rows without any finite."""
+_BINS_PER_SAMPLE = 1.5
+"""Bins over which a Hann window correlates neighbouring ones."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def _fit_rows(
 ) -> tuple[FloatArray, FloatArray]:
     """Fit power = a reference exp(-k f) + noise at each depth.
 
-    Least squares of logarithms, whose error is the same at each frequency, for each of some noises.
+    Least squares of logarithms, whose error is the same at each frequency.
 
     Returns
     -------
@@ -158,28 +159,28 @@ def _fit_rows(
         Per MHz, and its standard deviation.
     """
     f = frequency_mhz - frequency_mhz.mean()
-    shape, known = (v / np.maximum(v.mean(axis=1, keepdims=True), 1e-30) for v in (power, reference))
-    log_shape = np.log(np.maximum(shape, 1e-9))[:, None]
-    weight = (shape / np.maximum(shape.max(axis=1, keepdims=True), 1e-9))[:, None]
-    weight = weight / (weight + NOISE_WEIGHT)
-    noise = _NOISES[:, None]
-    values = np.zeros((len(shape), _NOISES.size, 2))
-    for _ in range(_ROUNDS):
-        echo = known[:, None] * np.exp(np.clip(values[..., :1] - values[..., 1:] * f, -20.0, 20.0))
-        model = echo + noise
-        left, share = log_shape - np.log(model), echo / model
-        jacobian = np.stack([share, -share * f], axis=-1)
-        normal = np.einsum("rnfi,rnfj,rnf->rnij", jacobian, jacobian, weight + 0.0 * left) + 1e-6 * np.eye(2)
-        step = np.linalg.solve(normal, np.einsum("rnfi,rnf->rni", jacobian, weight * left)[..., None])
-        values += np.clip(step[..., 0], -1.0, 1.0)
-    cost = (weight * left**2).sum(axis=-1)
-    row, best = np.arange(len(shape)), cost.argmin(axis=1)
-    with_noise = np.concatenate([jacobian, (noise / model)[..., None]], axis=-1)[row, best]
-    normal = np.einsum("rfi,rfj,rf->rij", with_noise, with_noise, weight[:, 0])
-    covariance = np.linalg.inv(normal + np.diag([1e-6, 1e-6, 0.05]))
-    variance = cost[row, best] / (f.size - 3)
-    variance = _BINS_PER_SAMPLE * np.maximum(variance, np.median(variance))
-    return values[row, best, 1], np.sqrt(variance * covariance[:, 1, 1])
+    weight = power / np.maximum(power.max(axis=1, keepdims=True), 1e-30)
+    weight = np.sqrt(weight / (weight + NOISE_WEIGHT))
+    log_power, log_reference = (
+        np.log(np.maximum(v / np.maximum(v.mean(axis=1, keepdims=True), 1e-30), 1e-9))
+        for v in (power, reference)
+    )
+    rows = []
+    for row in zip(weight, log_power, log_reference, strict=True):
+
+        def misfit(values: FloatArray, *row: FloatArray) -> FloatArray:
+            (gain, fall, log_noise), (weight, own, known) = values, row
+            model = np.logaddexp(known + gain - fall * f, log_noise)
+            return np.append(weight * (own - model), (log_noise - LITTLE_NOISE) / NOISE_SIGMA)
+
+        starts = ([0.0, 0.0, log_noise] for log_noise in (LITTLE_NOISE, -1.0))
+        fit = min((least_squares(misfit, x, method="lm", args=row) for x in starts), key=lambda f: f.cost)
+        jacobian = np.asarray(fit.jac)
+        variance = np.linalg.inv(jacobian.T @ jacobian)[1, 1]
+        rows.append((fit.x[1], variance, 2.0 * fit.cost / (f.size - 3)))
+    fall, variance, misfits = np.array(rows).T
+    misfits = _BINS_PER_SAMPLE * np.maximum(misfits, np.median(misfits))
+    return fall, np.sqrt(misfits * variance)
 
 
 def _difference(

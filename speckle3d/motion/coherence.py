@@ -38,8 +38,6 @@ tissue fitted in halves read 1 % longer), more would outlast the tissue's layers
 NOISY_GAIN = 0.9
 """Part of the correlation that noise leaves, below which a row is noisy: speckle looks finer, structure
 unsure."""
-LEAST_SHARE = 1e-4
-"""Root mean square share that stands for none."""
 ROW_SIGMA, PRIOR_ROWS = 0.06, 10
 """Scatter of the scales that rows of patches ask for over tissue, and how many rows of the sweep's own it
 counts: simulated tissue of two physics has 0.04 to 0.09, the scatter of 13 rows is known to a third."""
@@ -71,31 +69,6 @@ class CoherenceSettings(BaseModel):
     adapt: bool = Field(True, description="Adapt to coherent echoes and noise; false: phantom curves alone.")
 
 
-@shown
-@dataclass(frozen=True)
-class Coherence:
-    """Share of structure and gain of every patch, by piece of the sweep, and the error of the scale.
-
-    Attributes
-    ----------
-    frame : ndarray, shape (b,)
-        Middles of the pieces.
-    share, gain : ndarray, shape (b, p)
-    scale_sigma : float
-        Standard deviation of the logarithm of the scale of all distances.
-    """
-
-    frame: FloatArray
-    share: FloatArray
-    gain: FloatArray
-    scale_sigma: float
-
-    def models(self, frame: IntArray) -> EchoModels:
-        """Echo models of pairs about frames of shape (e,): those of the nearest piece."""
-        piece = np.abs(frame[:, None] - self.frame).argmin(axis=1)
-        return EchoModels(self.share[piece], self.gain[piece])
-
-
 @dataclass(frozen=True)
 class RowScales:
     """Scale that each row of patches asks for, over that of the path.
@@ -109,6 +82,37 @@ class RowScales:
     depth_mm: FloatArray
     logarithm: FloatArray
     gain: FloatArray
+
+
+@shown
+@dataclass(frozen=True)
+class Coherence:
+    """Share of structure and gain of every patch, by piece of the sweep, and the scale of distances.
+
+    Attributes
+    ----------
+    frame : ndarray, shape (b,)
+        Middles of the pieces.
+    share, gain : ndarray, shape (b, p)
+    scale : float
+        Of all distances over those of the path that they were read from.
+    scale_sigma : float
+        Standard deviation of its logarithm.
+    rows : RowScales or None
+        None if not adapted to the sweep.
+    """
+
+    frame: FloatArray
+    share: FloatArray
+    gain: FloatArray
+    scale: float = 1.0
+    scale_sigma: float = CURVES_SIGMA
+    rows: RowScales | None = None
+
+    def models(self, frame: IntArray) -> EchoModels:
+        """Echo models of pairs about frames of shape (e,): those of the nearest piece."""
+        piece = np.abs(frame[:, None] - self.frame).argmin(axis=1)
+        return EchoModels(self.share[piece], self.gain[piece])
 
 
 @dataclass(frozen=True)
@@ -252,7 +256,7 @@ def _median(values: FloatArray) -> float:
 
 def estimate_coherence(
     problem: MotionProblem, table: CorrelationTable, sound: BoolArray, path: FloatArray
-) -> tuple[Coherence, float, RowScales]:
+) -> Coherence:
     """Estimate shares of structure, gains, and the factor that distances along the path are still to get.
 
     Structure of an echo turns its phase, so that it decays with some power of speckle's coherence; of
@@ -265,13 +269,6 @@ def estimate_coherence(
         Pairs of the table that count.
     path : ndarray, shape (n, 2) or (n, 3)
         Elevational position of each frame's centre, and its slopes along x and, if known, y.
-
-    Returns
-    -------
-    Coherence
-    float
-        True distances over those of the path, median over the patches.
-    RowScales
     """
     binned, centres = _binned(problem, table, sound, path)
     determined, of_echo = binned.determined, problem.at_patches.of_echo
@@ -284,14 +281,13 @@ def estimate_coherence(
     frozen = binned.fit(most_share)
     typical = float(np.nanmean(row_medians(frozen[:, 2])))
     if typical < NO_STRUCTURE:
-        fits = [binned.fit(0.0)]
-    else:
-        fits = [*([] if of_echo else [frozen]), binned.fit(most_share, MOST_POWER)]
+        most_share = 0.0
+    fits = [binned.fit(most_share, MOST_POWER), *([frozen] if most_share and not of_echo else [])]
     # Where noise is most of the correlation, its course tells nothing of the scale.
     clear = determined & (frozen[:, 1] >= LEAST_GAIN)
     medians = [_median(fit[clear if clear.any() else determined, 0]) for fit in fits]
     log_scale = float(np.mean(medians))
-    gain, share = binned.fit(most_share, 0.0, log_scale, max(typical, LEAST_SHARE))[:, 1:3].T
+    gain, share = binned.fit(most_share, 0.0, log_scale, max(typical, NO_STRUCTURE))[:, 1:3].T
     # Patches that tell nothing are taken for the sweep's typical ones.
     gain, share = (np.where(determined, v, _median(v[determined])) for v in (gain, share))
     logarithm = row_medians(np.mean(fits, axis=0)[:, 0]) - log_scale
@@ -307,8 +303,6 @@ def estimate_coherence(
     errors = 1.2533 * spread / np.sqrt(count), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
     shape = centres.size, -1
-    return (
-        Coherence(centres, share.reshape(shape), gain.reshape(shape), sigma),
-        float(np.exp(log_scale)),
-        rows,
+    return Coherence(
+        centres, share.reshape(shape), gain.reshape(shape), float(np.exp(log_scale)), sigma, rows
     )

@@ -26,7 +26,7 @@ from scipy import fft
 from scipy.interpolate import CubicSpline
 
 from speckle3d.core.arrays import ComplexArray, FloatArray
-from speckle3d.core.curves import NominalProbe
+from speckle3d.core.curves import NominalProbe, curve_widths
 from speckle3d.core.threads import in_parallel
 from speckle3d.kernels.diffraction import lens_fields
 
@@ -161,26 +161,15 @@ def _two_way_fields(
     return np.concatenate([half[..., :0:-1], half], axis=-1), np.concatenate([-z[:0:-1], z])
 
 
-_WIDEST = 1.2
-
-
-def half_distance(distance_mm: FloatArray, correlation: FloatArray) -> float:
-    """Distance at which a falling curve is first at one half; one that ends above goes on as it ends."""
-    after = max(1, int(np.argmax(correlation < 0.5)) if correlation[-1] < 0.5 else correlation.size - 1)
-    high, low = correlation[after - 1], correlation[after]
-    part = (high - 0.5) / max(high - low, 1e-12)
-    return float(distance_mm[after - 1] + part * (distance_mm[after] - distance_mm[after - 1]))
-
-
 def log_width(
     probe: NominalProbe, depth_mm: FloatArray, backscatter_exponent: float = BACKSCATTER_EXPONENT
 ) -> FloatArray:
-    """Logarithm of the distance in mm that halves the correlation at each depth, shape (r,)."""
+    """Logarithm of the curves' widths at each depth, shape (r,); see `curve_widths`."""
     band = probe.low_hz, probe.high_hz
     frequency = band_nodes(band, 0.1)[::2]
     power = sheet_spectrum(
         frequency, band, probe.attenuation_db_cm_mhz, backscatter_exponent, depth_mm[:, None]
     )
-    distance: FloatArray = STEP_MM / 2 * np.arange(int(_WIDEST * probe.aperture_mm / STEP_MM), dtype=float)
+    distance = STEP_MM / 2 * np.arange(int(probe.aperture_mm / STEP_MM), dtype=float)
     rho = speckle_correlation(probe, depth_mm[:, None], frequency, power, distance)
-    return np.log([half_distance(distance, row) for row in rho])
+    return np.log(curve_widths(distance, np.maximum(rho, 1e-9)))

@@ -1,19 +1,17 @@
-"""Curves stretched by a factor at each depth, for another lens or a known length."""
+"""Curves stretched by a factor at each depth, for another lens."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.curves import ATTENUATION_SIGMA, DecorrelationCurves, NominalProbe, TiltResponse
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.curves import DecorrelationCurves, NominalProbe, TiltResponse
 from speckle3d.motion.coherence import NOISY_GAIN, ROW_SIGMA, RowScales
-from speckle3d.motion.diffraction import half_distance, log_width
+from speckle3d.motion.diffraction import log_width
 
 FOCUS_SIGMA = 0.15
 """Standard deviation of the logarithm of the focal length about its data sheet's: the tolerance that sheets
@@ -77,58 +75,3 @@ def _log_widths_by_focus(sheet: NominalProbe, depth_mm: tuple[float, ...]) -> Fl
     """Logarithm of the curves' widths by `FOCI` and depth."""
     probes = [replace(sheet, focus_mm=sheet.focus_mm * float(np.exp(step))) for step in FOCI]
     return np.stack([log_width(probe, np.array(depth_mm)) for probe in probes])
-
-
-@dataclass(frozen=True)
-class Length:
-    """Logarithm of a sweep's true elevational length over the images', and its standard deviation."""
-
-    log_scale: float
-    sigma: float
-
-
-def corrected_curves(
-    curves: DecorrelationCurves, read_with: Sequence[DecorrelationCurves], lengths: Sequence[Length]
-) -> DecorrelationCurves:
-    """Correct the curves of a probe by sweeps whose true length is known from a crossing or a tracker.
-
-    All distances are multiplied by one factor; where the sweeps were read with another lens than `curves`
-    have, its factors by depth go before it. Tissue whose structure reads short is corrected with it: curves
-    learnt over tissue are right over tissue.
-
-    Parameters
-    ----------
-    curves : DecorrelationCurves
-    read_with : sequence of DecorrelationCurves
-        With which each sweep was read in the end.
-    lengths : sequence of Length
-
-    Returns
-    -------
-    DecorrelationCurves
-        Of origin "crossing"; their `scale_sigma` is that of the lengths and of tissue that attenuates
-        otherwise.
-
-    Raises
-    ------
-    InsufficientDataError
-        If there is no sweep, or none whose length is known.
-    """
-    scale, sigma = (np.array([getattr(each, name) for each in lengths]) for name in ("log_scale", "sigma"))
-    if not read_with or scale.size != len(read_with) or not (np.isfinite(scale) & (sigma > 0)).all():
-        raise InsufficientDataError(
-            "corrected curves: expected for every sweep a finite log scale with a deviation above zero, got "
-            f"{scale.tolist()} and {sigma.tolist()} for {len(read_with)} sweeps"
-        )
-    weight = sigma**-2.0 / (sigma**-2.0).sum()
-    lens = np.mean([_log_widths(own) - _log_widths(curves) for own in read_with], axis=0)
-    left = float(
-        np.sqrt((weight * (scale - weight @ scale) ** 2).sum() / scale.size + 1.0 / (sigma**-2.0).sum())
-    )
-    # Widened for the attenuation of these sweeps, the curves go with a spectrum that has it.
-    better = replace(stretched(curves, lens + weight @ scale), spectrum=read_with[0].spectrum)
-    return replace(better, scale_sigma=float(np.hypot(left, ATTENUATION_SIGMA)), origin="crossing")
-
-
-def _log_widths(curves: DecorrelationCurves) -> FloatArray:
-    return np.log([half_distance(curves.distance_mm, row) for row in curves.correlation])

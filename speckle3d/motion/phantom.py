@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, SpeckleSize, TiltResponse
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, SpeckleSize, TiltResponse, curve_widths
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import RFSettings, Sweep
@@ -76,8 +76,8 @@ class PhantomSamples:
     pairs: int
 
 
-def known_positions(sweep: Sweep) -> tuple[RigidTransform, str]:
-    """Poses of a phantom sweep's frames and their source: the stored truth, or the tracker's, smoothed.
+def known_positions(sweep: Sweep) -> RigidTransform:
+    """Poses of a phantom sweep's frames: the stored truth, or the tracker's, smoothed.
 
     A tracker's jitter is a good part of the distances wanted here. The probe moves more smoothly: a smoothing
     spline, its stiffness from generalised cross-validation, takes the jitter out.
@@ -88,14 +88,14 @@ def known_positions(sweep: Sweep) -> tuple[RigidTransform, str]:
         If there is neither, or the tracker does not cover every frame.
     """
     if sweep.truth is not None:
-        return sweep.truth, "truth"
+        return sweep.truth
     if sweep.tracker is None:
         raise InsufficientDataError(
             f"{sweep.name}: expected a phantom sweep with known positions (/truth or /tracker), got neither"
         )
     poses = sweep.tracker.world_from_image(sweep.frame_time_s)
     if len(poses) < 8:
-        return poses, "tracker"
+        return poses
     first = poses[0]
     motion = (first.inv() * poses).as_matrix()
     values = np.hstack([motion[:, :3, 3], Rotation.from_matrix(motion[:, :3, :3]).as_rotvec()])
@@ -103,7 +103,7 @@ def known_positions(sweep: Sweep) -> tuple[RigidTransform, str]:
         [make_smoothing_spline(sweep.frame_time_s, v)(sweep.frame_time_s) for v in values.T], axis=1
     )
     moved = RigidTransform.from_components(smooth[:, :3], Rotation.from_rotvec(smooth[:, 3:]))
-    return first * moved, "tracker"
+    return first * moved
 
 
 def phantom_pairs(sweep: Sweep, settings: CurveSettings | None = None) -> IntArray:
@@ -114,32 +114,18 @@ def phantom_pairs(sweep: Sweep, settings: CurveSettings | None = None) -> IntArr
     InsufficientDataError
         If positions are not known, or no frames are near enough to each other.
     """
-    s = settings or CurveSettings()
-    pairs = _choose_pairs(_separations(known_positions(sweep)[0], sweep.grid.centre_mm), s)
-    if not len(pairs):
+    s, poses = settings or CurveSettings(), known_positions(sweep)
+    centres, normals = poses.apply(sweep.grid.centre_mm), poses.rotation.apply([0.0, 0.0, 1.0])
+    first, second = np.triu_indices(len(poses), 1)
+    separation = np.abs(((centres[second] - centres[first]) * normals[first]).sum(axis=1))
+    order = np.argsort(separation, kind="stable")[: int((separation <= s.largest_mm).sum())]
+    if not order.size:
         raise InsufficientDataError(
             f"{sweep.name}: expected phantom frames closer than {s.largest_mm:g} mm, got none"
         )
-    return pairs
-
-
-def _separations(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
-    """Elevational distance of each frame's centre from each other's plane, shape (n, n), mm."""
-    centres = poses.apply(centre_mm)
-    normals = poses.rotation.apply([0.0, 0.0, 1.0])
-    return np.asarray(np.abs(np.einsum("ijk,ik->ij", centres[None] - centres[:, None], normals)))
-
-
-def _choose_pairs(separation: FloatArray, settings: CurveSettings) -> IntArray:
-    """Pairs within reach, thinned evenly over separation, shape (m, 2), first before second."""
-    first, second = np.triu_indices(len(separation), 1)
-    near = separation[first, second] <= settings.largest_mm
-    pairs = np.column_stack([first[near], second[near]])
-    if len(pairs) <= settings.pairs:
-        return pairs
-    order = np.argsort(separation[pairs[:, 0], pairs[:, 1]], kind="stable")
-    kept = order[np.linspace(0, len(order) - 1, settings.pairs).astype(int)]
-    return np.asarray(pairs[np.sort(kept)])
+    # Thinned evenly over separation.
+    kept = order[np.linspace(0, order.size - 1, min(order.size, s.pairs)).astype(int)]
+    return np.asarray(np.column_stack([first, second])[np.sort(kept)])
 
 
 def phantom_samples(
@@ -153,7 +139,7 @@ def phantom_samples(
     pairs : ndarray, shape (m, 2)
         Those of the table that count.
     """
-    poses, _ = known_positions(sweep)
+    poses = known_positions(sweep)
     counted = np.isin(table.first * len(poses) + table.second, pairs @ [len(poses), 1])
     first, second, correlation = table.first[counted], table.second[counted], table.correlation[counted]
     normal = (poses[first].inv() * poses[second]).as_matrix()[:, 2]
@@ -177,16 +163,13 @@ def phantom_speckle(
     seen : iterable of (ndarray, SpeckleSize)
         Depths of a sweep's rows of patches, and the sizes there, NaN where they are not known.
     """
-    some = list(seen)
-    depth = np.concatenate([depths for depths, _ in some])
-    sizes = []
+    some, sizes = list(seen), []
     for name in ("lateral_mm", "axial_mm"):
-        values = np.concatenate([getattr(size, name) for _, size in some])
-        known = np.isfinite(values)
-        if not known.any():
+        known = [(depths, getattr(size, name)) for depths, size in some]
+        known = [(depths[fair], size[fair]) for depths, size in known if (fair := np.isfinite(size)).any()]
+        if not known:
             return None
-        at, mean = _means(np.round(depth[known], 6), depth[known], values[known])
-        sizes.append(np.interp(depth_mm, at, mean))
+        sizes.append(np.mean([np.interp(depth_mm, *sweep) for sweep in known], axis=0))
     return SpeckleSize(*sizes)
 
 
@@ -209,35 +192,31 @@ def fit_curves(
     InsufficientDataError
         If a depth has too few samples over too little of its curve.
     """
-    s = settings or CurveSettings()
-    every = list(samples)
+    s, every = settings or CurveSettings(), list(samples)
     if not every:
         raise InsufficientDataError("expected samples of at least one phantom sweep, got none")
     depth, offset, tilt, rho = (
-        np.concatenate([getattr(one, name) for one in every])
+        np.concatenate([getattr(one, name)[np.isfinite(one.correlation)] for one in every])
         for name in ("depth_mm", "offset_mm", "tilt_rad", "correlation")
     )
-    rows, grid = np.unique(np.round(depth, 6)), np.linspace(0.0, s.largest_mm, 251)
-    at = [np.flatnonzero((np.abs(depth - row) < 1e-5) & np.isfinite(rho)) for row in rows]
-    echo, response, distance = key.correlation_of == "echo", None, np.abs(offset)
-    wavenumber = two_way_wavenumber(key.signal) if isinstance(key.signal, RFSettings) else 0.0
+    (rows, row), grid = np.unique(np.round(depth, 6), return_inverse=True), np.linspace(0, s.largest_mm, 251)
+    of_echo, response, distance = key.correlation_of == "echo", None, np.abs(offset)
     fair = np.ones(depth.size, dtype=bool)
     # Turning distorts the curves a little and is itself read from them: estimate both in turn.
     for turn in range(TILT_ROUNDS):
-        some = [own[fair[own]] for own in at]
-        fitted = [
-            _fit_row(row, grid, s.terms, echo, distance[own], rho[own])
-            for row, own in zip(rows, some, strict=True)
+        own = [np.flatnonzero(fair & (row == number)) for number in range(rows.size)]
+        fits = [
+            _fit_row(at, grid, s.terms, of_echo, distance[some], rho[some])
+            for at, some in zip(rows, own, strict=True)
         ]
-        curves, cells, ends = (np.array(part) for part in zip(*fitted, strict=True))
+        curves, cells, ends = (np.array(part) for part in zip(*fits, strict=True))
         if turn == TILT_ROUNDS - 1:
             break
-        known = [(offset[own], tilt[own], rho[own]) for own in at]
-        response = fit_tilt_response(rows, curves, cells, grid, wavenumber, echo, known)
+        response = _fit_tilt(key, DecorrelationCurves(key, rows, grid, curves, cells), row, offset, tilt, rho)
         if response is None:
             break
-        here = response.at(depth, rows)
-        distance = effective_distance(offset, tilt, here.pivot_mm, here.spread_mm)
+        pivot, spread = response.pivot_mm[row], response.spread_mm[row]
+        distance = effective_distance(offset, tilt, pivot, spread)
         fair = np.abs(distance - np.abs(offset)) <= LITTLE_TILT_MM + LITTLE_TILT * np.abs(offset)
     grid = grid[: max(2, int(np.searchsorted(grid, ends.min(), side="right")))]
     pairs = sum(one.pairs for one in every)
@@ -298,53 +277,47 @@ def effective_distance(
     return np.asarray(np.hypot(offset_mm - pivot_mm * tilt_rad, spread_mm * tilt_rad))
 
 
-def fit_tilt_response(
-    depths_mm: FloatArray,
-    curves: FloatArray,
-    cells: FloatArray,
-    distance_mm: FloatArray,
-    wavenumber_per_mm: float,
-    of_echo: bool,
-    samples: list[tuple[FloatArray, FloatArray, FloatArray]],
+def _fit_tilt(
+    key: CurveKey,
+    curves: DecorrelationCurves,
+    row: IntArray,
+    offset_mm: FloatArray,
+    tilt_rad: FloatArray,
+    rho: FloatArray,
 ) -> TiltResponse | None:
     """Fit the pivot at each depth to phantom frames that turned; None if they hardly did.
 
-    Spread and pivot cannot be separated while frames turn about the probe's face; the spread is therefore
-    that of a Gaussian beam of the curves' own width: two-way wavenumber times width squared.
+    Wavefronts change slowly with depth: it is a parabola. Spread and pivot cannot be separated while frames
+    turn about the probe's face; the spread is therefore that of a Gaussian beam of the curves' own width:
+    two-way wavenumber times width squared.
 
     Parameters
     ----------
-    depths_mm, cells : ndarray, shape (r,)
-    curves : ndarray, shape (r, k)
-        On `distance_mm`, shape (k,).
-    wavenumber_per_mm : float
-        Two-way, 4 pi over the wavelength; 0 if it is not known.
-    samples : list of r tuples of ndarray
-        Signed offset, tilt and correlation at each depth.
+    row : ndarray of int, shape (n,)
+        Of the curves at each sample's depth.
     """
-    width = np.array([np.interp(0.5, -np.log(curve), distance_mm) for curve in curves])
-    spread = wavenumber_per_mm * width**2
-    fits = []
-    for curve, own, wide, sample in zip(curves, cells / PAIRS_PER_FACT, spread, samples, strict=True):
-        turned = (np.abs(sample[1]) > TURNED_RAD) & (np.abs(sample[0]) < distance_mm[-1])
-        if turned.sum() < 4 * PAIRS_PER_FACT:
-            return None
-        offset, tilt, rho = (values[turned] for values in sample)
-
-        def misfit(pivot: FloatArray, *known: FloatArray | float) -> FloatArray:
-            offset, tilt, rho, curve, own, wide = known
-            at = effective_distance(np.asarray(offset), np.asarray(tilt), pivot[0], wide)
-            expected = np.interp(at, distance_mm, np.asarray(curve))
-            variance = correlation_variance(np.minimum(expected, 0.98), own, of_echo)
-            return np.asarray((rho - expected) / np.sqrt(variance))
-
-        known = offset, tilt, rho, curve, own, wide
-        starts = [least_squares(misfit, [x], loss="soft_l1", args=known) for x in (-8.0, 0.0, 8.0)]
-        fit = min(starts, key=lambda f: float(f.cost))
-        fits.append((float(fit.x[0]), float(1 / np.sqrt(np.square(np.asarray(fit.jac)).sum() + 1e-9))))
-    pivot, deviation = np.array(fits).T
-    if np.median(deviation) > SURE_MM:
+    depth, step, of_echo = curves.depth_mm, float(curves.distance_mm[1]), key.correlation_of == "echo"
+    wavenumber = two_way_wavenumber(key.signal) if isinstance(key.signal, RFSettings) else 0.0
+    spread = wavenumber * curve_widths(curves.distance_mm, curves.correlation) ** 2
+    turned = (np.abs(tilt_rad) > TURNED_RAD) & (np.abs(offset_mm) < curves.distance_mm[-1])
+    row, offset, tilt, rho = row[turned], offset_mm[turned], tilt_rad[turned], rho[turned]
+    if np.bincount(row, minlength=depth.size).min() < 4 * PAIRS_PER_FACT:
         return None
-    # Wavefronts change slowly with depth.
-    smooth = np.polynomial.Polynomial.fit(depths_mm, pivot, min(2, depths_mm.size - 1), w=1 / deviation)
-    return TiltResponse(smooth(depths_mm), spread)
+    design = np.vander((depth - depth.mean()) / max(np.ptp(depth), 1.0), min(3, depth.size))
+
+    def misfit(values: FloatArray) -> FloatArray:
+        at = effective_distance(offset, tilt, (design @ values)[row], spread[row]) / step
+        cell = np.minimum(at.astype(int), curves.distance_mm.size - 2)
+        low, high = curves.correlation[row, cell], curves.correlation[row, cell + 1]
+        expected = low + np.minimum(at - cell, 1.0) * (high - low)
+        variance = correlation_variance(
+            np.minimum(expected, 0.98), curves.cells[row] / PAIRS_PER_FACT, of_echo
+        )
+        return np.asarray((rho - expected) / np.sqrt(variance))
+
+    starts = [np.append(np.zeros(design.shape[1] - 1), pivot_mm) for pivot_mm in (-8.0, 0.0, 8.0)]
+    fit = min((least_squares(misfit, start, loss="soft_l1") for start in starts), key=lambda f: float(f.cost))
+    jacobian = np.asarray(fit.jac)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian)
+    deviation = np.sqrt(np.einsum("ri,ij,rj->r", design, covariance, design))
+    return TiltResponse(design @ fit.x, spread) if np.median(deviation) <= SURE_MM else None

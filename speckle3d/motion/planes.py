@@ -128,17 +128,20 @@ class MotionProblem:
         end = self.at_patches.amplitude[:, -1]
         return np.where(end**2 > WELL_FALLEN, end, 0.0)
 
+    @cached_property
+    def _typical(self) -> FloatArray:
+        """Amplitude of the median patch's fully developed speckle on the curves' grid."""
+        return np.asarray(np.median(self.at_patches.amplitude, axis=0))
+
     def typical_distance(self, amplitude: FloatArray | float) -> FloatArray:
         """Distance at which the median patch's fully developed speckle keeps an amplitude, mm."""
-        typical = np.median(self.at_patches.amplitude, axis=0)
-        return np.asarray(np.interp(-np.asarray(amplitude), -typical, self.curves.distance_mm))
+        return np.asarray(np.interp(-np.asarray(amplitude), -self._typical, self.curves.distance_mm))
 
     def typical_correlation(self, distance_mm: FloatArray) -> FloatArray:
-        """Median over the patches of fully developed speckle's correlation; 0 where it was not measured."""
-        rho = self.at_patches.amplitude**2
-        beyond = float(np.median(np.where(self.end_amplitude > 0, 0.0, rho[:, -1])))
-        grid = self.curves.distance_mm
-        return np.asarray(np.interp(distance_mm, grid, np.median(rho, axis=0), right=beyond))
+        """Correlation of the median patch's fully developed speckle; 0 where it was not measured."""
+        rho = self._typical**2
+        beyond = 0.0 if rho[-1] > WELL_FALLEN else rho[-1]
+        return np.interp(distance_mm, self.curves.distance_mm, rho, right=beyond)
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,7 @@ def pair_planes(
     problem: MotionProblem,
     table: CorrelationTable,
     rows: IntArray,
-    models: EchoModels | None = None,
+    models: EchoModels,
     start_mm: FloatArray | None = None,
     subset: BoolArray | None = None,
     slopes: FloatArray | None = None,
@@ -208,8 +211,8 @@ def pair_planes(
     ----------
     rows : ndarray of int, shape (e,)
         Of the table.
-    models : EchoModels, optional
-        How echoes depart from fully developed speckle; a phantom's, if not given.
+    models : EchoModels
+        How echoes depart from fully developed speckle, by pair or for all.
     start_mm : ndarray, shape (e,), optional
         About how far apart the frames are; by default by the pair's median correlation.
     subset : ndarray of bool, shape (e, p), optional
@@ -227,12 +230,11 @@ def pair_planes(
         comes to lie farther away than the curves were measured, or might.
     """
     correlation = table.correlation[rows]
-    echo = models or fully_developed(correlation.shape[1])
-    used = _measured(problem, correlation, echo)
+    used = _measured(problem, correlation, models)
     used = used if subset is None else used & subset
     used &= (used.sum(axis=1) >= LEAST_PATCHES)[:, None]
     if start_mm is None:
-        share = echo.share.mean(axis=1)
+        share = models.share.mean(axis=1)
         left = (np.sqrt(np.maximum(table.median[rows], 0.0)) - share) / np.maximum(1.0 - share, 0.1)
         start = problem.typical_distance(left)
     else:
@@ -256,7 +258,7 @@ def pair_planes(
             correlation[some],
             used[some],
             lost[some],
-            echo if len(echo.share) == 1 else EchoModels(echo.share[some], echo.gain[some]),
+            models if len(models.share) == 1 else EchoModels(models.share[some], models.gain[some]),
             problem.levers,
             problem.at_patches,
             start[some],
@@ -307,7 +309,7 @@ def raised(problem: MotionProblem, moved_mm: FloatArray, slopes: FloatArray) -> 
 
 
 def patch_distances(
-    problem: MotionProblem, correlation: Float32Array, models: EchoModels | None = None
+    problem: MotionProblem, correlation: Float32Array, models: EchoModels
 ) -> tuple[FloatArray, FloatArray]:
     """Unsigned elevational distance of each patch of each pair and its standard deviation, shape (e, p), mm.
 
@@ -315,7 +317,7 @@ def patch_distances(
     where the slope vanishes, it is the squared distance whose deviation stays finite.
     """
     curves, grid = problem.at_patches, problem.curves.distance_mm
-    share, gain = models or fully_developed(correlation.shape[1])
+    share, gain = models
     amplitude = (np.sqrt(np.maximum(correlation, 0.0) / gain) - share) / (1.0 - share)
     least = np.sqrt(np.maximum(LEAST_CORRELATION, curves.amplitude[:, -1] ** 2))
     amplitude = np.where(amplitude > least, amplitude, np.nan)

@@ -17,9 +17,9 @@ from speckle3d.motion.planes import PairPlanes
 
 HYPOTHESES = 8
 """Paths that are followed; 4 move lengths by at most 0.06 %."""
-PLAIN_ERROR, ADAPTED_ERROR = 0.25, 0.1
-"""Relative error of distances by a phantom's curves and with coherence adapted to. Coherent tissue makes long
-distances too short, so that a misfit of a quarter is no sign of turning back."""
+RELATIVE_ERROR = 0.25
+"""Of distances, besides their covariance. Coherent tissue makes long distances too short, so that a misfit of
+a quarter is no sign of turning back; 0.1 where coherence is adapted to moves lengths by at most 0.1 %."""
 TREND_MM = 0.3
 """Travel over which a direction is remembered: a few frames of a hand-held sweep."""
 TURNING_COST = 2.0
@@ -56,7 +56,6 @@ class Strangers(NamedTuple):
 def likeliest_path(
     planes: PairPlanes,
     frames: int,
-    relative_error: float,
     strangers: Strangers,
     known: FloatArray | None = None,
 ) -> FloatArray:
@@ -71,8 +70,6 @@ def likeliest_path(
         Sorted by the second frame.
     frames : int
         Of the sweep.
-    relative_error : float
-        Of offsets and slopes, besides their covariance: `PLAIN_ERROR` or `ADAPTED_ERROR`.
     strangers : Strangers
     known : ndarray, shape (m, 2), optional
         Position and slope of the first m frames, which stay.
@@ -84,7 +81,7 @@ def likeliest_path(
     """
     rules = PathRules(
         HYPOTHESES,
-        relative_error,
+        RELATIVE_ERROR,
         PLACED,
         CAP,
         TURNING_COST,

@@ -3,54 +3,45 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.kernels.plane_misfit import EchoModels
-from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.planes import MotionProblem, PairPlanes, pair_planes, patch_distances, raised
+from speckle3d.motion.estimate import Motion
+from speckle3d.motion.planes import pair_planes, patch_distances, raised
+from speckle3d.motion.trajectory import edges_of, solve_trajectory
 
 
-def consistent_planes(
-    problem: MotionProblem,
-    pairs: PairPlanes,
-    table: CorrelationTable,
-    models: EchoModels | None,
-    scale: float,
-    sensed: Rotation,
-    direction: int,
-) -> PairPlanes:
-    """Planes of the sensed orientation, through the patches that agree with it; their own if too few do.
+def consistent_poses(motion: Motion, sensed: Rotation) -> tuple[RigidTransform, BoolArray]:
+    """Poses from the orientation-consistent patches, and each pair's patches used.
+
+    Planes have the sensed orientation and go through the patches that agree with it; pairs of which too few
+    do keep their own.
 
     Parameters
     ----------
-    pairs : PairPlanes
-        From all patches, signed.
-    models : EchoModels or None
-        With which the pairs were read.
-    scale : float
-        Of all distances.
+    motion : Motion
+        Of the true sign.
     sensed : Rotation, length n
         Orientation of every frame.
-    direction : int
-        Sign of the elevational motion, with which that of every pair is multiplied.
     """
+    problem, table, pairs, scale = motion.problem, motion.table, motion.pairs, motion.coherence.scale
+    models, correlation = motion.coherence.models(pairs.first), table.correlation[pairs.row]
     sign = np.where(pairs.offset_mm < 0, -1.0, 1.0)
     relative = (sensed[pairs.first].inv() * sensed[pairs.second]).as_matrix()[:, 2, :2]
-    moved, slopes = table.inplane[pairs.row, :2], direction * sign[:, None] * relative
+    moved, slopes = table.inplane[pairs.row, :2], sign[:, None] * relative
     farther, offset = raised(problem, moved, slopes), np.abs(pairs.offset_mm)
     # Only frames that cross, or nearly, leave the side open.
     open_side = offset < np.ptp(farther, axis=1)
-    distance, sigma = patch_distances(problem, table.correlation[pairs.row], models)
-    support_sigma = problem.planes.support_sigma
-    agreed = consistent_subset(scale * distance, scale * sigma, farther, open_side, support_sigma)
+    distance, sigma = (scale * v for v in patch_distances(problem, correlation, models))
+    agreed = consistent_subset(distance, sigma, farther, open_side, problem.planes.support_sigma)
     planes, determined = pair_planes(problem, table, pairs.row, models, offset, agreed, slopes, open_side)
     # Slopes are the sensor's; distances have the scale of all patches.
     planes.coefficients[:] *= [scale, 1.0, 1.0] * sign[:, None]
     planes.covariance[:] *= scale**2
     for name in ("coefficients", "covariance", "used"):
         getattr(planes, name)[~determined] = getattr(pairs, name)[~determined]
-    return planes
+    edges, huber = edges_of(table, planes), problem.trajectory.huber
+    return solve_trajectory(edges, problem.frames, problem.centre_mm, huber).poses, planes.used
 
 
 def consistent_subset(

@@ -63,12 +63,11 @@ def solve_trajectory(
     huber : float
         Standard deviations at which a pair begins to lose weight.
     """
-    lone = np.flatnonzero(unjoined(pairs.second, frames))
-    after = lone[lone + 1 < frames]
-    pairs = joined(pairs, held(np.concatenate([lone - 1, after]), np.concatenate([lone, after + 1])))
-    poses, root = _chain(pairs, frames), np.linalg.cholesky(np.linalg.inv(pairs.covariance))
-    for _ in range(ROUNDS):
-        jacobian, left = _linearised(pairs, root, poses, huber)
+    pairs = _with_loose_edges(pairs, frames)
+    poses, root = RigidTransform.identity(frames), np.linalg.cholesky(np.linalg.inv(pairs.covariance))
+    for number in range(ROUNDS):
+        # From nowhere, all pairs are far off alike.
+        jacobian, left = _linearised(pairs, root, poses, huber if number else np.finfo(float).max)
         step = np.zeros((frames, 6))
         step[1:] = _factored(jacobian).solve(-jacobian.T @ left).reshape(-1, 6)
         poses = poses * RigidTransform.from_exp_coords(step[:, _TWIST])
@@ -127,18 +126,6 @@ def _marginals(normal: Any, frames: int) -> FloatArray:
     return np.asarray(covariance + covariance.transpose(0, 2, 1)) / 2
 
 
-def _chain(pairs: RelativePoses, frames: int) -> RigidTransform:
-    """Each frame from the pair whose distance is most certain."""
-    best = np.zeros(frames, dtype=np.int64)
-    backwards = np.lexsort((pairs.covariance[:, 2, 2], pairs.second))[::-1]
-    best[pairs.second[backwards]] = backwards  # the last that is written stays
-    first, step = pairs.first[best].tolist(), pairs.poses.as_matrix()[best]
-    matrices = np.tile(np.eye(4), (frames, 1, 1))
-    for frame in range(1, frames):
-        matrices[frame] = matrices[first[frame]] @ step[frame]
-    return RigidTransform.from_matrix(matrices)
-
-
 def unjoined(second: IntArray, frames: int) -> BoolArray:
     """Frames after the first that are the second of no pair, shape (n,)."""
     lone = np.ones(frames, dtype=bool)
@@ -147,22 +134,16 @@ def unjoined(second: IntArray, frames: int) -> BoolArray:
     return lone
 
 
-def held(first: IntArray, second: IntArray) -> RelativePoses:
-    """Edges that say no more than that a probe does not jump: for frames that no pair joins to others."""
-    deviation = np.repeat([HELD_MM, HELD_RAD], 3)
-    poses = RigidTransform.from_translation(np.zeros((first.size, 3)))
-    return RelativePoses(first, second, poses, np.tile(np.diag(deviation**2), (first.size, 1, 1)))
-
-
-def joined(pairs: RelativePoses, others: RelativePoses) -> RelativePoses:
-    """Two sets of edges."""
-    if not (len(pairs) and len(others)):
-        return pairs if len(pairs) else others
+def _with_loose_edges(pairs: RelativePoses, frames: int) -> RelativePoses:
+    """Join frames that no pair joins to others by edges that say no more than that a probe does not jump."""
+    lone = np.flatnonzero(unjoined(pairs.second, frames))
+    after = lone[lone + 1 < frames]
+    loose = np.diag(np.repeat([HELD_MM, HELD_RAD], 3) ** 2)
     return RelativePoses(
-        np.concatenate([pairs.first, others.first]),
-        np.concatenate([pairs.second, others.second]),
-        RigidTransform.concatenate([pairs.poses, others.poses]),
-        np.concatenate([pairs.covariance, others.covariance]),
+        np.concatenate([pairs.first, lone - 1, after]),
+        np.concatenate([pairs.second, lone, after + 1]),
+        RigidTransform.concatenate([pairs.poses, RigidTransform.identity(lone.size + after.size)]),
+        np.concatenate([pairs.covariance, np.tile(loose, (lone.size + after.size, 1, 1))]),
     )
 
 

@@ -56,7 +56,7 @@ def common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: SharedE
     centres = poses.apply(centre_mm)
     z = centres[:, 2] - centres[0, 2]
     factors = np.zeros((3, len(z), 6))
-    factors[0, :, 2] = np.hypot(shared.scale_sigma, shared.curves_sigma) * z
+    factors[0, :, 2] = shared.length_sigma * z
     yaw, tilt = shared.turn_sigma_per_mm
     for number, angle, shift, rate, sign in ((1, 4, 0, yaw, 1.0), (2, 3, 1, tilt, -1.0)):
         # A turn that grows with z moves the centre sideways by half of it times z.

@@ -24,7 +24,7 @@ from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import track
 
 STAGES = ("coherence", "planes", "trajectory")
-NOT_OF_THE_PATH = ("data_sheet", "diffraction", "lens", "phantom")
+NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
 """Modules of curves, which change no estimate."""
 
 

@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra, NominalProbe
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, EchoSpectra, NominalProbe, curve_widths
 from speckle3d.core.sweep import RFSettings
 from speckle3d.motion.attenuation import UNKNOWN_SIGMA, estimate_attenuation
-from speckle3d.motion.diffraction import half_distance, sheet_spectrum, speckle_correlation
+from speckle3d.motion.diffraction import sheet_spectrum, speckle_correlation
 
 BAND = (5e6, 10e6)
 DEPTH = np.arange(3.5, 40.0, 3.0)
@@ -65,10 +65,7 @@ def test_attenuation_in_spite_of_structure_and_noise(difference):
 def test_curves_stretch_as_the_beam_widens(difference):
     there, given = _curves(0.5 + difference), _curves(0.5)
     stretched = _found(given, _power(0.5 + difference)).applied(given)
-    half = [
-        np.array([half_distance(DISTANCE, row) for row in each.correlation])
-        for each in (stretched, there, given)
-    ]
+    half = [curve_widths(DISTANCE, each.correlation) for each in (stretched, there, given)]
     # Length depends on the mean over depth; one power of wavelength for all depths is off by 2 % at some.
     assert abs((half[0] / half[1]).mean() - 1.0) < 0.012
     assert np.abs(half[0] / half[1] - 1.0).max() < 0.025

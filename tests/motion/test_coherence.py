@@ -93,8 +93,8 @@ def estimate(share=0.0, noise=0.0, start=1.0, seed=0, correlate="echo", yaw_rad=
     path = made_path(yaw_rad=yaw_rad)
     share, noise = (np.broadcast_to(values, len(PATCHES)) for values in (share, noise))
     table = sweep_table(path, share, noise, correlate, seed)
-    coherence, scale, _ = estimated(start * path, table, correlate)
-    return coherence, start * scale
+    coherence = estimated(start * path, table, correlate)
+    return coherence, start * coherence.scale
 
 
 def some(values, seed=1):
@@ -142,9 +142,9 @@ def test_claims_of_the_scale_hold():
 def test_a_long_sweep_is_fitted_in_pieces():
     path = np.column_stack([np.linspace(0.0, 25.0, 251), np.zeros(251)])
     table = sweep_table(path[:251], some([0.0, 0.3]), np.zeros(len(PATCHES)), "echo", steps=(1, 2, 4, 8))
-    coherence, scale, _ = estimated(path, table)
+    coherence = estimated(path, table)
     assert coherence.frame.size == len(coherence.share) == 2
     models = coherence.models(np.array([0, 250]))
     np.testing.assert_array_equal(models.share, coherence.share)
     np.testing.assert_array_equal(models.gain, coherence.gain)
-    assert scale == pytest.approx(1.0, abs=0.02)
+    assert coherence.scale == pytest.approx(1.0, abs=0.02)

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from speckle3d.core.curves import NominalProbe
+from speckle3d.core.curves import NominalProbe, curve_widths
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.motion.data_sheet import ProbeSheet
-from speckle3d.motion.diffraction import half_distance, log_width, speckle_correlation
-from speckle3d.sheet_curves import data_sheet_curves
+from speckle3d.motion.diffraction import log_width, speckle_correlation
+from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 from speckle3d.simulation.beam import Probe, tabulate_beam
 from speckle3d.simulation.medium import fully_developed
 from speckle3d.simulation.movement import stepped_poses
@@ -19,7 +18,7 @@ SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=
 
 
 def widths(curves, depth_mm):
-    return np.array([half_distance(curves.distance_mm, row) for row in curves.at(depth_mm).correlation])
+    return curve_widths(curves.distance_mm, curves.at(depth_mm).correlation)
 
 
 def test_in_the_focus_the_field_is_the_apertures_transform_on_a_curved_wavefront():

@@ -68,7 +68,7 @@ def test_an_intensitys_deviation_is_that_of_sampled_coefficients(u):
     b = rho * a + np.sqrt(1 - rho**2) * b
     r = np.array([np.corrcoef(x, y)[0, 1] for x, y in zip(a, b, strict=True)])
     r = r[: r.size // len(PATCHES) * len(PATCHES)].reshape(-1, len(PATCHES))
-    distance, _ = patch_distances(problem(of="intensity"), r)
+    distance, _ = read(problem(of="intensity"), r)
     _, sigma = read(problem(of="intensity"), rho)
     # The prediction is of first order; the curve bends over a deviation.
     assert abs(np.nanstd(distance) / sigma.mean() - 1) < 0.1

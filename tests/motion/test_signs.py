@@ -4,12 +4,10 @@ import numpy as np
 import pair_planes
 import pytest
 
-from speckle3d.motion.signs import PLAIN_ERROR, Strangers, likeliest_path, on_path
+from speckle3d.motion.signs import Strangers, likeliest_path, on_path
 
 REACH_MM, KEY_MM, TURNED_MM = 0.85, 0.2, 8.0
 """Pairs share speckle up to the first; the second apart, a key frame is kept; a slope's worth in travel."""
-ADAPTED = 0.1
-"""Relative error of distances where coherence has been adapted to."""
 NONE = Strangers(np.zeros(0, int), np.zeros(0, int), 0.0)
 
 
@@ -127,8 +125,8 @@ class Sweep:
     def planes(self):
         return planes_of(*(np.array(x) for x in (self.first, self.second, self.moved, self.covariance)))
 
-    def resolve(self, relative_error=PLAIN_ERROR):
-        return likeliest_path(self.planes, len(self.z), relative_error, NONE)
+    def resolve(self):
+        return likeliest_path(self.planes, len(self.z), NONE)
 
     def wrong_signs(self, path, clear_mm=0.07, after=0):
         """Pairs with a clear sign that got the other, up to the mirror image of the whole."""
@@ -146,12 +144,12 @@ class Sweep:
         return min(off.sum(), (~off).sum())
 
 
-def failures(sweep, seeds=12, error=(), clear_mm=0.07, after=0, **noise):
+def failures(sweep, seeds=12, clear_mm=0.07, after=0, **noise):
     """Seeds of which any sign is wrong."""
     bad = []
     for seed in range(seeds):
         made = Sweep(*sweep(np.random.default_rng(100 + seed), seed), seed, **noise)
-        if made.wrong_signs(made.resolve(*error), clear_mm, after):
+        if made.wrong_signs(made.resolve(), clear_mm, after):
             bad.append(seed)
     return bad
 
@@ -200,12 +198,12 @@ def wobbled(seed, told):
     known = np.tile(np.diag([0.03**2, 1e-8]), (read.size, 1, 1))
     unlike = Strangers(*np.array(strangers).T, 0.3) if told else NONE
     planes = planes_of(first.astype(int), second.astype(int), moved, known)
-    path = likeliest_path(planes, z.size, ADAPTED, unlike)
+    path = likeliest_path(planes, z.size, unlike)
     step, true = np.diff(path[:, 0]), np.diff(z)
     return int(((np.sign(step) != np.sign(true)) & (np.abs(true) > 0.05)).sum())
 
 
 def test_frames_that_do_not_resemble_each_other_are_apart():
-    seeds = (2, 3, 4)
+    seeds = (21, 28, 31)
     assert sum(wobbled(seed, told=True) for seed in seeds) == 0
     assert sum(wobbled(seed, told=False) for seed in seeds) > 10

@@ -56,9 +56,8 @@ def curves(
     from speckle3d.io.curves import read_curves, write_curves
     from speckle3d.io.load import load_sweep
     from speckle3d.io.toml import load_toml
-    from speckle3d.motion.data_sheet import ProbeSheet
     from speckle3d.phantom_curves import calibrate_curves
-    from speckle3d.sheet_curves import data_sheet_curves
+    from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
     from speckle3d.tracked_curves import jitters, tracked_curves
 
     require_own_place(out, "curves", *(sweeps or []), config_file, probe, like, start)
