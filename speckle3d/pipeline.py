@@ -219,11 +219,11 @@ def track(
     (32, 'tracker', False)
     """
     require_kind(sweep, Sweep, "sweep", "load_sweep(path)")
-    curves = _curves_beside(sweep) if curves is None else curves
+    settings = config or Config()
+    curves = _curves_beside(sweep, settings.curves.same_probe) if curves is None else curves
     require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
     if len(sweep) < 2:
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
-    settings = config or Config()
     matcher = matcher_for(sweep, curves, settings)
     doubts = examine_recording(sweep, matcher, curves)
 
@@ -299,13 +299,13 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
         raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")
 
 
-def _curves_beside(sweep: Sweep) -> DecorrelationCurves:
+def _curves_beside(sweep: Sweep, same_probe: bool) -> DecorrelationCurves:
     """Read the curves that lie beside a sweep's recording."""
     if sweep.path is None:
         raise InvalidInputError(f"{sweep.name}: expected curves of its probe (load_curves(path)), got none")
     path = curves_beside(sweep.path)
     curves = read_curves(path)
-    warnings.warn(trust_words(path, curves), stacklevel=3)
+    warnings.warn(trust_words(path, curves, same_probe), stacklevel=3)
     return curves
 
 

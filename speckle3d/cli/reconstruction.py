@@ -111,7 +111,7 @@ def reconstruct(
     used = curves_file or curves_beside(sweep_file)
     curves = read_curves(used)
     if curves_file is None:
-        note(trust_words(used, curves))
+        note(trust_words(used, curves, settings.curves.same_probe))
     mount(sweep, calibrations)
     crossing = None
     if crossing_file is not None or crossing_frames is not None:

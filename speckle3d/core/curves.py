@@ -44,6 +44,11 @@ class CurveKey:
         Width of the band's edges over its width.
     probe : str
         Name of probe and preset as the recording has it; empty if it has none, and then not compared.
+    lines : {"parallel", "fan", ""}
+        How vectors lie; empty if nothing says, and then not compared.
+    array_radius_mm, line_step_rad : float
+        Of a fan's array (0: phased), and the angle between its vectors. Of fans these are compared in place
+        of the pitch, which grows with the depth that is recorded.
     """
 
     signal: RFSettings | BModeSettings
@@ -54,6 +59,9 @@ class CurveKey:
     correlation_of: str = "intensity"
     edge_fraction: float = EDGE_FRACTION
     probe: str = ""
+    lines: str = ""
+    array_radius_mm: float = 0.0
+    line_step_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if self.correlation_of not in ("echo", "intensity"):
@@ -66,8 +74,10 @@ class CurveKey:
         others = _settings(other)
         if self.probe and other.probe and self.probe != other.probe:
             raise MismatchError(f"{what}: probe is {self.probe!r} and {other.probe!r}")
+        if self.lines and other.lines and self.lines != other.lines:
+            raise MismatchError(f"{what}: lines are {self.lines!r} and {other.lines!r}")
         for name, mine in _settings(self).items():
-            theirs = others[name]
+            theirs = others.get(name, mine)
             exact = isinstance(mine, str)
             if not (mine == theirs if exact else np.allclose(mine, theirs, rtol=1e-3, atol=1e-9)):
                 advice = BAND_ADVICE if name == "bandwidth_hz" else ""
@@ -286,6 +296,9 @@ def curve_widths(distance_mm: FloatArray, correlation: FloatArray) -> FloatArray
 def _settings(key: CurveKey) -> dict[str, Any]:
     kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
     numbers = {name: getattr(key, name) for name in (*PATCH_NUMBERS, "edge_fraction")}
+    if key.lines == "fan":
+        del numbers["vector_pitch_mm"]
+        numbers |= {name: getattr(key, name) for name in ("array_radius_mm", "line_step_rad")}
     # How finely the echo was sampled, real or as I/Q, is no property of the beam, and matching resamples it.
     left_out = ("demodulation_frequency_hz", *(("sampling_rate_hz",) if kind == "RF" else ()))
     signal = {name: value for name, value in vars(key.signal).items() if name not in left_out}

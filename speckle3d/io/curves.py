@@ -34,9 +34,9 @@ def curves_beside(sweep_file: Path) -> Path:
     return beside
 
 
-def trust_words(path: Path, curves: DecorrelationCurves) -> str:
+def trust_words(path: Path, curves: DecorrelationCurves, same_probe: bool) -> str:
     """Say which curves were taken that nobody named, and how far to trust them."""
-    percent = 196.0 * curves.mismatch(True)
+    percent = 196.0 * curves.mismatch(same_probe)
     return f"curves: {path}, by {curves.origin}; lengths by them are right to {percent:.0f} % (95 %)"
 
 

@@ -16,6 +16,7 @@ from scipy import fft
 
 from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
 from speckle3d.core.curves import CurveKey
+from speckle3d.core.grid import FanLines
 from speckle3d.core.region import Region
 from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.core.threads import in_parallel
@@ -106,6 +107,7 @@ class FrameMatcher:
             "echo" if self.of_echo else "intensity",
             intensity.edge_fraction,
             sweep.probe,
+            **_lines_of(sweep.grid.fan),
         )
 
     def keep_depths(self, depth_mm: FloatArray) -> None:
@@ -206,3 +208,10 @@ def inverse(motion: FloatArray) -> FloatArray:
     """In-plane motion the other way round."""
     place = -np.exp(-1j * motion[2]) * complex(*motion[:2])
     return np.array([place.real, place.imag, -motion[2]])
+
+
+def _lines_of(fan: FanLines | None) -> dict[str, Any]:
+    """How vectors lie, as a `CurveKey` has it."""
+    if fan is None:
+        return {"lines": "parallel"}
+    return {"lines": "fan", "array_radius_mm": fan.radius_mm, "line_step_rad": fan.step_rad}
