@@ -164,7 +164,7 @@ class LiveTracker:
             return float("nan")
         # Live, no spectrum tells how much more than the phantom the tissue attenuates.
         curves_sigma = motion.problem.curves.mismatch(self._config.curves.same_probe)
-        return float(np.hypot(motion.scale_sigma, curves_sigma))
+        return float(np.hypot(motion.coherence.scale_sigma, curves_sigma))
 
     @property
     def flags(self) -> IntArray:
