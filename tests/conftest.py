@@ -75,15 +75,15 @@ def small_sweeps(tmp_path_factory, shipped) -> Path:
 
 
 @pytest.fixture(scope="session")
-def report_study(tmp_path_factory, small_sweeps) -> Path:
-    """Folder of a small study with its report."""
+def report_study(tmp_path_factory, small_sweeps):
+    """A small study with its report."""
     from report_examples import small_study
 
     from speckle3d.report.page import write_report
 
-    folder = small_study(tmp_path_factory.mktemp("report-study"), small_sweeps)
-    write_report(folder)
-    return folder
+    study = small_study(tmp_path_factory.mktemp("report-study"), small_sweeps)
+    write_report(study)
+    return study
 
 
 @pytest.fixture

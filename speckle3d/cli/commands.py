@@ -154,7 +154,7 @@ def _flag(name: str) -> str:
 def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> None:
     """Refuse an option against the rule that its help begins with, and an input that is not there."""
     (info,) = option.annotation.__metadata__
-    if rule := _RULE.search(info.help or ""):
+    for rule in _RULE.finditer(info.help or ""):
         others = [other for other in rule[2].split(" or ") if other in flags]
         if rule[1] == "With" and not others:
             raise InvalidInputError(f"{flag}: expected {rule[2]} with it, got none")

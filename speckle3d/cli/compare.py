@@ -36,7 +36,7 @@ def compare(
     calibration: Paths = None,
     config_file: MaybePath = None,
     scheduler: MaybeText = None,
-    workers: int | None = None,
+    workers: Annotated[int | None, typer.Option(min=1)] = None,
     paper: bool = False,
     as_json: Json = False,
 ) -> None:
@@ -65,7 +65,7 @@ def compare(
     workers
         Run in so many processes on this machine, instead of in one.
     scheduler
-        Address of a Dask scheduler, as tcp://host:8786, to run on.
+        Address of a Dask scheduler, as tcp://host:8786, to run on. Not with --workers.
     calibration, config_file
 
     Examples
@@ -91,20 +91,19 @@ def compare(
             study = compare_sweeps(
                 paths, out, drift, reference, curves_file, settings, calibration or (), where, bar
             )
-    write_report(out)
+    write_report(study)
     emit((out / "study.json").read_text(encoding="utf-8") if as_json else table or study.table)
     _tell(study)
 
 
 def _tell(study: Study) -> None:
     """Say on stderr what became of the sweeps; fail if all did."""
-    failed = [outcome for outcome in study.outcomes if outcome.status == "failed"]
     skipped = sum(outcome.skipped for outcome in study.outcomes)
     if skipped:
         note(f"{skipped} of {len(study.outcomes)} sweeps were finished before and are taken as they are")
-    for outcome in failed:
+    for outcome in study.broken:
         note(f"{outcome.name}: failed: {outcome.reason}")
     out = study.directory
     note(f"results in {out}; the report is {out / 'report.html'}")
-    if len(failed) == len(study.outcomes):
+    if not study.done:
         raise InsufficientDataError(f"{out}: expected a sweep that can be compared, got none")

@@ -161,8 +161,8 @@ def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | No
 
     posed = open_posed(result.directory / "reconstruction.h5", mode, sweep_file)
     notes(posed.notes())
-    with progress_bar(f"compounding {out.name}") as progress:
-        note(write_voxels(posed, VolumeRequest(out, settings.volume), progress).line)
+    with progress_bar(f"compounding {out.name}"):
+        note(write_voxels(posed, VolumeRequest(out, settings.volume)).line)
 
 
 def _part(sweep: Sweep, frames: str | None, option: str) -> Sweep:

@@ -16,10 +16,9 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import FramePairs
-from speckle3d.report.data import Record
 from speckle3d.scoring.references import SweepCurves
 from speckle3d.study.figures import CURVE_LABELS, colour_of, label_of, new_figure, spread_frames
-from speckle3d.study.overall import words_of
+from speckle3d.study.overall import Row, words_of
 
 MOST_POINTS = 240
 """Points of a curve: more than print or screen resolve, and each costs bytes."""
@@ -35,16 +34,16 @@ _LAYOUT: Mapping[str, Any] = {
 }
 
 
-def draw_overview(rows: Sequence[Record], modes: Sequence[str], title: str) -> Figure:
+def draw_overview(rows: Sequence[Row], modes: Sequence[str], title: str) -> Figure:
     """Draw errors of length and tilt: a point for every part of every sweep, a bar at the mean magnitude."""
     figure = new_figure(9.0, 1.8 + 0.5 * len(modes))
     panels = figure.subplots(1, 2, sharey=True)
     for axes, key in zip(panels, ("length_error_percent", "tilt_error_deg"), strict=True):
         axes.axvline(0.0, color="0.6", linewidth=0.8)
         for level, mode in enumerate(modes):
-            errors = np.array([row[key] for row in rows if row["mode"] == mode and row[key] is not None])
+            errors = np.array([row[key] for row in rows if row["mode"] == mode and np.isfinite(row[key])])
             if errors.size:
-                colour, size = colour_of(mode, modes), np.abs(errors).mean()
+                colour, size = colour_of(mode), np.abs(errors).mean()
                 spread = level + 0.3 * np.linspace(-0.5, 0.5, errors.size) * (errors.size > 1)
                 axes.plot([-size, size], [level, level], color=colour, linewidth=6, alpha=0.25)
                 axes.plot(errors, spread, "o", color=colour, markersize=4, alpha=0.7)
@@ -93,7 +92,7 @@ def plot_curves(curves: SweepCurves) -> go.Figure:
 
 def _curve_traces(curves: SweepCurves, q: int, zero: FloatArray) -> list[go.Scatter]:
     """One quantity of the reference and of all modes, less `zero`; named in the legend once."""
-    frames, modes = spread_frames(curves.frames, MOST_POINTS), list(curves.modes)
+    frames = spread_frames(curves.frames, MOST_POINTS)
 
     def trace(values: FloatArray, name: str, line: dict[str, Any], **look: Any) -> go.Scatter:
         look = {"showlegend": q == 0, "legendgroup": name, "mode": "lines", **look}
@@ -109,8 +108,8 @@ def _curve_traces(curves: SweepCurves, q: int, zero: FloatArray) -> list[go.Scat
         traces.append(trace(middle - half, name, {"width": 0}, hoverinfo="skip", showlegend=False))
         band = {"fill": "tonexty", "fillcolor": faint, "hoverinfo": "skip"}
         traces.append(trace(middle + half, name, {"width": 0}, **band))
-    for i, mode in enumerate(modes):
-        line = {"width": 1.8, "dash": _DASHES[i % len(_DASHES)], "color": colour_of(mode, modes)}
+    for i, mode in enumerate(curves.modes):
+        line = {"width": 1.8, "dash": _DASHES[i % len(_DASHES)], "color": colour_of(mode)}
         traces.append(trace(curves.modes[mode], label_of(mode), line, hovertemplate="%{y:.2f}"))
     return traces
 
@@ -127,7 +126,7 @@ def plot_outlines(poses: Mapping[str, RigidTransform], grid: ImageGrid) -> go.Fi
         frames = spread_frames(len(laid), OUTLINES)
         line = np.concatenate([part for i in frames for part in (laid[int(i)].apply(closed), breaks)])
         x, y, z = (_numbers(line[:, axis]) for axis in (2, 0, 1))
-        look = {"color": colour_of(mode, list(poses)), "width": 6 if mode == "truth" else 3}
+        look = {"color": colour_of(mode), "width": 6 if mode == "truth" else 3}
         figure.add_scatter3d(
             x=x, y=y, z=z, mode="lines", name=label_of(mode), line=look, hoverinfo="name",
             opacity=0.4 if mode == "truth" else 1.0,

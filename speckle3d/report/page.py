@@ -20,10 +20,11 @@ from speckle3d.core.printable import printable
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.report import figures as draw
 from speckle3d.report import tables
-from speckle3d.report.data import Record, StudyData, SweepView, load_view, read_study
+from speckle3d.report.data import SweepView, load_view
 from speckle3d.scoring.displacements import MEANINGS
 from speckle3d.study.figures import save_figure
-from speckle3d.study.overall import counted, means_table
+from speckle3d.study.overall import Row, counted, means_table
+from speckle3d.study.results import Study, SweepOutcome
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure as Plot
@@ -68,39 +69,26 @@ class Section:
     broken: str = ""
 
 
-def write_report(directory: Path) -> Path:
-    """Write ``report.html`` from a study's ``study.json`` and its sweeps' folders, and ``overview.png``.
+def write_report(study: Study) -> Path:
+    """Write a study's ``report.html``, from its results and its sweeps' folders, and ``overview.png``.
 
-    The page is one file that needs no network. A sweep that cannot be shown is listed with its reason, and
-    does not stop the others.
-
-    Parameters
-    ----------
-    directory : path
-        The study's folder.
-
-    Returns
-    -------
-    Path
-        Of the page, which appears whole or not at all.
+    The page is one file that needs no network, and appears whole or not at all. A sweep that cannot be shown
+    is listed with its reason, and does not stop the others.
 
     Raises
     ------
-    InvalidInputError
-        If there is no study in the folder.
     FileError
         If the page cannot be written.
     """
-    study = read_study(directory)
-    overview = _overview(study, directory)
-    sections = [_section(directory, entry, f"sweep-{i + 1}") for i, entry in enumerate(study.done)]
-    target = directory / "report.html"
+    overview = _overview(study)
+    sections = [_section(study.directory, each, f"sweep-{i + 1}") for i, each in enumerate(study.done)]
+    target = study.directory / "report.html"
     with atomic_path(target) as part:
         part.write_text(_page(study, overview, sections), encoding="utf-8")
     return target
 
 
-def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Section]) -> str:
+def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]) -> str:
     """Fill the template."""
     from plotly.offline import get_plotlyjs
 
@@ -115,30 +103,30 @@ def _page(study: StudyData, overview: PageFigure | None, sections: Sequence[Sect
         lstrip_blocks=True,
     )
     plots = [overview, *(each for some in sections for each in some.figures)]
-    keys = ("name", "path", "sha256", "key", "seconds")
+    keys, (intervals, paired) = ("name", "path", "sha256", "key", "seconds"), study.statistics
     drifts = {key for row in study.drift for key, value in row.items() if value is not None}
     return environment.get_template("page.html").render(
         shown=counted(len(study.done) or len(study.broken), "sweep"),
         lead=tables.summary_lines(study),
         doubts=tables.records_table([_said(each) for each in study.doubts], (), anchors),
-        broken=tables.records_table(study.broken, ("name", "status", "reason")),
+        broken=tables.records_table([each.record() for each in study.broken], ("name", "status", "reason")),
         overview=overview,
         parts=tables.parts_table(study.rows, anchors),
         drift=tables.records_table(study.drift, (), anchors),
         meanings={key.partition("_")[0]: words for key, words in MEANINGS.items() if key in drifts},
-        intervals=means_table(study.intervals) if study.intervals else [],
-        paired=tables.pairs(study.paired),
+        intervals=means_table(intervals) if intervals else [],
+        paired=tables.pairs(paired),
         sections=sections,
         plots=[each for each in plots if each is not None and each.plot],
         configuration=study.settings_toml,
         version=version("speckle3d"),
-        provenance=tables.records_table(study.sweeps, keys),
+        provenance=tables.records_table([each.record() for each in study.outcomes], keys),
         scripts=[Markup(text) for text in scripts],
         script_hashes=" ".join(_hash(text) for text in scripts),
     )
 
 
-def _said(doubt: Record) -> dict[str, str]:
+def _said(doubt: Row) -> dict[str, str]:
     """A doubt as a line of the page's table."""
     fate = "refused" if doubt.get("refuted") else "used"
     return {name: str(doubt[name]) for name in ("sweep", "about", "suspect", "evidence")} | {"it is": fate}
@@ -149,23 +137,23 @@ def _shown(value: Any) -> Any:
     return printable(value, kept="\n\t") if type(value) is str else value
 
 
-def _overview(study: StudyData, directory: Path) -> PageFigure | None:
-    if not study.scored:
+def _overview(study: Study) -> PageFigure | None:
+    rows = tables.scored(study)
+    if not rows:
         return None
-    modes = [mode for mode in study.modes if any(row["mode"] == mode for row in study.scored)]
+    modes = list(dict.fromkeys(row["mode"] for row in rows))
     caption = "a point: a part of a sweep; a bar: the mean magnitude of all, either way"
-    path = save_figure(draw.draw_overview(study.scored, modes, caption), directory / "overview.png")
+    path = save_figure(draw.draw_overview(rows, modes, caption), study.directory / "overview.png")
     return _picture(path, f"Errors: {caption}.")
 
 
-def _section(directory: Path, entry: Record, anchor: str) -> Section:
-    name = str(entry["name"])
+def _section(directory: Path, outcome: SweepOutcome, anchor: str) -> Section:
     try:
-        view = load_view(directory, entry)
+        view = load_view(directory, outcome)
         pictures = [_picture(view.folder / file, caption) for file, caption in _PICTURES.items()]
     except (Speckle3DError, OSError) as error:
-        return Section(anchor, name, broken=str(error))
-    return Section(anchor, name, view.notes, [*_plots(view, anchor), *pictures])
+        return Section(anchor, outcome.name, broken=str(error))
+    return Section(anchor, outcome.name, view.notes, [*_plots(view, anchor), *pictures])
 
 
 def _plots(view: SweepView, anchor: str) -> list[PageFigure]:

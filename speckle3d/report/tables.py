@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from markupsafe import Markup
 
 from speckle3d.core.printable import printable
-from speckle3d.report.data import Record, StudyData
 from speckle3d.scoring.statistics import FEWEST
 from speckle3d.study.figures import colour_of
 from speckle3d.study.overall import (
     ERRORS,
+    Row,
     counted,
     number,
     reference_words,
@@ -19,12 +20,13 @@ from speckle3d.study.overall import (
     with_interval,
     words_of,
 )
+from speckle3d.study.results import Study
 
 Table = Sequence[Sequence[str]]
 """Cells, the first line the heads; markup of our own is `Markup`."""
 
 
-def parts_table(rows: Sequence[Record], anchors: Mapping[str, str]) -> Table:
+def parts_table(rows: Sequence[Row], anchors: Mapping[str, str]) -> Table:
     """Errors of every sweep, part and mode; sweeps lead to their figures."""
     shown = []
     for row in rows:
@@ -35,7 +37,7 @@ def parts_table(rows: Sequence[Record], anchors: Mapping[str, str]) -> Table:
     return records_table(shown, columns + remark, anchors)
 
 
-def pairs(paired: Sequence[Record]) -> Table:
+def pairs(paired: Sequence[Row]) -> Table:
     """Difference of every two modes in every quantity, bold where they are told apart."""
     columns = list(dict.fromkeys(f"{row['mode']} − {row['against']}" for row in paired))
     lines: dict[str, dict[str, str]] = {}
@@ -50,7 +52,7 @@ def pairs(paired: Sequence[Record]) -> Table:
 
 
 def records_table(
-    records: Sequence[Record], columns: Sequence[str] = (), anchors: Mapping[str, str] | None = None
+    records: Sequence[Row], columns: Sequence[str] = (), anchors: Mapping[str, str] | None = None
 ) -> Table:
     """Any list of records, by default a column for each of their names in the order they first appear.
 
@@ -77,26 +79,31 @@ def _cell(key: str, value: object, anchors: Mapping[str, str]) -> str:
     return text
 
 
-def summary_lines(study: StudyData) -> list[str]:
+def scored(study: Study) -> list[Row]:
+    """Rows with an error of length."""
+    return [row for row in study.rows if np.isfinite(row["length_error_percent"])]
+
+
+def summary_lines(study: Study) -> list[str]:
     """Say in plain sentences how large the errors are, and whether the sweeps tell the modes apart."""
-    done, broken = len(study.done), len(study.broken)
+    done, broken, rows = len(study.done), len(study.broken), scored(study)
     if not done:
         return [f"Nothing could be reconstructed from {counted(broken, 'sweep')}; the reasons are below."]
-    lines = []
+    lines, (intervals, paired) = [], study.statistics
     for quantity in ("length_error_percent", "tilt_error_deg"):
-        rows = [row for row in study.intervals if row["quantity"] == quantity]
+        of = [row for row in intervals if row["quantity"] == quantity]
         each = ", ".join(
-            f"{row['mode']} {with_interval(row, 'mean')} ({counted(row['sweeps'], 'sweep')})" for row in rows
+            f"{row['mode']} {with_interval(row, 'mean')} ({counted(row['sweeps'], 'sweep')})" for row in of
         )
-        if rows:
+        if of:
             lines.append(f"mean magnitude of {words_of(quantity)}, with its 95 % interval: {each}")
-    if not study.scored:
+    if not rows:
         lines.append("no sweep has a reference: the lengths below are estimates alone")
     elif not lines:
         lines.append(f"fewer than {FEWEST} sweeps: no means over sweeps; errors stand below, sweep by sweep")
-    lines += told_apart(study.paired)
-    references = {row["sweep"]: row["reference"] for row in study.scored}
-    lines.append(reference_words({row["mode"] for row in study.scored}, references))
+    lines += told_apart(paired)
+    references = {row["sweep"]: row["reference"] for row in rows}
+    lines.append(reference_words({row["mode"] for row in rows}, references))
     if broken:
         lines.append(f"{broken} of {done + broken} sweeps have no result; the reasons are below")
     return [f"{line[0].upper()}{line[1:]}." for line in lines if line]

@@ -12,7 +12,6 @@ import json
 import os
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -27,9 +26,8 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.scoring.references import require_reference
-from speckle3d.study.job import RESULTS, run_job
-from speckle3d.study.request import SUBSET, available_modes
-from speckle3d.study.results import FILES, Study, SweepOutcome, is_study, require_own, write_study
+from speckle3d.study.job import RESULTS, SUBSET, available_modes, run_job
+from speckle3d.study.results import FILES, Study, SweepOutcome, read_summary, require_own, write_study
 from speckle3d.study.schedulers import Scheduler
 
 KNOWN_MODES = ("image", SUBSET, *DRIFT_MODES)
@@ -58,16 +56,14 @@ class StudyRequest:
         """Plan a sweep: its folder is named after all that determines its content; failed if it cannot be."""
         crossing = self._crossing(path)
         try:
-            if crossing is not None and not crossing.exists():
-                raise InvalidInputError(f"mode crossed: expected a crossing sweep {crossing.name} beside it")
             frames, sha256 = len(load_sweep(path)), recording_sha256(path)
             used = [sha256_of(each) for each in (self._curves(path), *self.calibrations)]
             used += [] if crossing is None else [recording_sha256(crossing)]
         except Exception as error:  # noqa: BLE001 - one row that says why
-            return SweepOutcome(name, path, "failed", _reason(error))
+            return failed(SweepOutcome(name, path), _reason(error))
         parts = [sha256, self.settings_toml, version("speckle3d"), self.modes, self.reference, used]
         key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-        return SweepOutcome(name, path, "planned", "", sha256, key, f"sweeps/{name}-{key[:8]}", 0.0, frames)
+        return SweepOutcome(name, path, "", sha256, key, f"sweeps/{name}-{key[:8]}", frames)
 
     def run(self, planned: SweepOutcome) -> SweepOutcome:
         """Do a sweep unless it is done; whatever is wrong with it becomes the outcome's reason."""
@@ -75,20 +71,16 @@ class StudyRequest:
         skipped = (folder / RESULTS.primary).is_file()
         try:
             if not skipped:
-                self._reconstruct(planned, folder)
+                self._reconstruct(planned.path, folder)
+            return replace(planned, skipped=skipped, summary=read_summary(folder, planned.name))
         except Exception as error:  # noqa: BLE001 - one broken sweep, or one bug that it reveals, stops no other
             return failed(planned, _reason(error))
-        (summary,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
-        return replace(planned, status="done", seconds=summary["details"]["seconds"], skipped=skipped)
 
-    def _reconstruct(self, planned: SweepOutcome, folder: Path) -> None:
-        path = planned.path
-        if recording_sha256(path) != planned.sha256:
-            raise InvalidInputError(f"{path}: expected the file that the study began with, got another")
-        settings, sweep, crossing = (
+    def _reconstruct(self, path: Path, folder: Path) -> None:
+        settings, crossing, sweep = (
             config_from_toml(self.settings_toml),
-            load_sweep(path),
             self._crossing(path),
+            load_sweep(path),
         )
         mounted, _ = apply_calibrations(sweep, self.calibrations)
         modes = available_modes(mounted, settings) if self.modes is None else self.modes
@@ -116,7 +108,7 @@ class StudyRequest:
 
 def failed(planned: SweepOutcome, reason: str) -> SweepOutcome:
     """What became of a sweep that failed."""
-    return replace(planned, status="failed", reason=reason, folder="")
+    return replace(planned, reason=reason, folder="")
 
 
 def compare_sweeps(
@@ -161,7 +153,7 @@ def compare_sweeps(
         if mode not in KNOWN_MODES:
             raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
     require_reference(reference)
-    require_own(directory, FILES, is_study(directory), "a study to go on with or to replace")
+    require_own(directory, FILES)
     if curves is not None:
         read_curves(curves)
     settings = (config or Config()).to_toml()
@@ -184,33 +176,26 @@ def compare_sweeps(
     make_folder(directory / "sweeps")
     done, total, tell = 0, sum(each.frames for each in todo), progress or (lambda done, total: None)
     tell(done, total)
-    try:
-        for outcome in (scheduler or Scheduler()).run(request.run, todo, failed):
-            outcomes[outcome.name] = outcome
-            done += outcome.frames
-            tell(done, total)
-    finally:
-        for folder in (directory / "sweeps", directory):
-            with suppress(OSError):  # it holds finished sweeps
-                folder.rmdir()
-    return write_study(directory, list(outcomes.values()), settings)
+    for outcome in (scheduler or Scheduler()).run(request.run, todo, failed):
+        outcomes[outcome.name] = outcome
+        done += outcome.frames
+        tell(done, total)
+    study = Study(directory, list(outcomes.values()), settings)
+    write_study(study)
+    return study
 
 
 def named(paths: Sequence[Path]) -> list[tuple[str, Path]]:
-    """Name each file once, by its stem; files of one stem with their folder, too, and a hash if need be.
+    """Name each file once, by its stem, and by a hash of its path, too, if others have the same stem.
 
     Names depend on the files alone, not on their order: a study given again in another order is the same.
     """
     files = list({path.resolve(): path.absolute() for path in paths}.values())
     # What a terminal would obey is escaped, with % in place of the backslash.
-    names = [printable(path.stem).replace("\\", "%") for path in files]
-    folders = [printable(path.parent.name).replace("\\", "%") for path in files]
+    stems = [printable(path.stem).replace("\\", "%") for path in files]
     marks = [hashlib.sha256(os.fsencode(path)).hexdigest()[:6] for path in files]
-    for more in (folders, marks):
-        counts = Counter(names)
-        names = [
-            name if counts[name] == 1 else f"{word}-{name}" for word, name in zip(more, names, strict=True)
-        ]
+    counts = Counter(stems)
+    names = [stem if counts[stem] == 1 else f"{stem}-{mark}" for stem, mark in zip(stems, marks, strict=True)]
     return list(zip(names, files, strict=True))
 
 

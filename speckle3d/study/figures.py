@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,6 @@ _COLOURS = {
 }
 """From Okabe and Ito's and Tol's palettes, told apart with any vision."""
 
-_SPARE_COLOURS = ("#F0E442", "#56B4E9", "#44AA99")
 UNSEEN = "#33415c"
 """Blue-grey of a reslice's pixels that no frame reached."""
 
@@ -51,11 +50,9 @@ def label_of(mode: str) -> str:
     return "tracker alone" if mode == "tracker" else mode
 
 
-def colour_of(mode: str, modes: Sequence[str] = ()) -> str:
-    """Colour of a mode, the same in all figures; the truth is black."""
-    others = [m for m in modes if m not in _COLOURS]
-    spare = _SPARE_COLOURS[others.index(mode) % len(_SPARE_COLOURS) if mode in others else 0]
-    return _COLOURS.get(mode, spare)
+def colour_of(mode: str) -> str:
+    """Colour of a mode, the same in all figures; dark grey of a volume and of modes that older files hold."""
+    return _COLOURS.get(mode, "#404040")
 
 
 def spread_frames(count: int, most: int) -> IntArray:
@@ -70,7 +67,7 @@ def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
     """
-    figure, modes, frames = new_figure(10.0, 4.2), list(curves.modes), np.arange(curves.frames)
+    figure, frames = new_figure(11.5, 4.2), np.arange(curves.frames)
     for q, axes in enumerate(figure.subplots(1, 2)):
         if curves.reference is not None:
             look = {"color": colour_of(curves.reference_name), "label": curves.reference_name}
@@ -79,13 +76,15 @@ def figure_drift(curves: SweepCurves, title: str = "") -> Figure:
             middle, half = curves.modes["image"][q], curves.half_width[q]
             look = {"color": colour_of("image"), "label": "95 % interval of image"}
             axes.fill_between(frames, middle - half, middle + half, linewidth=0, alpha=0.15, **look)
-        for mode, dash in zip(modes, cycle(_DASHES), strict=False):
-            look = {"color": colour_of(mode, modes), "label": label_of(mode)}
+        for mode, dash in zip(curves.modes, cycle(_DASHES), strict=False):
+            look = {"color": colour_of(mode), "label": label_of(mode)}
             axes.plot(frames, curves.modes[mode][q], linestyle=dash, linewidth=1.3, **look)
-        axes.legend(frameon=False, fontsize="small")
         axes.set(xlabel="frame", ylabel=CURVE_LABELS[q])
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(visible=True, alpha=0.3)
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc="outside right upper", frameon=False, fontsize="small"
+    )
     name_figure(figure, title)
     return figure
 

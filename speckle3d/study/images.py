@@ -1,32 +1,25 @@
-"""Images of a sweep to look at: grey levels, or a narrow strip of every frame to cut along the sweep."""
+"""Grey images of a sweep to look at, and the sweep that a reconstruction was made from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.config import Config, stored_config
+from speckle3d.config import stored_config
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.sweep import BModeSettings, Sweep, read_frame
-from speckle3d.correction.crossing.stack import ImageStack
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.load import load_sweep, recording_sha256
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.matching.intensity import IntensityExtractor, IntensitySettings
-
-STRIP_MM = 2.4
-PIXEL_MM = 0.1
-"""Pixel of a cut along the sweep, and spacing of the depths that `Strip` keeps."""
 
 _GLANCES = 24
 """Frames looked at for the brightest echo; one between them may still be cut off by a few decibels."""
@@ -42,8 +35,6 @@ class GreyImages:
     sweep : Sweep
     dynamic_range_db : float
         Of the log-compressed levels 0 to 255.
-    progress : callable, optional
-        Called with the number of each image and of all.
     settings : IntensitySettings, optional
     clipped : bool
         Let the brightest echoes saturate, as on a screen.
@@ -65,11 +56,12 @@ class GreyImages:
         If `dynamic_range_db` is not above zero, or echoes are asked for as stored.
     """
 
+    any_thread = True
+
     def __init__(
         self,
         sweep: Sweep,
         dynamic_range_db: float = 60.0,
-        progress: Callable[[int, int], None] | None = None,
         settings: IntensitySettings | None = None,
         clipped: bool = True,
         levels: Levels = "log",
@@ -77,7 +69,7 @@ class GreyImages:
         if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
             raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
         bmode = sweep.signal if isinstance(sweep.signal, BModeSettings) else None
-        self._sweep, self._progress, self._levels = sweep, progress, levels
+        self._sweep, self._levels = sweep, levels
         self._extractor = IntensityExtractor.for_sweep(sweep, settings)
         source = sweep.grid if levels == "stored" else self._extractor.grid
         self._convert = ScanConversion(source) if source.fan is not None else None
@@ -111,14 +103,7 @@ class GreyImages:
         """Shape (frame, vector, sample)."""
         return len(self._sweep), self.grid.vectors, self.grid.samples
 
-    @property
-    def any_thread(self) -> bool:
-        """Whether images may be made by several threads at once: if nothing is to be told in between."""
-        return self._progress is None
-
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        if self._progress:
-            self._progress(index + 1, len(self._sweep))
         levels = self._levels_of(read_frame(self._sweep.frames, index))
         return levels if self._convert is None else self._convert(levels)
 
@@ -139,7 +124,6 @@ def _decibel(intensity: Float32Array) -> Float32Array:
 def grey_images(
     sweep: Sweep,
     dynamic_range_db: float = 60.0,
-    progress: Callable[[int, int], None] | None = None,
     reconstruction: Reconstruction | None = None,
     levels: Levels = "log",
 ) -> GreyImages:
@@ -150,8 +134,6 @@ def grey_images(
     sweep : Sweep
     dynamic_range_db : float
         Range of the log-compressed grey levels 0 to 255.
-    progress : callable, optional
-        Called with the number of each image and of all.
     reconstruction : Reconstruction, optional
         To make the images as its configuration says.
     levels : {"log", "linear", "stored"}
@@ -180,7 +162,7 @@ def grey_images(
     settings = None
     if reconstruction is not None and reconstruction.config_toml:
         settings = stored_config(reconstruction.config_toml).intensity
-    return GreyImages(sweep, dynamic_range_db, progress, settings, levels=levels)
+    return GreyImages(sweep, dynamic_range_db, settings, levels=levels)
 
 
 def usual_levels(sweep: Sweep) -> Levels:
@@ -234,35 +216,3 @@ def part_at(sweep: Sweep, time_s: FloatArray) -> Sweep:
     if not np.array_equal(times, time_s):
         raise MismatchError(f"{sweep.name}: expected frames at the times that were reconstructed, got others")
     return sweep if len(times) == len(sweep) else sweep.part(first, first + len(times))
-
-
-class Strip:
-    """A few vectors about the middle of every frame, pooled in depth: enough for a reslice, and small.
-
-    Attributes
-    ----------
-    stack : ImageStack
-        Of the strip's images.
-    """
-
-    def __init__(self, sweep: Sweep, config: Config) -> None:
-        grid = IntensityExtractor.for_sweep(sweep, config.intensity).grid
-        self._convert = None
-        if grid.fan is not None:
-            middle = (grid.vectors - 1) / 2
-            (x, top), (_, bottom) = grid.mm([middle, middle], [0, grid.samples - 1])
-            columns, rows = round(STRIP_MM / PIXEL_MM) + 1, int((bottom - top) / PIXEL_MM) + 1
-            left = float(x) - STRIP_MM / 2
-            strip = ImageGrid(columns, rows, PIXEL_MM, PIXEL_MM, float(top), first_vector_mm=left)
-            self._convert, self._vectors = ScanConversion(grid, strip), slice(None)
-            self.stack = ImageStack(strip, PIXEL_MM)
-            return
-        width = min(grid.vectors, 2 * int(STRIP_MM / 2 / grid.vector_pitch_mm) + 1)
-        first = (grid.vectors - width) // 2
-        self._vectors, left = slice(first, first + width), first * grid.vector_pitch_mm
-        self.stack = ImageStack(replace(grid, vectors=width, first_vector_mm=left), PIXEL_MM)
-
-    def keep(self, index: int, intensity: Float32Array) -> None:
-        """Keep the strip of a frame."""
-        picture = intensity if self._convert is None else self._convert(intensity)
-        self.stack.keep(index, picture[self._vectors])

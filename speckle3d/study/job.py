@@ -10,12 +10,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.config import Config
-from speckle3d.core.arrays import Float32Array
 from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.progress import Progress, after
 from speckle3d.core.reconstruction import FramePairs, Provenance, Reconstruction, SourceFile
@@ -23,28 +23,35 @@ from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
 from speckle3d.correction.crossing.stack import ImageStack
-from speckle3d.correction.modes import PUBLISHED
+from speckle3d.correction.modes import PUBLISHED, require_modes
 from speckle3d.corrections import Correction, correct
 from speckle3d.crossing_sweeps import crossing_side, curves_from, require_pair, stack_for
 from speckle3d.examine.disagreements import differing_lengths
-from speckle3d.examine.sensors import believed, require_believed
+from speckle3d.examine.sensors import believed, cleaned_readings, require_believed
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import PathLike
-from speckle3d.io.load import import_record, kind_of, load_landmarks, load_sweep, recording_sha256
-from speckle3d.io.reconstructions import FORMAT as RECONSTRUCTION
+from speckle3d.io.load import import_record, load_landmarks, load_sweep, recording_sha256
 from speckle3d.io.reconstructions import write_reconstruction
+from speckle3d.motion.direction import sensed_orientation
 from speckle3d.pipeline import Tracked, track
 from speckle3d.scoring.displacements import score_row
 from speckle3d.scoring.lengths import TRACKER
 from speckle3d.scoring.modes import length_claims, relative_claims
-from speckle3d.scoring.references import Reference, error_rows, sweep_curves, tracker_alone
+from speckle3d.scoring.references import (
+    Reference,
+    error_rows,
+    find_reference,
+    sweep_curves,
+    tracker_alone,
+)
 from speckle3d.study.details import details_of, doubted_modes, trust_of
-from speckle3d.study.figures import figure_drift, save_figure
-from speckle3d.study.images import Strip
-from speckle3d.study.request import SUBSET, require_possible
-from speckle3d.study.reslices.reslice_figures import draw_strip
-from speckle3d.study.results import SUMMARY_FILES, Summary, is_study, require_own, summary_text, write_summary
+from speckle3d.study.figures import RANGE_DB, figure_drift, save_figure
+from speckle3d.study.images import GreyImages
+from speckle3d.study.posed import OpenedModes, PosedSweep, pose_mark
+from speckle3d.study.reslices.cuts import length_words
+from speckle3d.study.reslices.reslice_figures import draw_along
+from speckle3d.study.results import SUMMARY_FILES, Summary, require_own, summary_text, write_summary
 
 
 @shown
@@ -58,20 +65,27 @@ class JobResult:
         The folder of results.
     summary : Summary
         Errors by part and mode, and details of the reconstruction.
-    table : str
-        The same errors as text.
-    seconds : float
-        It took.
     curves : DecorrelationCurves or None
         Corrected by the crossing sweep; None without one, or if it was refused.
     """
 
     directory: Path
     summary: Summary
-    table: str
-    seconds: float
     curves: DecorrelationCurves | None = None
 
+    @property
+    def table(self) -> str:
+        """The same errors as text."""
+        return summary_text([self.summary])
+
+    @property
+    def seconds(self) -> float:
+        """It took."""
+        return float(self.summary.details["seconds"])
+
+
+SUBSET = "consistent-subset"
+"""Mode of the images alone with the patches that contradict the sensed orientation left out."""
 
 PICTURES = ("drift.png", "reslice.png", "enlarged.png")
 RESULTS = FileSet("reconstruction.h5", (*SUMMARY_FILES, *PICTURES))
@@ -131,32 +145,27 @@ def run_job(
     """
     began, settings = time.perf_counter(), config or Config()
     source, directory = Path(source), Path(directory)
-    require_own_results(directory)
+    require_own(directory, RESULTS)
     sweep, mounted = apply_calibrations(sweep, calibrations)
     compared = require_possible(sweep, drift, reference, settings, crossing is not None)
-    strip, sweeps, second_file = Strip(sweep, settings), [sweep], None
+    sweeps, second_file = [sweep], None
     if crossing is not None:
         sweeps.append(apply_calibrations(crossing[0], calibrations)[0])
         second_file = SourceFile(written_path(crossing[1]), recording_sha256(crossing[1]))
         require_pair(*sweeps)
     stacks = [] if crossing is None else [stack_for(each, settings) for each in sweeps]
-    pair, corrected, refusal = None, None, ""
+    pair, corrected, left_out = None, None, dict[str, str]()
     with RESULTS.replaced(directory) as part:
-        pairs = list[FramePairs]()
-
-        def keep(index: int, intensity: Float32Array) -> None:
-            strip.keep(index, intensity)
-            if stacks:
-                stacks[0].keep(index, intensity)
-
+        pairs, keep = list[FramePairs](), stacks[0].keep if stacks else None
         report = after(progress, 0, sum(map(len, sweeps)))
         tracked = track(sweep, curves, settings, report, pairs.append, keep)
         if stacks:
             try:
                 pair, corrected = _crossed(sweeps, stacks, tracked, curves, settings, progress)
             except (InsufficientDataError, MismatchError) as error:
-                refusal = f"{sweep.name}: drift mode crossed: {error}"
-        poses, corrections, left_out = _corrected(tracked, sweep, drift, settings, pair, refusal)
+                # Said even if only `fused` was to use it: it went without.
+                left_out["crossed"] = f"{sweep.name}: drift mode crossed: {error}"
+        poses, corrections = _corrected(tracked, sweep, drift, settings, pair, left_out)
         provenance = Provenance(
             written_path(source),
             recording_sha256(source),
@@ -171,13 +180,19 @@ def run_job(
         )
         write_reconstruction(part / RESULTS.primary, made, pairs)
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
-        alone = tracker_alone(believed(sweep, tracked.doubts))
-        if reference is None and compared is not None and compared.name == TRACKER:
-            compared = compared if believed(sweep, tracked.doubts).tracker is not None else None
+        trusted = believed(sweep, tracked.doubts)
+        alone, centre = tracker_alone(trusted), sweep.grid.centre_mm
+        if (
+            reference is None
+            and compared is not None
+            and compared.name == TRACKER
+            and trusted.tracker is None
+        ):
+            compared = None
         every = poses if alone is None else {**poses, TRACKER: alone}
-        centre = sweep.grid.centre_mm
-        drawn = poses if compared is None or compared.name == TRACKER else every
-        moved = sweep_curves(drawn, centre, compared, tracked.covariance)
+        shown, last = dict(every), "image"
+        if compared is not None and compared.covered.all():
+            shown[compared.name], last = compared.world_from_image, compared.name
         claims = relative_claims(poses, trust, centre)
         doubts = (*tracked.doubts, *differing_lengths(length_claims(poses, trust, centre)))
         rows = [
@@ -198,11 +213,16 @@ def run_job(
             claims,
             _drift(every, compared, sweep, source),
         )
+        estimates = {mode: each for mode, each in every.items() if mode != summary.reference}
+        moved = sweep_curves(estimates, centre, compared, tracked.covariance)
         save_figure(figure_drift(moved, _title(summary)), part / PICTURES[0])
-        draw_strip(strip, every, compared, sweep.name, rows, (part / PICTURES[1], part / PICTURES[2]))
+        posed = PosedSweep(sweep, np.arange(len(sweep)), poses["image"], "image")
+        opened = OpenedModes(posed, shown, last, {mode: pose_mark(each) for mode, each in shown.items()})
+        images = GreyImages(sweep, RANGE_DB, settings=settings.intensity)
+        draw_along(opened, images, length_words(rows, last), (part / PICTURES[1], part / PICTURES[2]))
         details["seconds"] = time.perf_counter() - began
         write_summary(part, summary)
-    return JobResult(directory, summary, summary_text([summary]), details["seconds"], corrected)
+    return JobResult(directory, summary, corrected)
 
 
 def _crossed(
@@ -227,20 +247,38 @@ def _crossed(
     return pair, curves_from(both, pair, curves)
 
 
-def require_own_results(directory: Path) -> None:
-    """Refuse a folder in which a job's names stand for something else.
+def require_possible(
+    sweep: Sweep, modes: Sequence[str], reference: str | None, config: Config, crossing: bool = False
+) -> Reference | None:
+    """Check that a sweep has what is asked of it, before any work is done; returns the reference.
+
+    Parameters
+    ----------
+    crossing : bool
+        Whether there is a crossing sweep.
 
     Raises
     ------
-    InvalidInputError
-        Naming the first such file.
+    InvalidInputError, InsufficientDataError
+        If it does not have it, naming the mode or the reference.
     """
-    primary = directory / RESULTS.primary
-    try:
-        is_own = primary.is_file() and not is_study(directory) and kind_of(primary) == RECONSTRUCTION
-    except (FileError, InvalidInputError):
-        is_own = False
-    require_own(directory, RESULTS, is_own, "the results of `reconstruct` to replace")
+    require_modes(sweep, [mode for mode in modes if mode != SUBSET], crossing)
+    if SUBSET in modes and sensed_orientation(sweep, config.sensors) is None:
+        raise InsufficientDataError(
+            f"{sweep.name}: mode {SUBSET}: expected sensed orientation over every frame and the setting "
+            "sensors.consistent_subset, got none"
+        )
+    return find_reference(cleaned_readings(sweep)[0] if config.sensors.examine else sweep, reference)
+
+
+def available_modes(sweep: Sweep, config: Config) -> Sequence[str]:
+    """Modes beside `image` that need no more than the sweep's sensors, calibrated to the image."""
+    possible = []
+    for mode in (SUBSET, "orientation", "pose", "fused"):
+        with suppress(InsufficientDataError):
+            require_possible(sweep, [mode], None, config)
+            possible.append(mode)
+    return possible
 
 
 def _corrected(
@@ -249,18 +287,10 @@ def _corrected(
     modes: Sequence[str],
     config: Config,
     pair: CrossedPair | None,
-    refusal: str,
-) -> tuple[dict[str, RigidTransform], dict[str, Correction], dict[str, str]]:
-    """Poses by mode, corrections by mode, and why modes are left out.
-
-    Parameters
-    ----------
-    refusal : str
-        Why the sweeps could not be crossed; empty if they were, or need not be.
-    """
+    left_out: dict[str, str],
+) -> tuple[dict[str, RigidTransform], dict[str, Correction]]:
+    """Poses by mode and corrections by mode; modes that are refused go to `left_out`, with the reason."""
     poses, corrections = {"image": tracked.image}, dict[str, Correction]()
-    # Said even if only `fused` was to use it: it went without.
-    left_out = {"crossed": refusal} if refusal else {}
     for mode in modes:
         where = f"{sweep.name}: mode {mode}" if mode == SUBSET else f"{sweep.name}: drift mode {mode}"
         try:
@@ -277,13 +307,14 @@ def _corrected(
             if mode in PUBLISHED and isinstance(error, InsufficientDataError):
                 raise
             left_out[mode] = str(error) if str(error).startswith(sweep.name) else f"{where}: {error}"
-    return poses | {mode: each.poses for mode, each in corrections.items()}, corrections, left_out
+    return poses | {mode: each.poses for mode, each in corrections.items()}, corrections
 
 
 def _title(summary: Summary) -> str:
-    """Name of the sweep and the modes in doubt, for figures."""
-    doubted = [f"{mode} in doubt: {why}" for mode, why in summary.doubted.items()]
-    return "; ".join([summary.sweep, *doubted, *(f"{mode} left out" for mode in summary.left_out)])
+    """Name of the sweep, what is in doubt and which modes are left out, for figures."""
+    doubts = ", ".join(dict.fromkeys(summary.doubted.values()))
+    left_out = [f"{mode} left out" for mode in summary.left_out]
+    return "; ".join([summary.sweep, *([f"in doubt: {doubts}"] if doubts else []), *left_out])
 
 
 def _drift(

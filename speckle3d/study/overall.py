@@ -102,8 +102,8 @@ def overall_text(
     """
     if not intervals:
         return ""
-    lines = text_table(means_table(intervals)).splitlines()
-    lines.append("[..]: 95 % interval over sweeps, by bootstrap; (n): of n sweeps only")
+    lines = text_table(means_table(intervals), (0, 1, 2)).splitlines()
+    lines.append("[..]: 95 % interval over sweeps, by bootstrap")
     shown = {row["quantity"] for row in intervals}
     lines += [f"{key.partition('_')[0]}: {words}" for key, words in MEANINGS.items() if key in shown]
     lines += [line for text in told_apart(paired) for line in _wrapped(text)]
@@ -112,21 +112,14 @@ def overall_text(
 
 
 def means_table(intervals: Sequence[Row]) -> list[list[str]]:
-    """Cells of means and intervals: heads, then a line for each quantity with a column for each mode.
-
-    A mean of fewer sweeps than others has their number behind it.
-    """
-    most = max((row["sweeps"] for row in intervals), default=0)
-    modes = list(dict.fromkeys(row["mode"] for row in intervals))
-    lines = [[f"mean of {counted(most, 'sweep')}", *modes]]
-    for quantity in dict.fromkeys(row["quantity"] for row in intervals):
-        cells = {
-            row["mode"]: with_interval(row, "mean") + f" ({row['sweeps']})" * (row["sweeps"] != most)
+    """Cells of means and intervals: heads, then a line for each quantity and mode."""
+    return [
+        ["mean over sweeps", "mode", "mean", "sweeps"],
+        *(
+            [words_of(row["quantity"]), row["mode"], with_interval(row, "mean"), str(row["sweeps"])]
             for row in intervals
-            if row["quantity"] == quantity
-        }
-        lines.append([words_of(quantity), *(cells.get(mode, "-") for mode in modes)])
-    return lines
+        ),
+    ]
 
 
 def told_apart(paired: Sequence[Row]) -> list[str]:
@@ -150,20 +143,12 @@ def counted(count: int, what: str) -> str:
 
 def reference_words(modes: Collection[str], references: Mapping[str, str]) -> str:
     """What the sweeps were compared with, and which mode was fitted to it; empty without any reference."""
-    by_name: dict[str, list[str]] = {}
-    for sweep, name in references.items():
-        if name != "none":
-            by_name.setdefault(name, []).append(sweep)
-    words = f"reference: {next(iter(by_name))}" if by_name else ""
-    if len(by_name) > 1:
-        which = "; ".join(f"{name} of {', '.join(sweeps)}" for name, sweeps in by_name.items())
-        words = f"references differ: {which}; the means mix errors against both"
+    names = sorted({*references.values()} - {"none"})
+    words = f"reference{'s' * (len(names) > 1)}: {', '.join(names)}" if names else ""
+    words += "; the means mix errors against both" * (len(names) > 1)
     fitted = sorted(FITTED_TO_TRACKER.intersection(modes))
-    if fitted and "tracker" in by_name:
-        words += (
-            f"; {' and '.join(fitted)} was fitted to this tracker: its errors say how well it fits, "
-            "not how right it is"
-        )
+    if fitted and "tracker" in names:
+        words += f"; fitted to it, so that errors say how well they fit: {', '.join(fitted)}"
     return words
 
 

@@ -37,10 +37,11 @@ from speckle3d.io.sweep_writer import write_sweep
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.scoring.lengths import TRACKER, ModeError
 from speckle3d.scoring.references import error_rows, find_reference, tracker_alone
-from speckle3d.scoring.statistics import MeanInterval, mean_interval
+from speckle3d.scoring.statistics import mean_interval
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.study.compare import compare_sweeps
-from speckle3d.study.results import Study, json_text, write_texts
+from speckle3d.study.overall import number, with_interval, words_of
+from speckle3d.study.results import Study, SweepOutcome, json_text, write_texts
 from speckle3d.study.schedulers import Scheduler
 
 _TISSUE = SimulationSettings(preset="tissue", vectors=48, length_mm=20.0)
@@ -63,6 +64,7 @@ CURVE_SWEEPS: Mapping[str, SimulationSettings] = {
 """Phantom sweeps, of other seeds, from which decorrelation curves are measured if none are given."""
 
 
+QUANTITIES = ("length_error_percent", "tilt_error_deg")
 MODES = ("image", "pose", "orientation")
 """In the order of the paper's tables 3 and 4: image-based, six DOF correction, orientation correction."""
 
@@ -134,8 +136,10 @@ def paper_study(
             write_curves(curves, calibrate_curves([load_sweep(inputs[name]) for name in CURVE_SWEEPS]))
     paths = [inputs[name] for name in SWEEPS]
     study = compare_sweeps(paths, directory, None, TRACKER, curves, scheduler=where, progress=progress)
-    ours = {each.sweep: each.rows for each in study.summaries}
-    rows: Rows = {TRACKER: ours, "truth": _against_truth(study)}
+    rows: Rows = {
+        TRACKER: {each.sweep: each.rows for each in study.summaries},
+        "truth": {each.name: _against_truth(study.directory, each) for each in study.done},
+    }
     table = text_beside(rows)
     records = [
         {"reference": name, "sweep": sweep, **asdict(row)}
@@ -149,28 +153,30 @@ def paper_study(
 
 
 def beside(rows: Rows) -> list[dict[str, Any]]:
-    """Means of absolute errors over all parts, by mode.
+    """Means of absolute errors over all parts, published and ours.
 
     Returns
     -------
     list of dict
-        ``mode``; ``published_percent`` of length and ``published_deg`` of tilt; ``length_percent`` and
-        ``tilt_deg``, ours by reference, as `MeanInterval`. Parts, not sweeps, are the units, as there are 17
-        in the tables.
+        ``mode``, ``against`` ("published", or a reference of ours), ``quantity`` and its `MeanInterval`.
+        Parts, not sweeps, are the units, as there are 17 in the tables.
     """
-    means: list[dict[str, Any]] = []
-    for mode in MODES:
-        percent, deg = np.abs([each[mode] for each in published().values()]).mean(axis=0).tolist()
-        row: dict[str, Any] = {"mode": mode, "published_percent": percent, "published_deg": deg}
-        for name, quantity in (("length_percent", "length_error_percent"), ("tilt_deg", "tilt_error_deg")):
-            row[name] = {
-                reference: mean_interval(
-                    [abs(getattr(r, quantity)) for some in by_sweep.values() for r in some if r.mode == mode]
-                )
-                for reference, by_sweep in rows.items()
-            }
-        means.append(row)
-    return means
+    errors = {"published": {mode: [each[mode] for each in published().values()] for mode in MODES}}
+    for name, by_sweep in rows.items():
+        every = [row for some in by_sweep.values() for row in some]
+        errors[name] = {mode: [_error(row) for row in every if row.mode == mode] for mode in MODES}
+    return [
+        {
+            "mode": mode,
+            "against": name,
+            "quantity": key,
+            **asdict(mean_interval(np.abs(errors[name][mode])[:, k])),
+        }
+        for k, key in enumerate(QUANTITIES)
+        for mode in MODES
+        for name in errors
+        if errors[name][mode]
+    ]
 
 
 def text_beside(rows: Rows) -> str:
@@ -179,26 +185,31 @@ def text_beside(rows: Rows) -> str:
     The first reference's errors are listed part by part.
     """
     first = next(iter(rows))
-    lines = [["data set", *(f"length % {mode}" for mode in MODES), *(f"tilt deg {mode}" for mode in MODES)]]
+    lines = [["data set", *(f"{mode} {unit}" for unit in ("%", "°") for mode in MODES)]]
     for (name, part), theirs in published().items():
-        ours = {row.mode: row for row in rows[first].get(name, ()) if row.part == part}
-        line = [f"{name} {part}"]
-        for k, (quantity, digits) in enumerate((("length_error_percent", 1), ("tilt_error_deg", 2))):
-            for mode in MODES:
-                value = f"{getattr(ours[mode], quantity):+.{digits}f}" if mode in ours else "missing"
-                line.append(f"{theirs[mode][k]:+.{digits}f} | {value}")
-        lines.append(line)
-    means = [["mean absolute error of all parts", "", "length %", "tilt deg"]]
-    for each in beside(rows):
-        printed = f"{each['published_percent']:.1f}", f"{each['published_deg']:.3f}"
-        means.append([each["mode"], "published", *printed])
-        length, tilt = each["length_percent"], each["tilt_deg"]
-        means += [["", name, _interval(length[name], 2), _interval(tilt[name], 3)] for name in rows]
+        ours = {row.mode: _error(row) for row in rows[first].get(name, ()) if row.part == part}
+        cells = [
+            " | ".join(
+                number(key, each[mode][k], signed=True) if mode in each else "-" for each in (theirs, ours)
+            )
+            for k, key in enumerate(QUANTITIES)
+            for mode in MODES
+        ]
+        lines.append([f"{name} {part}", *cells])
+    means = [["mean absolute error", "mode", "against", "mean [95 % of bootstrap samples]"]]
+    means += [
+        [words_of(row["quantity"]), row["mode"], row["against"], with_interval(row, "mean")]
+        for row in beside(rows)
+    ]
     return (
-        f"Errors as published (Housden 2008, tables 3 and 4) | in simulation, against the {first}.\n"
-        "The published sweeps of beef are 1.5 to 4 mm long, these 10 or 20 mm.\n\n"
-        f"{text_table(lines)}\n{text_table(means, (0, 1))}[..]: 95 % of bootstrap samples\n"
+        "Errors of length (%) and tilt (°), published (Housden 2008, tables 3 and 4) | simulated, against "
+        f"the {first}.\nThe published sweeps of beef are 1.5 to 4 mm long, these 10 or 20 mm.\n\n"
+        f"{text_table(lines)}\n{text_table(means, (0, 1, 2, 3))}"
     )
+
+
+def _error(row: ModeError) -> tuple[float, float]:
+    return row.length_error_percent, row.tilt_error_deg
 
 
 def _write_input(job: _Input) -> None:
@@ -223,18 +234,9 @@ def _with_tracked_orientation(sweep: Sweep) -> Sweep:
     return replace(sweep, orientation=OrientationSensor(readings, mounting, tracker.time_offset_s))
 
 
-def _against_truth(study: Study) -> dict[str, list[ModeError]]:
-    """Errors of the same poses, and of the tracker alone, against the truth, by data set."""
-    rows = {}
-    for outcome in study.outcomes:
-        if outcome.status == "done":
-            sweep, path = load_sweep(outcome.path), study.directory / outcome.folder / "reconstruction.h5"
-            alone, poses = tracker_alone(sweep), read_reconstruction(path, with_pairs=False).poses
-            every = poses if alone is None else {**poses, TRACKER: alone}
-            rows[outcome.name] = error_rows(every, find_reference(sweep, "truth"), sweep.grid.centre_mm)
-    return rows
-
-
-def _interval(mean: MeanInterval, digits: int) -> str:
-    interval = "" if mean.low is None else f" [{mean.low:.{digits}f}, {mean.high:.{digits}f}]"
-    return f"{mean.mean:.{digits}f}{interval}"
+def _against_truth(directory: Path, outcome: SweepOutcome) -> list[ModeError]:
+    """Errors of the same poses, and of the tracker alone, against the truth."""
+    sweep, path = load_sweep(outcome.path), directory / outcome.folder / "reconstruction.h5"
+    alone, poses = tracker_alone(sweep), read_reconstruction(path, with_pairs=False).poses
+    every = poses if alone is None else {**poses, TRACKER: alone}
+    return error_rows(every, find_reference(sweep, "truth"), sweep.grid.centre_mm)

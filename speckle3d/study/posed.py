@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from hashlib import sha256
 from pathlib import Path
 
@@ -16,7 +17,6 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
-from speckle3d.core.volume import Volume
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
@@ -66,21 +66,18 @@ class PosedSweep:
     range_is_known: bool = True
     chosen_for: str = ""
 
-    def images(
-        self, dynamic_range_db: float = USUAL_RANGE_DB, progress: Callable[[int, int], None] | None = None
-    ) -> tuple[Images, ImageGrid]:
+    def images(self, dynamic_range_db: float = USUAL_RANGE_DB) -> tuple[Images, ImageGrid]:
         """Images of the frames that have a pose, in the order of their poses, and their grid, for cuts.
 
         Log-compressed; B-mode of unknown range as it is stored.
         """
-        source, _ = self.source("log" if self.range_is_known else "stored", dynamic_range_db, progress)
+        source, _ = self.source("log" if self.range_is_known else "stored", dynamic_range_db)
         return source.images, source.grid
 
     def source(
         self,
         levels: Levels | None = None,
         dynamic_range_db: float = USUAL_RANGE_DB,
-        progress: Callable[[int, int], None] | None = None,
     ) -> tuple[PosedImages, str]:
         """Images to compound with their poses, and what their grey levels are in words.
 
@@ -102,7 +99,7 @@ class PosedSweep:
         """
         chosen = levels or usual_levels(self.sweep)
         self._require_range(chosen)
-        every = grey_images(self.sweep, dynamic_range_db, progress, self.reconstruction, chosen)
+        every = grey_images(self.sweep, dynamic_range_db, self.reconstruction, chosen)
         grid = replace(every.grid, skew_rad=self.skew_rad)
         return PosedImages(ChosenImages(every, self.frames), grid, self.world_from_image), every.meaning
 
@@ -134,7 +131,7 @@ class PosedSweep:
 
 
 MARK = "poses_mark"
-"""Field of a volume's file that says which poses it was made at, by `pose_mark`."""
+"""Field of a volume's file that says at which poses it was made, by `pose_mark`."""
 
 
 def pose_mark(world_from_image: RigidTransform) -> str:
@@ -143,12 +140,12 @@ def pose_mark(world_from_image: RigidTransform) -> str:
     return sha256(np.ascontiguousarray(rounded).tobytes()).hexdigest()[:16]
 
 
-def require_made_at(volume: Volume, world_from_image: RigidTransform, where: str) -> None:
-    """Raise `MismatchError` if a volume's file says that it was made at other poses."""
-    if volume.fields.get(MARK, pose_mark(world_from_image)) != pose_mark(world_from_image):
+def require_made_at(mark: str, poses_mark: str, where: str) -> None:
+    """Raise `MismatchError` if a file's mark, if it has one, is of other poses."""
+    if mark not in ("", poses_mark):
         raise MismatchError(
-            f"{where}: expected a volume made at these poses, got one of another reconstruction or "
-            "recording: make it again (speckle3d volume)"
+            f"{where}: expected it made at these poses, got poses of another reconstruction or recording: "
+            "make it again (speckle3d volume, speckle3d reslice)"
         )
 
 
@@ -237,3 +234,59 @@ def posed_at(
         )
     frames = np.flatnonzero(reference.covered)
     return PosedSweep(sweep, frames, reference.world_from_image, reference.name, reconstruction)
+
+
+@dataclass(frozen=True)
+class OpenedModes:
+    """A sweep at the poses of several modes.
+
+    Attributes
+    ----------
+    posed : PosedSweep
+        Of the frames that all modes have.
+    poses : dict of str to RigidTransform, length n
+    reference : str
+        One of the modes.
+    marks : dict of str to str
+        Of the poses of all frames, by `pose_mark`.
+    """
+
+    posed: PosedSweep
+    poses: dict[str, RigidTransform]
+    reference: str
+    marks: dict[str, str]
+
+
+def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> OpenedModes:
+    """Take an opened sweep at several modes.
+
+    Parameters
+    ----------
+    first : PosedSweep
+    modes : sequence of str
+        Modes of the reconstruction, "tracker" or "truth"; by default the one it is opened at.
+    reference : str, optional
+        What to compare them with; by default the truth or a tracker that covers all frames, if there are
+        several modes, else the first.
+
+    Raises
+    ------
+    InvalidInputError, InsufficientDataError
+        If there is no such mode.
+    """
+    asked = list(dict.fromkeys(modes)) or [first.mode]
+    if reference is None:
+        known = find_reference(first.sweep) if len(asked) > 1 else None
+        reference = asked[0] if known is None or not known.covered.all() else known.name
+    every = {
+        mode: posed_at(first.sweep, mode, first.reconstruction) for mode in dict.fromkeys([*asked, reference])
+    }
+    shared = reduce(np.intersect1d, [each.frames for each in every.values()])
+    if not shared.size:
+        raise InsufficientDataError(
+            f"{first.sweep.name}: expected a frame that has a pose in {' and '.join(every)}, got none"
+        )
+    poses = {mode: each.world_from_image[np.isin(each.frames, shared)] for mode, each in every.items()}
+    posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
+    marks = {mode: pose_mark(each.world_from_image) for mode, each in every.items()}
+    return OpenedModes(posed, poses, reference, marks)

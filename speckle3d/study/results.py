@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,18 @@ FILES = FileSet(
 
 SUMMARY_FILES = ("summary.json", "table.txt", "table.csv")
 
-_HEADS = ("sweep", "part", "mode", "length / mm", "+- 95 %", "reference / mm", "error / %",
-          "tilt / °", "yaw / °", "roll / °")  # fmt: skip
+_HEADS = (
+    "sweep",
+    "part",
+    "mode",
+    "length/mm",
+    "+- 95 %",
+    "reference",
+    "error/%",
+    "tilt/°",
+    "yaw/°",
+    "roll/°",
+)
 
 
 @dataclass(frozen=True)
@@ -110,18 +121,24 @@ class Summary:
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """What became of one sweep; `status` is "done" or "failed", and `reason` says why it failed."""
+    """What is planned for one sweep and became of it; failed without a summary, and `reason` says why."""
 
     name: str
     path: Path
-    status: str
     reason: str = ""
     sha256: str = ""
     key: str = ""
     folder: str = ""
-    seconds: float = 0.0
     frames: int = 0
     skipped: bool = False
+    summary: Summary | None = None
+
+    def record(self) -> dict[str, Any]:
+        """The outcome as ``study.json`` has it."""
+        names = ("name", "path", "reason", "sha256", "key", "folder", "frames")
+        seconds = self.summary.details["seconds"] if self.summary else 0.0
+        status = "done" if self.summary else "failed"
+        return {name: getattr(self, name) for name in names} | {"status": status, "seconds": seconds}
 
 
 @dataclass(frozen=True)
@@ -130,9 +147,49 @@ class Study:
 
     directory: Path
     outcomes: Sequence[SweepOutcome]
-    summaries: Sequence[Summary]
-    drift: Sequence[Mapping[str, Any]]
-    table: str
+    settings_toml: str
+
+    @property
+    def done(self) -> list[SweepOutcome]:
+        """Sweeps with results."""
+        return [each for each in self.outcomes if each.summary is not None]
+
+    @property
+    def broken(self) -> list[SweepOutcome]:
+        """Sweeps without."""
+        return [each for each in self.outcomes if each.summary is None]
+
+    @property
+    def summaries(self) -> list[Summary]:
+        """Of the sweeps with results."""
+        return [each.summary for each in self.outcomes if each.summary is not None]
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """Errors by sweep, part and mode."""
+        return [record for each in self.summaries for record in each.records()]
+
+    @cached_property
+    def drift(self) -> list[dict[str, Any]]:
+        """Drift by sweep and mode."""
+        return [{"sweep": each.sweep, **row} for each in self.summaries for row in each.drift]
+
+    @property
+    def doubts(self) -> list[dict[str, Any]]:
+        """What of the recordings is in doubt, by sweep."""
+        return [{"sweep": each.sweep, **asdict(doubt)} for each in self.summaries for doubt in each.doubts]
+
+    @cached_property
+    def statistics(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+        """Means over sweeps by mode, and modes compared in pairs, as `over_sweeps`."""
+        return over_sweeps(self.rows, self.drift)
+
+    @property
+    def table(self) -> str:
+        """All sweeps' errors, remarks and statistics as text."""
+        failures = [f"{each.name}  failed: {each.reason}" for each in self.broken]
+        overall = overall_text(*self.statistics, {each.sweep: each.reference for each in self.summaries})
+        return summary_text(self.summaries, failures) + (f"\n{overall}" if overall else "")
 
 
 def write_summary(directory: Path, summary: Summary) -> list[Path]:
@@ -184,8 +241,8 @@ def csv_text(records: Sequence[Mapping[str, Any]], *more: str) -> str:
     return text.getvalue()
 
 
-def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml: str) -> Study:
-    """Gather what is in the sweeps' folders, and write ``study.json``, ``table.txt`` and ``table.csv``.
+def write_study(study: Study) -> None:
+    """Write ``study.json``, ``table.txt`` and ``table.csv``.
 
     They replace those of an earlier study together; its report is removed.
 
@@ -194,49 +251,28 @@ def write_study(directory: Path, outcomes: Sequence[SweepOutcome], settings_toml
     FileError
         If the folder cannot be written.
     """
-    done = [each for each in outcomes if each.status == "done"]
-    failed = [each for each in outcomes if each.status == "failed"]
-    summaries = [read_summary(directory / each.folder, each.name) for each in done]
-    rows = [record for each in summaries for record in each.records()]
-    drift = [{"sweep": each.sweep, **row} for each in summaries for row in each.drift]
-    intervals, paired = over_sweeps(rows, drift)
-    references = {each.sweep: each.reference for each in summaries}
-    remarks = [f"{each.name}  failed: {each.reason}" for each in failed]
-    overall = overall_text(intervals, paired, references)
-    table = summary_text(summaries, remarks) + (f"\n{overall}" if overall else "")
-    sweeps = [asdict(each) for each in outcomes]
-    for each in sweeps:
-        del each["skipped"]
+    intervals, paired = study.statistics
     contents = {
         "format": FORMAT,
         "version": VERSION,
-        "settings_toml": settings_toml,
-        "modes": list(dict.fromkeys(row["mode"] for row in rows)),
-        "sweeps": sweeps,
-        "rows": rows,
-        "doubts": [{"sweep": each.sweep, **asdict(doubt)} for each in summaries for doubt in each.doubts],
-        "drift": drift,
+        "settings_toml": study.settings_toml,
+        "modes": list(dict.fromkeys(row["mode"] for row in study.rows)),
+        "sweeps": [each.record() for each in study.outcomes],
+        "rows": study.rows,
+        "doubts": study.doubts,
+        "drift": study.drift,
         "intervals": intervals,
         "paired": paired,
     }
-    paths = {each.name: each.path for each in outcomes}
-    lines = [row | {"path": paths[row["sweep"]]} for row in rows]
-    lines += [{"sweep": each.name, "path": each.path, "reason": each.reason} for each in failed]
-    texts = {"study.json": json_text(contents), "table.txt": table}
-    with FILES.replaced(directory) as part:
+    paths = {each.name: each.path for each in study.outcomes}
+    lines = [row | {"path": paths[row["sweep"]]} for row in study.rows]
+    lines += [{"sweep": each.name, "path": each.path, "reason": each.reason} for each in study.broken]
+    texts = {"study.json": json_text(contents), "table.txt": study.table}
+    with FILES.replaced(study.directory) as part:
         write_texts(part, texts | {"table.csv": csv_text(lines, "path", "reason")})
-    return Study(directory, outcomes, summaries, drift, table)
 
 
-def is_study(directory: Path) -> bool:
-    """Whether a folder holds a study; a file of that name and other content is none."""
-    try:
-        return bool(json.loads((directory / FILES.primary).read_text(encoding="utf-8"))["format"] == FORMAT)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-
-
-def require_own(directory: Path, files: FileSet, is_own: bool, what: str) -> None:
+def require_own(directory: Path, files: FileSet) -> None:
     """Refuse a folder in which names of a result stand for something else.
 
     Raises
@@ -245,9 +281,10 @@ def require_own(directory: Path, files: FileSet, is_own: bool, what: str) -> Non
         Naming the first such file.
     """
     taken = [name for name in files.names if (directory / name).exists()]
-    if taken and not is_own:
+    if taken and files.primary not in taken:
         raise InvalidInputError(
-            f"{directory / taken[0]}: expected a new folder or {what}, got a file of another origin"
+            f"{directory / taken[0]}: expected a new folder, or one with {files.primary} to replace, got a "
+            "file of another origin"
         )
 
 
@@ -267,14 +304,15 @@ def json_text(value: Any) -> str:
 
 
 def read_summary(folder: Path, name: str) -> Summary:
-    """Read a sweep's summary back, without its details; a number that was not finite is NaN again."""
+    """Read a sweep's summary back, of its details the time alone; what was not finite is NaN again."""
     (stored,) = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sweeps"]
     records: list[dict[str, Any]] = [
         {key: math.nan if value is None else value for key, value in row.items()} for row in stored["rows"]
     ]
-    rows = [ModeError(**row) for row in records]
+    rows = [ModeError(**record) for record in records]
     doubts = [Doubt(**each) for each in stored["doubts"]]
-    return Summary(**stored | {"sweep": name, "rows": rows, "doubts": doubts, "details": {}})
+    details = {"seconds": stored["details"]["seconds"]}
+    return Summary(**stored | {"sweep": name, "rows": rows, "doubts": doubts, "details": details})
 
 
 def write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:

@@ -54,7 +54,7 @@ class Scheduler:
             yield from map(function, jobs)
             return
         again = []
-        with self._executor(len(jobs)) as executor:
+        with self._executor() as executor:
             futures = {executor.submit(_alone, function, job): job for job in jobs}
             try:
                 for future in as_completed(futures):
@@ -72,13 +72,14 @@ class Scheduler:
         for job in again:
             yield from self.run(function, [job], lost)
 
-    def _executor(self, jobs: int) -> Any:
+    def _executor(self) -> Any:
         if self.client is not None:
             # Not pure: a job's key must not be taken for that of an earlier study that is still held.
             return self.client.get_executor(pure=False)
-        # Spawned: threads of this process, which a fork would not take along, may hold locks.
+        # Spawned: threads of this process, which a fork would not take along, may hold locks. Ctrl-C, which a
+        # terminal sends to every process, ends a worker without a traceback.
         context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(max(1, min(self.workers, jobs)), context, _die_of_interrupts)
+        return ProcessPoolExecutor(self.workers, context, signal.signal, (signal.SIGINT, signal.SIG_DFL))
 
 
 @contextmanager
@@ -90,14 +91,10 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
     Raises
     ------
     InvalidInputError
-        If both are asked for, or Dask is not installed.
+        If Dask is not installed.
     FileError
         If no cluster answers at the address.
     """
-    if address is not None and workers is not None:
-        raise InvalidInputError("expected --scheduler or --workers, got both")
-    if workers is not None and workers < 1:
-        raise InvalidInputError(f"--workers: expected at least 1, got {workers}")
     if address is None:
         yield Scheduler(workers or 1)
         return
@@ -118,8 +115,3 @@ def _alone(function: Callable[[Job], Result], job: Job) -> Result:
     """Run a job on a worker, without a second thread."""
     with on_one_thread():
         return function(job)
-
-
-def _die_of_interrupts() -> None:
-    """Let Ctrl-C, which a terminal sends to every process, end a worker without a traceback."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)

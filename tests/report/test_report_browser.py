@@ -10,7 +10,7 @@ VISIBLE = "element => element.getClientRects().length > 0"
 
 @pytest.fixture(scope="module")
 def report(report_study):
-    return report_study / "report.html"
+    return report_study.directory / "report.html"
 
 
 @pytest.fixture(scope="module")

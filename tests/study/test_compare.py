@@ -93,7 +93,7 @@ def test_a_second_start_does_nothing_again_but_what_is_missing(study, sweeps, tm
 @pytest.mark.slow
 def test_worker_processes_give_the_same_bits(study, sweeps, tmp_path):
     again = compare_sweeps(sweeps, tmp_path / "out", scheduler=Scheduler(2))
-    assert [each.status for each in again.outcomes] == ["done", "failed", "done"]
+    assert [each.summary is not None for each in again.outcomes] == [True, False, True]
     assert numbers(again.directory) == numbers(study.directory)
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.study.reslices.places import Place
 
 _CODE = (
     "font-family:ui-monospace,'DejaVu Sans Mono',monospace;font-size:11px;white-space:pre-wrap;"
@@ -17,7 +16,7 @@ _CODE = (
 
 
 def reslice_command(
-    source: Path, out: str, modes: Sequence[str], place: Place, sweep_file: Path | None = None
+    source: Path, out: str, modes: Sequence[str], place: Mapping[str, float], sweep_file: Path | None = None
 ) -> str:
     """`speckle3d reslice` of a place at one mode, or at two against the first.
 
@@ -28,7 +27,8 @@ def reslice_command(
     out : str
         Picture to write.
     modes : sequence of str
-    place : Place
+    place : mapping of str to float
+        Options of the command by name, as ``depth_mm``.
     sweep_file : path, optional
         The sweep, if it is not where the reconstruction says.
     """
@@ -37,9 +37,8 @@ def reslice_command(
         words += ["--mode", mode]
     if len(modes) > 1:
         words += ["--difference-to", modes[0]]
-    for name in ("lateral_mm", "depth_mm", "frame", "reach_mm"):
-        if (value := getattr(place, name)) is not None:
-            words += ["--" + name.replace("_", "-"), f"{value:g}"]
+    for name, value in place.items():
+        words += ["--" + name.replace("_", "-"), f"{value:g}"]
     return shlex.join([*words, *(["--sweep", str(sweep_file)] if sweep_file else [])])
 
 

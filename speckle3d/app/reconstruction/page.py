@@ -26,9 +26,9 @@ from speckle3d.report.figures import plot_curves, plot_outlines
 from speckle3d.scoring.references import find_reference, sweep_curves
 from speckle3d.study.figures import RANGE_DB, label_of
 from speckle3d.study.pose_errors import PICKED, caution, measure
-from speckle3d.study.posed import PosedSweep
-from speckle3d.study.reslices.cuts import OpenedModes, at_modes, cut_posed
-from speckle3d.study.reslices.places import Place
+from speckle3d.study.posed import OpenedModes, PosedSweep, at_modes
+from speckle3d.study.reslices.cuts import cut_posed
+from speckle3d.study.reslices.places import along_sweep, in_frame
 
 KEPT_BYTES = 600_000_000
 """Of images that are kept; those of a longer sweep are made again when they are needed."""
@@ -241,15 +241,21 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
     def _pair(self) -> tuple[str, str | None]:
         return self.mode, self.other if self.other not in ("", self.mode) else None
 
-    def _place(self, name: str) -> Place:
+    def _slider(self, name: str) -> dict[str, Any]:
+        """Name and value of the slider that moves a cut."""
         slider = _CUTS[name][0]
-        return Place(**{slider: getattr(self, slider)}, reach_mm=self._page.reach_mm)
+        return {slider: getattr(self, slider)}
 
     @batched
     def _cut(self, name: str) -> None:
         opened, plot = self._page.opened(*self._pair), self._plots[name]
         try:
-            picture = cut_posed(opened, self._place(name), RANGE_DB, made=self._page.images)
+            (images, grid), reach_mm = self._page.images, self._page.reach_mm
+            if name == "frame":
+                place = in_frame(opened, grid, self.frame, reach_mm=reach_mm)
+            else:
+                place = along_sweep(opened, grid, **self._slider(name))
+            picture = cut_posed(opened, place, RANGE_DB, (images, grid), reach_mm=reach_mm)
         except Speckle3DError as error:
             plot.plot.title.text = str(error).split(";")[0]
             return
@@ -278,7 +284,15 @@ class _Viewer(param.Parameterized):  # type: ignore[misc]
         for plot in self._plots.values():
             plot.show_points(self._cross_mm, points)
         self._commands.object = "".join(
-            code(reslice_command(page.source, f"{name}.png", self._modes, self._place(name), page.sweep_file))
+            code(
+                reslice_command(
+                    page.source,
+                    f"{name}.png",
+                    self._modes,
+                    {**self._slider(name), "reach_mm": page.reach_mm},
+                    page.sweep_file,
+                )
+            )
             for name in _CUTS
         )
         if self._space.object is not None:

@@ -59,7 +59,8 @@ def measure(
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import PICKED, caution
     from speckle3d.study.pose_errors import measure as measure_points
-    from speckle3d.study.reslices.cut_geometry import read_plane, require_same_poses
+    from speckle3d.study.posed import pose_mark, require_made_at
+    from speckle3d.study.reslices.cut_geometry import read_plane
 
     columns = WORLD if on is None else PICTURE
     if (points is None) == (not point):
@@ -71,8 +72,8 @@ def measure(
     made, why = read_reconstruction(reconstruction_file, with_pairs=False), ""
     if on is not None:
         shown = read_plane(on, mode)
-        require_same_poses(shown, poses_of(made, shown.mode), str(on))
-        places, mode = shown.cut.world_from_mm(places[:, 0], places[:, 1]), shown.mode
+        require_made_at(shown.mark, pose_mark(poses_of(made, shown.mode)), str(on))
+        places, mode = shown.world_mm(places), shown.mode
     elif mode is None:
         mode, why = default_mode(made)
     picked = PICKED * made.grid.vector_pitch_mm if pick_mm is None else pick_mm
@@ -194,7 +195,7 @@ def _errors(
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import caution, posed_errors_of
-    from speckle3d.study.posed import require_made_at
+    from speckle3d.study.posed import MARK, pose_mark, require_made_at
 
     made_at = volume.fields.get("poses", mode or "image")
     if mode is not None and mode != made_at:
@@ -202,7 +203,7 @@ def _errors(
     if path is None:
         return None
     made = read_reconstruction(path, with_pairs=False)
-    require_made_at(volume, poses_of(made, made_at), str(where))
+    require_made_at(volume.fields.get(MARK, ""), pose_mark(poses_of(made, made_at)), str(where))
     if (words := caution(made, made_at)) is not None:
         note(words)
     return posed_errors_of(made, made_at), made.grid

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 from speckle3d.cli.calibrations import files_of, given_settings
-from speckle3d.cli.commands import Fields
 from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Paths, notes
 from speckle3d.cli.look.volumes import Imported, region_of
 from speckle3d.cli.outputs import require_own_place
@@ -16,11 +13,9 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from speckle3d.core.arrays import ByteArray, FloatArray
-    from speckle3d.core.volume import Volume
-    from speckle3d.study.reslices.cuts import OpenedModes
+    from speckle3d.core.arrays import FloatArray
+    from speckle3d.study.posed import OpenedModes
 
-_PLACED = ("lateral_mm", "depth_mm", "frame", "angle_deg", "pixel_mm", "reach_mm")
 Triple = tuple[float, float, float]
 
 
@@ -30,7 +25,10 @@ def reslice(
     *,
     mode: list[str] | None = None,
     difference_to: MaybeText = None,
-    placed: Annotated[dict[str, Any], Fields("speckle3d.study.reslices.places:Place", _PLACED)],
+    lateral_mm: MaybeNumber = None,
+    depth_mm: MaybeNumber = None,
+    frame: int | None = None,
+    angle_deg: float = 0.0,
     points: MaybeText = None,
     origin: Triple | None = None,
     right: Triple | None = None,
@@ -38,8 +36,8 @@ def reslice(
     curve: MaybePath = None,
     on: MaybePath = None,
     straight: bool = False,
-    outlines: bool = False,
-    volume: MaybePath = None,
+    pixel_mm: float = 0.2,
+    reach_mm: float = 0.5,
     state: MaybePath = None,
     region: MaybeText = None,
     sweep_file: MaybePath = None,
@@ -48,7 +46,7 @@ def reslice(
     transform: MaybeText = None,
     imported: Imported,
 ) -> None:
-    """Cut a plane or along a curve, straight from the frames at the poses of one or more modes.
+    """Cut a plane or along a curve, straight from the frames at the poses of one or more modes, or a volume.
 
     Parameters
     ----------
@@ -78,23 +76,19 @@ def reslice(
     angle_deg
         With --frame: turn out of it about its depth line; 90 is along the sweep.
     origin
-        Cut through this point of the world, mm. Not with --curve.
+        With --right: cut through this point of the world, mm. Not with --curve.
     right
-        With --origin: direction of the picture's rows.
+        With --origin: direction of the picture's rows. With --down.
     down
         With --origin or --curve: direction of its columns (curve: depth).
     straight
         Join the curve's points by straight lines, not by a spline.
-    outlines
-        Draw where the frames are instead. Not with --volume or --region.
-    volume
-        Cut this volume of the sweep, not its frames. Not with --difference-to or --region or --reach-mm.
     state
-        What `volume --state` wrote: empty voxels are not shown.
+        Of a volume, what `volume --state` wrote: empty voxels are not shown.
     pixel_mm
-        Side of a pixel.
+        Side of a pixel (0.2).
     reach_mm
-        Frames farther from a pixel do not count.
+        Frames farther from a pixel do not count (0.5).
     dynamic_range_db
         Range of log-compressed grey levels (60).
     region, sweep_file, calibration, transform
@@ -103,89 +97,72 @@ def reslice(
     --------
     $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
     """
+    from speckle3d.imaging.cuts.oblique import spanned_plane, three_point_plane
     from speckle3d.io.shapes.picks import parse_places
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
-    from speckle3d.io.voxels.volumes import may_be_volume
+    from speckle3d.io.voxels.volumes import may_be_volume, read_states, read_volume
     from speckle3d.study.figures import RANGE_DB
-    from speckle3d.study.posed import open_posed, require_made_at
-    from speckle3d.study.reslices.cuts import at_modes, cut_as_volume, cut_posed, cut_voxels
-    from speckle3d.study.reslices.places import Place
-    from speckle3d.study.reslices.reslice_figures import save_outlines, save_reslices
+    from speckle3d.study.posed import at_modes, open_posed
+    from speckle3d.study.reslices.cuts import cut_as_volume, cut_posed, cut_voxels
+    from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
+    from speckle3d.study.reslices.reslice_figures import save_reslices
 
     as_volume = out.name.lower().endswith(SUFFIXES)
-    read = (input_file, sweep_file, curve, on, volume, state, *files_of(imported, calibration))
+    read = (input_file, sweep_file, curve, on, state, *files_of(imported, calibration))
     require_own_place(out, "volume" if as_volume else "picture", *read)
-    corners = None if points is None else parse_places(points.split(), option="--points")
-    place = Place(**placed, points_mm=corners, origin_mm=origin, right=right, down=down, smooth=not straight)
-
-    def located(opened: OpenedModes | None) -> Place:
-        return place if curve is None else replace(place, curve_mm=_curve(curve, on, opened))
-
-    if input_file.is_file() and may_be_volume(input_file) and not outlines:
-        of_sweeps = {**imported, "mode": mode, "volume": volume, "sweep": sweep_file, "region": region,
-                     "calibration": calibration, "transform": transform, "difference_to": difference_to,
-                     "dynamic_range_db": dynamic_range_db}  # fmt: skip
-        for name in (name for name, value in of_sweeps.items() if value):
-            flag = name.replace("_", "-")
-            raise InvalidInputError(f"--{flag}: expected a sweep with it, got the volume {input_file.name}")
-        voxels, states = _voxels(input_file, state)
-        picture = cut_voxels(voxels, located(None), input_file.name, states)
+    plane = None
+    if points is not None:
+        plane = three_point_plane(parse_places(points.split(), option="--points"))
+    elif origin is not None and right is not None and down is not None:
+        plane = spanned_plane(origin, right, down)
+    of_sweeps = {**imported, "mode": mode, "sweep": sweep_file, "region": region, "calibration": calibration,
+                 "transform": transform, "difference_to": difference_to, "lateral_mm": lateral_mm,
+                 "depth_mm": depth_mm, "frame": frame, "dynamic_range_db": dynamic_range_db}  # fmt: skip
+    is_volume = input_file.is_file() and may_be_volume(input_file)
+    for name, value in (of_sweeps if is_volume else {"state": state}).items():
+        if value or value == 0:
+            flag, kind = name.replace("_", "-"), "a sweep" if is_volume else "a volume"
+            raise InvalidInputError(f"--{flag}: expected {kind} with it, got {input_file.name}")
+    if is_volume:
+        voxels = read_volume(input_file)
+        states = None if state is None else read_states(state, voxels)
+        points_mm = None if curve is None else _curve(curve, on, None)
+        picture = cut_voxels(voxels, input_file.name, states, plane, points_mm, down, not straight, pixel_mm)
     else:
-        if state is not None and volume is None:
-            raise InvalidInputError("--state: expected --volume with it, got none")
-        made = None if volume is None else _voxels(volume, state)
-        modes = _modes_of(None if made is None else made[0], mode or ())
         imports = given_settings(input_file, imported, transform)
         stated = sweep_file, imports, calibration or (), dynamic_range_db
-        first = open_posed(input_file, modes[0] if modes else None, *stated)
-        opened = at_modes(first, modes, difference_to)
+        first = open_posed(input_file, mode[0] if mode else None, *stated)
+        opened = at_modes(first, mode or (), difference_to)
         notes(opened.posed.notes())
-        if outlines and as_volume:
-            raise InvalidInputError(f"{out}: expected a picture of --outlines, as .png")
-        if outlines:
-            save_outlines(opened, out)
-            return
-        if made is not None:
-            require_made_at(made[0], opened.poses[opened.reference], str(volume))
         part = region_of(region, input_file, stated, first)
-        with progress_bar(f"reslicing {out.name}") as progress:
-            range_db = dynamic_range_db or RANGE_DB
-            picture = cut_posed(opened, located(opened), range_db, made, progress, region=part)
+        range_db = dynamic_range_db or RANGE_DB
+        images, grid = opened.posed.images(range_db)
+        if curve is not None:
+            points_mm = _curve(curve, on, opened)
+            place = along_curve(opened, grid, points_mm, down, not straight, pixel_mm)
+        elif plane is not None:
+            place = in_world(opened, grid, plane, pixel_mm, reach_mm)
+        elif frame is not None:
+            place = in_frame(opened, grid, frame, angle_deg, lateral_mm, pixel_mm, reach_mm)
+        else:
+            place = along_sweep(opened, grid, lateral_mm, depth_mm, pixel_mm)
+        with progress_bar(f"reslicing {out.name}"):
+            picture = cut_posed(opened, place, range_db, (images, grid), part, reach_mm)
     if as_volume:
         write_volume(out, cut_as_volume(picture))
     else:
         save_reslices(picture, out)
 
 
-def _modes_of(volume: Volume | None, modes: Sequence[str]) -> Sequence[str]:
-    """Modes to cut: of a volume the one in whose world it lies, if its file says so."""
-    if volume is None:
-        return modes
-    made_at = volume.fields.get("poses")
-    if len(modes) > 1 or (modes and made_at not in (None, *modes)):
-        raise InvalidInputError(
-            f"--mode: expected {made_at or 'one'}, at whose poses --volume was made, got {', '.join(modes)}"
-        )
-    return modes if made_at is None else (made_at,)
-
-
-def _voxels(path: Path, state: Path | None) -> tuple[Volume, ByteArray | None]:
-    """Read a volume and, if there is a file of them, the states of its voxels."""
-    from speckle3d.io.voxels.volumes import read_states, read_volume
-
-    volume = read_volume(path)
-    return volume, None if state is None else read_states(state, volume)
-
-
 def _curve(path: Path, picture: Path | None, opened: OpenedModes | None) -> FloatArray:
     """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
     from speckle3d.io.shapes.picks import PICTURE, WORLD, read_places
-    from speckle3d.study.reslices.cut_geometry import read_plane, require_same_poses
+    from speckle3d.study.posed import require_made_at
+    from speckle3d.study.reslices.cut_geometry import read_plane
 
     if picture is None:
         return read_places(path, WORLD)
-    x, y = read_places(path, PICTURE).T
     shown = read_plane(picture, None if opened is None else opened.reference)
     if opened is not None:
-        require_same_poses(shown, opened.poses[opened.reference], str(picture), opened.posed.frames)
-    return shown.cut.world_from_mm(x, y)
+        require_made_at(shown.mark, opened.marks[opened.reference], str(picture))
+    return shown.world_mm(read_places(path, PICTURE))

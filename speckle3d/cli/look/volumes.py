@@ -162,8 +162,8 @@ def volume(
     (posed,) = open_sweep_at([mode], input_file, stated)
     part = region_of(region, input_file, stated, posed)
     request = VolumeRequest(out, checked, GridRequest(**grid), part, state, deviation)
-    with progress_bar(f"compounding {out.name}") as progress:
-        report = write_voxels(posed, request, progress)
+    with progress_bar(f"compounding {out.name}"):
+        report = write_voxels(posed, request)
     if as_json:
         emit_json(report.summary())
     made = posed.reconstruction

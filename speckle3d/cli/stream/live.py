@@ -151,7 +151,8 @@ def live(
     from speckle3d.live.crossing import CrossingCheck
     from speckle3d.live.session import Session, SessionSettings
     from speckle3d.live.warming import warm_up
-    from speckle3d.study.job import require_own_results
+    from speckle3d.study.job import RESULTS
+    from speckle3d.study.results import require_own
 
     host, _, port = server.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
@@ -162,7 +163,7 @@ def live(
     recorded = out / "sweep.h5"
     if recorded.exists():
         raise InvalidInputError(f"{recorded}: there already; expected a folder without a recorded sweep")
-    require_own_results(out)
+    require_own(out, RESULTS)
     out.mkdir(parents=True, exist_ok=True)
     known, packed = from_options(ImportSettings, imported), compression == "gzip"
     settings = SessionSettings(recorded, image, transform, orientation, known, config, volume, check, packed)

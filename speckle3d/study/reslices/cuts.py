@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import reduce
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,25 +12,21 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.region import Region
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
+from speckle3d.imaging.cuts.oblique import covering_box, vector_words
+from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
+from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM
 from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
 from speckle3d.imaging.images import Images
 from speckle3d.scoring.lengths import ModeError
-from speckle3d.scoring.references import Reference, error_rows, find_reference
+from speckle3d.scoring.references import Reference, error_rows
 from speckle3d.study.figures import RANGE_DB
-from speckle3d.study.posed import PosedSweep, posed_at
-from speckle3d.study.reslices.cut_geometry import Anchors, anchors_of
-from speckle3d.study.reslices.places import (
-    AnyCut,
-    Place,
-    frame_lines,
-    sweep_extent,
-    view_of,
-)
+from speckle3d.study.posed import OpenedModes
+from speckle3d.study.reslices.places import REACH_MM, AnyCut, Place, Vector, swept
 
 
 @dataclass(frozen=True)
@@ -71,8 +67,8 @@ class CutPicture:
         Black and white.
     name : str
         Of the sweep or the volume.
-    anchors : mapping of str to mapping
-        Poses of some frames of each mode; see `cut_geometry.anchors_of`.
+    marks : mapping of str to str
+        Of the poses of each mode, by `pose_mark`.
     lengths : mapping of str to str
         How long each mode is, in words.
     """
@@ -83,140 +79,66 @@ class CutPicture:
     unit: str = "dB, 0: maximum"
     levels: tuple[float, float] | None = None
     name: str = ""
-    anchors: Mapping[str, Anchors] = field(default_factory=dict)
+    marks: Mapping[str, str] = field(default_factory=dict)
     lengths: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class OpenedModes:
-    """A sweep at the poses of several modes.
-
-    Attributes
-    ----------
-    posed : PosedSweep
-        Of the frames that all modes have.
-    poses : dict of str to RigidTransform, length n
-    reference : str
-        One of the modes.
-    """
-
-    posed: PosedSweep
-    poses: dict[str, RigidTransform]
-    reference: str
-
-
-def at_modes(first: PosedSweep, modes: Sequence[str] = (), reference: str | None = None) -> OpenedModes:
-    """Take an opened sweep at several modes.
-
-    Parameters
-    ----------
-    first : PosedSweep
-    modes : sequence of str
-        Modes of the reconstruction, "tracker" or "truth"; by default the one it is opened at.
-    reference : str, optional
-        What to compare them with; by default the truth or a tracker that covers all frames, if there are
-        several modes, else the first.
-
-    Raises
-    ------
-    InvalidInputError, InsufficientDataError
-        If there is no such mode.
-    """
-    asked = list(dict.fromkeys(modes)) or [first.mode]
-    if reference is None:
-        known = find_reference(first.sweep) if len(asked) > 1 else None
-        reference = asked[0] if known is None or not known.covered.all() else known.name
-    every = {
-        mode: posed_at(first.sweep, mode, first.reconstruction) for mode in dict.fromkeys([*asked, reference])
-    }
-    shared = reduce(np.intersect1d, [each.frames for each in every.values()])
-    if not shared.size:
-        raise InsufficientDataError(
-            f"{first.sweep.name}: expected a frame that has a pose in {' and '.join(every)}, got none"
-        )
-    poses = {mode: each.world_from_image[np.isin(each.frames, shared)] for mode, each in every.items()}
-    posed = replace(first, frames=shared, world_from_image=poses[asked[0]], mode=asked[0])
-    return OpenedModes(posed, poses, reference)
 
 
 def cut_posed(
     opened: OpenedModes,
     place: Place,
     dynamic_range_db: float = RANGE_DB,
-    voxels: tuple[Volume, ByteArray | None] | None = None,
-    progress: Callable[[int, int], None] | None = None,
     made: tuple[Images, ImageGrid] | None = None,
     region: Region | None = None,
+    reach_mm: float = REACH_MM,
 ) -> CutPicture:
-    """Cut a sweep at the poses of every mode, from its frames or from voxels made of it and their states.
+    """Cut a sweep at the poses of every mode, straight from its frames.
 
     Parameters
     ----------
     opened : OpenedModes
     place : Place
+        Of these modes.
     dynamic_range_db : float
-    voxels : tuple of Volume and ndarray or None, optional
-    progress : callable, optional
-        Called with the number of images made and of all.
     made : tuple of Images and ImageGrid, optional
         What `opened.posed.images` gives, by those who have it.
     region : Region, optional
         Of the images; samples outside it do not count.
+    reach_mm : float
+        Frames farther from a pixel do not count.
 
     Raises
     ------
     InvalidInputError
-        If the place is incomplete, or shows nothing; says where the sweep is.
+        If the cut shows nothing.
     """
-    images, grid = made or opened.posed.images(dynamic_range_db, progress)
-    poses, numbers = opened.poses, opened.posed.frames
-    placed = place.counted_in(numbers).cuts(poses, grid, opened.reference)
+    images, grid = made or opened.posed.images(dynamic_range_db)
+    poses, there = opened.poses, opened.poses[opened.reference]
     unit, limits = "dB, 0: maximum", (-dynamic_range_db, 0.0)
-    if voxels is None:
-        mask = None if region is None else region.mask(grid)
-        wanted = [(poses[mode], placed[mode]) for mode in placed]
-        levels = reslice_at(images, grid, wanted, place.reach_mm, mask)
-        if opened.posed.range_is_known:
-            levels = [((each - 255) * (dynamic_range_db / 255)).astype(np.float32) for each in levels]
-        else:
-            unit, limits = "level", (0.0, getattr(opened.posed.sweep.signal, "full_scale", 255.0))
-    else:
-        levels = [reslice_volume(voxels[0], cut, voxels[1]) for cut in placed.values()]
-    there = poses[opened.reference]
-    if not any(np.isfinite(each).any() for each in levels):
-        raise InvalidInputError(
-            f"cut: expected one that meets the sweep, which lies {sweep_extent(there, grid)}, got one that "
-            "shows nothing"
-        )
-    shown = placed[opened.reference]
-    lengths = error_rows(poses, Reference.over_all(opened.reference, there), grid.centre_mm)
-    return CutPicture(
-        drawn_cuts(dict(zip(placed, levels, strict=True)), placed, grid, poses),
-        place.axes(shown, there),
-        ", ".join(filter(None, [place.words(grid), view_of(shown, there)])),
-        unit if voxels is None else _unit_of(voxels[0]),
-        limits if voxels is None else None,
-        opened.posed.sweep.name,
-        {mode: anchors_of(each, numbers) for mode, each in poses.items()},
-        length_words(lengths, opened.reference),
+    mask = None if region is None else region.mask(grid)
+    levels = reslice_at(
+        images, grid, [(poses[mode], cut) for mode, cut in place.cuts.items()], reach_mm, mask
     )
-
-
-def drawn_cuts(
-    images: Mapping[str, Float32Array],
-    cuts: Mapping[str, AnyCut],
-    grid: ImageGrid,
-    poses: Mapping[str, RigidTransform],
-) -> dict[str, DrawnCut]:
-    """Cuts by mode with where the frames are that they were made from."""
-    return {
-        mode: DrawnCut(
-            image,
-            cuts[mode],
-            frame_lines(cuts[mode], grid, poses[mode]),
-        )
-        for mode, image in images.items()
+    if opened.posed.range_is_known:
+        levels = [((each - 255) * (dynamic_range_db / 255)).astype(np.float32) for each in levels]
+    else:
+        unit, limits = "level", (0.0, getattr(opened.posed.sweep.signal, "full_scale", 255.0))
+    if not any(np.isfinite(each).any() for each in levels):
+        raise InvalidInputError("cut: expected one that meets the sweep, got one that shows nothing")
+    cuts = {
+        mode: DrawnCut(image, cut, frame_lines(cut, grid, poses[mode]))
+        for (mode, cut), image in zip(place.cuts.items(), levels, strict=True)
     }
+    rows = error_rows(poses, Reference.over_all(opened.reference, there), grid.centre_mm)
+    lengths, name = length_words(rows, opened.reference), opened.posed.sweep.name
+    return CutPicture(cuts, place.axes, place.words, unit, limits, name, opened.marks, lengths)
+
+
+def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) -> FloatArray:
+    """Lines in which frames cross a plane, by its axes, (n, 2, 2), mm; NaN for none; none on a sheet."""
+    if isinstance(cut, CurvedSheet):
+        return np.empty((0, 2, 2))
+    lines = crossings(frame_outlines(grid, world_from_image), cut.world_from_plane)
+    return np.asarray(lines + np.array(cut.first_mm))
 
 
 def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
@@ -231,24 +153,40 @@ def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
     return {mode: ", ".join(each) for mode, each in words.items()}
 
 
-def cut_voxels(volume: Volume, place: Place, name: str = "", state: ByteArray | None = None) -> CutPicture:
-    """Cut a volume; by default across the middle of its third axis.
+def cut_voxels(
+    volume: Volume,
+    name: str = "",
+    state: ByteArray | None = None,
+    plane: RigidTransform | None = None,
+    curve_mm: FloatArray | None = None,
+    down: Vector | None = None,
+    smooth: bool = True,
+    pixel_mm: float = DEFAULT_PIXEL_MM,
+) -> CutPicture:
+    """Cut a volume in a plane of the world, by default across the middle of its third axis, or along a curve.
 
     Raises
     ------
     InvalidInputError
-        If the place is incomplete, or misses the volume.
+        If the cut misses the volume.
     """
-    cut = place.cut_of_box(volume)
+    corners = np.array(list(product(*([0, n - 1] for n in volume.shape))), dtype=float)
+    corners = corners @ volume.world_from_index[:3, :3].T + volume.world_from_index[:3, 3]
+    cut: AnyCut
+    if curve_mm is not None:
+        words, axes = f"along a curve through {len(curve_mm)} points", ("along the curve", "down")
+        down = volume.world_from_index[:3, 1] if down is None else down
+        cut = swept(curve_mm, down, corners, pixel_mm, smooth)
+    elif plane is not None:
+        words, axes = f"plane from {vector_words(plane.translation)} mm", ("in the cut", "in the cut")
+        cut = covering_box(plane, corners, pixel_mm)
+    else:
+        words, axes = "middle plane of i and j", ("i", "j")
+        middle = RigidTransform.from_translation([0, 0, (volume.shape[2] - 1) / 2 * volume.spacing_mm[2]])
+        cut = covering_box(volume.world_from_grid * middle, corners, pixel_mm)
     drawn = DrawnCut(reslice_volume(volume, cut, state), cut)
-    names = ("i", "j") if place.is_along_sweep else ("in the cut", "in the cut")
-    return CutPicture({"volume": drawn}, names, place.words(), _unit_of(volume), name=name)
-
-
-def _unit_of(volume: Volume) -> str:
-    """What a volume's levels are, as far as its file says."""
-    levels = volume.fields.get("levels", "")
-    return f"level, {levels}" if levels else "level"
+    unit = ", ".join(filter(None, ["level", volume.fields.get("levels")]))
+    return CutPicture({"volume": drawn}, axes, words, unit, name=name)
 
 
 def cut_as_volume(picture: CutPicture) -> Volume:

@@ -5,11 +5,9 @@ The lengths over the cuts are those of the tables (`speckle3d.scoring.lengths`).
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,12 +18,7 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.imaging.cuts.outlines import frame_outlines
-from speckle3d.imaging.cuts.planes import ReslicePlane, lateral_line, planes_from_first_frame
-from speckle3d.imaging.cuts.reslice import reslice_frames
-from speckle3d.matching.intensity import IntensityExtractor
-from speckle3d.scoring.lengths import ModeError
-from speckle3d.scoring.references import Reference
+from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.study.figures import (
     RANGE_DB,
     colour_of,
@@ -36,87 +29,65 @@ from speckle3d.study.figures import (
     show_grey,
     spread_frames,
 )
-from speckle3d.study.images import PIXEL_MM, Strip
-from speckle3d.study.reslices.cut_geometry import KEYWORD, PicturedCut, anchors_of
-from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, OpenedModes, drawn_cuts, length_words
-from speckle3d.study.reslices.places import view_of
+from speckle3d.study.images import GreyImages
+from speckle3d.study.posed import OpenedModes
+from speckle3d.study.reslices.cut_geometry import KEYWORD, picture_text
+from speckle3d.study.reslices.cuts import CutPicture, DrawnCut, cut_posed
+from speckle3d.study.reslices.places import along_sweep
 
 _BRIGHTEST_PERCENTILE = 99.9
 """Taken as the maximum: a single specular echo must not darken the tissue."""
 
+_PIXEL_MM = 0.1
+"""Of the cut along a sweep that goes with every reconstruction."""
+
 _DEEP_MM, _LONG_MM = 12.0, 16.0
 """Part of a cut that is enlarged: about as deep as a short sweep is long."""
-
-_LARGEST_MM = (400.0, 200.0)
-"""Of the cut along a sweep that goes with every reconstruction, however far a mode runs away."""
 
 _ACROSS_IN, _DOWN_IN = 11.0, 6.0
 """Width and height that the cuts share."""
 
 
-def draw_strip(
-    strip: Strip,
-    poses: Mapping[str, RigidTransform],
-    reference: Reference | None,
-    name: str,
-    rows: Sequence[ModeError],
-    paths: tuple[Path, Path],
+def draw_along(
+    opened: OpenedModes, images: GreyImages, lengths: Mapping[str, str], paths: tuple[Path, Path]
 ) -> None:
     """Cut a sweep along its middle at the poses of every mode; write the whole cut and a part enlarged.
 
-    As in figures 7 and 8 of Housden et al., BioMedical Engineering OnLine 7:5, 2008, the tracker alone stands
-    beside the modes.
+    As in figures 7 and 8 of Housden et al., BioMedical Engineering OnLine 7:5, 2008.
 
     Parameters
     ----------
-    poses : mapping of str to RigidTransform, length n
-        By mode, "tracker" among them where the sensor alone is shown.
-    reference : Reference, optional
-        Shown, too, if it covers every frame.
-    rows : sequence of ModeError
-        The modes' lengths.
+    opened : OpenedModes
+        Of all frames.
+    images : GreyImages
+        Over `RANGE_DB`.
+    lengths : mapping of str to str
+        How long each mode is, in words.
     paths : tuple of path
         Of the two PNGs.
     """
-    shown, last = dict(poses), "image"
-    if reference is not None and reference.covered.all():
-        shown[reference.name], last = reference.world_from_image, reference.name
-    grid, lateral_mm = strip.stack.grid, float(strip.stack.grid.centre_mm[0])
-    kept = strip.stack.images(len(poses["image"]))
-    planes = planes_from_first_frame(shown, lateral_line(grid, lateral_mm), PIXEL_MM, _LARGEST_MM)
-    levels = []
-    for mode, each in shown.items():
-        # A reach of two of the longest steps, so that no gaps show between frames.
-        steps = np.diff((each[0].inv() * each).translation[:, 2])
-        reach_mm = max(0.3, 2.0 * float(np.percentile(np.abs(steps), 99)))
-        levels.append(reslice_frames(kept, grid, each, planes[mode], reach_mm))
-    seen = np.concatenate([each[np.isfinite(each)] for each in levels])
-    maximum = np.float32(np.percentile(seen, _BRIGHTEST_PERCENTILE)) if seen.size else np.float32(0.0)
-    images = {mode: each - maximum for mode, each in zip(shown, levels, strict=True)}
-    where = f"at lateral {lateral_mm:.4g} mm", view_of(planes[last], shown[last])
-    picture = CutPicture(
-        drawn_cuts(images, planes, grid, shown),
-        place=", ".join(filter(None, where)),
-        levels=(-RANGE_DB, 0.0),
-        name=name,
-        anchors={mode: anchors_of(each) for mode, each in shown.items()},
-        lengths=length_words(rows, last),
-    )
+    # A reach of two of the longest steps, so that no gaps show between frames.
+    steps = [(each[0].inv() * each).translation[:, 2] for each in opened.poses.values()]
+    reach_mm = max(0.3, *(2.0 * float(np.percentile(np.abs(np.diff(each)), 99)) for each in steps))
+    place = along_sweep(opened, images.grid, pixel_mm=_PIXEL_MM)
+    picture = cut_posed(opened, place, RANGE_DB, (images, images.grid), reach_mm=reach_mm)
+    picture = replace(picture, lengths=lengths)
     save_reslices(picture, paths[0])
-    rows_shown = round(_DEEP_MM / PIXEL_MM)
-    top = busiest_rows(images[last], rows_shown)
-    parts = {mode: _part(images[mode], planes[mode], top, rows_shown) for mode in images}
-    place = "part of the cut along the sweep, enlarged"
-    save_reslices(replace(picture, cuts=parts, place=place), paths[1], 3.0 * len(parts))
+    rows = round(_DEEP_MM / _PIXEL_MM)
+    top = busiest_rows(picture.cuts[opened.reference].image, rows)
+    parts = {mode: _part(drawn, top, rows) for mode, drawn in picture.cuts.items()}
+    enlarged = replace(picture, cuts=parts, place="part of the cut along the sweep, enlarged")
+    save_reslices(enlarged, paths[1], 3.0 * len(parts))
 
 
-def _part(image: Float32Array, plane: ReslicePlane, top: int, rows: int) -> DrawnCut:
+def _part(drawn: DrawnCut, top: int, rows: int) -> DrawnCut:
     """Some rows of a cut along the sweep, from its beginning on, and no more columns than `_LONG_MM`."""
-    part = image[top : top + rows, : round(_LONG_MM / PIXEL_MM)]
-    height_mm, width_mm = (PIXEL_MM * max(size - 1, 1) for size in part.shape)
-    down = RigidTransform.from_translation([0.0, top * PIXEL_MM, 0.0])
-    first = plane.first_mm[0], plane.first_mm[1] + top * PIXEL_MM
-    return DrawnCut(part, ReslicePlane(plane.world_from_plane * down, width_mm, height_mm, PIXEL_MM, first))
+    part, plane = drawn.image[top : top + rows, : round(_LONG_MM / _PIXEL_MM)], drawn.cut
+    assert isinstance(plane, ReslicePlane)
+    height_mm, width_mm = (_PIXEL_MM * max(size - 1, 1) for size in part.shape)
+    down = RigidTransform.from_translation([0.0, top * _PIXEL_MM, 0.0])
+    first = plane.first_mm[0], plane.first_mm[1] + top * _PIXEL_MM
+    return DrawnCut(part, ReslicePlane(plane.world_from_plane * down, width_mm, height_mm, _PIXEL_MM, first))
 
 
 def save_reslices(picture: CutPicture, path: Path, across_in: float = _ACROSS_IN) -> Path:
@@ -130,10 +101,8 @@ def save_reslices(picture: CutPicture, path: Path, across_in: float = _ACROSS_IN
         If no cut shows anything.
     """
     figure, _ = draw_cuts(picture, across_in)
-    cuts = [PicturedCut(mode, each.cut, picture.anchors.get(mode, {})) for mode, each in picture.cuts.items()]
-    words = {"axes": picture.axes, "place": picture.place, "name": picture.name}
-    record = {"version": 1, **words, "cuts": [each.record() for each in cuts]}
-    return save_figure(figure, path, {KEYWORD: json.dumps(record)})
+    text = picture_text({mode: each.cut for mode, each in picture.cuts.items()}, picture.marks)
+    return save_figure(figure, path, {KEYWORD: text})
 
 
 def draw_cuts(picture: CutPicture, across_in: float = _ACROSS_IN) -> tuple[Figure, dict[str, Axes]]:
@@ -161,11 +130,9 @@ def draw_cuts(picture: CutPicture, across_in: float = _ACROSS_IN) -> tuple[Figur
     places = figure.subplots(down, across, squeeze=False).ravel()
     panels = dict(zip(cuts, places, strict=True))
     for mode, drawn in cuts.items():
-        # A volume has none of the colours of modes.
-        colour = "#404040" if mode == "volume" else colour_of(mode, list(cuts))
         image = show_grey(panels[mode], drawn.image, drawn.cut.extent_mm, levels)
         title = "\n".join(filter(None, [label_of(mode), picture.lengths.get(mode, "")]))
-        panels[mode].set_title(title, fontsize="small", color=colour, parse_math=False)
+        panels[mode].set_title(title, fontsize="small", color=colour_of(mode), parse_math=False)
         lines = list(drawn.frames[spread_frames(len(drawn.frames), 8)])
         panels[mode].add_collection(
             LineCollection(lines, colors="#FFD700", linewidths=0.6, alpha=0.6), autolim=False
@@ -176,38 +143,6 @@ def draw_cuts(picture: CutPicture, across_in: float = _ACROSS_IN) -> tuple[Figur
     figure.colorbar(image, ax=list(places), label=picture.unit, shrink=0.8)
     name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
     return figure, panels
-
-
-def save_outlines(opened: OpenedModes, path: Path) -> Path:
-    """Draw the outlines of a sweep's frames at several modes, all from the first one's place; write a PNG.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
-    """
-    grid = IntensityExtractor.for_sweep(opened.posed.sweep).grid
-    figure = new_figure(7.0, 6.5)
-    axes: Any = figure.add_subplot(projection="3d")
-    for mode, poses in opened.poses.items():
-        outlines = frame_outlines(grid, poses[0].inv() * poses)
-        # Along the sweep comes second; a line is broken between frames.
-        lines = outlines[spread_frames(len(outlines), 30)][..., [0, 2, 1]]
-        broken = np.pad(lines, ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(-1, 3)
-        colour = colour_of(mode, list(opened.poses))
-        axes.plot(*broken.T, color=colour, linewidth=0.6, label=label_of(mode))
-    axes.set_xlabel("lateral / mm", labelpad=12)
-    axes.set_ylabel("along the sweep / mm", labelpad=12)
-    axes.set_zlabel("depth / mm", labelpad=8)
-    axes.tick_params(labelsize="small")
-    axes.invert_zaxis()
-    sides = [np.ptp(limits) for limits in (axes.get_xlim(), axes.get_ylim(), axes.get_zlim())]
-    axes.set_box_aspect(sides, zoom=0.72)
-    axes.view_init(elev=22.0, azim=-35.0)
-    axes.locator_params(nbins=4)
-    axes.legend(frameon=False, fontsize="small")
-    name_figure(figure, f"{opened.posed.sweep.name}: frames, all from the first one's place")
-    return save_figure(figure, path)
 
 
 def busiest_rows(image: Float32Array, count: int) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +94,7 @@ def write_scene(
         One sweep with the poses of one mode or more.
     request : SceneRequest, optional
     progress : callable, optional
-        Called with the number of planes compounded and their total, of all modes.
+        Called with the number of modes done and of all.
 
     Returns
     -------
@@ -117,10 +116,11 @@ def write_scene(
     names = [name for mode in modes for name in asked.files(mode).values()]
     reports = []
     with FileSet(SCENE, tuple(names), _stale(target, names)).replaced(target) as part:
-        for i, each in enumerate(posed):
-            shown = None if progress is None else partial(_told, progress, i, len(posed))
-            report = _write_mode(part, each, asked, shown)
+        for each in posed:
+            report = _write_mode(part, each, asked)
             reports.append(replace(report, path=target / report.path.name))
+            if progress is not None:
+                progress(len(reports), len(posed))
         (part / SCENE).write_text(_scene_text(posed, asked), encoding="utf-8")
     return reports
 
@@ -149,14 +149,7 @@ def _stale(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(sorted(name for name in ours - {*names} if (folder / name).exists()))
 
 
-def _told(progress: Progress, i: int, count: int, done: int, total: int) -> None:
-    """Tell the progress of one mode as a part of that of all."""
-    progress(i * total + done, count * total)
-
-
-def _write_mode(
-    folder: Path, posed: PosedSweep, request: SceneRequest, progress: Progress | None
-) -> VolumeReport:
+def _write_mode(folder: Path, posed: PosedSweep, request: SceneRequest) -> VolumeReport:
     files = {what: folder / name for what, name in request.files(posed.mode).items()}
     voxels = VolumeRequest(
         files["volume"],
@@ -166,7 +159,7 @@ def _write_mode(
         files["state"],
         files.get("deviation"),
     )
-    report = write_voxels(posed, voxels, progress)
+    report = write_voxels(posed, voxels)
     sweep, poses = slicer_sequence(posed, request.settings.dynamic_range_db)
     outlines = frame_outlines(sweep.grid, posed.world_from_image)
     write_polylines(files["outlines"], outlines, {"frame": posed.frames.astype(np.float64)})

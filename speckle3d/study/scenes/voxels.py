@@ -16,7 +16,6 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, LabelMap
 from speckle3d.core.pose_errors import PosedErrors
-from speckle3d.core.progress import Progress
 from speckle3d.core.region import Region
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
@@ -176,15 +175,13 @@ class VolumeReport:
         return f"{self.path}: {size}, mode {self.mode}, {self.grid}: {named}; {self.seconds:.1f} s"
 
 
-def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress | None = None) -> VolumeReport:
+def write_voxels(posed: PosedSweep, request: VolumeRequest) -> VolumeReport:
     """Compound a sweep's images and write the volume as it is made.
 
     Parameters
     ----------
     posed : PosedSweep
     request : VolumeRequest
-    progress : callable, optional
-        Called with the number of planes done and of all.
 
     Raises
     ------
@@ -216,8 +213,6 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest, progress: Progress |
     for path, voxels in made.items():
         if path is not None:
             write_volume(path, voxels)
-    if progress is not None:
-        progress(grid.shape[2], grid.shape[2])
     counts, seconds = np.bincount(state.ravel(), minlength=3), time.perf_counter() - began
     return VolumeReport(request.path, posed.mode, grid, counts, request.path.stat().st_size, seconds)
 

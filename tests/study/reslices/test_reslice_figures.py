@@ -1,8 +1,10 @@
 """Pictures of cuts: one scale, true axes, how long each mode is, and where the picture's points lie."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.cuts.curved import curved_sheet
 from speckle3d.imaging.cuts.planes import ReslicePlane
 from speckle3d.scoring.lengths import ModeError
@@ -36,14 +38,14 @@ def test_cuts_share_one_scale_true_axes_and_the_lengths_of_the_table():
     }
 
 
-def test_where_planes_and_sheets_lie_comes_back_from_the_file(tmp_path):
+def test_where_a_plane_lies_comes_back_from_the_file(tmp_path):
     sheet = curved_sheet([[0, 0, 0], [5, 0, 0], [5, 7, 0]], [0, 0, 2.0], (-1.0, 4.0), 0.5, smooth=False)
-    cuts = {"pose": PLANE, "truth": sheet}
+    cuts = {"truth": sheet, "pose": PLANE}
     drawn = {mode: DrawnCut(np.zeros(cut.shape, np.float32), cut) for mode, cut in cuts.items()}
-    path = save_reslices(CutPicture(drawn), tmp_path / "cut.png")
-    x, y = np.meshgrid([0.3, 2.0, 6.0], [3.0, 3.5])
-    for mode, cut in cuts.items():
-        shown = read_plane(path, mode).cut
-        np.testing.assert_allclose(shown.world_from_mm(x, y), cut.world_from_mm(x, y), atol=1e-9)
-        assert shown.shape == cut.shape
-    np.testing.assert_allclose(read_plane(path).cut.world_from_mm(-1.0, 2.5), PLACED.translation)
+    path = save_reslices(CutPicture(drawn, marks={"pose": "a mark"}), tmp_path / "cut.png")
+    shown = read_plane(path)
+    assert (shown.mode, shown.mark) == ("pose", "a mark")
+    picked = np.array([[-1.0, 2.5], [2.0, 3.5]])
+    np.testing.assert_allclose(shown.world_mm(picked), PLANE.world_from_mm(*picked.T), atol=1e-9)
+    with pytest.raises(InvalidInputError):
+        read_plane(path, "truth")
