@@ -26,7 +26,7 @@ from speckle3d.scoring.lengths import compare_modes
 from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
 from speckle3d.simulation.beam import tabulate_beam
 from speckle3d.simulation.presets import SimulationSettings, simulate
-from speckle3d.simulation.receiver import received_as_bmode
+from speckle3d.simulation.receiver import received
 
 TABLE = Path(__file__).parent / "accuracy" / "table.toml"
 KEPT = os.environ.get("SPECKLE3D_ACCURACY_SWEEPS")
@@ -127,7 +127,7 @@ def backwards(sweep):
 
 
 def grey(sweep):
-    return received_as_bmode(sweep, 60.0)
+    return received(sweep, 60.0)
 
 
 def untracked(sweep):

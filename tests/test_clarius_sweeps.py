@@ -12,7 +12,7 @@ from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import compare_modes
-from speckle3d.simulation.receiver import received_as_iq
+from speckle3d.simulation.receiver import received
 
 RATE_HZ = 11.0
 NOISE_DEG = 0.1
@@ -39,7 +39,7 @@ def turning(image, mounting, times, seed=5):
 @pytest.mark.parametrize("signal", ["rf", "iq"])
 def test_a_package_reconstructs_as_the_sweep_it_was_made_from(tmp_path, sweep, curves, signal):
     plain, image = slowed(sweep)
-    plain = plain if signal == "rf" else received_as_iq(plain)
+    plain = plain if signal == "rf" else received(plain)
     first, last = plain.frame_time_s[[0, -1]]
     times = examples.bursts_s(first - 0.2, last)
     # One pause of half a second, as both public recordings have.

@@ -7,7 +7,7 @@ import pytest
 
 from speckle3d.core.geometry import elevational_steps
 from speckle3d.pipeline import track
-from speckle3d.simulation.receiver import received_as_iq
+from speckle3d.simulation.receiver import received
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ def length_of_rf(rf, length_of):
     ids=["centre", "off centre", "6.7 MHz for a band of 6"],
 )
 def test_i_and_q_give_the_lengths_of_their_rf(rf, length_of, length_of_rf, middle_hz, decimation):
-    length = length_of(received_as_iq(rf, middle_hz, decimation))
+    length = length_of(received(rf, None, middle_hz, decimation))
     # Both signals hold the same echoes; 16 bits and the filters' ends made 0.012 % at most on twelve sweeps.
     assert length == pytest.approx(length_of_rf, rel=2e-3)
     # 1.1 %, the worst of a phantom's sweeps of 20 mm in the documentation, over the root of a fifth of that.
@@ -42,6 +42,6 @@ def test_i_and_q_give_the_lengths_of_their_rf(rf, length_of, length_of_rf, middl
 
 
 def test_the_other_sign_of_q_is_told(rf, curves):
-    iq = received_as_iq(rf)
+    iq = received(rf)
     frames = np.conj([iq.frames[k] for k in range(len(iq))])
     assert any("sign of Q" in str(doubt) for doubt in track(replace(iq, frames=frames), curves).doubts)

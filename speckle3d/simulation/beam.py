@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 
@@ -105,13 +106,14 @@ class BeamTable:
     """
 
     probe: Probe
-    depth_mm: FloatArray
     lateral_mm: FloatArray
-    elevation_mm: FloatArray
     residual: Complex64Array
     components: ComplexArray
     reach: IntArray
     curvature_per_mm: FloatArray
+
+    depth_mm: ClassVar[FloatArray] = _DEPTH_MM
+    elevation_mm: ClassVar[FloatArray] = _ELEVATION_MM
 
     @property
     def lateral_extent_mm(self) -> float:
@@ -181,7 +183,7 @@ def tabulate_beam(probe: Probe | None = None, attenuation_db_cm_mhz: float = 0.0
     field *= np.exp(2j * echo[..., None] * wavenumbers)
     residual, components = _compress(field, probe.spectrum(_NODES_HZ))
     curvature = np.stack([kx, kz], axis=1)
-    return BeamTable(probe, _DEPTH_MM, lateral, _ELEVATION_MM, residual, components, reach, curvature)
+    return BeamTable(probe, lateral, residual, components, reach, curvature)
 
 
 def _sides(coordinate: FloatArray) -> FloatArray:

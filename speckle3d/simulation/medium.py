@@ -7,9 +7,9 @@ media that presets name are at the end: a uniform phantom, a phantom with inclus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -169,7 +169,7 @@ class Clusters(NamedTuple):
         return position.reshape(-1, 3), strength.ravel().astype(np.float32)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TiledMedium:
     """A slab without sides, made on demand in square columns.
 
@@ -200,29 +200,15 @@ class TiledMedium:
 
     def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Tiles that together hold all scatterers in a box of the image."""
-        return [self._tile(i, j) for i, j in tiles_near(medium_from_image, box).tolist()]
+        return [_tile(self, i, j) for i, j in tiles_near(medium_from_image, box).tolist()]
 
-    def __getstate__(self) -> dict[str, object]:
-        """Copies make their own tiles."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
-
-    @cached_property
-    def _tile(self) -> Callable[[int, int], Scatterers]:
-        return lru_cache(_KEPT_TILES)(self._make)
-
-    @cached_property
-    def _family(self) -> Callable[[int, int], Scatterers]:
-        """Children of all parents in a tile; some lie outside it."""
-        return lru_cache(_KEPT_TILES)(
-            lambda i, j: _joined([kind.draw(self.entropy, n, i, j) for n, kind in enumerate(self.clusters)])
-        )
-
-    def _make(self, i: int, j: int) -> Scatterers:
+    def make_tile(self, i: int, j: int) -> Scatterers:
+        """All scatterers of one tile."""
         parts = [self._background(i, j)]
         parts += [self._fascia(layer, n, i, j) for n, layer in enumerate(self.layers) if layer.fascia]
         # Children of a neighbouring tile's parents may lie in this tile.
         around = np.indices((3, 3)).reshape(2, -1).T + np.array([i - 1, j - 1])
-        for position, strength in [self._family(*tile) for tile in around.tolist()] if self.clusters else ():
+        for position, strength in [_family(self, *tile) for tile in around.tolist()] if self.clusters else ():
             inside = (np.floor(position[:, [0, 2]] / TILE_MM) == [i, j]).all(axis=1)
             parts.append((position[inside], strength[inside]))
         position, strength = _joined(parts)
@@ -271,11 +257,22 @@ class TiledMedium:
         return position, np.full(n, layer.fascia / _FASCIA_PER_MM2, np.float32)
 
 
+@lru_cache(_KEPT_TILES)
+def _tile(medium: TiledMedium, i: int, j: int) -> Scatterers:
+    return medium.make_tile(i, j)
+
+
+@lru_cache(_KEPT_TILES)
+def _family(medium: TiledMedium, i: int, j: int) -> Scatterers:
+    """Children of all parents in a tile; some lie outside it."""
+    return _joined([kind.draw(medium.entropy, n, i, j) for n, kind in enumerate(medium.clusters)])
+
+
 def _joined(parts: Sequence[Scatterers]) -> Scatterers:
     return np.concatenate([p for p, _ in parts]), np.concatenate([s for _, s in parts])
 
 
-def fully_developed(entropy: int, length_mm: float) -> TiledMedium:
+def fully_developed(entropy: int) -> TiledMedium:
     """Make a uniform speckle phantom."""
     return TiledMedium(entropy, _PER_MM3, 0.3)
 

@@ -8,16 +8,13 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.geometry import rotation_from_fixed_angles
 from speckle3d.simulation.settings import SimulationSettings
 
 _KNOT_RATE_HZ = 100.0
@@ -26,8 +23,22 @@ _KNOT_RATE_HZ = 100.0
 _LEAD_S = 0.5
 """The trajectory starts and ends this much beyond the frames, for sensors on their own clocks."""
 
+_TREMOR_HZ = (8.0, 12.0)
+_TREMOR = np.repeat([0.012, np.deg2rad(0.016)], 3)
+"""Physiological tremor: its band, and its standard deviation in each axis, mm and rad."""
+
+_PAUSE_S = 0.3
+
+_WOBBLE_HZ = 3.0
+
 _SWINGS = np.array([2.3, 3.7, 2.9, 6.5, 1.6, 4.3])
 """Swings of each column during a calibration scan: incommensurate, so that all combinations occur."""
+
+_YAW_ROLL_DEG = (90.0, 11.0)
+"""How far either way a calibration scan turns about these axes."""
+
+_NEAREST_MM, _FARTHEST_MM = 12.0, 34.0
+"""Depth of the floor or the crossing in a calibration scan."""
 
 _ROAMING_MM = 15.0
 """How far either way the probe wanders over the floor."""
@@ -47,8 +58,8 @@ class HandMotion:
     ----------
     speed_variation : float
         Slow unevenness of the speed, as a fraction of its mean (largest, not standard, deviation).
-    pauses, pause_s : int, float
-        How many times the hand stops, and for how long.
+    pauses : int
+        How many times the hand stops.
     drift_mm : float
         Slow wander of the lateral and axial position over the sweep.
     wander_rad : float
@@ -57,27 +68,20 @@ class HandMotion:
         Tilt, yaw and roll of the first frame.
     turn_rad : tuple of float
         Deliberate tilt, yaw and roll from the first frame to the last.
-    tremor_band_hz, tremor_mm, tremor_rad
-        Physiological tremor, in every axis.
     reverse : bool
         Sweep forward, then back over the same tissue.
-    wobble_mm, wobble_hz : float
-        Deliberate to and fro along the elevational axis: amplitude and frequency, both uneven.
+    wobble_mm : float
+        Deliberate to and fro along the elevational axis: amplitude, uneven as the frequency is.
     """
 
     speed_variation: float = 0.3
     pauses: int = 1
-    pause_s: float = 0.3
     drift_mm: float = 0.5
     wander_rad: float = np.deg2rad(0.6)
     start_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    tremor_band_hz: tuple[float, float] = (8.0, 12.0)
-    tremor_mm: float = 0.012
-    tremor_rad: float = np.deg2rad(0.016)
     reverse: bool = False
     wobble_mm: float = 0.0
-    wobble_hz: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -86,33 +90,39 @@ class Trajectory:
 
     Parameters
     ----------
-    knot_s : ndarray, shape (m,)
-    knots : ndarray, shape (m, 6)
-        Three positions (mm), then tilt, yaw, roll (rad), of what `medium_from_columns` makes poses.
-    medium_from_columns : callable
-        Poses in the medium from columns interpolated between the knots.
+    columns : BSpline
+        Three positions (mm), then tilt, yaw, roll (rad), of the middle of the face, by time (s).
+    order : str
+        Of the turns, as of ``Rotation.from_euler``.
+    in_medium : ndarray, shape (3,)
+        1 for positions along the medium's axes, 0 for those along the image's, which say where a point of the
+        medium is seen.
+    face_mm : float
+        Width of the image; the probe turns about the middle of its face.
     world_from_medium : RigidTransform
+    medium_from_start : RigidTransform, optional
+        What positions in the medium count from.
     """
 
-    knot_s: FloatArray
-    knots: FloatArray
-    medium_from_columns: Callable[[FloatArray], RigidTransform]
+    columns: BSpline[np.float64]
+    order: str
+    in_medium: FloatArray
+    face_mm: float
     world_from_medium: RigidTransform
+    medium_from_start: RigidTransform | None = None
 
     def medium_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the medium at any times within the knots."""
-        return self.medium_from_columns(self._spline(time_s))
+        place, turns = np.split(self.columns(time_s), 2, axis=-1)
+        rotation = Rotation.from_euler(self.order, turns[..., ["XYZ".index(axis) for axis in self.order]])
+        in_image = [self.face_mm / 2.0, 0.0, 0.0] + place * (1.0 - self.in_medium)
+        moved = place * self.in_medium - rotation.apply(in_image)
+        pose = RigidTransform.from_components(moved, rotation)
+        return pose if self.medium_from_start is None else self.medium_from_start * pose
 
     def world_from_image(self, time_s: FloatArray) -> RigidTransform:
         """Pose in the world at any times within the knots."""
         return self.world_from_medium * self.medium_from_image(time_s)
-
-    @cached_property
-    def _spline(self) -> BSpline[np.float64]:
-        # Quintic, because an accelerometer feels the second derivative.
-        spline = make_interp_spline(self.knot_s, self.knots, k=5)
-        spline.extrapolate = False
-        return spline
 
 
 def frame_times(frames: int, rate_hz: float, rng: np.random.Generator, jitter_s: float = 1e-3) -> FloatArray:
@@ -124,6 +134,13 @@ def frame_times(frames: int, rate_hz: float, rng: np.random.Generator, jitter_s:
 def _knot_times(duration_s: float) -> FloatArray:
     knots = round((duration_s + 2 * _LEAD_S) * _KNOT_RATE_HZ) + 1
     return np.linspace(-_LEAD_S, duration_s + _LEAD_S, knots)
+
+
+def _spline(time: FloatArray, columns: FloatArray) -> BSpline[np.float64]:
+    """Quintic, because an accelerometer feels the second derivative."""
+    spline = make_interp_spline(time, columns, k=5)
+    spline.extrapolate = False
+    return spline
 
 
 def hand_sweep(
@@ -140,14 +157,13 @@ def hand_sweep(
     Parameters
     ----------
     face_mm : float
-        Width of the image; the probe turns about the middle of its face.
+        Width of the image.
     medium_from_start : RigidTransform
         Where and in which direction the sweep starts.
     """
     time = _knot_times(duration_s)
-    pivot = np.array([face_mm / 2.0, 0.0, 0.0])
     columns = np.zeros((time.size, 6))
-    columns[:, :3] = pivot
+    columns[:, 0] = face_mm / 2.0
     columns[:, 2] += _progress(time, duration_s, motion, rng) * length_mm
     phase = np.clip(time / duration_s, 0.0, 1.0)
     columns[:, 3:] = motion.start_rad + _smooth_step(phase)[:, None] * np.asarray(motion.turn_rad)
@@ -155,23 +171,17 @@ def hand_sweep(
         slow = motion.drift_mm if axis < 3 else motion.wander_rad
         if axis != 2:
             columns[:, axis] += slow * _band_noise(time, (0.0, 1.0 / duration_s), rng)
-        columns[:, axis] += _tremor(time, axis, motion, rng)
+        columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
     if motion.wobble_mm > 0:
         columns[:, 2] += _wobble(time, duration_s, motion, rng)
-
-    def medium_from_columns(columns: FloatArray) -> RigidTransform:
-        tilt, yaw, roll = np.moveaxis(columns[..., 3:], -1, 0)
-        rotation = rotation_from_fixed_angles(roll, yaw, tilt)
-        moved = columns[..., :3] - rotation.apply(pivot)
-        return medium_from_start * RigidTransform.from_components(moved, rotation)
-
-    return Trajectory(time, columns, medium_from_columns, world_from_medium)
+    spline = _spline(time, columns)
+    return Trajectory(spline, "ZYX", np.ones(3), face_mm, world_from_medium, medium_from_start)
 
 
 def calibration_scan(
     settings: SimulationSettings, face_mm: float, world: RigidTransform, rng: np.random.Generator
 ) -> Trajectory:
-    """Turn and lift the probe over the ranges in `settings`, all axes at once, as a hand would.
+    """Turn and lift the probe, all axes at once, as a hand would.
 
     Over a floor at y = 0 of the medium (`plane`), the columns are x of the point of the floor that the
     image's middle vector meets, its depth in the image, its z. About a point at the medium's origin
@@ -181,25 +191,16 @@ def calibration_scan(
     """
     over_floor = settings.preset == "plane"
     across, off = (_ROAMING_MM, _ROAMING_MM) if over_floor else (_LATERAL_SHARE * face_mm, _OFF_POINT_MM)
-    nearest, farthest = settings.depth_range_mm
-    turns = np.deg2rad([settings.tilt_range_deg, settings.yaw_range_deg, settings.roll_range_deg])
-    reach = np.array([across, (farthest - nearest) / 2.0, off, *turns])
+    turns = np.deg2rad([settings.tilt_range_deg, *_YAW_ROLL_DEG])
+    reach = np.array([across, (_FARTHEST_MM - _NEAREST_MM) / 2.0, off, *turns])
     time = _knot_times(settings.duration_s)
     columns = np.empty((time.size, 6))
     for axis in range(6):
         columns[:, axis] = reach[axis] * _swings(time / settings.duration_s, _SWINGS[axis], rng)
-        columns[:, axis] += _tremor(time, axis, HandMotion(), rng)
-    columns[:, 1] += (nearest + farthest) / 2.0
-    pivot = np.array([face_mm / 2.0, 0.0, 0.0])
-    in_medium = np.array([1.0, 0.0, 1.0]) if over_floor else np.zeros(3)
-
-    def medium_from_columns(columns: FloatArray) -> RigidTransform:
-        rotation = Rotation.from_euler("YXZ", columns[..., [4, 3, 5]])
-        in_image = pivot + columns[..., :3] * (1.0 - in_medium)
-        moved = columns[..., :3] * in_medium - rotation.apply(in_image)
-        return RigidTransform.from_components(moved, rotation)
-
-    return Trajectory(time, columns, medium_from_columns, world)
+        columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
+    columns[:, 1] += (_NEAREST_MM + _FARTHEST_MM) / 2.0
+    in_medium = np.array([1.0, 0.0, 1.0]) * over_floor
+    return Trajectory(_spline(time, columns), "YXZ", in_medium, face_mm, world)
 
 
 def stepped_poses(steps: int, step_mm: float, blocks: int, gap_mm: float) -> RigidTransform:
@@ -228,7 +229,7 @@ def _progress(
     duration = float(time[inside][-1])
     speed = 1.0 + motion.speed_variation * np.tanh(_band_noise(time, (0.0, 0.8), rng))
     # In a very short sweep a whole pause would leave no motion at all.
-    pause_s = min(motion.pause_s, 0.2 * duration)
+    pause_s = min(_PAUSE_S, 0.2 * duration)
     for centre in rng.uniform(0.15, 0.85, motion.pauses) * duration:
         # At rest for a pause, which begins and ends within a quarter of it.
         speed *= 1.0 - np.clip(3.0 - 4.0 * np.abs((time - centre) / pause_s), 0.0, 1.0)
@@ -249,17 +250,12 @@ def _wobble(time: FloatArray, duration_s: float, motion: HandMotion, rng: np.ran
     uneven = _band_noise(time, (0.0, 0.3), rng)
     strength = 1.0 + 0.15 * np.tanh(_band_noise(time, (0.0, 0.5), rng))
     during = np.clip(time / 0.5, 0.0, 1.0) * np.clip((duration_s - time) / 0.5, 0.0, 1.0)
-    phase = 2.0 * np.pi * motion.wobble_hz * time + uneven
+    phase = 2.0 * np.pi * _WOBBLE_HZ * time + uneven
     return np.asarray(motion.wobble_mm * strength * _smooth_step(during) * np.sin(phase))
 
 
 def _smooth_step(u: FloatArray) -> FloatArray:
     return u * u * (3.0 - 2.0 * u)
-
-
-def _tremor(time: FloatArray, axis: int, motion: HandMotion, rng: np.random.Generator) -> FloatArray:
-    size = motion.tremor_mm if axis < 3 else motion.tremor_rad
-    return size * _band_noise(time, motion.tremor_band_hz, rng)
 
 
 def _band_noise(time: FloatArray, band_hz: tuple[float, float], rng: np.random.Generator) -> FloatArray:

@@ -24,7 +24,7 @@ from speckle3d.simulation.movement import (
     turned_about,
     world_from_medium,
 )
-from speckle3d.simulation.receiver import received_as_bmode, received_as_iq
+from speckle3d.simulation.receiver import received
 from speckle3d.simulation.scan import SimulatedFrames
 from speckle3d.simulation.sensors import (
     OrientationModel,
@@ -41,19 +41,8 @@ _PHANTOM_FRAMES = 150
 _BATH_MM = (320.0, -150.0, -240.0)
 """Place of the bath in the tracker's world, off its axes."""
 
-_PUBLISHED = TrackerModel(
-    mounting_rad=tuple(np.deg2rad([-0.55, 44.22, -90.37]).tolist()), mounting_mm=(-270.86, 4.86, -65.08)
-)
-"""The mounting of table 3 of TR 303 (Prager et al., 1997)."""
-
-_MEDIA = {
-    "phantom": phantom,
-    "tissue": tissue,
-    "reversal": tissue,
-    "rotation": phantom,
-    "crossed": tissue,
-    "stepped": fully_developed,
-}
+_TISSUE = ("tissue", "reversal", "crossed")
+_BATH = ("plane", "wires")
 
 
 @shown
@@ -107,23 +96,25 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     (8, 600)
     """
     medium_seed, heading_seed, *sweep_seeds = np.random.SeedSequence(settings.seed).spawn(4)
-    heading, bearing = np.random.default_rng(heading_seed).uniform(-np.pi, np.pi, 2)
-    world = world_from_medium(float(heading))
-    entropy = _entropy(medium_seed)
-    medium: Medium
-    if settings.preset in _MEDIA:
-        medium = _MEDIA[settings.preset](entropy, settings.length_mm)
-    else:
-        floor = settings.preset == "plane"
-        medium = water_bath(entropy, settings.reflector) if floor else crossed_threads(entropy)
-        slope = np.deg2rad(settings.floor_slope_deg) * np.array([np.cos(bearing), 0.0, np.sin(bearing)])
-        sloping = RigidTransform.from_rotation(Rotation.from_rotvec(slope))
-        world = RigidTransform.from_translation(_BATH_MM) * world * sloping
+    world = world_from_medium(float(np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)))
+    if settings.preset in _BATH:
+        world = RigidTransform.from_translation(_BATH_MM) * world
+    medium = _medium(settings, _entropy(medium_seed))
     beam = tabulate_beam(Probe(), attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
     count = 2 if settings.preset == "crossed" else 1
     return tuple(
         _sweep(settings, beam, medium, world, seed, number) for number, seed in enumerate(sweep_seeds[:count])
     )
+
+
+def _medium(settings: SimulationSettings, entropy: int) -> Medium:
+    if settings.preset == "plane":
+        return water_bath(entropy, settings.reflector)
+    if settings.preset == "wires":
+        return crossed_threads(entropy)
+    if settings.preset == "stepped":
+        return fully_developed(entropy)
+    return (tissue if settings.preset in _TISSUE else phantom)(entropy, settings.length_mm)
 
 
 def _entropy(seed: np.random.SeedSequence) -> int:
@@ -139,7 +130,7 @@ def _sweep(
     number: int,
 ) -> SimulatedSweep:
     """Sweep `number` of a preset: images and sensors along a trajectory of its own."""
-    probe, in_water = beam.probe, settings.preset not in _MEDIA
+    probe, in_bath = beam.probe, settings.preset in _BATH
     image = _image_grid(settings, probe)
     tracker: Tracker | None = None
     orientation: OrientationSensor | None = None
@@ -153,20 +144,20 @@ def _sweep(
         times = frame_times(frames, rate_hz, np.random.default_rng(clock_seed))
         trajectory = _trajectory(settings, image, duration, world, number, np.random.default_rng(motion_seed))
         poses, span = trajectory.medium_from_image(times), (-0.3, duration + 0.3)
-        noise = settings.sensor_noise if in_water else 1.0
-        model = _PUBLISHED if settings.mounting == "published" else TrackerModel()
-        tracker = simulate_tracker(trajectory, span, model, np.random.default_rng(tracker_seed), noise)
+        noise = settings.sensor_noise if in_bath else 1.0
+        tracker = simulate_tracker(
+            trajectory, span, TrackerModel(), np.random.default_rng(tracker_seed), noise
+        )
         rng = np.random.default_rng(orientation_seed)
         orientation = simulate_orientation(trajectory, span, OrientationModel(), rng, noise)
     rf = SimulatedFrames(beam, medium, poses, image, settings.snr_db, _entropy(seed))
     reflector = f"-{settings.reflector}" if settings.preset == "plane" else ""
     name = f"{settings.preset}{reflector}-{settings.seed}" + ("-crossing" if number else "")
     sweep = Sweep(rf, image, probe.signal, times, orientation, tracker, world * poses, name=name)
-    if settings.signal == "iq":
-        sweep = received_as_iq(sweep, settings.demodulation_frequency_hz, settings.decimation)
-    elif settings.signal == "bmode":
-        sweep = received_as_bmode(sweep, settings.dynamic_range_db, settings.decimation)
-    if orientation is None or tracker is None or not (in_water or settings.uncalibrated):
+    if settings.signal != "rf":
+        range_db = settings.dynamic_range_db if settings.signal == "bmode" else None
+        sweep = received(sweep, range_db, settings.demodulation_frequency_hz, settings.decimation)
+    if orientation is None or tracker is None or not (in_bath or settings.uncalibrated):
         return SimulatedSweep(sweep, settings)
     bare = replace(
         sweep,
@@ -186,16 +177,12 @@ def _image_grid(settings: SimulationSettings, probe: Probe) -> ImageGrid:
     return ImageGrid.of_fan(settings.vectors, settings.samples, spacing_mm, radius_mm, (-half, half))
 
 
-def _comes_back(settings: SimulationSettings) -> bool:
-    return settings.preset == "reversal" or (settings.preset == "rotation" and settings.reverse)
-
-
 def _timing(settings: SimulationSettings) -> tuple[int, float, float]:
     """Frames, duration (s) and frame rate (Hz)."""
-    if settings.preset not in _MEDIA:
+    if settings.preset in _BATH:
         frames = settings.frames or _PHANTOM_FRAMES
         return frames, settings.duration_s, frames / settings.duration_s
-    frames = settings.frames or round(8 * settings.length_mm * (2 if _comes_back(settings) else 1))
+    frames = settings.frames or round((16 if settings.preset == "reversal" else 8) * settings.length_mm)
     return frames, frames / settings.frame_rate_hz, settings.frame_rate_hz
 
 
@@ -207,21 +194,15 @@ def _trajectory(
     number: int,
     rng: np.random.Generator,
 ) -> Trajectory:
-    if settings.preset not in _MEDIA:
+    if settings.preset in _BATH:
         return calibration_scan(settings, image.width_mm, world, rng)
-    motion = HandMotion(
-        drift_mm=settings.drift_mm,
-        reverse=_comes_back(settings),
-        wobble_mm=settings.wobble_mm,
-        wobble_hz=settings.wobble_hz,
-        tremor_mm=settings.tremor_mm,
-    )
-    fan, turn = np.deg2rad([settings.fan_deg, settings.turn_deg]).tolist()
+    motion = HandMotion(reverse=settings.preset == "reversal", wobble_mm=settings.wobble_mm)
+    fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
     if settings.preset == "crossed":
         motion = replace(motion, start_rad=(-fan / 2.0, 0.0, 0.0), turn_rad=(fan, 0.0, 0.0))
     elif settings.preset == "rotation":
         turns = (turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0)
         motion = replace(motion, turn_rad=turns)
     centre = np.array([image.width_mm / 2.0, 0.0, settings.length_mm / 2.0])
-    start = turned_about(centre, float(np.deg2rad(settings.crossing_deg)) * number)
+    start = turned_about(centre, crossing * number)
     return hand_sweep(settings.length_mm, duration_s, image.width_mm, motion, start, world, rng)

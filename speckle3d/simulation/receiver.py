@@ -80,47 +80,36 @@ class ReceivedFrames:
         return np.rint(255.0 * np.clip(level, 0.0, 1.0)).astype(np.uint8)
 
 
-def received_as_iq(sweep: Sweep, frequency_hz: float | None = None, decimation: int | None = None) -> Sweep:
-    """Make an RF sweep one of I/Q.
+def received(
+    sweep: Sweep,
+    dynamic_range_db: float | None = None,
+    frequency_hz: float | None = None,
+    decimation: int | None = None,
+) -> Sweep:
+    """Make an RF sweep one of I/Q, or with a dynamic range one of 8-bit B-mode whose columns are the vectors.
 
     Parameters
     ----------
+    dynamic_range_db : float, optional
+        Of B-mode, from black to white.
     frequency_hz : float, optional
         What the echoes are shifted down by, by default their centre frequency.
     decimation : int, optional
-        By default the largest that leaves a quarter more than the band needs.
+        By default 4 of B-mode, and of I/Q the largest that leaves a quarter more than the band needs.
 
     Raises
     ------
     InvalidInputError
-        If the sweep is not RF, or the rate that is left does not hold the band.
+        If the rate that is left does not hold the band.
     """
-    return _received(sweep, frequency_hz, decimation, None)
-
-
-def received_as_bmode(sweep: Sweep, dynamic_range_db: float, decimation: int | None = None) -> Sweep:
-    """Make an RF sweep one of 8-bit B-mode images whose columns are the vectors.
-
-    Raises
-    ------
-    InvalidInputError
-        If the sweep is not RF, or the rows do not hold the band.
-    """
-    decimation = _GREY_DECIMATION if decimation is None else decimation
-    return _received(sweep, None, decimation, dynamic_range_db)
-
-
-def _received(
-    sweep: Sweep, frequency_hz: float | None, decimation: int | None, dynamic_range_db: float | None
-) -> Sweep:
     rf = sweep.signal
-    if not isinstance(rf, RFSettings) or rf.are_complex:
-        raise InvalidInputError(f"{sweep.name}: expected RF, got samples of another kind")
+    assert isinstance(rf, RFSettings)
     (low, high), rate_hz = rf.bandwidth_hz, rf.sampling_rate_hz
-    frequency_hz = rf.centre_frequency_hz if frequency_hz is None else frequency_hz
+    frequency_hz = frequency_hz or rf.centre_frequency_hz
     width_hz = 2 * (max(high - frequency_hz, frequency_hz - low) + _GUARD * (high - low))
     most = int(rate_hz / (_LEAST_ROOM * width_hz))
-    every = max(1, int(rate_hz / (_ROOM * width_hz))) if decimation is None else decimation
+    usual = max(1, int(rate_hz / (_ROOM * width_hz))) if dynamic_range_db is None else _GREY_DECIMATION
+    every = decimation or usual
     if not 1 <= every <= most:
         raise InvalidInputError(
             f"decimation: expected 1 to {most} for the band about {frequency_hz:g} Hz, got {every}"

@@ -9,7 +9,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 Reflector = Literal["wall", "bar"]
 Signal = Literal["rf", "iq", "bmode"]
 Preset = Literal["phantom", "tissue", "reversal", "rotation", "crossed", "stepped", "plane", "wires"]
-Mounting = Literal["bench", "published"]
 
 
 class SimulationSettings(BaseModel):
@@ -47,7 +46,6 @@ class SimulationSettings(BaseModel):
     blocks: int = Field(4, ge=1, description="stepped: independent blocks.")
     turn_deg: float = Field(5.0, ge=-30, le=30, description="rotation: turn from first to last frame.")
     turn_axis: Literal["tilt", "yaw"] = Field("tilt", description="rotation: the axis of the turn.")
-    reverse: bool = Field(False, description="rotation: sweep forward, then back, turning on.")
     crossing_deg: float = Field(90.0, gt=0, lt=180, description="crossed: angle between the sweeps.")
     fan_deg: float = Field(
         0.0,
@@ -55,22 +53,10 @@ class SimulationSettings(BaseModel):
         le=90,
         description="crossed: tilt within each sweep, half either way; calibration needs it.",
     )
-    mounting: Mounting = Field(
-        "bench",
-        description="How the tracker sits on the probe: bench, the same in all presets, or published, as in "
-        "table 3 of Prager et al. 1997.",
-    )
     uncalibrated: bool = Field(
         False, description="Do not say how the sensors sit on the probe: a calibration will."
     )
-    drift_mm: float = Field(
-        0.5, ge=0, le=20, description="Slow lateral and axial wander, standard deviation."
-    )
     wobble_mm: float = Field(0.0, ge=0, le=5, description="Deliberate to and fro along the sweep, amplitude.")
-    wobble_hz: float = Field(3.0, ge=0.5, le=8, description="Its frequency.")
-    tremor_mm: float = Field(
-        0.012, ge=0, le=1, description="Tremor of the hand in each axis, standard deviation."
-    )
     snr_db: float = Field(
         40.0, ge=-10, le=80, description="Speckle over electronic noise at the transmit focus."
     )
@@ -79,14 +65,6 @@ class SimulationSettings(BaseModel):
     )
     duration_s: float = Field(30.0, gt=0, le=600, description="plane, wires: how long the scan lasts.")
     tilt_range_deg: float = Field(25.0, ge=0, le=60, description="plane, wires: tilt, either way.")
-    roll_range_deg: float = Field(11.0, ge=0, le=45, description="plane, wires: roll, either way.")
-    yaw_range_deg: float = Field(90.0, ge=0, le=180, description="plane, wires: yaw, either way.")
-    depth_range_mm: tuple[float, float] = Field(
-        (12.0, 34.0), description="plane, wires: nearest and farthest depth of floor or crossing (12 34)."
-    )
-    floor_slope_deg: float = Field(
-        0.0, ge=0, le=60, description="plane: slope of the floor, in a random direction."
-    )
     sensor_noise: float = Field(
         1.0, ge=0, le=10, description="plane, wires: factor on the noise of both sensors; 0: exact ones."
     )
@@ -103,13 +81,6 @@ class SimulationSettings(BaseModel):
     dynamic_range_db: float = Field(
         60.0, gt=0, le=200, description="bmode: from black to white, which is 20 dB over the mean of speckle."
     )
-
-    @field_validator("depth_range_mm")
-    @classmethod
-    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
-        if not 2.0 <= value[0] <= value[1] <= 44.0:
-            raise ValueError("expected 2 <= nearest <= farthest <= 44")
-        return value
 
     @field_validator("radius_mm", "sector_deg")
     @classmethod

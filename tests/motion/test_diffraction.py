@@ -84,7 +84,7 @@ def test_other_lenses_agree_with_phantoms_simulated_in_three_dimensions(aperture
     beam = tabulate_beam(probe, attenuation_db_cm_mhz=attenuation)
     poses = stepped_poses(21, 0.05, 2, 2.0 * float(beam.elevation_extent_mm.max()))
     grid = ImageGrid(26, 1800, probe.pitch_mm, probe.signal.sample_spacing_mm)
-    frames = SimulatedFrames(beam, fully_developed(5, 24.0), poses, grid, 40.0, 5)
+    frames = SimulatedFrames(beam, fully_developed(5), poses, grid, 40.0, 5)
     phantom = Sweep(frames, grid, probe.signal, np.arange(len(poses)) / 25.0, truth=poses, name="steps")
     phantom = replace(phantom, frames=np.stack([frames[k] for k in range(len(poses))]))
     measured = calibrate_curves([phantom])

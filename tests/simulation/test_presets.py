@@ -5,7 +5,7 @@ import pytest
 
 from speckle3d.core.geometry import roll_yaw_tilt
 from speckle3d.simulation.presets import SimulationSettings, simulate
-from speckle3d.simulation.receiver import received_as_bmode, received_as_iq
+from speckle3d.simulation.receiver import received
 
 
 def small(preset, **changes):
@@ -56,10 +56,10 @@ def test_sweeps_are_stored_as_i_and_q_or_as_grey_levels_where_asked_for():
     given = {"preset": "phantom", "vectors": 8, "samples": 600, "frames": 3, "seed": 4}
     made = [simulate(SimulationSettings(signal=kind, **given))[0].sweep for kind in ("rf", "iq", "bmode")]
     rf, iq, grey = made
-    expected = received_as_iq(rf)
+    expected = received(rf)
     np.testing.assert_array_equal(iq.frames[1], expected.frames[1])
     assert (iq.grid, iq.signal) == (expected.grid, expected.signal)
-    np.testing.assert_array_equal(grey.frames[1], received_as_bmode(rf, 60.0).frames[1])
+    np.testing.assert_array_equal(grey.frames[1], received(rf, 60.0).frames[1])
     np.testing.assert_array_equal(iq.truth.as_matrix(), rf.truth.as_matrix())
 
 

@@ -6,7 +6,7 @@ from scipy import signal as filters
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.simulation.receiver import received_as_bmode, received_as_iq
+from speckle3d.simulation.receiver import received
 from speckle3d.simulation.scan import SPECKLE_RMS_COUNTS
 
 RF = RFSettings(200e6 / 3, 1540.0, 7.5e6, (5e6, 10e6))
@@ -28,7 +28,7 @@ def tone(frequency_hz, amplitude=10000.0, phase=0.4):
 @pytest.mark.parametrize("middle_hz", [6.5e6, 8.5e6])
 @pytest.mark.parametrize("frequency_hz", [4.6e6, 10.4e6])
 def test_a_tone_turns_at_what_it_is_off_the_demodulation_with_its_phase_and_no_delay(frequency_hz, middle_hz):
-    sweep = received_as_iq(tone(frequency_hz), middle_hz)
+    sweep = received(tone(frequency_hz), None, middle_hz)
     t = np.arange(sweep.grid.samples) / sweep.signal.sampling_rate_hz
     expected = 10000.0 * np.exp(1j * (2 * np.pi * (frequency_hz - middle_hz) * t + 0.4))
     # 80 dB of the filter, and whole counts.
@@ -37,7 +37,7 @@ def test_a_tone_turns_at_what_it_is_off_the_demodulation_with_its_phase_and_no_d
 
 @pytest.mark.parametrize("frequency_hz", [1e6, 14.6e6])
 def test_what_would_fold_into_the_band_is_filtered_out(frequency_hz):
-    sweep = received_as_iq(tone(frequency_hz), 7.5e6)
+    sweep = received(tone(frequency_hz), None, 7.5e6)
     # Without the filter these would be where the band is kept.
     rate_hz = sweep.signal.sampling_rate_hz
     assert abs((frequency_hz - 7.5e6 + rate_hz / 2) % rate_hz - rate_hz / 2) < 3e6
@@ -48,7 +48,7 @@ def test_grey_levels_are_the_envelope_in_decibel():
     # The envelope's square over speckle's, whose rms as RF is that of a tone of the root of two times it.
     for decibel in (0.0, -13.0, 15.0):
         amplitude = np.sqrt(2) * SPECKLE_RMS_COUNTS * 10 ** (decibel / 20)
-        sweep = received_as_bmode(tone(7.5e6, amplitude), 60.0)
+        sweep = received(tone(7.5e6, amplitude), 60.0)
         grey = sweep.frames[0][0, INSIDE].astype(float)
         assert sweep.frames.dtype == np.uint8
         expected = 255 * (1 + (decibel - 20.0) / 60.0)
@@ -62,7 +62,7 @@ def test_the_magnitude_is_the_envelope_at_every_rate(decimation):
     noise = rng.normal(size=(2, 4000))
     band = filters.firwin(301, (5.2e6, 9.8e6), pass_zero=False, fs=RF.sampling_rate_hz)
     echoes = 10000.0 * filters.convolve(noise, band[None], mode="same")
-    found = np.abs(received_as_iq(rf_sweep(echoes), 7.5e6, decimation).frames[0])
+    found = np.abs(received(rf_sweep(echoes), None, 7.5e6, decimation).frames[0])
     envelope = np.abs(filters.hilbert(echoes, axis=1))[:, ::decimation]
     inner = slice(400 // decimation, -400 // decimation)  # away from the ends of the filters
     # The passband is flat to 80 dB; what the window cuts of the band's edges is within a percent.

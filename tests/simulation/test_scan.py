@@ -24,7 +24,7 @@ def image(vectors, beam, samples=3818):
 
 
 def test_uniform_speckle_is_fully_developed_at_every_depth(beam):
-    frames = SimulatedFrames(beam, fully_developed(7, 20.0), STILL, image(48, beam), snr_db=60.0)
+    frames = SimulatedFrames(beam, fully_developed(7), STILL, image(48, beam), snr_db=60.0)
     rf = frames[0].astype(float)
     intensity = np.abs(hilbert(rf, axis=-1)) ** 2
     for depth_mm in (5, 10, 20, 30, 40):

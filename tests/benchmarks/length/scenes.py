@@ -62,7 +62,7 @@ def stepped_phantom(probe: Probe, attenuation_db_cm_mhz: float, seed: int, folde
     path = folder / f"steps-{seed}-{key_of(f'{probe}{attenuation_db_cm_mhz}{_STEPS}')}.h5"
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
-        medium = fully_developed(seed, LENGTH_MM)
+        medium = fully_developed(seed)
         beam = tabulate_beam(probe, attenuation_db_cm_mhz=attenuation_db_cm_mhz)
         gap_mm = 2.0 * float(beam.elevation_extent_mm.max())
         poses = stepped_poses(_STEPS["steps"], _STEPS["step_mm"], _STEPS["blocks"], gap_mm)
