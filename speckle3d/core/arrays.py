@@ -1,15 +1,19 @@
-"""Array types by their elements; shapes are in docstrings."""
+"""Array types by their elements; shapes are in docstrings.
+
+Written out, since files are read by them: NumPy 2.5 hides the element within `numpy.typing.NDArray`.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+from typing import Any
 
-FloatArray = npt.NDArray[np.float64]
-Float32Array = npt.NDArray[np.float32]
-Float16Array = npt.NDArray[np.float16]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
-ByteArray = npt.NDArray[np.uint8]
-ComplexArray = npt.NDArray[np.complex128]
-Complex64Array = npt.NDArray[np.complex64]
+import numpy as np
+
+FloatArray = np.ndarray[tuple[Any, ...], np.dtype[np.float64]]
+Float32Array = np.ndarray[tuple[Any, ...], np.dtype[np.float32]]
+Float16Array = np.ndarray[tuple[Any, ...], np.dtype[np.float16]]
+IntArray = np.ndarray[tuple[Any, ...], np.dtype[np.int64]]
+BoolArray = np.ndarray[tuple[Any, ...], np.dtype[np.bool_]]
+ByteArray = np.ndarray[tuple[Any, ...], np.dtype[np.uint8]]
+ComplexArray = np.ndarray[tuple[Any, ...], np.dtype[np.complex128]]
+Complex64Array = np.ndarray[tuple[Any, ...], np.dtype[np.complex64]]
