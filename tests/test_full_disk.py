@@ -47,7 +47,7 @@ def recorded(path):
 
 WRITERS = {
     "sweep.h5": lambda path: write_sweep(path, SWEEP),
-    "sequence.mhd": lambda path: write_sequence(path, SWEEP, compressed=False),
+    "sequence.mha": lambda path: write_sequence(path, SWEEP, compressed=False),
     "attached.h5": lambda path: attach_orientation(path, SWEEP.orientation),
     "volume.nii.gz": lambda path: write_volume(path, VOLUME),
     "figure.png": lambda path: save_figure(figure(), path),

@@ -195,6 +195,9 @@ def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
         members = [member for member in get_args(kind) if member is not type(None)]
         choices = tuple(value for member in members for value in get_args(member))
         kind = members[0] if len(members) == 1 else Literal[choices]
+    if get_origin(kind) is tuple:  # typer knows no bounds of a pair's numbers
+        plain = (one.__origin__ if hasattr(one, "__metadata__") else one for one in get_args(kind))
+        kind = tuple.__class_getitem__(tuple(plain))
     if field.metadata and any(hasattr(each, "write") for each in field.metadata):
         kind = str
     shown = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"

@@ -89,7 +89,7 @@ def convert(
     source
         Any recording that holds a sweep: a file, or a folder.
     out
-        Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .mhd, .nrrd), to write; or -o OUT.
+        Sweep file (.h5, .hdf5), or sequence of PLUS (.mha, .nrrd), to write; or -o OUT.
     calibration, mode, sampling_rate_hz, vector_pitch_mm, plus_config
 
     Other Parameters

@@ -8,13 +8,10 @@ every recording of its folder; those for a folder ``scan`` in ``scan.toml``, ``s
 from __future__ import annotations
 
 import os
-from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
@@ -25,9 +22,10 @@ SPEED_OF_SOUND_M_S = 1540.0
 
 _FOLDER_FILE = "import.toml"
 
-_NUMBERS = ("_hz", "_mm", "_m_s", "_db", "image_to_probe")
-_LEAST_HZ = 1e4
-"""Of a frequency of ultrasound or of its sampling, in Hz; less is a number in MHz or kHz."""
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Size = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
+Hertz = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e4)]
+"""Of ultrasound or of its sampling: less is a number in MHz or kHz."""
 
 
 class ImportSettings(BaseModel):
@@ -38,55 +36,52 @@ class ImportSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    sampling_rate_hz: float | None = Field(
-        None, gt=0, description="samples per second along a line, in the scanner's export settings or log"
+    sampling_rate_hz: Hertz | None = Field(
+        None, description="samples per second along a line, in the scanner's export settings or log"
     )
-    vector_pitch_mm: float | None = Field(
+    vector_pitch_mm: Size | None = Field(
         None,
-        gt=0,
         description="distance between lines; a linear probe's element pitch, in its data sheet, where each "
         "element has one line; of lines that spread: array_radius_mm and line_angles_deg",
     )
-    element_pitch_mm: float | None = Field(
+    element_pitch_mm: Size | None = Field(
         None,
-        gt=0,
         description="distance between elements of the array, in the probe's data sheet, where the file "
         "places its lines in elements",
     )
-    array_radius_mm: float | None = Field(
+    array_radius_mm: Number | None = Field(
         None, ge=0, description="radius of a curved array's face, in the probe's data sheet; 0: phased array"
     )
-    line_angles_deg: tuple[float, float] | None = Field(
+    line_angles_deg: tuple[Number, Number] | None = Field(
         None,
         description="angles of the first and the last line of a curved or phased array, from straight down",
     )
-    speed_of_sound_m_s: float | None = Field(
-        None, gt=0, description="assumed by the scanner; 1540 unless its manual says otherwise"
+    speed_of_sound_m_s: Size | None = Field(
+        None, description="assumed by the scanner; 1540 unless its manual says otherwise"
     )
-    centre_frequency_hz: float | None = Field(
-        None, gt=0, description="transmit frequency, on the scanner's screen or in the probe's data sheet"
+    centre_frequency_hz: Hertz | None = Field(
+        None, description="transmit frequency, on the scanner's screen or in the probe's data sheet"
     )
-    bandwidth_hz: tuple[float, float] | None = Field(
+    bandwidth_hz: tuple[Hertz, Hertz] | None = Field(
         None, description="lowest and highest frequency of the echoes, at -6 dB in the probe's data sheet"
     )
-    demodulation_frequency_hz: float | None = Field(
+    demodulation_frequency_hz: Number | None = Field(
         None, ge=0, description="frequency that I/Q were shifted down by, usually the transmit frequency"
     )
-    first_sample_depth_mm: float | None = Field(
+    first_sample_depth_mm: Number | None = Field(
         None, description="depth of a line's first sample; 0 unless the scanner records later"
     )
-    column_pitch_mm: float | None = Field(
+    column_pitch_mm: Size | None = Field(
         None,
-        gt=0,
         description="distance between columns, from the scanner's depth ruler or --plus-config",
     )
-    row_spacing_mm: float | None = Field(
-        None, gt=0, description="distance between rows, from the scanner's depth ruler or --plus-config"
+    row_spacing_mm: Size | None = Field(
+        None, description="distance between rows, from the scanner's depth ruler or --plus-config"
     )
-    dynamic_range_db: float | None = Field(
-        None, gt=0, description="decibels from black to white, beside the image on the scanner's screen"
+    dynamic_range_db: Size | None = Field(
+        None, description="decibels from black to white, beside the image on the scanner's screen"
     )
-    frame_rate_hz: float | None = Field(None, gt=0, description="frames per second, on the scanner's screen")
+    frame_rate_hz: Size | None = Field(None, description="frames per second, on the scanner's screen")
     probe: str | None = Field(
         None,
         description="model of the probe, printed on it, for its element pitch; or --element-pitch-mm",
@@ -103,27 +98,13 @@ class ImportSettings(BaseModel):
         description="device set of PLUS, with the place of the image on the probe and the size of its "
         "pixels; in TOML, a file of the same folder",
     )
-    image_to_probe: tuple[tuple[float, ...], ...] | None = Field(
+    image_to_probe: tuple[tuple[Number, ...], ...] | None = Field(
         None, description="image calibration of PLUS, pixels to mm, four rows of four numbers"
     )
     arrays: dict[str, str] = Field(
         default_factory=dict,
         description="arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which",
     )
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _numbers_of_the_unit(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse truth values and texts, which pydantic would turn to numbers, and slips of units."""
-        name = info.field_name or ""
-        if value is None or not name.endswith(_NUMBERS):
-            return value
-        numbers = np.ravel(np.asarray(value, dtype=object)).tolist()
-        if any(isinstance(one, bool) or not isinstance(one, Real) or one - one != 0 for one in numbers):
-            raise PydanticCustomError("number", "expected finite numbers")
-        if name.endswith("_hz") and name != "frame_rate_hz" and any(0 < one < _LEAST_HZ for one in numbers):
-            raise PydanticCustomError("hertz", "expected it in Hz (is this in MHz or kHz?)")
-        return value
 
     def over(self, path: PathLike, **found: Any) -> dict[str, Any]:
         """Put what is given over what a file says of the same names.
@@ -177,18 +158,14 @@ def settings_for(path: PathLike, given: ImportSettings | None = None) -> ImportS
         return given
     held = load_toml(ImportSettings, beside)
     if held.plus_config is not None:
-        held = held.model_copy(update={"plus_config": str(_of_folder(beside, held.plus_config))})
-    said = {name: getattr(given, name) for name in given.model_fields_set}
-    return held.model_copy(update={name: value for name, value in said.items() if value is not None})
-
-
-def _of_folder(beside: Path, name: str) -> Path:
-    """Path of a file that a TOML file names, which must lie in its folder, symbolic links followed."""
-    folder = beside.parent.resolve()
-    found = (folder / name).resolve()
-    if Path(name).is_absolute() or not found.is_relative_to(folder):
-        raise InvalidInputError(f"{beside}: plus_config: expected a file of the same folder, got {name!r}")
-    return beside.parent / name
+        config = beside.parent / held.plus_config
+        if not config.resolve().is_relative_to(beside.parent.resolve()):
+            raise InvalidInputError(
+                f"{beside}: plus_config: expected a file of the same folder, got {held.plus_config!r}"
+            )
+        held = held.model_copy(update={"plus_config": str(config)})
+    said = given.model_dump(exclude_unset=True, exclude_none=True)
+    return held.model_copy(update=said)
 
 
 def settings_file(path: PathLike) -> Path | None:

@@ -46,7 +46,6 @@ def write_images(folder):
 
     image_examples.write_mha(folder / "a.mha", image_examples.grey(), frames=image_examples.tracked(3)[2])
     write_sequence(folder / "b.nrrd", sweeps()["bmode"][0])
-    write_sequence(folder / "c.mhd", sweeps()["bmode"][0])
 
 
 def write_shapes(folder):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -46,6 +46,24 @@ def single(group: h5py.Group, name: str) -> float | None:
             f"{locate(group, name)}: expected one number, got {values.min():g} to {values.max():g}"
         )
     return float(values[0]) if values.size else None
+
+
+def values_of(group: h5py.Group, places: Mapping[str, str], scale: float = 1.0) -> dict[str, Value]:
+    """Numbers of a file by the names of their settings, of those that are there and not 0."""
+    numbers = {name: single(group, place) for name, place in places.items()}
+    return {
+        name: Value(scale * number, f"in {group.name.strip('/')}/{places[name]}".replace("in /", "in "))
+        for name, number in numbers.items()
+        if number
+    }
+
+
+def band_about(values: Mapping[str, Value], share: float | None, place: str) -> dict[str, Value]:
+    """Band about the centre frequency, by its width as a share of that; none where either is not known."""
+    centre = values.get("centre_frequency_hz")
+    if not share or centre is None:
+        return {}
+    return {"bandwidth_hz": Value((centre.value * (1 - share / 2), centre.value * (1 + share / 2)), place)}
 
 
 def text_of(value: Any) -> str:

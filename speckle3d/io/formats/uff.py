@@ -16,6 +16,7 @@ References
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, flat, grey_frames, single, text_of
+from speckle3d.io.formats.hdf5_values import Grid, band_about, flat, grey_frames, single, text_of, values_of
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     file_format,
@@ -68,11 +69,17 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
     if (video := single(group, "frame_rate")) is not None:
         rows.append(("frame rate of videos made of it, not used", f"{video:g}", "frames/s"))
     modulation_hz = single(group, "modulation_frequency") or 0.0
-    values["demodulation_frequency_hz"] = Value(modulation_hz, f"in {name}/modulation_frequency")
-    values |= _pulse(group, f"in {name}", modulation_hz)
+    modulation = Value(modulation_hz, f"in {name}/modulation_frequency")
+    values["demodulation_frequency_hz"] = modulation
+    if modulation_hz:
+        values["centre_frequency_hz"] = replace(modulation, source=f"assumed: {modulation.source[3:]}")
+    values |= values_of(group, {"centre_frequency_hz": "pulse/center_frequency"})
+    if single(group, "pulse/center_frequency"):
+        share = single(group, "pulse/fractional_bandwidth")
+        values |= band_about(values, share, f"in {name}/pulse/fractional_bandwidth")
     for other, kind in _objects(file).items():
-        if kind == _CHANNELS and (speed := single(file, f"{other}/sound_speed")):
-            values["speed_of_sound_m_s"] = Value(speed, f"{other}/sound_speed")
+        if kind == _CHANNELS:
+            values |= values_of(file, {"speed_of_sound_m_s": f"{other}/sound_speed"})
     shape = count, lines, samples
     source = HDF5Slices(path, parts, Grid(shape[1:], (0, 1)), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
@@ -175,20 +182,6 @@ def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:
         )
     axis = 0 if reverse else 3
     return (axis, shape[axis]) if full else (None, 1)
-
-
-def _pulse(group: h5py.Group, where: str, modulation_hz: float) -> dict[str, Value]:
-    """Centre frequency, of the pulse or else what the data were shifted down by, and the pulse's band."""
-    centre, share = (single(group, f"pulse/{name}") for name in ("center_frequency", "fractional_bandwidth"))
-    values = {}
-    if centre:
-        values["centre_frequency_hz"] = Value(centre, f"{where}/pulse/center_frequency")
-    elif modulation_hz:
-        values["centre_frequency_hz"] = Value(modulation_hz, f"assumed: {where}/modulation_frequency")
-    if centre and share:
-        band = (centre * (1.0 - share / 2.0), centre * (1.0 + share / 2.0))
-        values["bandwidth_hz"] = Value(band, f"{where}/pulse/fractional_bandwidth")
-    return values
 
 
 READER = Reader(FORMAT, None, open_uff, claims_hdf5=is_uff)

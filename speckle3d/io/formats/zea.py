@@ -18,7 +18,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -31,7 +30,7 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, grey_frames, single, text_of
+from speckle3d.io.formats.hdf5_values import Grid, band_about, grey_frames, single, text_of, values_of
 from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import (
     file_format,
@@ -59,28 +58,6 @@ _TIP_FROM_IMAGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _ROTATIONS = ("quaternion_wxyz", "quaternion_xyzw", "euler_xyz")
 
 
-@dataclass(frozen=True)
-class _Array:
-    """Where the data lie.
-
-    Attributes
-    ----------
-    group : str
-        Data set, from the root; since 0.0.12 a group of ``values``, ``coordinates`` and ``timestamps``.
-    home : str
-        What stands before ``data`` and ``scan``: nothing at the root, or a track.
-    kind : str
-        One of `_READ`.
-    values : str
-        Data set of the values.
-    """
-
-    group: str
-    home: str
-    kind: str
-    values: str
-
-
 def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
     names = (*_READ, *_NOT_BEAMFORMED)
@@ -92,40 +69,45 @@ def is_zea(file: h5py.File) -> bool:
 def open_zea(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
     with open_hdf5(path) as file:
-        facts = {"written by zea": "zea_version", "scanner": "us_machine"}
-        told = {words: text_of(file.attrs.get(name)) for words, name in facts.items()}
-        rows: list[Row] = [(words, text, "") for words, text in told.items() if text]
-        rows.append(("holds", _contents(file), ""))
+        rows: list[Row] = [("holds", _contents(file), "")]
         return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
 
 
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
-    array = _chosen(file, path, settings)
-    rows.append(("read", array.values, ""))
-    node, values = require_dataset(file, array.values), _scan(file, array)
-    is_beamformed = array.kind == "beamformed_data"
+    name, home, kind = _chosen(file, path, settings)
+    rows.append(("read", name, ""))
+    scan, node = f"{home}scan", require_dataset(file, name)
+    places = {"speed_of_sound_m_s": f"{scan}/sound_speed", "centre_frequency_hz": f"{scan}/center_frequency"}
+    values = values_of(file, places)
+    percent = single(file, f"{scan}/bandwidth_percent") or 0.0
+    values |= band_about(values, percent / 100.0, f"in {scan}/bandwidth_percent")
+    is_beamformed, is_image = kind == "beamformed_data", node.dtype == np.uint8
     channels = node.shape[3] if is_beamformed and node.ndim == 4 else 1
-    is_number = node.dtype.kind == "f" or (array.kind.startswith("image") and node.dtype == np.uint8)
-    if not is_number or node.ndim not in (3, 3 + is_beamformed) or channels not in (1, 2):
+    if not (
+        (node.dtype.kind == "f" or (is_image and kind.startswith("image")))
+        and node.ndim in (3, 3 + is_beamformed)
+        and channels in (1, 2)
+    ):
         raise InvalidInputError(
             f"{locate(node)}: expected echoes of shape (frame, z, x), of beamformed_data (frame, z, x, 1 or "
             f"2), got {node.shape} {node.dtype}"
         )
     count, first, second = node.shape[:3]
-    places = f"{array.group}/coordinates"
-    left_mm, x_first, trailing = None, False, node.shape[3:] if channels == 1 else ()
-    if array.values != array.group and has_member(file, places):
-        x_mm, z_mm, x_first = _pixels(require_dataset(file, places), (count, first, second))
+    group, left_mm, x_first = name.removesuffix("/values"), None, False
+    if group != name and has_member(file, f"{group}/coordinates"):
+        coordinates = require_dataset(file, f"{group}/coordinates")
+        x_mm, z_mm, x_first = _pixels(coordinates, (count, first, second))
         left_mm = float(x_mm[0])
-        values |= grid_values(x_mm, z_mm, locate(file, places), "of the coordinates")
+        values |= grid_values(x_mm, z_mm, locate(coordinates), "of the coordinates")
+    trailing = node.shape[3:] if channels == 1 else ()
     grid = Grid((first, second, *trailing), (0, 1) if x_first else (1, 0), channels == 2)
     shape = (count, first, second) if x_first else (count, second, first)
-    source = HDF5Slices(path, (array.values,), grid)
-    if is_beamformed or node.dtype == np.uint8:
-        dtype = np.complex64 if channels == 2 else np.uint8 if node.dtype == np.uint8 else np.float32
+    source = HDF5Slices(path, (name,), grid)
+    if is_beamformed or is_image:
+        dtype = np.uint8 if is_image else np.complex64 if channels == 2 else np.float32
         frames = source.frames(shape, dtype)
     else:
-        is_db, given_db = array.kind != "envelope_data", settings.dynamic_range_db
+        is_db, given_db = kind != "envelope_data", settings.dynamic_range_db
         frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, given_db)
     shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
     shift_hz = shifts.pop() if len(shifts) == 1 else None
@@ -141,7 +123,7 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         settings,
         frames,
         values,
-        time_s=_times(file, array, count),
+        time_s=_times(file, group, scan, count),
         tracker=tracker,
         chain=_POSES,
         probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe"))),
@@ -158,29 +140,26 @@ def _homes(file: h5py.File) -> list[str]:
     return [home for home in homes if isinstance(find_member(file, f"{home}data"), h5py.Group)]
 
 
-def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> _Array:
-    """What to read: the earliest product, where not given by name."""
-    arrays = []
-    for home, kind in product(_homes(file), _READ):
-        group = f"{home}data/{kind}"
-        arrays += [
-            _Array(group, home, kind, values)
-            for values in (group, f"{group}/values")
-            if isinstance(find_member(file, values), h5py.Dataset)
-        ]
-    asked = settings.arrays.get("data")
-    if asked is not None:
-        arrays = [one for one in arrays if asked.strip("/") in (one.values, one.group)]
-    elif all(one.group == one.values for one in arrays):
-        # What came before scan conversion may be polar, and says nothing of it.
-        arrays = [one for one in arrays if one.kind == "image_sc"] or arrays
-    arrays = [one for one in arrays if one.kind == min((other.kind for other in arrays), key=_READ.index)]
+def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> tuple[str, str, str]:
+    """Data set to read, what stands before its ``data``, and its kind: the earliest, unless one is named."""
+    asked = settings.arrays.get("data", "").strip("/")
+    arrays = [
+        (f"{home}data/{kind}{end}", home, kind)
+        for home, kind, end in product(_homes(file), _READ, ("", "/values"))
+        if isinstance(find_member(file, f"{home}data/{kind}{end}"), h5py.Dataset)
+        and asked in ("", f"{home}data/{kind}", f"{home}data/{kind}{end}")
+    ]
+    # What came before scan conversion may be polar, and says nothing of it without coordinates.
+    is_old = not asked and not any(name.endswith("/values") for name, _, _ in arrays)
+    order = [*_READ[3:], *_READ[:3]] if is_old else [*_READ]
+    kinds = sorted({kind for _, _, kind in arrays}, key=order.index)
+    arrays = [one for one in arrays if one[2] == kinds[0]]
     if not arrays:
         raise InvalidInputError(f"{path}: expected {' or '.join(_READ[:3])}, got {_contents(file)}")
     if len(arrays) > 1:
         raise InvalidInputError(
-            f"{path}: expected one track, got {', '.join(one.values for one in arrays)}: say which by arrays "
-            f'= {{ data = "{arrays[0].values}" }} in {path.name}.toml beside it'
+            f"{path}: expected one track, got {', '.join(name for name, *_ in arrays)}: say which by "
+            f'arrays = {{ data = "{arrays[0][0]}" }} in {path.name}.toml beside it'
         )
     return arrays[0]
 
@@ -203,48 +182,31 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, int, int]) -> tuple[FloatArray
     if node.shape != (*shape, 3) or not shape[0]:
         raise InvalidInputError(f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape}")
     start, middle, end = (1e3 * node[i].astype(np.float64) for i in (0, shape[0] // 2, shape[0] - 1))
-    x, y, z = start.transpose(2, 0, 1)
     for x_first in (False, True):
-        columns, depths = (x.T, z.T) if x_first else (x, z)
-        x_mm, z_mm = columns[0], depths[:, 0]
-        off = [columns - x_mm, depths.T - z_mm, y - y[0, 0], middle - start, end - start]
+        x, y, z = (start.swapaxes(0, 1) if x_first else start).transpose(2, 0, 1)
+        off = [x - x[:1], z - z[:, :1], y - y[0, 0], middle - start, end - start]
         is_flat = all(np.abs(one).max() <= _TOLERANCE_MM for one in off)
-        if is_flat and np.ptp(x_mm) > 0 and np.ptp(z_mm) > 0:
-            return x_mm, z_mm, x_first
+        if is_flat and np.ptp(x) > 0 and np.ptp(z) > 0:
+            return x[0], z[:, 0], x_first
     raise InvalidInputError(
         f"{locate(node)}: expected pixels on a Cartesian grid in one plane, the same in all frames, got "
         "others, as of a polar image: beamform onto zea's cartesian_pixel_grid, or scan-convert it"
     )
 
 
-def _scan(file: h5py.File, array: _Array) -> dict[str, Value]:
-    """What ``scan`` says of the echoes; its sampling frequency is that of channel data."""
-    values, home = {}, f"{array.home}scan"
-    for name, field in (("speed_of_sound_m_s", "sound_speed"), ("centre_frequency_hz", "center_frequency")):
-        if value := single(file, f"{home}/{field}"):
-            values[name] = Value(value, f"in {home}/{field}")
-    percent, centre = single(file, f"{home}/bandwidth_percent"), values.get("centre_frequency_hz")
-    if percent and centre is not None:
-        half = centre.value * percent / 200.0
-        band = (centre.value - half, centre.value + half)
-        values["bandwidth_hz"] = Value(band, f"in {home}/bandwidth_percent")
-    return values
-
-
-def _times(file: h5py.File, array: _Array, count: int) -> FloatArray | None:
+def _times(file: h5py.File, group: str, scan: str, count: int) -> FloatArray | None:
     """Time of each frame after the first transmission: of the data, or of the times between transmissions.
 
     Where one of a frame's is not known, the next frame has no time, and later ones count the median for it.
     """
-    group, name = array.group, f"{array.home}scan/time_to_next_transmit"
-    if array.values != group and has_member(file, f"{group}/timestamps"):
+    if has_member(file, f"{group}/timestamps"):
         stamps = read_checked(file, f"{group}/timestamps", (count,))
         return np.asarray(stamps + (single(file, f"{group}/start_time_offset") or 0.0))
+    name = f"{scan}/time_to_next_transmit"
     if len(_homes(file)) > 1 or not has_member(file, name):
         return None
-    steps = read_checked(file, name, (count, "transmission"))
     # The last transmission of all has no next one.
-    lengths = steps[:-1].sum(axis=1)
+    lengths = read_checked(file, name, (count, "transmission"))[:-1].sum(axis=1)
     known = np.isfinite(lengths)
     if not known.any():
         return None

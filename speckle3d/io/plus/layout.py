@@ -102,15 +102,6 @@ class Layout:
             pixels = np.moveaxis(joined, 0, self._pair_axis)
         return self._flipped(pixels if self.has_lines_in_rows else pixels.T)
 
-    def pixels(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Turn samples, shape (vector, sample), into pixels, shape (y, x): what `frame` undoes."""
-        turned = self._flipped(frame) if self.has_lines_in_rows else self._flipped(frame).T
-        if self.is_complex:
-            pairs = np.moveaxis(turned, self._pair_axis, 0)
-            parted = np.stack([pairs.real, pairs.imag], axis=1).reshape(-1, *pairs.shape[1:])
-            turned = np.moveaxis(parted, 0, self._pair_axis)
-        return np.ascontiguousarray(turned)
-
     def shape(self, size: tuple[int, ...]) -> tuple[int, int]:
         """Vectors and samples of an image of a size (x, y)."""
         y, x = (size[1 - axis] // (1 + (self.is_complex and axis == self._pair_axis)) for axis in (0, 1))

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
@@ -21,7 +22,6 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
-from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.headers import (
     GZIP,
@@ -33,14 +33,12 @@ from speckle3d.io.headers import (
     nrrd_type,
     packer,
     put_packed_size,
-    read_header,
 )
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
 from speckle3d.io.text import numbers
 
-SUFFIXES = (".mha", ".mhd", ".nrrd")
+SUFFIXES = (".mha", ".nrrd")
 """Of the files that `write_sequence` writes, as .igs.mha."""
 
 _OF_SLICER = ".seq.nrrd"
@@ -61,16 +59,12 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
         Naming the field that does not make sense.
     """
     own: dict[str, Any] = {}
-    for key, text in fields.items():
-        name = key.removeprefix(_PREFIX)
-        if name == key or name not in (*ImportSettings.model_fields, "full_scale"):
-            continue
-        if name == "probe":
+    for name in (*ImportSettings.model_fields, "full_scale"):
+        if (text := fields.get(_PREFIX + name)) is not None and name != "probe":
+            values = numbers(text, 2 if name == "bandwidth_hz" else 1, f"{path}: {_PREFIX}{name}")
+            own[name] = values if len(values) == 2 else values[0]
+        elif text is not None:
             own[name] = text
-        else:
-            count = 2 if name == "bandwidth_hz" else 1
-            values = numbers(text, count, f"{path}: {key}")
-            own[name] = values if count == 2 else values[0]
     return own
 
 
@@ -90,7 +84,7 @@ def write_sequence(
     Parameters
     ----------
     path : path
-        With a suffix of `SUFFIXES`; pixels of .mhd go to a .raw or .zraw file beside it.
+        With a suffix of `SUFFIXES`.
     progress : callable, optional
         Called with the number of images written and their total.
     compressed : bool
@@ -110,59 +104,47 @@ def write_sequence(
     FileError
         If the file cannot be written.
     """
-    target = Path(path)
-    suffix = target.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InvalidInputError(f"{path}: expected a name ending in {', '.join(SUFFIXES)}, got {suffix!r}")
+    target, name = Path(path), Path(path).name.lower()
+    if not name.endswith(SUFFIXES):
+        raise InvalidInputError(f"{path}: expected a name ending in {' or '.join(SUFFIXES)}")
     if sweep.grid.fan is not None:
         raise InvalidInputError(
             f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
         )
     fields, frames = _standard_fields(sweep), _timed(sweep.frame_time_s)
     omitted = _add_sensors(frames, sweep)
-    for name, matrices in (transforms or {}).items():
-        _add(frames, name, matrices)
+    for transform, matrices in (transforms or {}).items():
+        _add(frames, transform, matrices)
         fields["ElementSpacing"] = "1 1 1"
-    layout = Layout(fields["UltrasoundImageType"], fields["UltrasoundImageOrientation"])
-    dtype = sweep.frames.dtype
+    dtype, is_nrrd = sweep.frames.dtype, name.endswith(".nrrd")
     if dtype.kind == "c":
         dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
-    y, x = layout.pixels(sweep.frames[0]).shape
-    shape, kind = (x, y, len(sweep)), meta_type(dtype)
-
-    def write_images(file: BinaryIO, window: int) -> int:
-        """Write all images and return how many bytes that took."""
-        pack, size = packer(window) if compressed else None, 0
-        for i in range(len(sweep)):
-            raw = layout.pixels(sweep.frames[i]).astype(dtype.newbyteorder("<"), order="C").data.cast("B")
-            size += file.write(raw if pack is None else pack.compress(raw))
-            if progress is not None:
-                progress(i + 1, len(sweep))
-        return size + (0 if pack is None else file.write(pack.flush()))
-
-    if suffix == ".mhd":
-        beside, other = (f"{target.stem}.{end}" for end in ("zraw", "raw")[:: 1 if compressed else -1])
-        data, old = target.with_name(beside), read_header(target).data if target.exists() else None
-        if data.exists() and data.resolve() != old:
-            raise InvalidInputError(f"{data}: is there and no part of {target.name}: give another name")
-        stale = () if old is None or old.name != other else (other,)
-        with FileSet(target.name, (beside,), stale).replaced(target.parent) as part:
-            with (part / beside).open("wb") as file:
-                size = write_images(file, ZLIB)
-            packed = size if compressed else None
-            (part / target.name).write_bytes(_meta_header(fields, frames, shape, kind, beside, packed))
-        return omitted
-    head = _meta_header(fields, frames, shape, kind, "LOCAL", 0 if compressed else None)
-    if suffix == ".nrrd":
-        is_slicers = target.name.lower().endswith(_OF_SLICER)
+    shape = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep))
+    if is_nrrd:
         encoding = "gzip" if compressed else "raw"
-        head = _nrrd_header(fields, frames, shape, nrrd_type(dtype), encoding, is_slicers)
+        head = _nrrd_header(fields, frames, shape, nrrd_type(dtype), encoding, name.endswith(_OF_SLICER))
+    else:
+        head = _meta_header(fields, frames, shape, meta_type(dtype), 0 if compressed else None)
+    pack = packer(GZIP if is_nrrd else ZLIB) if compressed else None
     with atomic_path(target) as place, place.open("wb") as file:
         file.write(head)
-        size = write_images(file, GZIP if suffix == ".nrrd" else ZLIB)
-        if compressed and suffix == ".mha":
-            put_packed_size(file, head, size)
+        for i in range(len(sweep)):
+            raw = _pixels(sweep.frames[i]).astype(dtype.newbyteorder("<"), order="C").data.cast("B")
+            file.write(raw if pack is None else pack.compress(raw))
+            if progress is not None:
+                progress(i + 1, len(sweep))
+        if pack is not None:
+            file.write(pack.flush())
+            if not is_nrrd:
+                put_packed_size(file, head, file.tell() - len(head))
     return omitted
+
+
+def _pixels(frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Pixels (y, x) of a frame (vector, sample): lines of echoes in rows, I and Q in turn; images upright."""
+    if frame.dtype.kind == "c":
+        return np.stack([frame.real, frame.imag], axis=2).reshape(len(frame), -1)
+    return frame.T if frame.dtype == np.uint8 else frame
 
 
 def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[str, FloatArray]) -> None:
@@ -185,7 +167,7 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     for name, matrices in transforms.items():
         _add(frames, name, matrices)
     with atomic_path(path) as part:
-        part.write_bytes(_meta_header({}, frames, (0, 0, len(frames)), "UCHAR", "LOCAL", None))
+        part.write_bytes(_meta_header({}, frames, (0, 0, len(frames)), "UCHAR", None))
 
 
 def _timed(times_s: FloatArray) -> list[dict[str, str]]:
@@ -282,7 +264,6 @@ def _meta_header(
     frames: list[dict[str, str]],
     shape: tuple[int, int, int],
     kind: str,
-    data: str,
     packed: int | None,
 ) -> bytes:
     lines = [
@@ -292,7 +273,7 @@ def _meta_header(
         "Kinds = domain domain list",
         *(f"{name} = {value}" for name, value in {"ElementSpacing": "1 1 1", **fields}.items()),
         *_frame_lines(frames, " = "),
-        f"ElementDataFile = {data}",
+        "ElementDataFile = LOCAL",
     ]
     return header_bytes(lines)
 

@@ -25,7 +25,7 @@ RF = ImportSettings(
 @pytest.mark.parametrize("make", [sweep_examples.bmode_sweep, sweep_examples.rf_sweep])
 @pytest.mark.parametrize(
     ("suffix", "compressed"),
-    [(".mha", True), (".mhd", False), (".seq.nrrd", False)],
+    [(".mha", True), (".seq.nrrd", False)],
 )
 def test_a_sweep_with_sensors_is_interpolated_at_its_frames(tmp_path, make, suffix, compressed):
     sweep = make()
@@ -115,7 +115,6 @@ def test_itk_reads_the_same_pixels(tmp_path, compressed):
 
     sweep = sweep_examples.rf_sweep()
     expected = np.stack([sweep.frames[i] for i in range(len(sweep))])
-    for name in ("a.mha", "a.mhd"):
-        write_sequence(tmp_path / name, sweep, compressed=compressed)
-        image = SimpleITK.ReadImage(str(tmp_path / name))
-        np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
+    write_sequence(tmp_path / "a.mha", sweep, compressed=compressed)
+    image = SimpleITK.ReadImage(str(tmp_path / "a.mha"))
+    np.testing.assert_array_equal(SimpleITK.GetArrayFromImage(image), expected)
