@@ -187,6 +187,11 @@ def _option(name: str, kind: Any, default: Any, info: Any, words: Words) -> insp
     return inspect.Parameter(name, only, default=default, annotation=Annotated[kind, info])
 
 
+def _unbounded(kind: Any) -> Any:
+    """A type without pydantic's bounds, of which typer knows nothing."""
+    return kind.__origin__ if get_origin(kind) is Annotated else kind
+
+
 def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
     """An option of a field: of its type if that is a word of a command, else text that the model reads."""
     kind: Any = field.annotation
@@ -195,9 +200,9 @@ def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
         members = [member for member in get_args(kind) if member is not type(None)]
         choices = tuple(value for member in members for value in get_args(member))
         kind = members[0] if len(members) == 1 else Literal[choices]
-    if get_origin(kind) is tuple:  # typer knows no bounds of a pair's numbers
-        plain = (one.__origin__ if hasattr(one, "__metadata__") else one for one in get_args(kind))
-        kind = tuple.__class_getitem__(tuple(plain))
+    if get_origin(kind) is tuple:
+        kind = tuple.__class_getitem__(tuple(map(_unbounded, get_args(kind))))
+    kind = _unbounded(kind)
     if field.metadata and any(hasattr(each, "write") for each in field.metadata):
         kind = str
     shown = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
