@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -105,29 +105,6 @@ class ImportSettings(BaseModel):
         default_factory=dict,
         description="arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which",
     )
-
-    def over(self, path: PathLike, **found: Any) -> dict[str, Any]:
-        """Put what is given over what a file says of the same names.
-
-        Parameters
-        ----------
-        path : path
-            The recording, for the message.
-        **found
-            By setting's name, the file's own value; None where it does not say and the value is needed.
-
-        Raises
-        ------
-        MissingSettingsError
-            Naming every setting that neither has.
-        """
-        values = {
-            name: own if (given := getattr(self, name)) is None else given for name, own in found.items()
-        }
-        lacking = tuple(name for name, value in values.items() if value is None)
-        if lacking:
-            raise MissingSettingsError(path, lacking)
-        return values
 
 
 class MissingSettingsError(InvalidInputError):

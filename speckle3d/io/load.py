@@ -6,14 +6,14 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
-from speckle3d.core.printable import printable, written_path
+from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, reading, require_file, sha256_of
+from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, sha256_of
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
 from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
@@ -81,13 +81,13 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
         raise InvalidInputError(
             f"{own}: expected none beside a {reader.format}, which says all itself: it would not be read"
         )
-    with reading(path), naming(str(path)):
+    with naming(str(path)):
         made = reader.read(path, settings)
     return made if isinstance(made, Recording) else Recording(path, settings, ready=made)
 
 
 def load_landmarks(path: PathLike) -> Landmarks | None:
-    """Read the landmarks that come with a sweep; None for all but scans of the TUS-REC challenge."""
+    """Landmarks that come with a sweep; None for all but scans of the TUS-REC challenge."""
     return challenge.read_landmarks(path) if kind_of(path) == challenge.FORMAT else None
 
 
@@ -99,9 +99,8 @@ def import_notes(path: PathLike, settings: ImportSettings | None = None) -> list
 
 def import_record(path: PathLike) -> ImportRecord | None:
     """Settings that a file beside a recording gives; None where there is none, or it would not be read."""
-    beside = settings_file(path)
-    reader = None if beside is None else find_reader(path)
-    if reader is None or beside is None or not reader.takes_settings:
+    beside, reader = settings_file(path), find_reader(path)
+    if beside is None or reader is None or not reader.takes_settings:
         return None
     return ImportRecord(written_path(beside.name), settings_for(path).model_dump_json(exclude_defaults=True))
 
@@ -155,21 +154,18 @@ def family_format(path: PathLike) -> str:
         If it is of no known kind.
     """
     known = ", ".join(reader.format for reader in readers())
-    if Path(path).is_dir():
-        raise FileError(f"{path}: expected a recording ({known}), got a folder that none of them is in")
-    require_file(path)
     start = first_bytes(path)
-    if not start.startswith(SIGNATURE):
-        got = "something else" if start else "an empty file"
-        if start.startswith(b"\x1f\x8b"):
-            got = "a file packed by gzip: unpack it first"
-        raise InvalidInputError(f"{path}: expected a recording ({known}), got {got}")
-    with reading(path), open_hdf5(path) as file:
-        kind = file_format(file)
-        if not kind.startswith("speckle3d."):
-            held = ", ".join(printable(str(name)) for name in file) or "nothing"
-            raise InvalidInputError(
-                f"{path}: HDF5, but none of the kinds that are read: it holds {held[:200]}: "
-                "`speckle3d convert` reads zea, USTB and MATLAB 7.3"
-            )
-        return kind
+    if start.startswith(SIGNATURE):
+        with open_hdf5(path) as file:
+            kind = file_format(file)
+            if kind.startswith("speckle3d."):
+                return kind
+            got = f"HDF5 of another kind, with {', '.join(map(str, file)) or 'nothing'}"[:200]
+    elif start.startswith(b"\x1f\x8b"):
+        got = "a file packed by gzip: unpack it first"
+    else:
+        got = "another file" if Path(path).is_file() else "a folder that none of them is in"
+    raise InvalidInputError(
+        f"{path}: expected a recording ({known}), got {got}. Logs of sensors are for `speckle3d imu info`, "
+        "paths of poses for `speckle3d trajectory score`"
+    )

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 
@@ -133,13 +133,12 @@ class Recording:
     ready: Sweep | None = None
 
     @classmethod
-    def of(cls, path: Path, settings: ImportSettings, rows: list[Row], make: Callable[[], Recording]) -> Self:
+    def of(cls, path: Path, settings: ImportSettings, rows: list[Row], make: Callable[[], Self]) -> Self:
         """What a reader makes, after rows of facts; where it cannot, those facts and why."""
         try:
-            made = make()
+            return replace(make(), rows=tuple(rows))
         except (InvalidInputError, FileError) as error:
             return cls(path, settings, fault=error, rows=tuple(rows))
-        return cast("Self", replace(made, rows=(*rows, *made.rows)))
 
     @property
     def sweep(self) -> Sweep:
@@ -157,40 +156,39 @@ class Recording:
     @property
     def notes(self) -> list[str]:
         """What a user should know of how the sweep was made."""
-        told = [self._told(name, one) for name, one in self.needed.items()]
-        assumed = [*filter(None, (assumption for _, _, assumption in told)), *self.assumptions]
-        words = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
-        return [*self.contradictions(), *self._timed[2], *self.remarks, *self._checked[1], *words]
+        words = {name: number_row(name, one.value) for name, one in self.needed.items() if one.is_assumed}
+        assumed = [" ".join(row) for name, row in words.items() if getattr(self.settings, name) is None]
+        assumed += self.assumptions
+        told = [f"assumed, as the file does not say: {', '.join(assumed)}"] if assumed else []
+        return [*self.contradictions(), *self._timed[2], *self.remarks, *self._checked[1], *told]
 
     def describe(self) -> list[Row]:
         """Rows of what the file says, where each number is from, and what is odd."""
-        numbers = [] if self.fault else [self._told(name, one)[0] for name, one in self.needed.items()]
         remarks = [*self._timed[2], *self.remarks]
         with suppress(InvalidInputError, FileError):  # which is told by who asks for the sweep
             remarks += self._checked[1]
+        numbers = () if self.fault else (self._told(name, one)[0] for name, one in self.needed.items())
         return [*self.rows, *numbers, *(("note", text, "") for text in remarks)]
 
     def contradictions(self) -> list[str]:
         """Tell each number that is given and is another than the recording says, by more than 1 %."""
-        told = (self._told(name, one)[1] for name, one in self.needed.items())
-        return [*filter(None, told)]
+        return [*filter(None, (self._told(name, one)[1] for name, one in self.needed.items()))]
 
-    def _told(self, name: str, one: Value) -> tuple[Row, str, str]:
-        """A number's row, what contradicts it if it is given, and words for what is assumed."""
+    def _told(self, name: str, one: Value) -> tuple[Row, str]:
+        """A number's row, and what contradicts it if it is given."""
         given, source = getattr(self.settings, name), f" ({one.source})" if one.source else ""
         words, own, unit = number_row(name, () if one.value is None else one.value)
         if given is None:
             asked = f"missing: --{self.asked.get(name, name).replace('_', '-')}"
-            assumption = f"{words} {own} {unit}" if one.is_assumed else ""
-            return (words, f"{own}{source}" if own else asked, unit if own else ""), "", assumption
+            return ((words, f"{own}{source}", unit) if own else (words, asked, "")), ""
         file, shown = settings_file(self.path), number_row(name, given)[1]
         is_of_file = file is not None and getattr(settings_for(self.path), name) == given
         by = f"given by {file.name}" if file is not None and is_of_file else "given"
         if not own or one.is_assumed or shown == own:
-            return (words, f"{shown} ({by})", unit), "", ""
-        against, is_far = f"{one.said_by} says {own}", differs(given, one.value)
-        contradiction = f"{words} {shown} {unit}, {by}: {against}{source}" if is_far else ""
-        return (words, f"{shown} ({by}, {against})", unit), contradiction, ""
+            return (words, f"{shown} ({by})", unit), ""
+        against = f"{one.said_by} says {own}"
+        contradiction = f"{words} {shown} {unit}, {by}: {against}{source}"
+        return (words, f"{shown} ({by}, {against})", unit), contradiction * differs(given, one.value)
 
     @cached_property
     def needed(self) -> dict[str, Value]:
@@ -198,26 +196,23 @@ class Recording:
         if self.frames is None:
             return {}
         dtype = np.dtype(self.frames.dtype)
-        names = ["first_sample_depth_mm"]
-        if dtype == np.uint8:
-            names += ["column_pitch_mm", "row_spacing_mm", "dynamic_range_db"]
-        else:
-            names += ["vector_pitch_mm", "speed_of_sound_m_s", *_RATES]
-        if any(name in self.values or getattr(self.settings, name) is not None for name in _SPREADING):
-            names = [name for name in names if name not in ("vector_pitch_mm", "column_pitch_mm")]
-            names += _SPREADING
+        known = {*self.values, *(name for name, value in self.settings if value is not None)}
+        is_grey, is_fan = dtype == np.uint8, not known.isdisjoint(_SPREADING)
+        pitch = "column_pitch_mm" if is_grey else "vector_pitch_mm"
+        names = ["first_sample_depth_mm", *(_SPREADING if is_fan else [pitch])]
+        names += ["row_spacing_mm", "dynamic_range_db"] if is_grey else ["speed_of_sound_m_s", *_RATES]
         if dtype.kind == "c":
             names.append("demodulation_frequency_hz")
         times, given_rate = self._timed[0], self.settings.frame_rate_hz is not None
         if given_rate or (times is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
         own = {"column_pitch_mm": self.values.get("vector_pitch_mm", Value())} | ASSUMED | {**self.values}
-        needed = {name: own.get(name, Value()) for name in names}
-        if given_rate and times is not None and "frame_rate_hz" not in self.values:
-            needed["frame_rate_hz"] = Value(rate_of(times), "of its times")
-        if "sampling_rate_hz" in needed and "sampling_rate_hz" not in own and "row_spacing_mm" in own:
-            needed["sampling_rate_hz"] = rate_by_spacing(own["row_spacing_mm"], self.settings, own)
-        return needed
+        if given_rate and times is not None:
+            own = {"frame_rate_hz": Value(rate_of(times), "of its times")} | own
+        spacing = own.get("row_spacing_mm", Value())
+        if "sampling_rate_hz" not in own and spacing.value is not None:
+            own["sampling_rate_hz"] = rate_by_spacing(spacing, self.settings, own)
+        return {name: own.get(name, Value()) for name in names}
 
     @cached_property
     def _timed(self) -> tuple[FloatArray | None, Any, list[str]]:
@@ -247,8 +242,8 @@ class Recording:
         if frames is None or 0 in frames.shape:
             shape = None if frames is None else frames.shape
             raise InvalidInputError(f"{self.path}: expected frames, got shape {shape}")
-        values = {name: getattr(self.settings, name) for name in self.needed}
-        values = {name: self.needed[name].value if one is None else one for name, one in values.items()}
+        own = {name: one.value for name, one in self.needed.items()}
+        values = own | {name: one for name, one in self.settings if name in own and one is not None}
         if lacking := [self.asked.get(name, name) for name, one in values.items() if one is None]:
             raise MissingSettingsError(self.path, tuple(lacking))
         if (rate_hz := values.get("frame_rate_hz")) is not None:
@@ -348,18 +343,16 @@ def number_row(name: str, value: Any) -> Row:
 
 
 _BOUNDS = {
-    "vector_pitch_mm": (0.005, 5.0, "mm"),
-    "sample_spacing_mm": (0.0005, 5.0, "mm"),
-    "first_sample_depth_mm": (-50.0, 400.0, "mm"),
-    "depth_mm": (0.0, 1000.0, "mm"),
-    "sampling_rate_hz": (2e5, 2e9, "Hz"),
-    "centre_frequency_hz": (1e5, 3e8, "Hz"),
-    "speed_of_sound_m_s": (300.0, 5000.0, "m/s"),
+    "vector_pitch_mm": (0.005, 5.0),
+    "sample_spacing_mm": (0.0005, 5.0),
+    "first_sample_depth_mm": (-50.0, 400.0),
+    "depth_mm": (0.0, 1000.0),
+    "sampling_rate_hz": (2e5, 2e9),
+    "centre_frequency_hz": (1e5, 3e8),
+    "speed_of_sound_m_s": (300.0, 5000.0),
+    "frame_interval_s": (1e-4, 20.0),
 }
-"""Lowest, highest, unit."""
-
-_INTERVAL_S = (1e-4, 20.0)
-"""Between frames: hands are imaged 5 to 100 times a second."""
+"""Lowest and highest, well beyond what scanners have; hands are imaged 5 to 100 times a second."""
 
 _CENTRE = 1.5
 """How far the centre may lie outside the band, as a factor: transmit frequencies are written for it."""
@@ -373,25 +366,20 @@ def require_plausible(sweep: Sweep) -> None:
     InvalidInputError
         Naming the number, and that its unit may be another.
     """
-    signal = sweep.signal
-    for holder in (sweep.grid, signal):
-        for name, (low, high, unit) in _BOUNDS.items():
-            value = getattr(holder, name, None)
-            if value is not None and not low <= value <= high:
-                raise InvalidInputError(
-                    f"{name}: expected {low:g} to {high:g} {unit}, got {value:g}: is it in another unit?"
-                )
-    if isinstance(signal, RFSettings):
-        low_hz, high_hz = signal.bandwidth_hz
-        if not low_hz / _CENTRE <= signal.centre_frequency_hz <= high_hz * _CENTRE:
+    signal, times = sweep.signal, sweep.frame_time_s
+    numbers = {name: getattr(sweep.grid, name, getattr(signal, name, None)) for name in _BOUNDS}
+    if times.size > 1:
+        numbers["frame_interval_s"] = float(np.median(np.diff(times)))
+    for name, value in numbers.items():
+        low, high = _BOUNDS[name]
+        if value is not None and not low <= value <= high:
             raise InvalidInputError(
-                f"centre_frequency_hz: expected one near the band, {low_hz:g} to {high_hz:g} Hz, got "
-                f"{signal.centre_frequency_hz:g}"
+                f"{name}: expected {low:g} to {high:g}, got {value:g}: is it in another unit?"
             )
-    if len(sweep) > 1:
-        interval_s = float(np.median(np.diff(sweep.frame_time_s)))
-        if not _INTERVAL_S[0] <= interval_s <= _INTERVAL_S[1]:
+    if isinstance(signal, RFSettings):
+        low, high = signal.bandwidth_hz
+        if not low / _CENTRE <= signal.centre_frequency_hz <= high * _CENTRE:
             raise InvalidInputError(
-                f"frame times: expected frames {_INTERVAL_S[0]:g} to {_INTERVAL_S[1]:g} s apart, got "
-                f"{interval_s:g} s: are they in another unit? (--frame-rate-hz replaces them)"
+                f"centre_frequency_hz: expected one near the band, {low:g} to {high:g} Hz, got "
+                f"{signal.centre_frequency_hz:g}"
             )

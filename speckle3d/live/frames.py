@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,10 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.core.sweep import Sweep
 from speckle3d.io.igtl.messages import ImageReceived
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError
+from speckle3d.io.recordings import Recording, Value
 
 _ECHOES, _GREY_LEVELS = ("int16", "float32"), "uint8"
 
@@ -68,7 +70,7 @@ class ImageLayout:
                 f"got {pixels.dtype}"
             )
         try:
-            example = _echoes(pixels, settings, where) if of_rf else _grey(pixels, image, settings, where)
+            example = _example(pixels, image, settings, where)
         except MissingSettingsError as error:
             options = ", ".join(f"--{name.replace('_', '-')}" for name in error.settings)
             raise MissingSettingsError(
@@ -122,36 +124,17 @@ def _plane(image: ImageReceived, where: str) -> npt.NDArray[Any]:
     return pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
 
 
-def _echoes(pixels: npt.NDArray[Any], settings: ImportSettings, where: str) -> Sweep:
-    if settings.demodulation_frequency_hz is not None:
-        raise InvalidInputError(
-            f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz"
-        )
-    needed = ("sampling_rate_hz", "speed_of_sound_m_s", "centre_frequency_hz", "bandwidth_hz")
-    known = settings.over(where, **dict.fromkeys((*needed, "vector_pitch_mm")), first_sample_depth_mm=0.0)
-    return Sweep.from_arrays(
-        np.zeros_like(pixels)[None],
-        pitch_mm=known["vector_pitch_mm"],
-        frame_time_s=[0.0],
-        signal=RFSettings(*(known[name] for name in needed)),
-        first_row_depth_mm=known["first_sample_depth_mm"],
-    )
-
-
-def _grey(pixels: npt.NDArray[Any], image: ImageReceived, settings: ImportSettings, where: str) -> Sweep:
-    spacing_mm = image.spacing_mm[:2]
-    said = spacing_mm if np.all(spacing_mm > 0) and not np.all(spacing_mm == 1.0) else [None, None]
-    known = settings.over(
-        where,
-        column_pitch_mm=said[0],
-        row_spacing_mm=said[1],
-        dynamic_range_db=None,
-        first_sample_depth_mm=0.0,
-    )
-    return Sweep.from_arrays(
-        np.zeros_like(pixels.T)[None],
-        pitch_mm=(float(known["column_pitch_mm"]), float(known["row_spacing_mm"])),
-        frame_time_s=[0.0],
-        dynamic_range_db=known["dynamic_range_db"],
-        first_row_depth_mm=known["first_sample_depth_mm"],
-    )
+def _example(pixels: npt.NDArray[Any], image: ImageReceived, settings: ImportSettings, where: str) -> Sweep:
+    """A sweep of one black frame; the speed of sound is asked for, as nothing told of it is seen later."""
+    if pixels.dtype != _GREY_LEVELS:
+        if settings.demodulation_frequency_hz is not None:
+            raise InvalidInputError(
+                f"{where}: expected RF, whose samples are real, got --demodulation-frequency-hz"
+            )
+        values, black = {"speed_of_sound_m_s": Value()}, np.zeros_like(pixels.T)
+    else:
+        column_mm, row_mm = image.spacing_mm[:2].tolist()
+        is_said = column_mm > 0 < row_mm and (column_mm, row_mm) != (1.0, 1.0)
+        sizes = {"column_pitch_mm": Value(column_mm), "row_spacing_mm": Value(row_mm)}
+        values, black = sizes if is_said else {}, np.zeros_like(pixels)
+    return Recording(Path(where), settings, black[None], values).sweep

@@ -14,6 +14,7 @@ from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
 from speckle3d.io.load import load_sweep, recording_files, recording_sha256
 from speckle3d.io.readers import Reader, find_reader
+from speckle3d.io.recordings import Recording, Value
 
 BMODE = "column_pitch_mm = 0.1\nrow_spacing_mm = 0.2\ndynamic_range_db = 60\n"
 
@@ -47,12 +48,10 @@ def test_the_hash_of_a_recording_covers_what_stands_beside_it(images):
 def folders(monkeypatch):
     """A reader of another package, for folders with a file `frames.npy`."""
 
-    def read(path: Path, settings: ImportSettings) -> Sweep:
-        given = settings.over(path, frame_rate_hz=None, column_pitch_mm=None)
+    def read(path: Path, settings: ImportSettings) -> Recording:
         frames = np.load(path / "frames.npy")
-        grid = ImageGrid(frames.shape[1], frames.shape[2], given["column_pitch_mm"], 0.1)
-        times = np.arange(len(frames)) / given["frame_rate_hz"]
-        return Sweep(frames, grid, BModeSettings(60.0), times, name=path.name)
+        values = {"row_spacing_mm": Value(0.1), "dynamic_range_db": Value(60.0)}
+        return Recording(path, settings, frames, values, name=path.name)
 
     reader = Reader(
         "folder of a lab",
@@ -71,7 +70,7 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path, mo
     scan.mkdir()
     np.save(scan / "frames.npy", np.zeros((3, 4, 5), dtype=np.uint8))
     assert find_reader(scan) is folders
-    with pytest.raises(MissingSettingsError, match=r"--frame-rate-hz.*--column-pitch-mm"):
+    with pytest.raises(MissingSettingsError, match=r"--column-pitch-mm.*--frame-rate-hz"):
         load_sweep(scan)
     (tmp_path / "scan.toml").write_text("frame_rate_hz = 10\ncolumn_pitch_mm = 0.3\n")
     rows = {name: value for name, value, _ in describe(scan)}
@@ -89,7 +88,7 @@ def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path, mo
     [
         ("column_pitch_mm", 300.0, "vector_pitch_mm: .*another unit"),
         ("row_spacing_mm", 0.0002, "sample_spacing_mm"),
-        ("frame_rate_hz", 25000.0, "frame times"),
+        ("frame_rate_hz", 25000.0, "frame_interval_s"),
     ],
 )
 def test_numbers_in_another_unit_are_refused(tmp_path, name, value, said):

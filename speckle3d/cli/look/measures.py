@@ -53,7 +53,8 @@ def measure(
     --------
     $ speckle3d measure out/reconstruction.h5 --point 3,10,1 --point 3,12,9
     """
-    from speckle3d.io.reconstructions import read_reconstruction
+    from speckle3d.io.load import kind_of
+    from speckle3d.io.reconstructions import FORMAT, read_reconstruction
     from speckle3d.io.shapes.picks import PICTURE, WORLD, parse_places, read_places
     from speckle3d.scoring.modes import default_mode
     from speckle3d.scoring.trajectories import poses_of
@@ -69,6 +70,11 @@ def measure(
     if pick_mm is not None and not 0.0 <= pick_mm < float("inf"):
         raise InvalidInputError(f"--pick-mm: expected zero or more, got {pick_mm}")
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
+    if (kind := kind_of(reconstruction_file)) != FORMAT:
+        raise InvalidInputError(
+            f"{reconstruction_file}: expected reconstruction.h5 of a results folder, with its errors, "
+            f"got {kind}: `speckle3d reconstruct` makes one of a sweep"
+        )
     made, why = read_reconstruction(reconstruction_file, with_pairs=False), ""
     if on is not None:
         shown = read_plane(on, mode)
