@@ -131,7 +131,7 @@ def test_a_connection_waits_for_its_server_and_reconnects():
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     with Connection("127.0.0.1", port) as connection:
-        until(lambda: "refused" in connection.state.last_failure)
+        until(lambda: "Connect call failed" in connection.state.last_failure)
         assert not connection.state.connected
         for k in range(2):
             with Server(port) as server:

@@ -5,15 +5,16 @@ Each end has one thread, which connects, reads and writes: nobody else waits for
 
 from __future__ import annotations
 
+import asyncio
 import queue
-import select
 import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Self
+from dataclasses import dataclass, field
+from typing import Self
 
 from speckle3d.core.errors import FileError
 from speckle3d.io.igtl.messages import HEADER, MessageError, Received, body_bytes, decode
@@ -22,10 +23,10 @@ DEFAULT_PORT = 18944
 """Registered for OpenIGTLink."""
 
 STALL_S = 10.0
-"""Longest pause within a message."""
+"""Longest time that a message may take."""
 
-_LOOK_S, _FULL_S = 0.1, 0.005
-"""Longest wait for the network, and where messages have to be taken first."""
+_LOOK_S = 0.005
+"""Between two looks at what another thread does."""
 _CONNECT_S = 5.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
 """Between two attempts to connect; doubled from one to the next."""
@@ -66,23 +67,13 @@ class LinkState:
     last_failure: str = ""
 
 
+@dataclass
 class _Peer:
-    """A connected socket: bytes of a message that is not whole yet, and messages to send."""
+    """Messages to send to a connected peer."""
 
-    def __init__(self, connected: socket.socket) -> None:
-        connected.setblocking(False)
-        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        self.socket, self.heard_s = connected, time.monotonic()
-        self.content, self.outbox, self.left = (
-            bytearray(),
-            deque[bytes](maxlen=_MOST_SENDING),
-            memoryview(b""),
-        )
-
-    def fileno(self) -> int:
-        """Of the socket, for `select`."""
-        return self.socket.fileno()
+    outbox: deque[bytes] = field(default_factory=lambda: deque(maxlen=_MOST_SENDING))
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
+    is_sending: bool = False
 
 
 class End:
@@ -95,8 +86,7 @@ class End:
     def __init__(self) -> None:
         self._inbox: queue.Queue[Received] = queue.Queue(_MOST_RECEIVED)
         self._peers: list[_Peer] = []
-        self._changed, self._over = threading.Condition(), threading.Event()
-        self._woken, self._wake = socket.socketpair()
+        self._loop, self._over = asyncio.new_event_loop(), asyncio.Event()
         self._made = self._dropped = self._messages = self._refused = 0
         self._last_refused = self._last_failure = ""
         self._heard_s = time.monotonic()
@@ -111,19 +101,14 @@ class End:
 
     def close(self) -> None:
         """End all connections; what was received and not taken can still be taken."""
-        self._over.set()
-        with suppress(OSError):  # closed already
-            self._wake.send(b"\0")
+        with suppress(RuntimeError):  # closed already
+            self._loop.call_soon_threadsafe(self._over.set)
         if self._thread.is_alive():
             self._thread.join()
-        for one in (*(peer.socket for peer in self._peers), self._wake, self._woken):
-            one.close()
-        self._peers = []
 
     def wait_connected(self, timeout_s: float) -> bool:
         """Wait for a peer; whether there is one."""
-        with self._changed:
-            return self._changed.wait_for(lambda: bool(self._peers), timeout_s)
+        return _until(lambda: bool(self._peers), timeout_s)
 
     def receive(self, timeout_s: float) -> list[Received]:
         """Take all messages in the order in which they came, waiting for the first one.
@@ -145,7 +130,8 @@ class End:
         for peer in list(self._peers):
             self._dropped += len(peer.outbox) == peer.outbox.maxlen
             peer.outbox.append(message)
-        self._wake.send(b"\0")
+            with suppress(RuntimeError):  # closed meanwhile
+                self._loop.call_soon_threadsafe(peer.wake.set)
 
     @property
     def state(self) -> LinkState:
@@ -155,75 +141,83 @@ class End:
             self._dropped, time.monotonic() - self._heard_s, self._last_failure,
         )  # fmt: skip
 
-    def _connect(self) -> list[socket.socket]:
-        """Make connections, if need be; returns sockets to look at beside those of peers."""
+    async def _serve(self) -> None:
+        """Make connections, for ever."""
         raise NotImplementedError
 
     def _run(self) -> None:
-        while not self._over.is_set():
-            more, is_full = self._connect(), self._inbox.full()
-            reading = [] if is_full else self._peers
-            writing = [peer for peer in self._peers if peer.outbox or peer.left]
-            wait_s = _FULL_S if is_full else _LOOK_S
-            looked_at: list[Any] = [self._woken, *more, *reading]
-            readable, writable, _ = select.select(looked_at, writing, [], wait_s)
-            if self._woken in readable:
-                self._woken.recv(_PIECE_BYTES)
-            for peer in list(self._peers):
-                try:
-                    if peer in writable:
-                        if not peer.left:
-                            peer.left = memoryview(peer.outbox[0])  # never neither here nor there
-                            peer.outbox.popleft()
-                        peer.left = peer.left[peer.socket.send(peer.left) :]
-                    if peer in readable:
-                        self._read(peer)
-                    elif peer.content and time.monotonic() - peer.heard_s > STALL_S:
-                        raise ConnectionError(f"expected the rest of a message, got none for {STALL_S:g} s")
-                except BlockingIOError:
-                    pass
-                except (OSError, MessageError) as error:
-                    self._last_failure = str(error)
-                    self._peers.remove(peer)
-                    peer.socket.close()
+        async def serve() -> None:
+            serving = asyncio.create_task(self._serve())
+            await self._over.wait()
+            serving.cancel()
 
-    def _add(self, connected: socket.socket) -> None:
-        with self._changed:
-            self._peers.append(_Peer(connected))
-            self._made += 1
-            self._changed.notify_all()
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:  # which ends all that still runs
+            runner.run(serve())
 
-    def _read(self, peer: _Peer) -> None:
-        """Take what came, and of it the messages that are whole."""
-        came = peer.socket.recv(_PIECE_BYTES)
-        if not came:
-            raise ConnectionError(f"closed by the peer{' within a message' if peer.content else ''}")
-        peer.content += came
-        self._heard_s = peer.heard_s = time.monotonic()
-        while len(peer.content) >= HEADER.size and not self._over.is_set():
-            start = bytes(peer.content[: HEADER.size])
+    async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Read and write until the connection is lost."""
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        peer = _Peer()
+        tasks = [asyncio.create_task(self._read(reader)), asyncio.create_task(self._write(peer, writer))]
+        self._peers.append(peer)
+        self._made += 1
+        try:
+            await asyncio.gather(*tasks)
+        except (OSError, MessageError) as error:
+            self._last_failure = str(error)
+        finally:
+            self._peers.remove(peer)
+            for task in tasks:
+                task.cancel()
+            writer.transport.abort()
+
+    async def _write(self, peer: _Peer, writer: asyncio.StreamWriter) -> None:
+        writer.transport.set_write_buffer_limits(0)  # so that `drain` waits until all is sent
+        while await peer.wake.wait():
+            peer.wake.clear()
+            while peer.outbox:
+                peer.is_sending = True
+                writer.write(peer.outbox.popleft())
+                await writer.drain()
+                peer.is_sending = False
+
+    async def _read(self, reader: asyncio.StreamReader) -> None:
+        while start := await reader.read(1):
             try:
-                stop = HEADER.size + body_bytes(start)
+                async with asyncio.timeout(STALL_S):
+                    start += await reader.readexactly(HEADER.size - 1)
+                    body = await reader.readexactly(body_bytes(start))
+                self._heard_s = time.monotonic()
+            except EOFError as error:
+                raise ConnectionError("closed by the peer within a message") from error
+            except TimeoutError as error:
+                raise ConnectionError(f"expected a whole message within {STALL_S:g} s") from error
             except MessageError as error:
                 self._refuse(error)
                 raise
-            if len(peer.content) < stop:
-                return
-            body = bytes(peer.content[HEADER.size : stop])
-            del peer.content[:stop]
             try:
                 message = decode(start, body)
             except MessageError as error:
                 self._refuse(error)
                 continue
-            while not self._over.is_set():
-                with suppress(queue.Full):
-                    self._inbox.put(message, timeout=_LOOK_S)
-                    self._messages += 1
-                    break
+            while self._inbox.full():
+                await asyncio.sleep(_LOOK_S)
+            self._inbox.put_nowait(message)
+            self._messages += 1
+        raise ConnectionError("closed by the peer")
 
     def _refuse(self, error: MessageError) -> None:
         self._refused, self._last_refused = self._refused + 1, str(error)
+
+
+def _until(is_so: Callable[[], bool], timeout_s: float) -> bool:
+    """Wait for what another thread does; whether it was in time."""
+    end_s = time.monotonic() + timeout_s
+    while not is_so():
+        if time.monotonic() > end_s:
+            return False
+        time.sleep(_LOOK_S)
+    return True
 
 
 class Connection(End):
@@ -248,20 +242,22 @@ class Connection(End):
 
     def __init__(self, host: str, port: int) -> None:
         super().__init__()
-        self._address, self._pause_s, self._before = (host, port), 0.0, 0
+        self._address = host, port
 
-    def _connect(self) -> list[socket.socket]:
-        if self._peers or self._over.wait(self._pause_s):
-            return []
-        # A server that closes at once is no better than none.
-        longer = min(2 * self._pause_s, _LONGEST_PAUSE_S)
-        self._pause_s = max(_FIRST_PAUSE_S, longer if self._messages == self._before else 0.0)
-        self._before = self._messages
-        try:
-            self._add(socket.create_connection(self._address, timeout=_CONNECT_S))
-        except (OSError, UnicodeError) as error:  # Unicode: a host that cannot be a name
-            self._last_failure = str(error)
-        return []
+    async def _serve(self) -> None:
+        pause_s = _FIRST_PAUSE_S
+        while True:
+            before = self._messages
+            try:
+                async with asyncio.timeout(_CONNECT_S):
+                    streams = await asyncio.open_connection(*self._address, limit=_PIECE_BYTES)
+                await self._talk(*streams)
+            except (OSError, UnicodeError) as error:  # Unicode: a host that cannot be a name
+                self._last_failure = str(error)
+            # A server that closes at once is no better than none.
+            is_better = self._messages > before
+            pause_s = _FIRST_PAUSE_S if is_better else min(2 * pause_s, _LONGEST_PAUSE_S)
+            await asyncio.sleep(pause_s)
 
 
 class Server(End):
@@ -287,7 +283,6 @@ class Server(End):
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise FileError(f"{address}:{port}: expected a free port to listen on: {reason}") from error
-        self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
 
     def close(self) -> None:
@@ -297,19 +292,16 @@ class Server(End):
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until all clients were sent everything; whether they were in time."""
-        end_s = time.monotonic() + timeout_s
-        while any(peer.outbox or peer.left for peer in list(self._peers)):
-            if time.monotonic() > end_s:
-                return False
-            time.sleep(_LOOK_S / 10)
-        return True
+        return _until(lambda: not any(one.outbox or one.is_sending for one in list(self._peers)), timeout_s)
 
     @property
     def clients(self) -> int:
         """How many are connected."""
         return len(self._peers)
 
-    def _connect(self) -> list[socket.socket]:
-        with suppress(OSError):  # there is none, or it was gone before it was accepted
-            self._add(self._socket.accept()[0])
-        return [self._socket]
+    async def _serve(self) -> None:
+        async def welcome(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            with suppress(asyncio.CancelledError):  # of which asyncio would print a traceback
+                await self._talk(reader, writer)
+
+        await asyncio.start_server(welcome, sock=self._socket, limit=_PIECE_BYTES)
