@@ -7,8 +7,7 @@ import pytest
 from image_examples import grey, tracked, write_mha
 
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.sweep import BModeSettings, Sweep
+from speckle3d.core.sweep import BModeSettings
 from speckle3d.io import readers
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
