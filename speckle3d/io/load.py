@@ -6,14 +6,14 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.printable import written_path
 from speckle3d.core.reconstruction import ImportRecord
 from speckle3d.core.sweep import Sweep
 from speckle3d.io import challenge, sweeps
 from speckle3d.io.challenge import Landmarks
-from speckle3d.io.hdf5 import SIGNATURE, file_format, open_hdf5, sha256_of
+from speckle3d.io.hdf5 import SIGNATURE, file_format, one_line, open_hdf5, sha256_of
 from speckle3d.io.import_settings import ImportSettings, settings_file, settings_for
 from speckle3d.io.metaimage import READER as _IMAGES
 from speckle3d.io.readers import Reader, find_reader, first_bytes, readers
@@ -81,8 +81,13 @@ def recording_of(reader: Reader, path: Path, settings: ImportSettings) -> Record
         raise InvalidInputError(
             f"{own}: expected none beside a {reader.format}, which says all itself: it would not be read"
         )
-    with naming(str(path)):
-        made = reader.read(path, settings)
+    try:
+        with naming(str(path)):
+            made = reader.read(path, settings)
+    except Speckle3DError:
+        raise
+    except (OSError, RuntimeError) as error:  # h5py's, of damage where nothing else is asked for
+        raise FileError(f"{path}: cannot be read: {one_line(error)}") from error
     return made if isinstance(made, Recording) else Recording(path, settings, ready=made)
 
 
