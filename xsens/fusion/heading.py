@@ -22,11 +22,11 @@ References
    noise", ICASSP 2013 (readings off the model).
 .. [3] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems",
    AIAA J., 1965 (the smoother).
+.. [4] V. H. de la Pena, T. L. Lai, Q.-M. Shao, "Self-normalized processes", Springer, 2009.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -36,23 +36,20 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import heading as kernel
 from xsens.fusion.settings import FusionSettings
 
-_FIRST, _BESIDE, _IRON = range(3)
+_FILTERS = 3
+_FIRST, _BESIDE, _IRON = range(_FILTERS)
 """The three filters."""
 
-_ODDS = np.array([0.0, 3.0, 100.0])
-"""Logarithms of the odds against each: one recording in twenty begins beside iron. Of BROAD's undisturbed
-trials, six have less than 25 of evidence for iron that is not there, one 240; a magnet of a tenth of the
-field has 170 in a minute of turning."""
+_BESIDE_ODDS, _IRON_ODDS = 3.0, 4.0
+"""Logarithms of the odds against each: one recording in twenty begins beside iron, one in fifty has it on the
+sensor. Until the sensor turns, what is claimed with iron is what these odds make of it."""
 
-_ALIKE = 18.0
-"""Bins that tell as much of iron as one: an uneven field lasts some seconds of movement. So what is claimed
-covers both headings until the evidence is plain. Simulated iron of 30 uT: errors of 4.5 claims become 2.5."""
+_PLAIN = 100.0
+"""Logarithm of the likelihood from which the heading is that with iron: claims cover both before. An uneven
+field has as much in one place; BROAD's undisturbed trials have less than 60, one 190, in which both agree."""
 
 _STRAY = 0.01
 """At first: of the norm, per component; a room without iron near."""
-
-_MEMORY_S = 300.0
-"""Time over which evidence is weighed while samples arrive; a recording is weighed as a whole."""
 
 _FIRST_STRAY = 0.25
 """The first reading's stray while samples arrive, as a fraction: the first readings are all there is, and a
@@ -138,7 +135,7 @@ class HeadingFilter:
     """The three filters, bin by bin; `online` if the readings so far are all there is."""
 
     def __init__(self, settings: FusionSettings, online: bool = True) -> None:
-        self._models = np.zeros(len(_ODDS), kernel.MODEL)
+        self._models = np.zeros(_FILTERS, kernel.MODEL)
         self._models["iron"] = 0.002  # what a calibration leaves
         self._models["iron"][_IRON], self._models["iron_put_on"][_IRON] = 0.7, 0.15
         self._models["first_place"], self._models["first_place"][_BESIDE] = settings.field_first_place, 0.3
@@ -147,12 +144,12 @@ class HeadingFilter:
         self._models["white_sqrt_s"] = settings.field_noise_sqrt_s
         self._models["lag_s"] = settings.magnetometer_lag_s
         self._models["first_stray"] = _FIRST_STRAY if online else 1.0
-        self._models["memory_s"] = _MEMORY_S if online else math.inf
         self._begin(_STRAY)
 
     def _begin(self, stray: float) -> None:
-        self._filters = np.zeros(len(_ODDS), kernel.FILTER)
+        self._filters = np.zeros(_FILTERS, kernel.FILTER)
         self._filters["stray"] = stray
+        self._evidence = np.zeros((1, 4))  # for iron over each of the others, and its squares
 
     def resume(self) -> None:
         """Find north again after a pause; keep iron, lag and the evidence."""
@@ -161,25 +158,43 @@ class HeadingFilter:
     def follow(self, bins: Any) -> FloatArray:
         """Take in bins; returns `NORTH` of each."""
         rows = self._run(bins)
-        return _mean(rows, _weights(rows), bins)
+        return _combined(rows, *self._weights(rows), bins)
 
     def smooth(self, bins: Any) -> FloatArray:
         """North over a whole stretch, smoothed backward; the stray at first is the recording's."""
         bins["bias"] = 0.0  # with a smoothed bias, there is no better one to come
         rows, moving = self._run(bins), ~bins["resting"]
-        best = _weights(rows[-1]).argmax()
+        best = self._weights(rows)[1][-1]
         self._begin(max(float(np.median(rows["stray"][moving, best])) if moving.any() else 0.0, _STRAY))
-        filtered = _shaped(len(_ODDS), len(bins))
+        filtered = _shaped(_FILTERS, len(bins))
         rows = self._run(bins, filtered)
-        weights = _weights(rows[-1])
+        weights, best = (values[-1] for values in self._weights(rows))
         weights[weights < _NEGLIGIBLE] = 0.0
-        for j in np.flatnonzero(weights):
+        for j in np.union1d(np.flatnonzero(weights), best):
             rows["turn_rad"][:, j], rows["variance"][:, j] = _backward(*(each[j] for each in filtered))
-        return _mean(rows, np.tile(weights, (len(bins), 1)), bins)
+        return _combined(rows, np.tile(weights, (len(bins), 1)), np.full(len(bins), best), bins)
+
+    def _weights(self, rows: Any) -> tuple[FloatArray, IntArray]:
+        """Weights of the filters after each bin, shape (n, filters), and the one whose heading is taken.
+
+        Evidence counts by its sum over its own scatter [4]_, which is at least twice the sum: what comes in
+        bursts, as of an uneven field, proves little however large it is, and no bin more than half.
+        """
+        gain = rows["evidence"][:, _IRON:] - rows["evidence"][:, :_IRON]
+        sums = np.cumsum(np.vstack([self._evidence, np.hstack([gain, gain**2])]), axis=0)[1:]
+        self._evidence = sums[-1:]
+        total, squares = np.hsplit(sums, 2)
+        proof = 0.5 * total * abs(total) / (squares + 2.0 * np.maximum(total, 0.0) + _ROUNDING)
+        beside = _BESIDE_ODDS + rows["doubt"][:, _BESIDE] - rows["doubt"][:, _FIRST]
+        iron = _IRON_ODDS - proof.min(axis=1) + np.minimum(beside, 0.0)
+        against = np.column_stack([np.zeros(len(rows)), beside, iron])
+        likely = np.exp(against.min(axis=1, keepdims=True) - against)
+        best = np.where(total.min(axis=1) > _PLAIN, _IRON, np.where(beside < 0.0, _BESIDE, _FIRST))
+        return likely / likely.sum(axis=1, keepdims=True), best
 
     def _run(self, bins: Any, filtered: list[FloatArray] | None = None) -> Any:
         """What each filter finds in each bin, shape (n, filters)."""
-        rows = np.zeros((len(bins), len(_ODDS)), kernel.HEADING)
+        rows = np.zeros((len(bins), _FILTERS), kernel.HEADING)
         kernel.find_headings(bins, self._models, self._filters, rows, *(filtered or _shaped(0, 0)))
         return rows
 
@@ -190,25 +205,14 @@ def _shaped(*shape: int) -> list[FloatArray]:
     return [np.zeros((*shape, *each)) for each in ((size,), *3 * [(size, size)])]
 
 
-def _weights(rows: Any) -> FloatArray:
-    """Weights of the filters: iron on the sensor by its evidence over the better one of the other two."""
-    evidence, against = rows["evidence"], np.tile(_ODDS, (*rows.shape[:-1], 1))
-    against[..., _IRON] -= evidence[..., _IRON] - evidence[..., :_IRON].max(axis=-1)
-    against[..., :_IRON] += rows["doubt"][..., :_IRON]
-    against[..., :_IRON] -= against[..., :_IRON].min(axis=-1, keepdims=True)
-    against[..., _IRON] /= _ALIKE
-    likely = np.exp(against.min(axis=-1, keepdims=True) - against)
-    return np.asarray(likely / likely.sum(axis=-1, keepdims=True))
-
-
-def _mean(rows: Any, weights: FloatArray, bins: Any) -> FloatArray:
-    """The likeliest filter's angle, and deviation of all from it by their weights, shape (n, filters)."""
-    best = np.take_along_axis(rows["turn_rad"], weights.argmax(axis=1)[:, None], axis=1)
-    off = np.angle(np.exp(1j * (rows["turn_rad"] - best)))
+def _combined(rows: Any, weights: FloatArray, best: IntArray, bins: Any) -> FloatArray:
+    """`NORTH` of each bin: the best filter's angle, and deviation of all from it by their weights."""
+    turn = np.take_along_axis(rows["turn_rad"], best[:, None], axis=1)
+    off = np.angle(np.exp(1j * (rows["turn_rad"] - turn)))
     variance = (weights * (rows["variance"] + off**2)).sum(axis=1)
     trust, stray = ((weights * rows[name]).sum(axis=1) for name in ("trust", "stray"))
     disturbed = bins["seen"] & (trust < _DISTRUSTED)
-    return np.column_stack([best, np.sqrt(variance), disturbed, stray, weights[:, _IRON]])
+    return np.column_stack([turn, np.sqrt(variance), disturbed, stray, weights[:, _IRON]])
 
 
 def _backward(

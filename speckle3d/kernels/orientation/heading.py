@@ -43,7 +43,6 @@ MODEL = np.dtype(
         ("white_sqrt_s", "f8"),  # of a reading's noise
         ("lag_s", "f8"),
         ("first_stray", "f8"),  # of the first reading's stray, a fraction of the stray's
-        ("memory_s", "f8"),  # time over which evidence is weighed
     ],
     align=True,
 )
@@ -55,7 +54,6 @@ FILTER = np.dtype(
         ("p", "f8", (SIZE, SIZE)),
         ("norm", "f8"),  # of the first reading, the unit of all
         ("bias", "f8", 3),  # that of the last bin
-        ("evidence", "f8"),
         ("doubt", "f8"),
         ("stray", "f8"),  # deviation now
         ("begun", "?"),  # in this stretch
@@ -68,8 +66,8 @@ FILTER = np.dtype(
 )
 
 HEADING = np.dtype([(name, "f8") for name in ("turn_rad", "variance", "evidence", "doubt", "trust", "stray")])
-"""Angle from the level axes to north at the end of a bin, and its variance; logarithm of the density of the
-readings in movement; of the odds that the first place was beside iron; the reading's weight, 0 to 1; the
+"""Angle from the level axes to north at the end of a bin, and its variance; logarithm of the density of its
+reading in movement; of the odds that the first place was beside iron; the reading's weight, 0 to 1; the
 stray."""
 
 _LEAST_STRAY, _MOST_STRAY = 0.005, 0.3
@@ -132,7 +130,7 @@ def find_headings(
         s, m = filters[j], models[j]
         for k in range(bins.shape[0]):
             b, out = bins[k], headings[k, j]
-            out.trust, out.turn_rad, out.variance = 0.0, 0.0, math.pi**2
+            out.trust, out.turn_rad, out.variance, out.evidence = 0.0, 0.0, math.pi**2, 0.0
             if not s.begun and b.seen:
                 _begin(s, b, m)
             if s.begun:
@@ -142,7 +140,7 @@ def find_headings(
                 out.turn_rad, out.variance = turn_to_north(s.x, s.p)
                 if states.shape[0] > 0:
                     states[j, k], covariances[j, k], transitions[j, k], noises[j, k] = s.x, s.p, f, q
-            out.stray, out.evidence, out.doubt = s.stray, s.evidence, s.doubt
+            out.stray, out.doubt = s.stray, s.doubt
 
 
 @compiled
@@ -233,8 +231,7 @@ def _correct(s: Any, b: Any, m: Any, rows: FloatArray, f: FloatArray, q: FloatAr
     v = _FREEDOM
     out.trust = min((v + 3.0) / (v + misfit), 1.0)
     if not b.resting:  # a sensor at rest repeats itself and proves nothing
-        s.evidence *= math.exp(-b.span_s / m.memory_s)
-        s.evidence -= 0.5 * math.log(determinant) + 0.5 * (v + 3.0) * math.log(1.0 + misfit / v)
+        out.evidence = -0.5 * math.log(determinant) - 0.5 * (v + 3.0) * math.log(1.0 + misfit / v)
         s.doubt += b.span_s * ((1.0 - out.trust) / _DOUBT_S + (1.0 / _BESIDE_S if s.beside else 0.0))
     if misfit > _OUTLIER:
         out.trust = 0.0
