@@ -25,8 +25,7 @@ from speckle3d.core.errors import FileError, InsufficientDataError, InvalidInput
 from speckle3d.core.files import PathLike, open_regular
 from speckle3d.core.streams import TimedRotations
 
-_COLUMNS = ("tilt", "yaw", "roll", "time_s", "until_s")
-_TIMES = {"time": "time_s", "until": "until_s"}
+_COLUMNS = ("tilt", "yaw", "roll", "time", "until")
 
 _LARGEST_BYTES = 16 * 2**20
 """Enough for a quarter of a million orientations, more than a mechanism is set to by hand or motor."""
@@ -85,7 +84,7 @@ def read_mechanism_csv(path: PathLike, turns: str = "roll, yaw, tilt") -> Mechan
     angles = [table.get(name, np.zeros(len(table["tilt"]))) for name in sequence]
     order = "".join(_AXIS[name] for name in sequence)
     rotation = Rotation.from_euler(order, np.stack(angles, axis=1), degrees=True)
-    start_s, end_s = table.get("time_s"), table.get("until_s")
+    start_s, end_s = table.get("time"), table.get("until")
     if start_s is not None and end_s is not None and (less := end_s < start_s).any():
         k = less.argmax()
         expected = f"expected until_s no less than time_s, {start_s[k]:g} s"
@@ -133,31 +132,22 @@ def readings_at(sensor: TimedRotations, settings: MechanismSettings) -> Rotation
 
 
 def _table(text: str, where: str) -> dict[str, FloatArray]:
-    """Columns by name."""
-    lines = [cells for line in text.splitlines() if (cells := _cells(line))]
-    names = list(_COLUMNS[:3][: len(lines[0])]) if lines else []
-    if lines and re.match(r"[\"a-z]", lines[0][0], re.IGNORECASE):
-        # Tilt_deg, tilt/deg and tilt(deg) are all tilt; time is time_s.
-        words = [re.split(r"[^a-z]", cell.lower().strip('"'))[0] for cell in lines.pop(0)]
-        names = [_TIMES.get(word, word) for word in words]
-    needed = {"tilt", "yaw", "time_s"} if "until_s" in names else {"tilt", "yaw"}
-    if len(set(names)) != len(names) or not needed <= set(names) <= set(_COLUMNS) or not lines:
+    """Columns by name; where semicolons separate, the decimal sign may be a comma."""
+    lines = [content for line in text.splitlines() if (content := line.partition("#")[0].strip().lower())]
+    if any(";" in line for line in lines):
+        lines = [line.replace(",", ".") for line in lines]
+    names = ["tilt", "yaw", "roll"]
+    if lines and re.match(r"[\"a-z]", lines[0]):
+        names = re.findall("|".join(_COLUMNS), lines.pop(0))  # Tilt_deg, tilt/deg and tilt(deg) are all tilt
+    try:
+        columns = np.array([re.split(r"\s*[;,]\s*|\s+", line) for line in lines], dtype=float).T
+    except ValueError as error:
+        raise InvalidInputError(f"{where}: expected as many numbers in every line, got others") from error
+    table = dict(zip(names, columns, strict=False))
+    needed = {"tilt", "yaw", "time"} if "until" in table else {"tilt", "yaw"}
+    if len(table) != len(columns) or not needed <= set(table) or not np.isfinite(columns).all():
         raise InvalidInputError(
             f"{where}: expected settings of tilt and yaw, perhaps roll, time_s and with it until_s, "
-            f"got {len(lines)} of {', '.join(names)[:80] or 'nothing'}"
+            f"got {len(lines)} of {len(columns)} columns"
         )
-    try:
-        columns = np.array(lines, dtype=float).T.copy()
-    except ValueError:
-        columns = np.zeros(0)
-    if len(columns) != len(names) or not np.isfinite(columns).all():
-        raise InvalidInputError(f"{where}: expected {len(names)} finite numbers in every line")
-    return dict(zip(names, columns, strict=True))
-
-
-def _cells(line: str) -> list[str]:
-    """Cells of a line without its comment; where semicolons separate, the decimal sign may be a comma."""
-    content = line.partition("#")[0].strip()
-    separator = next((mark for mark in ";,\t" if mark in content), None)
-    cells = [cell.strip() for cell in content.split(separator)] if content else []
-    return [cell.replace(",", ".") for cell in cells] if separator == ";" else cells
+    return table
