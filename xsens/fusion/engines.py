@@ -67,7 +67,7 @@ class Filter:
         if settings.use_magnetometer:
             sd[:, 2] = heading_sd
         return Estimate(
-            _turned(turn, steps.xyzw),
+            turned(turn, steps.xyzw),
             sd,
             known["bias"][of_step],
             disturbed > 0.0,
@@ -92,7 +92,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
         of_bins = HeadingFilter(settings, online=False).smooth(bins)
         time_s = np.append(0.0, np.cumsum(rows["duration_s"]))
         ends_s = time_s[1:][lasts_of_bins(count, settings)]
-        nodes = _turned(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
+        nodes = turned(np.interp(time_s, ends_s, np.unwrap(of_bins[:, 0])), nodes)
         sd[:, 2] = np.interp(time_s, ends_s, of_bins[:, 1])
         north = of_bins[np.arange(count) // steps_per_bin(settings)]
     elif settings.use_magnetometer:
@@ -104,7 +104,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     return Estimate(xyzw, sd[1:][of_step], biases[1:][of_step], disturbed > 0.0, resting, stray, iron)
 
 
-def _turned(angles_rad: FloatArray, xyzw: FloatArray) -> FloatArray:
+def turned(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
     """Quaternions, shape (k, 4), turned about up."""
     c, s = np.cos(0.5 * angles_rad), np.sin(0.5 * angles_rad)
     x, y, z, w = xyzw.T

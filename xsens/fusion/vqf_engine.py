@@ -1,23 +1,24 @@
 """VQF (Laidig and Seel, Information Fusion 91, 2023) as an engine beside the filter of this package.
 
 VQF wants an even clock, a field at every sample, and gives no standard deviation of the orientation. Here its
-samples are brought to an even clock where the log's is not, missing fields are carried by the orientation of
-this package's own engine, and what that engine claims, and how far VQF is from it, become VQF's deviation.
+samples are brought to an even clock, fields between those that came are interpolated, and what this package's
+own engine claims, and how far VQF is from it, become VQF's deviation.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from xsens.fusion.engines import turned
 from xsens.fusion.readings import Estimate, Samples
-from xsens.logs.worlds import nwu_from
 
 _EVEN = 0.05
-"""Largest distance of a sample from its place on an even clock, in steps, that is left as it is: at 5 rad/s
-and 100 samples/s it is 0.15 degrees, and does not add up."""
+"""Largest distance of a sample from its place on an even clock, in steps, that is not told."""
 
 
 class VqfEngine:
@@ -49,12 +50,9 @@ class VqfEngine:
     @property
     def notes(self) -> list[str]:
         """What VQF made of the log, for those who see the orientation."""
-        notes = []
-        if self._uneven:
-            notes.append(
-                f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"
-            )
-        return notes
+        if not self._uneven:
+            return []
+        return [f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"]
 
     def run(self, stretch: Samples, own: Estimate, offline: bool) -> Estimate:
         """Find the orientation of a stretch.
@@ -68,63 +66,60 @@ class VqfEngine:
         offline : bool
             Use later readings as well.
         """
-        magnetic = self._magnetic and bool(np.isfinite(stretch.field_au[:, 0]).any())
-        readings = [stretch.rate_rad_s, stretch.force_m_s2]
-        if magnetic:
-            readings.append(_field_carried(stretch, own.xyzw))
+        there = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
+        magnetic = self._magnetic and there.size > 0
         place = np.cumsum(stretch.step_s) - stretch.step_s[0]
-        step_s = float(place[-1]) / (len(place) - 1) if len(place) > 1 else float(stretch.step_s[0])
-        place, at = place / step_s, slice(None)
-        uneven = float(np.abs(place - np.arange(len(place))).max()) >= _EVEN
-        if uneven:
+        mean_s = float(place[-1]) / max(len(place) - 1, 1) or float(stretch.step_s[0])
+        # Losses make the mean step longer than the median, bursts shorter: at most two for one.
+        step_s = mean_s * min(max(float(np.median(stretch.step_s)) / mean_s, 0.5), 1.0)
+        place /= step_s
+        grid = np.arange(round(float(place[-1])) + 1.0)
+        if len(grid) != len(place) or np.abs(place - grid).max() >= _EVEN:
             self._uneven += len(stretch)
-            # Losses make the mean step longer than the median, bursts shorter: at most two for one.
-            fewer = min(max(float(np.median(stretch.step_s)) / step_s, 0.5), 1.0)
-            place, step_s = place / fewer, step_s * fewer
-            readings = _on_even_clock(readings, place)
+        # A reading of the gyroscope is the mean rate since the one before, here too: turns stay what they were.
+        angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=place[0])[:, None], axis=0)
+        rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
+        rate[0] = stretch.rate_rad_s[0]
+        force, field = _at(grid, place, stretch.force_m_s2), None
+        if magnetic:
+            field = _at(grid, place[there], stretch.field_au[there])
         find = self._vqf.offlineVQF if offline else self._vqf.VQF(step_s).updateBatch
-        found = find(*readings, *([] if magnetic else [None]), *([step_s] if offline else []))
-        turns = Rotation.from_quat(found["quat9D" if magnetic else "quat6D"], scalar_first=True)
-        north = nwu_from("ENU")
+        estimate = find(rate, force, field, *([step_s] if offline else []))
+        xyzw = estimate["quat9D" if magnetic else "quat6D"][:, [1, 2, 3, 0]]
+        # Neighbours of one sign, so that they can be interpolated: they are a small turn apart.
+        flips = np.einsum("ij,ij->i", xyzw[1:], xyzw[:-1]) < 0.0
+        xyzw[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+        xyzw = _at(place, grid, xyzw)
+        xyzw /= np.sqrt(np.einsum("ij,ij->i", xyzw, xyzw))[:, None]
+        north_rad = -0.5 * np.pi  # from VQF's world, x east
         if not magnetic:  # about up as the other engine begins
-            about_up = np.arctan2(*(Rotation.from_quat(own.xyzw[0]) * turns[0].inv()).as_quat()[2:])
-            north = Rotation.from_rotvec([0.0, 0.0, 2.0 * about_up])
-        turns = north * turns
-        if uneven:
-            turns = Slerp(np.arange(len(turns)), turns)(np.minimum(place, len(turns) - 1))
-            at = np.minimum(np.rint(place).astype(np.int64), len(found["bias"]) - 1)
+            first = Rotation.from_quat(own.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()
+            north_rad = 2.0 * float(np.arctan2(*first.as_quat()[2:]))
+        xyzw = turned(north_rad, xyzw)
+        at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
         disturbed = np.zeros(len(stretch), dtype=bool)
         if magnetic:
-            disturbed = found["magDistDetected"][at]
-        apart = (turns * Rotation.from_quat(own.xyzw).inv()).as_rotvec()
-        sd = np.minimum(np.hypot(own.sd_rad, apart), np.pi)
-        resting = found["restDetected"][at]
-        return Estimate(
-            turns.as_quat(), sd, found["bias"][at], disturbed, resting, own.field_stray, own.field_iron
+            disturbed = estimate["magDistDetected"][at]
+        sd = np.minimum(np.hypot(own.sd_rad, _apart(xyzw, own.xyzw)), np.pi)
+        return replace(
+            own,
+            xyzw=xyzw,
+            sd_rad=sd,
+            bias_rad_s=estimate["bias"][at],
+            disturbed=disturbed,
+            resting=estimate["restDetected"][at],
         )
 
 
-def _field_carried(stretch: Samples, xyzw: FloatArray) -> FloatArray:
-    """The field, each hole filled with the reading before it, or the first, which stays in the world."""
-    there = np.asarray(np.isfinite(stretch.field_au).all(axis=1))
-    if there.all():
-        return stretch.field_au
-    last = np.maximum.accumulate(np.where(there, np.arange(len(there)), np.argmax(there)))
-    turns = Rotation.from_quat(xyzw)
-    return np.asarray(turns.inv().apply(turns[last].apply(stretch.field_au[last])))
+def _at(places: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
+    """Columns interpolated at places, from those at known ones."""
+    return np.column_stack([np.interp(places, known, column) for column in values.T])
 
 
-def _on_even_clock(readings: list[FloatArray], place: FloatArray) -> list[FloatArray]:
-    """Rate, force and perhaps field that lie at places on an even clock, in its steps, brought to it.
-
-    A gyroscope's reading is the mean rate since the sample before; on the new clock, too, so that the turn
-    from end to end stays what it was. Accelerometer and field are interpolated.
-    """
-    grid = np.arange(round(float(place[-1])) + 1.0)
-
-    def at_grid(values: FloatArray) -> FloatArray:
-        return np.column_stack([np.interp(grid, place, axis) for axis in values.T])
-
-    rate, *others = readings
-    angle = np.cumsum(np.vstack([np.zeros(3), rate[1:] * np.diff(place)[:, None]]), axis=0)
-    return [np.vstack([rate[:1], np.diff(at_grid(angle), axis=0)]), *map(at_grid, others)]
+def _apart(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Turn between quaternions, scalar last, about each of the world's axes, to a sign, rad."""
+    (v, w), (u, z) = ((q[:, :3], q[:, 3:]) for q in (one, other))
+    across = z * v - w * u - np.cross(v, u)
+    sine = np.sqrt(np.einsum("ij,ij->i", across, across))
+    angle = 2.0 * np.arctan2(sine, np.abs(np.einsum("ij,ij->i", one, other)))
+    return np.asarray(across * (angle / np.maximum(sine, 1e-300))[:, None])
