@@ -184,7 +184,7 @@ def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
 
 def _rotation_vectors(wxyz: FloatArray) -> FloatArray:
     """Rotation vectors of quaternions; NaN of those that are damage."""
-    wxyz, _ = quaternions_of(wxyz, None)
+    wxyz = quaternions_of(wxyz)
     there = np.isfinite(wxyz)
     turns = Rotation.from_quat(np.where(there, wxyz, 1.0), scalar_first=True)
     return np.where(there[:, :1], turns.as_rotvec(), np.nan)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from xsens.logs.clocks import Stamps, require_rate, timeline
 from xsens.logs.faults import measured
 from xsens.logs.samples import ImuLog
-from xsens.logs.worlds import Claim, nwu_from, quaternions_of, seen_from_north, world_of
+from xsens.logs.worlds import Claim, nwu_from, quaternions_of, world_of
 
 
 @dataclass(frozen=True)
@@ -87,14 +88,14 @@ def assembled(parts: Parts, hints: Hints, source: str) -> ImuLog:
         notes.append("samples have no counter: losses cannot be found")
     own, there = None, np.zeros(0, dtype=bool)
     if rows is not None:
-        wxyz, told = quaternions_of(rows, parts.vectors[0])
-        notes += told
+        wxyz = quaternions_of(rows)
+        there = np.asarray(np.isfinite(wxyz).all(axis=1))
         claim = parts.claim if hints.world is None else Claim(hints.world, "as given", final=True)
         world = "NWU" if claim is None else claim.world
-        if claim is not None and not hints.as_stated and np.isfinite(wxyz).any():
+        if claim is not None and not hints.as_stated and there.any():
             world, told = world_of(claim, wxyz, parts.vectors[0], parts.vectors[2])
             notes += told
-        own, there = seen_from_north(wxyz, world)
+        own = nwu_from(world) * Rotation.from_quat(np.where(there[:, None], wxyz, 0.5), scalar_first=True)
         if not there.all():
             notes.append(f"{int((~there).sum())} samples lack the sensor's own orientation")
     line = timeline(stamps)

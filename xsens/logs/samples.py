@@ -57,7 +57,7 @@ class ImuLog:
         In the sensor's axes; a row is NaN where that sample lacks it. The field is in arbitrary units, about
         1 where the sensor was calibrated.
     world_from_sensor : Rotation, length m, optional
-        The sensor's own orientation; meaningless (the identity) where `oriented` is false.
+        The sensor's own orientation; meaningless where `oriented` is false.
     counter : ndarray of int, shape (m,), optional
         The sensor's own count, made to rise beyond its word length.
     gaps : tuple of Gap

@@ -168,7 +168,7 @@ def _mt9_export(table: TextTable) -> Parts:
     stamps, values = Stamps(time_s=table.values[timed, 0]), table.values[timed, 1:]
     if count == 4:
         return Parts(stamps, orientations=values, claim=_MT9)
-    if count == 10 and np.mean(are_rotations(values[:_ENOUGH].reshape(-1, 3, 3))) > 0.5:
+    if count == 10 and np.mean(are_rotations(values[:_ENOUGH])) > 0.5:
         return Parts(stamps, orientations=values, claim=_MT9, notes=("matrices are taken row by row",))
     return Parts(stamps, (values[:, :3], values[:, 3:6], values[:, 6:9]))
 
