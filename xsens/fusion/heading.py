@@ -34,6 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import heading as kernel
+from speckle3d.kernels.orientation.inclination import STEP
 from xsens.fusion.settings import FusionSettings
 
 _FILTERS = 3
@@ -86,8 +87,7 @@ def averaged_bins(
 
     Parameters
     ----------
-    rows : structured ndarray, shape (n,)
-        As in `xsens.fusion.inclination.FilterSteps`.
+    rows : structured ndarray, shape (n,), of `speckle3d.kernels.orientation.inclination.STEP`
     levels : ndarray, shape (n, 4)
         Level axes from the sensor's at the start of each step.
     bias_rad_s : ndarray, shape (n, 3)
@@ -131,10 +131,15 @@ reading was hardly believed; how much the field changes from place to place, a f
 component; the weight of the filter that takes iron to be on the sensor, 0 to 1."""
 
 
+UNKNOWN = (0.0, np.pi, False, np.nan, np.nan)
+"""Where no field has told the heading."""
+
+
 class HeadingFilter:
     """The three filters, bin by bin; `online` if the readings so far are all there is."""
 
     def __init__(self, settings: FusionSettings, online: bool = True) -> None:
+        self._settings = settings
         self._models = np.zeros(_FILTERS, kernel.MODEL)
         self._models["iron"] = 0.002  # what a calibration leaves
         self._models["iron"][_IRON], self._models["iron_put_on"][_IRON] = 0.7, 0.15
@@ -145,6 +150,7 @@ class HeadingFilter:
         self._models["lag_s"] = settings.magnetometer_lag_s
         self._models["first_stray"] = _FIRST_STRAY if online else 1.0
         self._begin(_STRAY)
+        self.resume()
 
     def _begin(self, stray: float) -> None:
         self._filters = np.zeros(_FILTERS, kernel.FILTER)
@@ -154,11 +160,24 @@ class HeadingFilter:
     def resume(self) -> None:
         """Find north again after a pause; keep iron, lag and the evidence."""
         self._filters["begun"] = False
+        self._rows = np.zeros(0, STEP)  # steps of a bin that is not whole
+        self._north = np.zeros((0, len(UNKNOWN)))  # at the end of the last bin
 
-    def follow(self, bins: Any) -> FloatArray:
-        """Take in bins; returns `NORTH` of each."""
-        rows = self._run(bins)
-        return _combined(rows, *self._weights(rows), bins)
+    def follow(self, rows: Any, to_end: bool = False) -> FloatArray:
+        """`NORTH` after each step by the last whole bin, or else the first; what is left is one `to_end`."""
+        per_bin, before = steps_per_bin(self._settings), len(self._rows)
+        rows, north = np.concatenate([self._rows, rows]), self._north
+        done = (np.arange(before, len(rows)) + 1) // per_bin + len(north) - 1
+        whole = len(rows) if to_end else len(rows) // per_bin * per_bin
+        self._rows = rows[whole:]
+        if whole:
+            rows = rows[:whole]
+            bins = averaged_bins(rows, rows["start"], rows["bias"], rows["sd"], self._settings)
+            estimates = self._run(bins)
+            north = np.concatenate([north, _combined(estimates, *self._weights(estimates), bins)])
+        self._north = north[-1:]
+        north = north if len(north) else np.array([UNKNOWN])
+        return np.asarray(north[np.clip(done, 0, len(north) - 1)])
 
     def smooth(self, bins: Any) -> FloatArray:
         """North over a whole stretch, smoothed backward; the stray at first is the recording's."""

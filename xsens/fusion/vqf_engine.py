@@ -76,7 +76,7 @@ class VqfEngine:
         grid = np.arange(round(float(place[-1])) + 1.0)
         if len(grid) != len(place) or np.abs(place - grid).max() >= _EVEN:
             self._uneven += len(stretch)
-        # A reading of the gyroscope is the mean rate since the one before, here too: turns stay what they were.
+        # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.
         angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=place[0])[:, None], axis=0)
         rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
         rate[0] = stretch.rate_rad_s[0]

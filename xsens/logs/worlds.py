@@ -73,7 +73,7 @@ def quaternions_of(numbers: FloatArray) -> FloatArray:
     Parameters
     ----------
     numbers : ndarray, shape (m, 4), (m, 9) or (m, 3)
-        Quaternions; matrices row after row; or roll, pitch and yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll).
+        Quaternions; matrices row by row; or roll, pitch and yaw in degrees, R = Rz(yaw) Ry(pitch) Rx(roll).
     """
     if numbers.shape[1] == 4:
         with np.errstate(over="ignore", invalid="ignore"):

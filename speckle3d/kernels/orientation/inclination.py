@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation.rotations import (
     Quaternion,
     Vector,
@@ -84,6 +84,7 @@ STEP = np.dtype(
         ("bias", "f8", 3),
         ("noise", "f8", SIZE),  # diagonal
         ("sd", "f8", 6),  # of attitude and bias
+        ("last", "i8"),  # sample after its last one
         ("resting", "?"),
         ("started", "?"),
     ],
@@ -133,7 +134,6 @@ def run_filter(
     limits: Any,
     unfinished: Any,
     steps: Any,
-    last: IntArray,
     covariance: FloatArray,
     transition: FloatArray,
     xyzw: FloatArray,
@@ -156,8 +156,6 @@ def run_filter(
         The increment that is not complete, from one call to the next.
     steps : structured ndarray, shape (n,), of `STEP`
         Filled, as many as are completed, as are the following.
-    last : ndarray of int, shape (n,)
-        Sample after each increment's last.
     covariance, transition : ndarray, shape (n, 9, 9), or (0, 9, 9) if they are not wanted
     xyzw : ndarray, shape (m, 4)
         Level axes from the sensor's at every sample, by what came before it.
@@ -174,7 +172,8 @@ def run_filter(
             _complete(s, r, step, f)
             if covariance.shape[0] > 0:
                 covariance[n], transition[n] = s.p, f
-            steps[n], last[n] = unfinished[0], k + 1
+            step.last = k + 1
+            steps[n] = unfinished[0]
             n += 1
             _open(s, step)
         level = quaternion(s.level)
@@ -238,8 +237,7 @@ def _turn(rate: FloatArray, bias: FloatArray, span_s: float) -> Quaternion:
 def orient_samples(
     step_s: FloatArray,
     rate_rad_s: FloatArray,
-    last: IntArray,
-    resting: BoolArray,
+    steps: Any,
     nodes: FloatArray,
     biases: FloatArray,
     xyzw: FloatArray,
@@ -249,27 +247,27 @@ def orient_samples(
     Parameters
     ----------
     step_s, rate_rad_s : ndarray, shapes (m,) and (m, 3)
-    last, resting : ndarray, shape (n,)
-        Sample after each step's last; whether the sensor stays at its step's start.
+    steps : structured ndarray, shape (n,), of `STEP`
+        At rest the sensor stays at a step's start.
     nodes : ndarray, shape (n + 1, 4)
         At the start and at the end of each step.
     biases : ndarray, shape (n + 1, 3)
     xyzw : ndarray, shape (m, 4)
     """
     first = 0
-    for n in range(last.shape[0]):
-        q, span_s = quaternion(nodes[n]), 0.0
-        for k in range(first, last[n]):
-            if not resting[n]:
+    for n in range(steps.shape[0]):
+        q, span_s, last = quaternion(nodes[n]), 0.0, steps[n].last
+        for k in range(first, last):
+            if not steps[n].resting:
                 q = product(q, _turn(rate_rad_s[k], biases[n], step_s[k]))
             xyzw[k] = q
         x, y, z = vector_of(product(quaternion(nodes[n + 1]), inverted(q)))
-        whole_s = step_s[first : last[n]].sum()
-        for k in range(first, last[n]):
+        whole_s = step_s[first:last].sum()
+        for k in range(first, last):
             span_s += step_s[k]
             share = span_s / whole_s
             xyzw[k] = product(quaternion_of(share * x, share * y, share * z), quaternion(xyzw[k]))
-        first = last[n]
+        first = last
 
 
 # -- start and rest
