@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -20,40 +20,37 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
 from xsens.logs.clocks import Stamps
-from xsens.logs.columns import column_of
 from xsens.logs.parts import Hints, Parts, assembled
 from xsens.logs.samples import VECTORS, ImuLog
-from xsens.logs.texttables import Names, TextTable, not_understood, number, read_table
+from xsens.logs.texttables import Names, TextTable, column_of, not_understood, number, read_table
 from xsens.logs.worlds import Claim, are_rotations
 
 _SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
 _RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.e+-]+)\s*hz", re.IGNORECASE)
-_WORLD = re.compile(r".*coordinate system\s*:[,;\s]*(ENU|NED|NWU)\b", re.IGNORECASE)
-_OWN_WORLD = re.compile(r"# world: (\w+)")
+_WORLDS = (
+    (re.compile(r"# world: (\w+)"), "as the file says", True),
+    (
+        re.compile(r".*coordinate system\s*:[,;\s]*(ENU|NED|NWU)\b", re.IGNORECASE),
+        "as its header says",
+        False,
+    ),
+)
+"""What names the orientation's world, who says so, and whether nothing outweighs it."""
+
 _ENOUGH = 1000
 """Lines that show whether nine numbers are a matrix."""
 
+_TICK_S, _DOT_TICK_S = 1e-4, 1e-6
+"""Ticks of MT Manager's clock, and of a DOT's."""
+
 _SLOWEST_HZ = 5.0
-"""An MT Manager's clock of 0.1 ms by which samples come more slowly is a DOT's, of 1 us: at 5 Hz no hand's
-movement can be followed."""
+"""An MT Manager's clock by which samples come more slowly is a DOT's: at 5 Hz no hand's movement can be
+followed."""
 
-_MATRIX = [f"{row}{column}" for row in "123" for column in "123"]
-
-
-@dataclass(frozen=True)
-class _Program:
-    """Facts that a program's exports leave out: units, and the world of orientations."""
-
-    claim: Claim
-    tick_s: float = 1e-4
-    gyroscope_to_rad: float = 1.0
-    counter_span: int = 1 << 16
-
-
-_MT_MANAGER = _Program(Claim("ENU", "the program's default", assumed=True))
-_DOT = _Program(Claim("ENU", "as the sensor's are", assumed=True), 1e-6, np.pi / 180.0, 1 << 32)
-_PLAIN = _Program(Claim("NWU", "as plain files are"))
-_MT9 = Claim("NWU", "as the MT9 software's are")
+_VECTORS = [[f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag")]
+_EULER = ["euler_roll", "euler_pitch", "euler_yaw"]
+_MATRIX = [f"mat_{row}{column}" for row in "123" for column in "123"]
+_QUATERNION, _OPTICAL = ([f"{source}_{axis}" for axis in "wxyz"] for source in ("quat", "optical"))
 
 
 def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: str = "text") -> ImuLog:
@@ -74,40 +71,57 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
     """
     with naming(source):
         table = read_table(StringIO(text, newline=None) if isinstance(text, str) else text)
-        parts = (_named if table.names else _mt9_export)(table)
+        table = table if table.names else _mt9_export(table)
+        parts = _samples(table)
         return assembled(replace(parts, notes=(*table.notes, *parts.notes)), hints or Hints(), source)
 
 
-def _named(table: TextTable) -> Parts:
-    """Samples of a table whose columns have names."""
-    stamps = {key: column for key in ("counter", "ticks", "time") if (column := table[key]) is not None}
-    timed = np.ones(len(table.values), dtype=bool)
-    for key, column in stamps.items():
-        timed &= np.isfinite(column)
-        if key != "time":
-            with np.errstate(invalid="ignore"):
-                timed &= (column >= 0.0) & (column < 2.0**53) & (column == np.floor(column))
+def _mt9_export(table: TextTable) -> TextTable:
+    """Name the columns of an export of the MT9 software; its kind is told by their number."""
+    count = table.rows.shape[1]
+    vectors = [*_VECTORS[0], *_VECTORS[1], *_VECTORS[2]]
+    keys = {4: _EULER, 10: vectors, 11: [*vectors, "temperature"]}.get(count)
+    if keys is None:
+        raise InvalidInputError(
+            f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {count} without"
+        )
+    notes = table.notes
+    if count == 10 and np.mean(are_rotations(table.rows[:_ENOUGH, 1:])) > 0.5:
+        keys, notes = _MATRIX, (*notes, "matrices are taken row by row")
+    return replace(table, columns=dict(zip(["time", *keys], table.rows.T, strict=True)), notes=notes)
+
+
+def _samples(table: TextTable) -> Parts:
+    """Samples of a table whose columns are known."""
+    timed, columns, notes = np.ones(len(table.rows), dtype=bool), table.columns, list[str]()
+    stamps = columns.keys() & {"counter", "ticks", "time"}
+    for key in stamps:
+        with np.errstate(invalid="ignore"):
+            whole = (columns[key] >= 0.0) & (columns[key] < 2.0**53) & (columns[key] % 1.0 == 0.0)
+        timed &= np.isfinite(columns[key]) if key == "time" else whole
     if not timed.any():
         raise InvalidInputError("expected lines with a time, got none")
-    notes = [] if timed.all() else [f"{(~timed).sum()} lines without a time were left out"]
-    table = replace(table, values=table.values if timed.all() else table.values[timed])
+    if not timed.all():
+        notes.append(f"{(~timed).sum()} lines without a time were left out")
+        columns = {key: column[timed] for key, column in columns.items()}
     counter, ticks = (
-        column[timed].astype(np.int64) if (column := stamps.get(key)) is not None else None
-        for key in ("counter", "ticks")
+        columns[key].astype(np.int64) if key in stamps else None for key in ("counter", "ticks")
     )
-    program = _program(table, counter, ticks)
-    if program.tick_s == _DOT.tick_s and not _says_dot(table):
+    dot = any("devicetag" in line.lower() for line in table.header)
+    if not dot and "time" not in stamps and _ticks_of_dot(counter, ticks):
+        dot = True
         notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
-    force, rate, field = (table.group(quantity, "xyz") for quantity in ("acc", "gyr", "mag"))
-    if rate is not None and not table.states_unit("gyr_x"):
-        rate = rate * program.gyroscope_to_rad
+    force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
+    if rate is not None and dot and "gyr_x" not in table.stated:
+        rate = np.deg2rad(rate)
     odd = _not_understood(table, "time" in stamps)
-    claim: Claim | None = program.claim
-    if (own := table.group("optical", "wxyz")) is not None:
+    claim = None
+    if (own := _side_by_side(columns, _OPTICAL)) is not None:
         notes.append("orientation: by cameras, in a world of their own: x and z need not be north and up")
-        claim = None
-    for quantity, axes in (("quat", "wxyz"), ("mat", _MATRIX), ("euler", ("roll", "pitch", "yaw"))):
-        own = table.group(quantity, axes) if own is None else own
+    else:
+        claim = _claim(table, "time" in stamps, dot)
+        notations = (_side_by_side(columns, keys) for keys in (_QUATERNION, _MATRIX, _EULER))
+        own = next((rows for rows in notations if rows is not None), None)
     if all(part is None for part in (force, rate, field, own)):
         got = "; ".join(odd) or "got none"
         raise InvalidInputError(
@@ -115,35 +129,29 @@ def _named(table: TextTable) -> Parts:
         )
     if force is None and "freeacc_x" in table.names:
         notes.append("acceleration without gravity is no accelerometer's reading and was left out")
-    told = _RATE.search("\n".join(table.header))
-    rate_hz = number(told[1]) if told else float("nan")
-    sent = Stamps(
-        counter,
-        ticks,
-        program.counter_span,
-        program.tick_s,
-        1.0 / rate_hz if rate_hz > 0.0 else float("nan"),
-        time_s=table["time"],
-    )
+    stated = _RATE.search("\n".join(table.header))
+    rate_hz = number(stated[1]) if stated else float("nan")
+    period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
+    span, tick_s = (1 << 32, _DOT_TICK_S) if dot else (1 << 16, _TICK_S)
+    sent = Stamps(counter, ticks, span, tick_s, period_s, time_s=columns.get("time"))
     return Parts(sent, (force, rate, field), own, claim, (*odd, *notes))
 
 
-def _program(table: TextTable, counter: IntArray | None, ticks: IntArray | None) -> _Program:
-    """Program that wrote the table; the world is as its header says, if it says one."""
-    program = _MT_MANAGER
-    if table["time"] is not None:
-        program = _PLAIN
-    elif _says_dot(table) or _ticks_of_dot(counter, ticks):
-        program = _DOT
-    for pattern, by, final in ((_OWN_WORLD, "as the file says", True), (_WORLD, "as its header says", False)):
+def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:
+    """Columns as an array, shape (rows, keys); None if one is missing."""
+    there = [columns[key] for key in keys if key in columns]
+    return np.stack(there, axis=1) if len(there) == len(keys) else None
+
+
+def _claim(table: TextTable, plain: bool, dot: bool) -> Claim:
+    """World of the orientations as the header says, or as its program has it."""
+    for pattern, by, final in _WORLDS:
         for line in table.header:
             if match := pattern.match(line):
-                return replace(program, claim=Claim(match[1], by, final))
-    return program
-
-
-def _says_dot(table: TextTable) -> bool:
-    return any("devicetag" in line.lower() for line in table.header)
+                return Claim(match[1], by, final)
+    if plain:
+        return Claim("NWU", "as plain files are" if table.names else "as the MT9 software's are")
+    return Claim("ENU", "as the sensor's are" if dot else "the program's default", assumed=True)
 
 
 def _ticks_of_dot(counter: IntArray | None, ticks: IntArray | None) -> bool:
@@ -152,25 +160,7 @@ def _ticks_of_dot(counter: IntArray | None, ticks: IntArray | None) -> bool:
         return False
     steps = np.diff(ticks) % (1 << 32)
     counts = np.ones(steps.size) if counter is None else np.maximum(np.diff(counter), 1)
-    return bool(np.median(steps / counts) * _MT_MANAGER.tick_s > 1.0 / _SLOWEST_HZ)
-
-
-def _mt9_export(table: TextTable) -> Parts:
-    """Samples of an export of the MT9 software; its kind is told by the number of columns."""
-    count = table.values.shape[1]
-    if count not in (4, 10, 11):  # angles, matrix or vectors, vectors and temperature
-        raise InvalidInputError(
-            f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {count} without"
-        )
-    timed = np.isfinite(table.values[:, 0])
-    if not timed.any():
-        raise InvalidInputError("expected times in the first column, got none")
-    stamps, values = Stamps(time_s=table.values[timed, 0]), table.values[timed, 1:]
-    if count == 4:
-        return Parts(stamps, orientations=values, claim=_MT9)
-    if count == 10 and np.mean(are_rotations(values[:_ENOUGH])) > 0.5:
-        return Parts(stamps, orientations=values, claim=_MT9, notes=("matrices are taken row by row",))
-    return Parts(stamps, (values[:, :3], values[:, 3:6], values[:, 6:9]))
+    return bool(np.median(steps / counts) * _TICK_S > 1.0 / _SLOWEST_HZ)
 
 
 def _not_understood(table: TextTable, plain: bool) -> Names:
@@ -178,11 +168,11 @@ def _not_understood(table: TextTable, plain: bool) -> Names:
 
     A program's exports hold many other columns: of theirs, only those that look like a sensor's are listed.
     """
-    keys = {name: column.key for name in table.names if (column := column_of(name))}
+    keys = {name: column[0] for name in table.names if (column := column_of(name))}
     odd = [name for name in table.names if name not in keys and (plain or _SENSOR_LIKE.match(name))]
-    for quantity, axes in (("acc", "xyz"), ("gyr", "xyz"), ("mag", "xyz"), ("quat", "wxyz")):
-        there = [name for name, key in keys.items() if key.startswith(f"{quantity}_")]
-        odd += there if len(there) < len(axes) else []
+    for quantity in (*_VECTORS, _QUATERNION):
+        there = [name for name, key in keys.items() if key in quantity]
+        odd += there if len(there) < len(quantity) else []
     return (not_understood(filter(None, odd)),) if any(odd) else ()
 
 

@@ -1,4 +1,7 @@
-"""Read tables of numbers in text: cells without a number are NaN, lines of another length are left out."""
+"""Read tables of numbers in text: names of columns, perhaps with units, to columns in SI units.
+
+Cells without a number are NaN, lines of another length are left out.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,10 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
+from scipy.constants import g
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.columns import Column, column_of, names_a_sensor
 
 Names = tuple[str, ...]
 
@@ -28,37 +31,86 @@ _LIKE_NAMES = re.compile(r"(?:[a-z°²µ_][\w .()\[\]/^°²µ-]*|)$")
 _AXES = frozenset("wxyzs")
 """Second line of names; s is the unit of a time."""
 
+# -- names of columns
+
+_DEG = 0.017453292519943295
+_UNITS = {
+    "acc": {"m_s2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g},
+    "gyr": {"rad_s": 1.0, "deg_s": _DEG, "dps": _DEG, "°_s": _DEG, "mdps": 1e-3 * _DEG, "mrad_s": 1e-3},
+    "mag": dict.fromkeys(("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss"), 1.0),
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
+}
+"""Units by quantity; the field stays in the unit it is in."""
+
+_VECTOR = re.compile(r"(?:imu )?(acc|gyr|mag)[a-z ]*[ _.]?([xyz])(?![a-z])\W*_?(.*?)\W*$", re.ASCII)
+_TIME = re.compile(r"time(?:[ _]?stamp)?[ _(\[/]+([a-zµ]+)[)\]]?$")
+_OTHERS = (
+    ("counter", re.compile(r"(?:packet)?counter$")),
+    ("ticks", re.compile(r"sampletimefine$")),
+    ("quat_{}", re.compile(r"quat(?:ernion)?_(?:q)?([wxyz0-3])$")),
+    ("optical_{}", re.compile(r"vicon orientation_([wxyz])$")),
+    ("euler_{}", re.compile(r"euler_([xyz])$|(roll|pitch|yaw)$")),
+    ("mat_{}{}", re.compile(r"mat\[([1-3])\]\[([1-3])\]$")),
+)
+_SAME = {
+    "quat_{}": {"0": "w", "1": "x", "2": "y", "3": "z"},
+    "euler_{}": {"x": "roll", "y": "pitch", "z": "yaw"},
+}
+"""Names of one axis."""
+
+_WHOSE = re.compile(
+    r"(?:sensor|device|imu|node|unit)[ _]?(?:id|name|no|nr|number|tag|serial)?$"
+    r"|(?:id|tag|mac(?:[ _]?address)?|serial(?:[ _]?number)?)$"
+)
+"""Names of columns that say which sensor a row is of."""
+
+
+def column_of(name: str) -> tuple[str, float | None] | None:
+    """Key of a column by its name in lower case; None if it is not understood.
+
+    With it comes what turns its numbers to SI units, None if the name states no unit.
+    """
+    if match := _VECTOR.match(name):
+        quantity, axis, unit = match.groups()
+        unit = re.sub(r"[/^*·. ]+", "_", unit.replace("²", "2").replace("^2", "2")).strip("_")
+        if unit and unit not in _UNITS[quantity]:
+            return None
+        return f"{quantity}_{axis}", _UNITS[quantity][unit] if unit else None
+    if match := _TIME.match(name):
+        return ("time", _UNITS["time"][match[1]]) if match[1] in _UNITS["time"] else None
+    for key, pattern in _OTHERS:
+        if match := pattern.match(name):
+            parts = filter(None, match.groups())
+            return key.format(*(_SAME.get(key, {}).get(part, part) for part in parts)), None
+    return None
+
+
+def not_understood(names: Iterable[str]) -> str:
+    """Sentence on names of columns, with some of those that are understood."""
+    names = list(names)
+    more = f" and {len(names) - 9} more" if len(names) > 9 else ""
+    listed = ", ".join(name[:40] for name in names[:9])
+    return f"columns not understood: {listed}{more} (expected time_s, acc_x, gyr_x_rad_s, mag_x)"
+
+
+# -- tables
+
 
 @dataclass(frozen=True)
 class TextTable:
     """A table of numbers: the lines before it, names in lower case, and the columns that are understood.
 
-    `values` has a column for each of `columns`, or for each cell where none has a name. `notes` count lines
-    of another length than the first or without a digit, and cells that hold no number.
+    `columns` are in SI units by key, without blank ones, those of `stated` by a unit in their name; where no
+    column has a name, `rows` has all cells. `notes` count lines of another length than the first or without a
+    digit, and cells that hold no number.
     """
 
     header: Names
     names: Names
-    columns: tuple[Column, ...]
-    values: FloatArray
+    columns: dict[str, FloatArray]
+    stated: frozenset[str]
+    rows: FloatArray
     notes: Names = ()
-
-    def __getitem__(self, key: str) -> FloatArray | None:
-        """Numbers of a column in SI units, shape (rows,); None if there is none, or it is blank."""
-        for column, values in zip(self.columns, self.values.T, strict=False):
-            if column.key == key and np.isfinite(values).any():
-                with np.errstate(over="ignore"):  # damage, which is left out as no measurement
-                    return np.asarray(values * (column.scale or 1.0))
-        return None
-
-    def group(self, quantity: str, axes: Iterable[str]) -> FloatArray | None:
-        """Columns of a quantity side by side, shape (rows, axes); None if one is missing."""
-        columns = [column for axis in axes if (column := self[f"{quantity}_{axis}"]) is not None]
-        return np.stack(columns, axis=1) if len(columns) == len(tuple(axes)) else None
-
-    def states_unit(self, key: str) -> bool:
-        """Whether a column's name says its unit."""
-        return any(column.key == key and column.scale is not None for column in self.columns)
 
 
 def read_table(lines: Iterable[str]) -> TextTable:
@@ -76,22 +128,21 @@ def read_table(lines: Iterable[str]) -> TextTable:
     for line in lines:
         comment = line.startswith(_COMMENT)
         for separator in () if comment else _SEPARATORS:
-            cells = _cells(line, separator)
-            for names in (cells, _of_two_lines(_cells(header[-1], separator), cells)):
+            cells, above = _cells(line, separator), _cells(header[-1], separator)
+            for names in (cells, _of_two_lines(above, cells)):
                 if sum(column_of(name) is not None for name in names) >= 2:
                     return _named(lines, tuple(header[1:]), names, separator)
             if len(cells) >= 4 and all(cell == "nan" or number(cell) == number(cell) for cell in cells):
-                _refuse_unknown_names(header[-1], len(cells))
+                for split in _SEPARATORS:  # a line above numbers may name their columns
+                    names = tuple(cell.strip(' "#') for cell in _cells(header[-1], split))
+                    if len(names) == len(cells) and any(names) and all(map(_LIKE_NAMES.match, names)):
+                        raise InvalidInputError(not_understood(names))
                 return _rows(chain([line], lines), tuple(header[1:]), (), separator, len(cells))
         header.append(line.rstrip("\n"))
         count += not comment
         if count > _LONGEST_HEADER:
             break
     raise InvalidInputError("expected a table of numbers, got none")
-
-
-def _cells(line: str, separator: str | None) -> Names:
-    return tuple(cell.strip().strip('"').lower() for cell in line.split(separator))
 
 
 def number(cell: str) -> float:
@@ -102,47 +153,36 @@ def number(cell: str) -> float:
         return float("nan")
 
 
+def _cells(line: str, separator: str | None) -> Names:
+    return tuple(cell.strip().strip('"').lower() for cell in line.split(separator))
+
+
 def _of_two_lines(groups: Names, axes: Names) -> Names:
     """Names of columns whose group is in the line above, at the first of its axes; empty if they are not."""
     if len(groups) != len(axes) or not _AXES & set(axes):
         return ()
-    names, group, last = [], "", 0
-    for at, (above, axis) in enumerate(zip(groups, axes, strict=True)):
+    names, group = list[str](), ""
+    for above, axis in zip(groups, axes, strict=True):
         group = above or group
-        names.append(f"{group}_{axis}" if axis in _AXES else group)
-        last = at + 1 if above or axis else last
-    return tuple(names[:last])  # without what a separator at the end of the line makes
-
-
-def _refuse_unknown_names(line: str, count: int) -> None:
-    """Raise if a line above numbers names their columns, none of them by a name that is understood."""
-    for separator in _SEPARATORS:
-        names = tuple(cell.strip(' "#') for cell in _cells(line, separator))
-        if len(names) == count and sum(map(bool, names)) > 1 and all(map(_LIKE_NAMES.match, names)):
-            raise InvalidInputError(not_understood(names))
-
-
-def not_understood(names: Iterable[str]) -> str:
-    """Sentence on names of columns, with some of those that are understood."""
-    names = list(names)
-    more = f" and {len(names) - 9} more" if len(names) > 9 else ""
-    listed = ", ".join(name[:40] for name in names[:9])
-    return f"columns not understood: {listed}{more} (expected time_s, acc_x, gyr_x_rad_s, mag_x)"
+        names.append(f"{group}_{axis}" if axis in _AXES else above)
+    while not names[-1]:  # what a separator at the end of the line makes
+        names.pop()
+    return tuple(names)
 
 
 def _named(lines: Iterator[str], header: Names, names: Names, separator: str | None) -> TextTable:
     first = next((line for line in lines if line.strip("\r\n") and _DIGIT.search(line)), "")
-    if len(_cells(first, separator)) != len(names):  # a blank where a tab should be, or the like
-        blanks = tuple(part for name in names for part in name.split())
-        names = blanks if len(blanks) == len(_cells(first, separator)) else names
+    blanks = tuple(part for name in names for part in name.split())
+    if len(names) != len(_cells(first, separator)) == len(blanks):  # a blank where a tab should be
+        names = blanks
     keys: dict[str, str] = {}
     for name in names:
-        if (column := column_of(name)) and column.key != "counter" and (twin := keys.get(column.key)):
+        key = (column_of(name) or ("",))[0]
+        if key not in ("", "counter") and key in keys:
             raise InvalidInputError(
-                f"expected the columns of one sensor, got two of {column.key}: {twin}, {name}"
+                f"expected the columns of one sensor, got two of {key}: {keys[key]}, {name}"
             )
-        if column:
-            keys[column.key] = name
+        keys[key] = name
     return _rows(chain([first], lines), header, names, separator, len(names))
 
 
@@ -150,7 +190,7 @@ def _rows(lines: Iterable[str], header: Names, names: Names, separator: str | No
     """Read the columns that are understood, or all if none has a name."""
     known = {i: column for i, name in enumerate(names) if (column := column_of(name)) is not None}
     kept = list(known) or range(count)
-    sensors = {i: dict[str, None]() for i, name in enumerate(names) if names_a_sensor(name)}
+    sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
     values, left_out, words = array("d"), 0, 0
     for line in lines:
         if not line.strip("\r\n"):
@@ -184,4 +224,11 @@ def _rows(lines: Iterable[str], header: Names, names: Names, separator: str | No
     if words:
         notes.append(f"{words} cells hold something else than a number: missing")
     rows = np.frombuffer(values).reshape(-1, len(kept))
-    return TextTable(header, names, tuple(known.values()), rows, tuple(notes))
+    with np.errstate(over="ignore"):  # damage, which is left out as no measurement
+        columns = {
+            key: column * (scale or 1.0)
+            for (key, scale), column in zip(known.values(), rows.T, strict=False)
+            if np.isfinite(column).any()
+        }
+    stated = frozenset(key for key, scale in known.values() if scale is not None)
+    return TextTable(header, names, columns, stated, rows, tuple(notes))
