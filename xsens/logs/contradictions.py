@@ -33,15 +33,10 @@ def contradictions(log: ImuLog) -> dict[str, str]:
 
     What tells nothing, as an accelerometer of a sensor that turns about the vertical alone, is left out.
     """
-    directions = {}
-    if log.accelerometer_m_s2 is not None:
-        directions["accelerometer"] = log.accelerometer_m_s2
-    if log.world_from_sensor is not None:
-        oblique = log.world_from_sensor.inv().apply([1.0, 1.0, 1.0])
-        directions["own orientation"] = np.where(log.oriented[:, None], oblique, np.nan)
+    directions = {"accelerometer": log.accelerometer_m_s2, "own orientation": log.own_direction}
     sentences = {}
     for name, direction in directions.items():
-        rates = _rates_across(log, direction)
+        rates = None if direction is None else _rates_across(log, direction)
         if rates is not None and max(map(_rms, rates)) > _TURNING_RAD_S:
             sentences[name] = _sentence(name, *rates)
     return sentences

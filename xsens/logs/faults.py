@@ -24,14 +24,16 @@ class _Limits(NamedTuple):
     spike: float
 
 
+_OWN = "own orientation"
 _LIMITS = {
     VECTORS[0]: _Limits(2000.0, 0.3, 100.0),
     VECTORS[1]: _Limits(60.0, 0.03, 10.0),
     VECTORS[2]: _Limits(100.0, 0.03, np.inf),
+    _OWN: _Limits(np.inf, 0.05, np.inf),
 }
 """Accelerometers end at 200 g, gyroscopes at 35 rad/s; a hand's knock lasts longer than a sample. A resting
-sensor's readings change by less than the second. The field's limits are in its median norm: a magnet at 1 cm
-makes six of it."""
+sensor's readings change by less than the second, its orientation by less than two degrees. The field's limits
+are in its median norm: a magnet at 1 cm makes six of it."""
 
 _ABSURD = 1e6
 """Larger numbers are damage in any unit."""
@@ -51,9 +53,6 @@ _TURNING_RAD_S = 0.2
 _FEW = 0.05
 """Share of readings that may be errors; more are in another unit."""
 
-_STUCK_RAD = 0.035
-"""Turn after a repeated orientation that shows that it was not at rest: two degrees."""
-
 _OTHER = 5.0
 """Of rows in turn of several sensors, how much farther neighbours are apart than rows of one sensor."""
 
@@ -71,26 +70,30 @@ def measured(log: ImuLog) -> ImuLog:
     InvalidInputError
         If its rows are of several sensors in turn.
     """
-    readings = {name: rows for name in VECTORS if (rows := getattr(log, name)) is not None}
-    _require_one_sensor(log, readings)
+    kept = dict.fromkeys(VECTORS, np.ones(len(log), dtype=bool)) | {_OWN: log.oriented}
+    readings = {name: getattr(log, name) for name in VECTORS} | {_OWN: log.own_direction}
+    readings = {name: rows for name, rows in readings.items() if rows is not None}
+    _require_one_sensor(readings)
     changed: dict[str, Any] = {}
     notes: list[str] = []
-    dead = np.zeros(len(log), dtype=bool)
+    dead, force, rate = np.zeros(len(log), dtype=bool), readings.get(VECTORS[0]), readings.get(VECTORS[1])
     for name, rows in readings.items():
-        bad = _bad(name, rows, dead, readings.get(VECTORS[0]), readings.get(VECTORS[1]))
+        some = slice(None) if kept[name].all() else kept[name]
+        others = (None if others is None else others[some] for others in (force, rate))
+        bad = _bad(name, rows[some], dead[some], *others)
         if name == VECTORS[0]:
             dead = bad["readings of zero"] | ~_finite(rows)
         counts = ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any())
+        wrong = np.zeros(len(log), dtype=bool)
+        wrong[some] = np.logical_or.reduce(list(bad.values()))
         if counts:
-            wrong = np.logical_or.reduce(list(bad.values()))
-            changed[name] = np.where(wrong[:, None], np.nan, rows)
             notes.append(f"{name.split('_')[0]}: {counts}: taken as missing")
-        if not _finite(changed.get(name, rows)).any():
-            changed[name] = None
-    if (stuck := _stuck(log)).any():
-        notes.append(f"own orientation: {int(stuck.sum())} repeated: taken as missing")
-        changed["oriented"] = log.oriented & ~stuck
-    return replace(log, **changed, notes=(*log.notes, *notes)) if changed else log
+        if name == _OWN:
+            changed["oriented"] = log.oriented & ~wrong
+        elif counts or not _finite(rows).any():
+            rows = np.where(wrong[:, None], np.nan, rows)
+            changed[name] = rows if _finite(rows).any() else None
+    return replace(log, **changed, notes=(*log.notes, *notes))
 
 
 def _finite(rows: FloatArray) -> BoolArray:
@@ -213,28 +216,11 @@ def _spikes(rows: FloatArray, height: float) -> BoolArray:
     return bad
 
 
-def _stuck(log: ImuLog) -> BoolArray:
-    """Own orientations that are repeated although the sensor went on turning."""
-    stuck = np.zeros(len(log), dtype=bool)
-    if log.world_from_sensor is None or log.oriented.sum() < 2:
-        return stuck
-    at = np.flatnonzero(log.oriented)
-    rows, rate = log.world_from_sensor[at].as_quat(), log.gyroscope_rad_s
-    runs = _Runs.of(rows)
-    behind = np.minimum(runs.start + runs.length, len(rows) - 1)
-    cosine = np.abs(np.einsum("ij,ij->i", rows[runs.start], rows[behind]))
-    moves = 2.0 * np.arccos(np.minimum(cosine, 1.0)) > _STUCK_RAD
-    moves[-1] |= _turning(None if rate is None else rate[at], runs)[-1]
-    stuck[at] = runs.marked(runs.long & moves, runs.usual)
-    return stuck
-
-
-def _require_one_sensor(log: ImuLog, readings: dict[str, FloatArray]) -> None:
+def _require_one_sensor(readings: dict[str, FloatArray]) -> None:
     """Raise if every second, third... row is alike and neighbours are not: sensors that take turns."""
-    kinds = [readings[name] for name in (VECTORS[0], VECTORS[2]) if name in readings]
-    if log.world_from_sensor is not None and log.oriented.all():
-        kinds.append(np.abs(log.world_from_sensor.as_quat()))
-    for rows in kinds if len(log) >= _ENOUGH else ():
+    for name, rows in readings.items():
+        if name == VECTORS[1] or len(rows) < _ENOUGH:  # a gyroscope's noise is as large as its rate
+            continue
         middle = len(rows) // 2
         rows = rows[max(middle - _LOOKED_AT, 0) : middle + _LOOKED_AT]
         rows = np.where((rows != 0.0).any(axis=1)[:, None], rows, np.nan)

@@ -140,6 +140,17 @@ class ImuLog:
         """Number of samples known to be missing."""
         return sum(gap.lost for gap in self.gaps)
 
+    @property
+    def own_direction(self) -> FloatArray | None:
+        """A direction that rests in the world, seen from the sensor by its own orientation, shape (m, 3).
+
+        NaN where it has none; None without any.
+        """
+        if self.world_from_sensor is None:
+            return None
+        oblique = self.world_from_sensor.inv().apply([1.0, 1.0, 1.0])
+        return np.where(self.oriented[:, None], oblique, np.nan)
+
     def rotations(self, max_gap_s: float = DEFAULT_MAX_GAP_S) -> TimedRotations:
         """The sensor's own orientation as a stream of the samples that have it.
 
