@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.samples import VECTORS, ImuLog
 
@@ -106,31 +106,13 @@ def _norm(rows: FloatArray) -> FloatArray:
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", rows, rows)))
 
 
-class _Runs(NamedTuple):
-    """First rows and lengths of runs of one value."""
-
-    start: IntArray
-    length: IntArray
-
-    @classmethod
-    def of(cls, rows: FloatArray) -> _Runs:
-        changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
-        start = np.flatnonzero(np.append(True, changes))
-        return cls(start, np.diff(np.append(start, len(rows))))
-
-    @property
-    def usual(self) -> int:
-        return int(np.median(self.length))
-
-    @property
-    def long(self) -> BoolArray:
-        """Longer than two samples of the sensor's rate."""
-        return np.asarray(self.length > max(2, 2 * self.usual))
-
-    def marked(self, which: BoolArray, but_first: int = 0) -> BoolArray:
-        """The rows of some runs, but the first so many of each."""
-        place = np.arange(self.length.sum()) - np.repeat(self.start, self.length)
-        return np.asarray(np.repeat(which, self.length) & (place >= but_first))
+def _change(rows: FloatArray, order: int) -> FloatArray:
+    """Length of the difference of that order along the rows; axis by axis, as logs may be large."""
+    square = np.zeros(len(rows) - order)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis in rows.T:
+            square += np.diff(axis, n=order) ** 2
+    return np.sqrt(square, out=square)
 
 
 def _bad(
@@ -150,19 +132,10 @@ def _bad(
         beyond = size >= _ABSURD
     if beyond.any() or not finite.all():
         rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
-    clipped, spikes = _clipped(rows), _spikes(rows, limits.spike * unit)  # before there is more in memory
-    runs = _Runs.of(rows)
-    step = np.pad(_norm(np.diff(rows, axis=0)), 1, constant_values=np.nan)
-    before, after = step[runs.start], step[runs.start + runs.length]
-    moves = (after > limits.change * unit) | (np.isnan(after) & (runs.start > 0))
-    repeat = runs.long & moves
-    if name == VECTORS[1]:  # a resting one may read its bias, or zero
-        begun = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
-        repeat &= ~((size[runs.start] < _SLOW_RAD_S) & begun & _steady(force, runs))
+    clipped, spikes = _clipped(rows), _spikes(rows, limits.spike * unit)
+    if name == VECTORS[1]:  # at rest zero is a reading
         zero &= dead
-    else:  # what is repeated to the log's end was left while the sensor turned
-        repeat &= ~np.isnan(after) | _turning(rate, runs)
-    repeated = runs.marked(repeat, runs.usual) & finite & ~zero
+    repeated = _repeated(name, rows, limits.change * unit, size, force, rate) & finite & ~zero
     return {
         "readings of zero": zero,
         "out of range": beyond,
@@ -172,19 +145,35 @@ def _bad(
     }
 
 
-def _steady(force: FloatArray | None, runs: _Runs) -> BoolArray:
-    """Runs in which the accelerometer shows no turning."""
-    if force is None:
-        return np.ones(len(runs.start), dtype=bool)
-    spread = [np.fmax.reduceat(axis, runs.start) - np.fmin.reduceat(axis, runs.start) for axis in force.T]
-    return np.asarray(~(np.fmax.reduce(spread) > _STEADY_M_S2))
-
-
-def _turning(rate: FloatArray | None, runs: _Runs) -> BoolArray:
-    """Runs in which the gyroscope turns."""
-    if rate is None:
-        return np.zeros(len(runs.start), dtype=bool)
-    return np.asarray(np.add.reduceat(np.nan_to_num(_norm(rate)), runs.start) > _TURNING_RAD_S * runs.length)
+def _repeated(
+    name: str,
+    rows: FloatArray,
+    change: float,
+    size: FloatArray,
+    force: FloatArray | None,
+    rate: FloatArray | None,
+) -> BoolArray:
+    """Rows that repeat the one before for longer than two samples of the sensor's rate, and then change."""
+    changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
+    start = np.flatnonzero(np.append(True, changes))
+    length = np.diff(np.append(start, len(rows)))
+    usual = int(np.median(length))
+    long = length > max(2, 2 * usual)
+    if not long.any():
+        return np.zeros(len(rows), dtype=bool)
+    step = np.pad(_change(rows, 1), 1, constant_values=np.nan)
+    before, after = step[start], step[start + length]
+    moves = (after > change) | (np.isnan(after) & (start > 0))
+    if name == VECTORS[1]:  # a resting one may read its bias, or zero
+        rest = (size[start] < _SLOW_RAD_S) & (np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S))
+        for axis in () if force is None else force.T:
+            rest &= ~(np.fmax.reduceat(axis, start) - np.fmin.reduceat(axis, start) > _STEADY_M_S2)
+        moves &= ~rest
+    else:  # what is repeated to the log's end was left while the sensor turned
+        turn = 0.0 if rate is None else np.add.reduceat(np.nan_to_num(_norm(rate)), start)
+        moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)
+    place = np.arange(len(rows)) - np.repeat(start, length)
+    return np.asarray(np.repeat(long & moves, length) & (place >= usual))
 
 
 def _clipped(rows: FloatArray) -> BoolArray:
@@ -209,10 +198,10 @@ def _spikes(rows: FloatArray, height: float) -> BoolArray:
     """Single rows far from both neighbours, which are near each other."""
     bad = np.zeros(len(rows), dtype=bool)
     if np.isfinite(height) and len(rows) > 2:
-        padded = np.concatenate([rows[1:2], rows, rows[-2:-1]])
-        away = 0.5 * _norm(np.diff(padded, n=2, axis=0))
-        at = np.flatnonzero(away > height)
-        bad[at[_norm(padded[at + 2] - padded[at]) < 0.2 * away[at]]] = True
+        at = np.flatnonzero(np.pad(_change(rows, 2), 1, constant_values=np.inf) > 2.0 * height)
+        before, after = np.abs(at - 1), np.where(at + 1 < len(rows), at + 1, at - 1)
+        away = 0.5 * _norm(rows[before] - 2.0 * rows[at] + rows[after])
+        bad[at[(away > height) & (_norm(rows[after] - rows[before]) < 0.2 * away)]] = True
     return bad
 
 
