@@ -108,14 +108,11 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     before, log = len(log.notes), measured(log)
     notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
     if rate is None or force is None:
-        why = [
-            note for note in (*log.notes[:before], *notes) if note.startswith(("columns", "gyro", "accel"))
-        ]
-        missing = " and ".join(
-            name for name, rows in (("gyroscope", rate), ("accelerometer", force)) if rows is None
-        )
-        got = "; ".join([f"no {missing}", *why])
-        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {got}")
+        got = [f"no {name}" for name, rows in (("gyroscope", rate), ("accelerometer", force)) if rows is None]
+        got += [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
+        if log.oriented.any():
+            got.append("--method sensor takes the sensor's own orientation")
+        raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {'; '.join(got)}")
     turns, told = (np.asarray(np.isfinite(rows).all(axis=1)) for rows in (rate, force))
     used = np.flatnonzero(_near(log.time_s, turns) & _near(log.time_s, told))
     if turns[used].sum() < 2 or told[used].sum() < 2:
