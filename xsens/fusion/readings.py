@@ -108,7 +108,8 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     before, log = len(log.notes), measured(log)
     notes, rate, force = list(log.notes[before:]), log.gyroscope_rad_s, log.accelerometer_m_s2
     if rate is None or force is None:
-        got = [f"no {name}" for name, rows in (("gyroscope", rate), ("accelerometer", force)) if rows is None]
+        missing = (name for name, rows in (("gyroscope", rate), ("accelerometer", force)) if rows is None)
+        got = [f"no {' and no '.join(missing)}"]
         got += [note for note in log.notes if note.startswith(("columns", "gyro", "accel"))]
         if log.oriented.any():
             got.append("--method sensor takes the sensor's own orientation")

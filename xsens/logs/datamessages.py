@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.logs.clocks import Stamps
+from xsens.logs.faults import saturated
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
 from xsens.logs.worlds import Claim, quaternions_of
 from xsens.messages.control import Configuration, MessageId, utc_time_s
 from xsens.messages.framing import Frames, Message
-from xsens.messages.mtdata import DataLayout, OutputMode, Values
+from xsens.messages.mtdata import DataLayout, OutputMode, as_floats
 from xsens.messages.mtdata2 import ORIENTATIONS, STAMPS, read_items
 from xsens.messages.rawcounts import BLOCK_SIZE, NOT_COMPENSATED, RawCalibration
 
@@ -43,11 +44,9 @@ def _stretches(frames: Frames, which: IntArray) -> Stamps:
 
 # -- legacy MTData
 
-_RAW = OutputMode.RAW | OutputMode.MT9
 _RAW_VECTORS = ("raw_accelerometer", "raw_gyroscope", "raw_magnetometer")
 _NOTATIONS = ("quaternion_wxyz", "matrix", "euler_deg")
-_SOME = 1 << 12
-"""Messages decoded at a time: as numbers they take several times their memory."""
+_WANTED = ("counter", *VECTORS, *_NOTATIONS)
 
 
 def legacy_samples(frames: Frames, which: IntArray) -> Parts:
@@ -68,14 +67,21 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
     if not fits.all():
         notes.append(f"{(~fits).sum()} data messages were not as long as configured: left out")
         which = which[fits]
-    raw = bool(layout.mode & _RAW)
-    if raw and calibration is None:
-        raise InvalidInputError("expected a calibration block before raw counts, got none")
-    if raw:
-        notes.append(NOT_COMPENSATED)
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
     rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
-    values = _decoded(layout, frames[which], calibration if raw else None)
+    rows = layout.decode(frames[which].payloads())
+    values = {name: as_floats(rows[name]) for name in rows.dtype.names if name in _WANTED}
+    if layout.mode & (OutputMode.RAW | OutputMode.MT9):
+        if calibration is None:
+            raise InvalidInputError("expected a calibration block before raw counts, got none")
+        notes.append(NOT_COMPENSATED)
+        for sensor, name in enumerate(VECTORS):
+            counts = as_floats(rows[_RAW_VECTORS[sensor]])
+            ends = saturated(counts)  # which the units' mixture of axes would hide
+            values[name] = calibration.to_units(sensor, counts)
+            if ends.any():
+                values[name][ends] = np.nan
+                notes.append(f"{name.split('_')[0]}: {ends.sum()} at the end of the range: taken as missing")
     counter = values.get("counter")
     return Parts(
         replace(
@@ -88,22 +94,6 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
         Claim(layout.frame, "as configured"),
         tuple(notes),
     )
-
-
-def _decoded(layout: DataLayout, frames: Frames, calibration: RawCalibration | None) -> Values:
-    """Counter, orientation and readings of all messages, raw counts in units."""
-    values: Values = {}
-    for first in range(0, len(frames), _SOME):
-        some = slice(first, first + _SOME)
-        decoded = layout.decode(frames[some].payloads())
-        if calibration is not None:
-            counts = np.stack([decoded[name] for name in _RAW_VECTORS], axis=1)
-            decoded |= zip(VECTORS, calibration.to_units(counts), strict=True)
-        for name in decoded.keys() & {"counter", *_NOTATIONS, *VECTORS}:
-            if name not in values:
-                values[name] = np.empty((len(frames), decoded[name].shape[1]))
-            values[name][some] = decoded[name]
-    return values
 
 
 def _last(frames: Frames, which: BoolArray, read: Callable[[Message], Any]) -> Any:

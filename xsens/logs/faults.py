@@ -28,12 +28,12 @@ _OWN = "own orientation"
 _LIMITS = {
     VECTORS[0]: _Limits(2000.0, 0.3, 100.0),
     VECTORS[1]: _Limits(60.0, 0.03, 10.0),
-    VECTORS[2]: _Limits(100.0, 0.03, np.inf),
+    VECTORS[2]: _Limits(100.0, 0.03, 1.0),
     _OWN: _Limits(np.inf, 0.05, np.inf),
 }
 """Accelerometers end at 200 g, gyroscopes at 35 rad/s; a hand's knock lasts longer than a sample. A resting
 sensor's readings change by less than the second, its orientation by less than two degrees. The field's limits
-are in its median norm: a magnet at 1 cm makes six of it."""
+are in its median norm: a magnet at 1 cm makes six of it, over many samples."""
 
 _ABSURD = 1e6
 """Larger numbers are damage in any unit."""
@@ -132,7 +132,7 @@ def _bad(
         beyond = size >= _ABSURD
     if beyond.any() or not finite.all():
         rows = np.where((finite & ~beyond)[:, None], rows, np.nan)
-    clipped, spikes = _clipped(rows), _spikes(rows, limits.spike * unit)
+    ends, spikes = saturated(rows), _spikes(rows, limits.spike * unit)
     if name == VECTORS[1]:  # at rest zero is a reading
         zero &= dead
     repeated = _repeated(name, rows, limits.change * unit, size, force, rate) & finite & ~zero
@@ -140,7 +140,7 @@ def _bad(
         "readings of zero": zero,
         "out of range": beyond,
         "repeated": repeated,
-        "at the end of the range": clipped & ~repeated & ~zero,
+        "at the end of the range": ends & ~repeated & ~zero,
         "single spikes": spikes & ~zero,
     }
 
@@ -176,7 +176,7 @@ def _repeated(
     return np.asarray(np.repeat(long & moves, length) & (place >= usual))
 
 
-def _clipped(rows: FloatArray) -> BoolArray:
+def saturated(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
     bad = np.zeros(len(rows), dtype=bool)
     for axis in rows.T:
@@ -184,8 +184,9 @@ def _clipped(rows: FloatArray) -> BoolArray:
             at = np.flatnonzero(axis == end)
             if at.size < 3:
                 continue
-            steps = np.pad(np.abs(np.diff(axis)), 2)  # into each sample from the second before it, and out
-            digit = np.min(steps[steps > 0.0], initial=np.inf)
+            steps = np.pad(np.diff(axis), 2)  # into each sample from the second before it, and out
+            np.abs(steps, out=steps)
+            digit = np.min(steps, where=steps > 0.0, initial=np.inf)
             first, last = at[np.diff(at, prepend=-2) > 1], at[np.diff(at, append=len(axis) + 1) > 1]
             steep = np.minimum(steps[first], steps[last + 3]) > 3.0 * digit
             for i, k in zip(first[steep], last[steep], strict=True):

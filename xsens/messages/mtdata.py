@@ -165,7 +165,6 @@ class DataLayout:
         """Bytes of the payload."""
         return self.dtype.itemsize
 
-    def decode(self, payloads: ByteArray) -> Values:
-        """Values of payloads, rows of bytes of shape (n, size)."""
-        rows = np.ascontiguousarray(payloads).view(self.dtype)[:, 0]
-        return {field.name: as_floats(rows[field.name]) for field in self.fields}
+    def decode(self, payloads: ByteArray) -> Any:
+        """Fields of payloads, rows of bytes of shape (n, size), by name; for `as_floats`."""
+        return np.ascontiguousarray(payloads).view(self.dtype)[:, 0]

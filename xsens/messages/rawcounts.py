@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
@@ -24,6 +23,9 @@ NOT_COMPENSATED = (
     "raw counts: dependence on temperature is not compensated (expect about 1 % of gravity), "
     "nor the housing's alignment applied"
 )
+
+_SOME = 1 << 12
+"""Rows at a time."""
 
 _BLOCK = np.dtype(
     {
@@ -89,17 +91,12 @@ class RawCalibration:
             np.concatenate((block["inertial"], block["magnetic"][None])) / 2.0**14,
         )
 
-    def to_units(self, counts: npt.ArrayLike) -> FloatArray:
-        """Acceleration in m/s², rate of turn in rad/s and field in arbitrary units.
+    def to_units(self, sensor: int, counts: FloatArray) -> FloatArray:
+        """Acceleration in m/s², rate of turn in rad/s or field in arbitrary units, of counts, shape (n, 3).
 
-        Parameters
-        ----------
-        counts : array_like, shape (n, 3, 3)
-            Counts of accelerometer, gyroscope and magnetometer, each x, y, z.
-
-        Returns
-        -------
-        ndarray, shape (3, n, 3)
+        The numbers take the place of the counts, as logs may be large.
         """
-        mixing = np.linalg.inv(self.misalignments) / self.gains[:, None]
-        return np.asarray(np.einsum("sij,nsj->sni", mixing, np.asarray(counts, dtype=float) - self.offsets))
+        axes = (np.linalg.inv(self.misalignments[sensor]) / self.gains[sensor]).T
+        for part in np.array_split(counts, 1 + len(counts) // _SOME):
+            part[:] = (part - self.offsets[sensor]) @ axes
+        return counts
