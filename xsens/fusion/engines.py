@@ -12,7 +12,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation import inclination as kernel
 from xsens.fusion.heading import UNKNOWN, HeadingFilter, averaged_bins, lasts_of_bins, steps_per_bin
-from xsens.fusion.readings import Estimate, Samples
+from xsens.fusion.readings import Estimate, Samples, turned
 from xsens.fusion.settings import FusionSettings
 
 _CLAIMED = np.array([0.6, 0.6, 1.0])
@@ -120,10 +120,3 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     _, _, disturbed, stray, iron = north[of_step].T
     resting = rows["resting"][of_step]
     return Estimate(xyzw, sd[of_step], biases[1:][of_step], disturbed > 0.0, resting, stray, iron)
-
-
-def turned(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
-    """Quaternions, shape (k, 4), turned about up."""
-    c, s = np.cos(0.5 * angles_rad), np.sin(0.5 * angles_rad)
-    x, y, z, w = xyzw.T
-    return np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])

@@ -85,6 +85,13 @@ class Estimate:
     field_iron: FloatArray
 
 
+def turned(angles_rad: FloatArray | float, xyzw: FloatArray) -> FloatArray:
+    """Quaternions, shape (k, 4), turned about up."""
+    c, s = np.cos(0.5 * angles_rad), np.sin(0.5 * angles_rad)
+    x, y, z, w = xyzw.T
+    return np.column_stack([c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z])
+
+
 def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
     """Prepare a log's readings for the filter.
 

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.fusion.engines import turned
-from xsens.fusion.readings import Estimate, Samples
+from xsens.fusion.readings import Estimate, Samples, turned
 
 _EVEN = 0.05
 """Largest distance of a sample from its place on an even clock, in steps, that is not told."""
