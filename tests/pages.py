@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -30,6 +31,11 @@ def run_page(page: Path, folder: Path) -> str:
 
     Installing is left out, as the tests run installed; so is the command that runs the tests.
     """
+    return "".join(printed for language, _, printed in ran(page, folder) if language in ("sh", "python"))
+
+
+def ran(page: Path, folder: Path) -> Iterator[tuple[str, str, str]]:
+    """Language and text of each block of a page, and what it printed when it was run as `run_page` does."""
     (folder / "data").symlink_to(ROOT / "data")
     command = folder.parent / f"{folder.name}-bin"
     command.mkdir()
@@ -43,25 +49,24 @@ def run_page(page: Path, folder: Path) -> str:
         "MPLBACKEND": "Agg",
     }
     script = command / "page.py"
-    printed = ""
     python: list[str] = []
     for language, text in blocks(page):
         if language == "sh":
-            runs = _without_installing(text)
-            arguments = ["bash", "-euo", "pipefail", "-c", runs]
+            arguments = ["bash", "-euo", "pipefail", "-c", _without_installing(text)]
         elif language == "python":
             # Blocks of a page share their names; those before are run again, without what they print.
             script.write_text(_after(python, text))
             python.append(text)
             arguments = [sys.executable, "-W", "error::DeprecationWarning:__main__", str(script)]
         else:
+            yield language, text, ""
             continue
         done = subprocess.run(
-            arguments, cwd=folder, env=environment, capture_output=True, text=True, timeout=_TIMEOUT_S
-        )
-        assert done.returncode == 0, f"{page.name}:\n{text}\n{done.stdout}{done.stderr}"
-        printed += done.stdout
-    return printed
+            arguments, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            text=True, timeout=_TIMEOUT_S,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{page.name}:\n{text}\n{done.stdout}"
+        yield language, text, done.stdout
 
 
 def _after(before: list[str], text: str) -> str:

@@ -1,0 +1,42 @@
+"""Write what tutorials print into their pages: ``python tests/docs/print_outputs.py [PAGE...]``.
+
+A block of text is what the block of commands before it prints; a line of three dots in it stays: it leaves
+out what lies between as many first and last lines as there were.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from pages import ROOT, ran
+
+
+def shortened(printed: str, shown: str) -> str:
+    """What was printed, cut where the page cuts it."""
+    lines, before = printed.splitlines(), shown.splitlines()
+    if "..." in before:
+        first = before.index("...")
+        last = len(before) - first - 1
+        lines = [*lines[:first], "...", *(lines[-last:] if last else [])]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def write_outputs(page: Path) -> None:
+    """Run a page, and put what it prints in place of what it shows."""
+    text, printed = page.read_text(encoding="utf-8"), ""
+    with tempfile.TemporaryDirectory() as folder:
+        empty = Path(folder) / "empty"
+        empty.mkdir()
+        for language, block, output in ran(page, empty):
+            if language == "text":
+                text = text.replace(f"```text\n{block}```", f"```text\n{shortened(printed, block)}```", 1)
+            printed = output or printed
+    page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    pages = sys.argv[1:] or sorted(map(str, (ROOT / "docs" / "tutorials").glob("*.md")))
+    for name in pages:
+        write_outputs(Path(name))
