@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.plane import Problem, Solution
+from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 

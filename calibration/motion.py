@@ -20,7 +20,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
 if TYPE_CHECKING:
-    from calibration.plane import Solution
+    from calibration.solution import Solution
 
 MAX_CONDITION = 1000.0
 """Robot calibration asks for 100 (TR 303, section 4.2); its bare-wall trials were at 211 and 448."""
@@ -191,7 +191,7 @@ def extents(solution: Solution) -> dict[str, float]:
         turns = solution.chain.target_from_image(points).rotation
         spread = (turns.mean().inv() * turns).as_rotvec().std(axis=0) / _STEP_RAD
         return dict(zip(MOTIONS, [*spread, *(points.pixels * size).std(axis=0) / steps_mm], strict=True))
-    up = points.turns.transpose(0, 2, 1) @ solution.chain.target_from_world.rotation.as_matrix()[2]
+    up = points.turns.transpose(0, 2, 1) @ solution.chain.target[2, :3]
     middle = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     swing = float(np.sum((up - np.outer(up @ middle, middle)).var(axis=0)))
     if solution.prior is not None:

@@ -20,12 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.points import SeenAs, columns_of
+from calibration.points import SCALES, SeenAs, columns_of
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.threads import ahead
 from speckle3d.kernels.wander import innovations
@@ -53,6 +54,8 @@ _SINGULAR = 1e-15
 """Ratio of eigenvalues below which a direction counts as not determined."""
 _SMALLEST = 1e-12
 """Residuals below are rounding: nothing wanders in them."""
+_FELT = 1e-9
+"""Share of the largest squared effect below which an error along an axis moves no residual."""
 _STEPS = 3
 """The first finds the answer, the second takes the errors out of the derivatives, the third the rest."""
 _SETTLED = 0.05
@@ -98,27 +101,12 @@ def make_grid(
     span = max(float(np.ptp(frame_time_s)), _SMALLEST)
     spacing = float(np.median(np.diff(frame_time_s))) if len(frame_time_s) > 1 else span
     times = np.geomspace(min(max(_SHORTEST * spacing, _SMALLEST), span), _LONGEST * span, _TIMES)
-    units = []
-    for proportion in proportions:
-        effect = float(np.mean((effects * proportion) ** 2)) * len(proportion)
-        units.append(proportion**2 / max(effect, _SMALLEST**2))
-    few, many = (
-        1.0 / (1 + len(units) * sum(shake > 0 for shake in jitter)),
-        len(WANDER) * len(jitter) * _TIMES * len(units),
-    )
-    rows = [
-        (0.0, shake, times[0], STEADY * few, *unit)
-        for shake in jitter
-        for unit in (units if shake else units[:1])
-    ]
-    rows += [
-        (wander, shake, time, (1.0 - STEADY) / many, *unit)
-        for wander in WANDER
-        for shake in jitter
-        for time in times
-        for unit in units
-    ]
-    return np.array(rows)
+    squares = [one**2 for one in proportions]
+    units = [one / max(float(np.sum(np.mean(effects**2, axis=0) * one)), _SMALLEST**2) for one in squares]
+    still = [(0.0, shake, times[0], unit) for shake in jitter for unit in (units if shake else units[:1])]
+    wandering = product(WANDER, jitter, times, units)
+    parts = [(STEADY, still), (1.0 - STEADY, list(wandering))]
+    return np.array([(*one, share / len(part), *unit) for share, part in parts for *one, unit in part])
 
 
 def fit_wandering(
@@ -128,8 +116,8 @@ def fit_wandering(
     starts: IntArray,
     frame_time_s: FloatArray,
     grid: FloatArray,
-    prior: FloatArray | None = None,
-    excess: FloatArray | None = None,
+    certainty: FloatArray | float = 0.0,
+    excess: FloatArray | float = 0.0,
 ) -> tuple[Noise, FloatArray]:
     """Solve linear least squares whose residuals carry white noise and a sensor's wandering error.
 
@@ -139,8 +127,8 @@ def fit_wandering(
     effects : ndarray, shape (m, k)
     starts : ndarray of int, shape (frames + 1,)
         First residual of each frame, and their number; residuals of a frame have one sensor reading.
-    prior : ndarray, shape (p, p), optional
-        Inverse covariance of what is known of the parameters besides.
+    certainty : ndarray, shape (p,), optional
+        Inverse variance of what is known of each parameter besides.
     excess : ndarray, shape (p,), optional
         By how much the present parameters exceed what is known.
 
@@ -152,7 +140,7 @@ def fit_wandering(
     """
     scale = np.linalg.norm(jacobian, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    information = np.zeros((len(scale), len(scale))) if prior is None else prior / np.outer(scale, scale)
+    information = np.broadcast_to(certainty / scale**2, scale.shape)
     columns = np.ascontiguousarray(np.column_stack([jacobian / scale, residuals]))
     wandering, jitter, constant_s, before, units = *grid.T[:4], grid[:, 4:]
     pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
@@ -174,9 +162,9 @@ def fit_wandering(
     likelihood = -0.5 * (free * np.log(variance) + log_determinant + volume)
     weight = before * np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
-    back = np.zeros(len(scale)) if excess is None else information @ (excess * scale)
-    spread = np.linalg.pinv(matrix / variance[:, None, None] + information, rcond=_SINGULAR, hermitian=True)
-    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + back)
+    known = matrix / variance[:, None, None] + np.diag(information)
+    spread = np.linalg.pinv(known, rcond=_SINGULAR, hermitian=True)
+    steps = -np.einsum("gij,gj->gi", spread, pull / variance[:, None] + information * excess * scale)
     step = weight @ steps
     away = steps - step
     covariance = np.einsum("g,gij->ij", weight, spread) + (weight * away.T) @ away
@@ -191,11 +179,23 @@ def fit_wandering(
 
 def sensor_effects(equations: Equations, chain: Chain) -> FloatArray:
     """How residuals move with turns of the sensor about the world's axes, rad, and shifts, mm; (n, r, 6)."""
-    points, target = equations.points, chain.target_from_world.as_matrix()[:3, :3]
-    in_world = equations.rows @ target
-    flat = np.column_stack([points.pixels * chain.pixel_mm, np.zeros(len(points))])
-    arm = np.einsum("nij,nj->ni", points.turns, chain.sensor_from_image.apply(flat))
+    points, in_world = equations.points, equations.rows @ chain.target[:3, :3]
+    in_sensor = (points.pixels * chain.pixel_mm) @ chain.probe[:3, :2].T + chain.probe[:3, 3]
+    arm = np.einsum("nij,nj->ni", points.turns, in_sensor)
     return np.concatenate([np.cross(arm[:, None], in_world), in_world], axis=2)
+
+
+def _felt(effects: FloatArray, directions: bool) -> tuple[FloatArray, FloatArray]:
+    """Turns and shifts that the residuals feel at all, as axes, shape (k, 6), and which are shifts, (k,).
+
+    An error is as likely along any axis, so that axes may be chosen: of a plane, two turns and one shift.
+    """
+    axes = []
+    for first in (0,) if directions else (0, 3):
+        block = effects[:, first : first + 3]
+        sizes, along = np.linalg.eigh(block.T @ block)
+        axes.append(np.pad(along.T[sizes > _FELT * sizes[-1]], ((0, 0), (first, 3 - first))))
+    return np.concatenate(axes), np.repeat([False, True][: len(axes)], [len(one) for one in axes])
 
 
 def fit_noise(
@@ -231,50 +231,41 @@ def fit_noise(
     frame_time_s = points.times[starts[:-1] // several]
     beside = np.zeros((equations.offsets.size, 0)) if more is None else more
     further, count = np.zeros(beside.shape[1]), len(free)
-    information, excess = _known(prior, chain, free, count + len(further))
-    corrected, expected, grid = equations, np.zeros(len(beside)), None
+    corrected, expected = equations, np.zeros(len(beside))
+    effects = sensor_effects(equations, chain).reshape(len(beside), 6)
+    axes, shifts = _felt(effects, seen_as == "direction")
+    in_mm = PROPORTIONS_MM if shifts.any() else PROPORTIONS_MM[:1]
+    proportions = [np.where(shifts, np.rad2deg(mm), 1.0) for mm in in_mm]
+    lonely = len(starts) - 1 == len(beside)
+    grid = make_grid(effects @ axes.T, frame_time_s, proportions, (0.0,) if lonely else JITTER)
     for number in range(_STEPS):
         values, slopes = corrected.at(chain)
         # What was taken out of the points, put back as the small thing that it is.
         residuals = values.ravel() + expected + beside @ further
         jacobian = np.hstack([slopes.reshape(len(beside), -1)[:, columns], beside])
-        effects = sensor_effects(corrected, chain).reshape(len(beside), -1)
-        if seen_as == "direction":
-            effects = effects[:, :2]  # the heading hardly moves lines of a plane that is nearly level
-        if grid is None:
-            lonely = len(starts) - 1 == len(beside)
-            grid = make_grid(effects, frame_time_s, _proportions(seen_as), (0.0,) if lonely else JITTER)
-        noise, grid = fit_wandering(
-            jacobian, residuals, effects, starts, frame_time_s, grid, information, excess
-        )
+        effects = sensor_effects(corrected, chain).reshape(len(beside), 6) @ axes.T
+        known = _known(prior, chain, free, count + len(further))
+        noise, grid = fit_wandering(jacobian, residuals, effects, starts, frame_time_s, grid, *known)
         sensor, image = _divided(residuals + jacobian @ noise.step, effects, starts, noise)
         step = np.zeros(slopes.shape[-1])
         step[columns] = noise.step[:count]
         chain, further = chain.displaced(step), further + noise.step[count:]
-        information, excess = _known(prior, chain, free, count + len(further))
-        corrected, expected = _corrected(equations, chain, sensor, image)
+        corrected, expected = _corrected(equations, chain, sensor @ axes, image)
         if number > 0 and (np.abs(noise.step) <= _SETTLED * np.sqrt(np.diag(noise.covariance))).all():
             break
     return chain, further, noise.covariance
 
 
-def _proportions(seen_as: SeenAs) -> list[FloatArray]:
-    if seen_as == "direction":
-        return [np.ones(2)]
-    return [np.repeat([1.0, np.rad2deg(mm)], 3) for mm in PROPORTIONS_MM]
-
-
 def _known(
     prior: PixelPrior | None, chain: Chain, free: Sequence[str], count: int
-) -> tuple[FloatArray | None, FloatArray | None]:
-    """Inverse covariance of what is known of the pixel size, and by how much the parameters exceed it."""
-    if prior is None:
-        return None, None
-    inverse, excess = np.zeros(count), np.zeros(count)
-    columns = [list(free).index(name) for name in ("s_x", "s_y")]
-    inverse[columns] = (prior.pixel_mm * prior.error) ** -2.0
-    excess[columns] = chain.pixel_mm - prior.pixel_mm
-    return np.diag(inverse), excess
+) -> tuple[FloatArray, FloatArray]:
+    """Inverse variances of what is known of the pixel size, and by how much the parameters exceed it."""
+    certainty, excess = np.zeros((2, count))
+    if prior is not None:
+        columns = [list(free).index(name) for name in SCALES]
+        certainty[columns] = (prior.pixel_mm * prior.error) ** -2.0
+        excess[columns] = chain.pixel_mm - prior.pixel_mm
+    return certainty, excess
 
 
 def _divided(
@@ -306,13 +297,11 @@ def _corrected(
 ) -> tuple[Equations, FloatArray]:
     """Take expected errors out of poses and pixels; return also what that takes out of the residuals."""
     points, (n, several) = equations.points, equations.offsets.shape
-    error = np.zeros((n, 6))
-    error[:, : sensor.shape[1]] = sensor[::several]
+    error = sensor[::several]
     moved = points.world_from_sensor.as_matrix()
     moved[:, :3, :3] = Rotation.from_rotvec(-error[:, :3]).as_matrix() @ points.turns
     moved[:, :3, 3] -= error[:, 3:]
-    in_world = equations.rows @ chain.target_from_world.as_matrix()[:3, :3]
-    in_image = in_world @ points.turns @ chain.sensor_from_image.as_matrix()[:3, :2]
+    in_image = equations.rows @ chain.target[:3, :3] @ points.turns @ chain.probe[:3, :2]
     # The smallest displacement in the image, mm, that explains what is left to it.
     square = in_image @ np.swapaxes(in_image, 1, 2) + 1e-9 * np.eye(several)
     pull = np.linalg.solve(square, image.reshape(n, several, 1))[..., 0]
@@ -321,5 +310,4 @@ def _corrected(
     shown = replace(points, world_from_sensor=poses, pixels=points.pixels - moved_mm / chain.pixel_mm)
     corrected = replace(equations, points=shown)
     effects = sensor_effects(corrected, chain).reshape(-1, 6)
-    turned = np.repeat(error, several, axis=0)
-    return corrected, np.sum(effects * turned, axis=1) + np.einsum("nri,ni->nr", in_image, moved_mm).ravel()
+    return corrected, np.sum(effects * sensor, axis=1) + np.einsum("nri,ni->nr", in_image, moved_mm).ravel()

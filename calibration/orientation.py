@@ -11,19 +11,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from calibration.motion import require_adequate
-from calibration.plane import (
-    Problem,
-    Solution,
-    angle_starts,
-    hemisphere,
-    in_plane_mirror,
-    line_directions,
-)
+from calibration.plane import angle_starts, hemisphere, line_directions
 from calibration.points import ANGLES, SOME_FRAMES, ImagePoints, as_directions
 from calibration.settings import OrientationFit
+from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 
@@ -87,8 +80,7 @@ def _upright(solution: Solution, viewed_from: str) -> Solution:
     InsufficientDataError
         If the beams are level on average.
     """
-    turns = solution.points_used.world_from_sensor.rotation * solution.chain.sensor_from_image.rotation
-    down = -float(turns.as_matrix()[:, 2, 1].mean())
+    down = -float((solution.points_used.turns[:, 2] @ solution.chain.probe[:3, 1]).mean())
     if abs(down) < MIRROR_LIMIT:
         raise InsufficientDataError(
             f"expected beams that point down on average, got {np.rad2deg(np.arcsin(down)):.0f} degrees "
@@ -97,15 +89,13 @@ def _upright(solution: Solution, viewed_from: str) -> Solution:
         )
     if (down > 0) == (viewed_from == "above"):
         return solution
-    mirror = in_plane_mirror(solution.chain.sensor_from_image.rotation)
-    chain = replace(solution.chain, sensor_from_image=RigidTransform.from_rotation(mirror))
-    return replace(solution, chain=chain, residuals=-solution.residuals)
+    return replace(solution, chain=solution.chain.mirrored(), residuals=-solution.residuals)
 
 
 def _require_floor(solution: Solution) -> None:
     """Refuse a plane that is certainly not a floor; `judge` names what leaves one undetermined."""
     certain = np.diag(solution.image_covariance(("beta_c", "gamma_c"))).max() < _CERTAIN_RAD**2
-    slope = float(np.arccos(min(abs(solution.chain.target_from_world.rotation.as_matrix()[2, 2]), 1.0)))
+    slope = float(np.arccos(min(abs(solution.chain.target[2, 2]), 1.0)))
     if certain and slope > STEEPEST_PLANE:
         raise InsufficientDataError(
             f"expected a plane within {np.rad2deg(STEEPEST_PLANE):.0f} degrees of level, got one at "

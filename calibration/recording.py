@@ -13,7 +13,7 @@ from calibration.beam import BeamBias
 from calibration.clock.fitted import estimate_offset, with_uncertain_offset
 from calibration.clock.offset import ClockOffset, covered
 from calibration.consensus import GATES_MM, Consensus, find_consensus
-from calibration.plane import Solution
+from calibration.solution import Solution
 from calibration.points import ImagePoints, Seen
 from calibration.registration import Choice
 from calibration.report import Shot, as_calibration

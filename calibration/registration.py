@@ -19,9 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.plane import Equations, Solution, least_squares
 from calibration.points import ImagePoints
 from calibration.settings import Registration, WireFit
+from calibration.solution import Solution
 from calibration.wires import calibrate_wires
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
@@ -107,8 +107,8 @@ def _missed_mm(solution: Solution) -> FloatArray:
     points, phantom, missed = solution.points, solution.phantom, []
     for frames in np.array_split(points.frames, FOLDS):
         out = np.isin(points.frame, frames)
-        kept = Equations.of(points[solution.used & ~out], phantom)
-        chain = least_squares(kept, solution.chain, solution.free)
-        left = Equations.of(points[out], phantom).residuals(chain)
+        kept = phantom.equations(points[solution.used & ~out])
+        chain = kept.least_squares(solution.chain, solution.free)
+        left = phantom.equations(points[out]).residuals(chain)
         missed.append(float(np.linalg.norm(left, axis=1).mean()))
     return np.array(missed)

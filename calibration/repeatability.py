@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.plane import Equations, Problem, Solution
 from calibration.points import ImagePoints, as_directions
+from calibration.solution import Problem, Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
@@ -117,4 +117,4 @@ def validate(solution: Solution, points: ImagePoints) -> FloatArray:
     points = as_directions(points, chain.pixel_mm) if solution.angular else points
     if phantom.seen_as != "dot" and phantom.determined:
         return Problem(phantom, (), np.inf).solve(points, chain).residuals
-    return Equations.of(points, phantom).residuals(chain)
+    return phantom.equations(points).residuals(chain)

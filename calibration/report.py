@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.plane import Solution
+from calibration.solution import Solution
 from calibration.points import ANGLES, CHAIN, SCALES
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable

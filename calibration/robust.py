@@ -11,6 +11,8 @@ _ROUNDING = 1e-9
 """Standard deviation below which residuals are rounding errors."""
 _ABSOLUTE, _SOLUTIONS = 0.6745, 4
 """Limit of Huber's weights, standard deviations: residuals above the median count by their absolute value."""
+_NEARLY, _TINY = 0.1, 1e-12
+"""Residuals above this share of the median count by their absolute value."""
 
 
 def robust_linear(matrix: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -43,6 +45,11 @@ def robust_linear(matrix: FloatArray, wanted: FloatArray) -> tuple[FloatArray, F
         weights = huber_weights(size / robust_sigma(size, _ROUNDING), _ABSOLUTE)
         root = np.repeat(np.sqrt(weights), group)
     return np.asarray(parameters), np.asarray(residuals).reshape(wanted.shape)
+
+
+def absolute_weights(sizes: FloatArray, axis: int | None = None) -> FloatArray:
+    """Weights by which most residuals count by their absolute value: Huber's, with a tenth of the median."""
+    return np.asarray(1.0 / np.maximum(sizes, _NEARLY * np.median(sizes, axis, keepdims=True) + _TINY))
 
 
 def autocorrelation_time(residuals: FloatArray) -> float:

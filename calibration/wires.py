@@ -17,10 +17,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
 from calibration.motion import require_adequate
-from calibration.plane import Chain, Equations, Phantom, Problem, Solution, probe_parameters
+from calibration.plane import Chain, Phantom
 from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
 from calibration.robust import robust_linear
 from calibration.settings import Registration, WireFit
+from calibration.solution import Problem, Solution, probe_parameters
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
@@ -34,7 +35,7 @@ _TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
-class CrossWire:
+class CrossWire(Phantom):
     """Two wires that cross, or a bead: one point, three equations (TR 303, equation 3)."""
 
     determined: tuple[str, ...] = TARGET[:3]
@@ -47,7 +48,7 @@ class CrossWire:
 
 
 @dataclass(frozen=True)
-class Wires:
+class Wires(Phantom):
     """Straight wires of known geometry: two equations for each dot (TR 303, equation 7).
 
     Parameters
@@ -105,7 +106,7 @@ def calibrate_cross_wire(
     solution = _beside(problem.best(chosen[near], [first.chain]), s.beside_mm)
     used = near.copy()
     used[near] = solution.used
-    residuals = Equations.of(chosen, CrossWire()).residuals(solution.chain)
+    residuals = CrossWire().equations(chosen).residuals(solution.chain)
     return require_adequate(replace(solution, points=chosen, used=used, residuals=residuals))
 
 
@@ -137,7 +138,7 @@ def squared(image: FloatArray, point_mm: FloatArray) -> Chain:
     size = np.maximum(np.linalg.norm(image[1:], axis=1), 1e-6)
     turn = Rotation.from_matrix(nearest_rotation((image[1:] / size[:, None]).T))
     probe = RigidTransform.from_components(image[0], turn)
-    return Chain(size, probe, RigidTransform.from_translation(-point_mm))
+    return Chain.of(size, probe, RigidTransform.from_translation(-point_mm))
 
 
 def calibrate_wires(
@@ -256,4 +257,4 @@ def wire_start(
     image = np.vstack([found[:3] - centre @ axes, axes])
     shift = RigidTransform.from_translation(found[9:] if shifted else np.zeros(3))
     chain = squared(image, np.zeros(3))
-    return replace(chain, target_from_world=shift * known), float(np.median(np.abs(left)))
+    return replace(chain, target=(shift * known).as_matrix()), float(np.median(np.abs(left)))

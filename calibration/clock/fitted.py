@@ -16,8 +16,8 @@ from calibration.clock.offset import ClockOffset, covered, delays_around, peak_o
 from calibration.clock.smoothing import SmoothReadings
 from calibration.motion import InadequateError
 from calibration.noise import fit_noise
-from calibration.plane import Equations, Solution, nearly_absolute, sigma_of
 from calibration.points import SCALES, SOME_FRAMES, ImagePoints, as_directions
+from calibration.solution import Solution, sigma_of
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
@@ -121,9 +121,9 @@ def _joint_fit(
         _as_seen(solution, points_at(at))[used]
         for at in (seconds, seconds + _DERIVATIVE_S, seconds - _DERIVATIVE_S)
     )
-    change = Equations.of(later, phantom).residuals(chain) - Equations.of(sooner, phantom).residuals(chain)
+    change = phantom.equations(later).residuals(chain) - phantom.equations(sooner).residuals(chain)
     column = change.reshape(-1, 1) / (2.0 * _DERIVATIVE_S)
-    equations, seen_as = Equations.of(here, phantom), phantom.seen_as
+    equations, seen_as = phantom.equations(here), phantom.seen_as
     _, further, joint = fit_noise(equations, chain, solution.free, seen_as, solution.prior, column)
     return float(further[-1]), joint
 
@@ -147,9 +147,9 @@ def _sigmas(
     sigmas = []
     for number, points in enumerate(some):
         solution = found[min(found, key=lambda begin: abs(begin - number))]
-        equations = Equations.of(_as_seen(solution, points), solution.phantom)
+        equations = solution.phantom.equations(_as_seen(solution, points))
         free = [name for name in solution.free if solution.prior is None or name not in SCALES]
-        chain = nearly_absolute(equations, solution.chain, free)
+        chain = equations.least_absolute(solution.chain, free)
         sigmas.append(sigma_of(equations.residuals(chain)))
     return np.array(sigmas)
 

@@ -1,0 +1,318 @@
+"""From a start to a calibration: frames that contradict the others, errors that wander, and the other answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from calibration.motion import Adequacy, judge
+from calibration.noise import fit_noise
+from calibration.points import CHAIN, POSE, PROBE, SCALES, SOME_FRAMES, ImagePoints, columns_of
+from calibration.robust import autocorrelation_time
+from calibration.settings import OUTLIER_SIGMA
+from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.geometry import skew
+from speckle3d.core.leastsquares import condition_number, robust_sigma
+from speckle3d.core.shown import shown
+
+if TYPE_CHECKING:
+    from calibration.plane import Chain, Phantom, PixelPrior
+
+_SMALLEST_SIGMA = 1e-7
+"""Residuals of exact data are rounding; nothing in them is an outlier."""
+_FREE_ROUNDS, _MOST_ROUNDS = 5, 30
+"""After so many rounds frames may be left out but not taken back, so that the rounds end."""
+_RUNAWAY, _RESIZED = 2.0, 0.1
+"""A fit with wandering errors that doubles the residuals or changes pixel sizes by a tenth has run away along
+what the motion leaves open."""
+_CUT = 3.0
+"""Residuals count up to so many standard deviations where answers are compared."""
+_APART_RAD, _APART = np.deg2rad(5.0), 0.1
+"""Two answers differ by this angle, or by this share of the image's size."""
+
+
+@shown
+@dataclass(frozen=True)
+class Solution:
+    """A calibration as the solver leaves it: the chain, its certainty, and the frames it is made from.
+
+    Attributes
+    ----------
+    free : tuple of str, length p
+        The parameters estimated, among `CHAIN`.
+    covariance : ndarray, shape (p, p)
+        Of the free parameters: small displacements in the image's frame and in the phantom's.
+    points : ImagePoints
+        All that were given.
+    used : ndarray of bool, shape (n,)
+    residuals : ndarray, shape (n, r)
+        Of all points, mm (sines of angles for directions).
+    sigma : float
+        Robust standard deviation of the residuals of the points used.
+    evidence : float
+        By how much the sum of squared residuals of another answer, far away, to which a discrete ambiguity
+        leads, exceeds the solution's, in variances of an independent one.
+    assumed : str
+        What no image tells, and was taken for granted.
+    """
+
+    chain: Chain
+    phantom: Phantom
+    free: tuple[str, ...]
+    covariance: FloatArray
+    points: ImagePoints
+    used: BoolArray
+    residuals: FloatArray
+    sigma: float
+    prior: PixelPrior | None = None
+    evidence: float = np.inf
+    assumed: str = ""
+
+    @property
+    def angular(self) -> bool:
+        """Whether only directions are known: residuals are sines of angles, and nothing has a length."""
+        return self.phantom.seen_as == "direction"
+
+    @cached_property
+    def jacobian(self) -> FloatArray:
+        """Derivatives of the residuals used by small displacements, shape (n r, p)."""
+        _, slopes = self.phantom.equations(self.points_used).at(self.chain)
+        return slopes.reshape(-1, len(CHAIN))[:, columns_of(self.free)]
+
+    @property
+    def condition_number(self) -> float:
+        """Of the derivatives, columns scaled to one length."""
+        return condition_number(self.jacobian)
+
+    @property
+    def corners_moved(self) -> FloatArray:
+        """Derivatives of the image's corners, mm, by the displacements of `CHAIN`, shape (4, 3, 14)."""
+        corners = _corners(self.points_used)
+        moved = np.zeros((4, 3, len(CHAIN)))
+        moved[:, 0, 0], moved[:, 1, 1] = corners.T
+        moved[:, :, 2:5] = np.eye(3)
+        moved[:, :, 7:4:-1] = -skew(np.column_stack([corners * self.chain.pixel_mm, np.zeros(4)]))
+        return moved
+
+    @cached_property
+    def adequacy(self) -> Adequacy:
+        """Whether the motion was sufficient, and what is missing."""
+        return judge(self)
+
+    @cached_property
+    def points_used(self) -> ImagePoints:
+        """The points that the solution is made from."""
+        return self.points[self.used]
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual of the points used."""
+        return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
+
+    @cached_property
+    def full_covariance(self) -> FloatArray:
+        """Covariance of all of `CHAIN`, zero for parameters held, shape (14, 14)."""
+        full, columns = np.zeros((len(CHAIN), len(CHAIN))), columns_of(self.free)
+        full[np.ix_(columns, columns)] = self.covariance
+        return full
+
+    def image_covariance(self, names: Sequence[str]) -> FloatArray:
+        """Covariance of some of the parameters, zero for those held."""
+        columns = columns_of(names)
+        return self.full_covariance[np.ix_(columns, columns)]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is solved, from whichever start.
+
+    Parameters
+    ----------
+    phantom : Phantom
+    probe : tuple of str
+        Which of `PROBE` to estimate, besides all that the phantom determines.
+    outlier_sigma : float
+        Frames whose largest residual exceeds so many robust standard deviations are left out.
+    prior : PixelPrior, optional
+        Counts where the pixel size is estimated.
+    """
+
+    phantom: Phantom
+    probe: tuple[str, ...] = PROBE
+    outlier_sigma: float = OUTLIER_SIGMA
+    prior: PixelPrior | None = None
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters estimated."""
+        return (*self.probe, *self.phantom.determined)
+
+    def solve(self, points: ImagePoints, start: Chain) -> Solution:
+        """Refine a start until residuals are least, leaving out frames that contradict the others.
+
+        Raises
+        ------
+        InsufficientDataError
+            If there are too few points, or fewer than half of the frames agree.
+        """
+        chain, used = self.agreed(points, start)
+        equations, free = self.phantom.equations(points), self.free
+        counting = equations[used]
+        settled, _, covariance = fit_noise(counting, chain, free, self.phantom.seen_as, self.prior)
+        resized = np.abs(np.log(settled.pixel_mm / chain.pixel_mm)).max()
+        grown = sigma_of(counting.residuals(settled)) / sigma_of(counting.residuals(chain))
+        if grown < _RUNAWAY and resized < _RESIZED:
+            chain = settled
+        if self.phantom.determined:
+            # Where the phantom is, as the readings say on average: what wanders is not in its place.
+            chain = counting.least_squares(chain, self.phantom.determined)
+        residuals = equations.residuals(chain)
+        sigma = sigma_of(residuals[used])
+        return Solution(chain, self.phantom, free, covariance, points, used, residuals, sigma, self.prior)
+
+    def agreed(self, points: ImagePoints, start: Chain) -> tuple[Chain, BoolArray]:
+        """Least squares of the frames that do not contradict the others, and which points those are."""
+        equations = self.phantom.equations(points)
+        # Pixel sizes that are known somewhat are held while wrong frames still pull.
+        first = [name for name in self.free if self.prior is None or name not in SCALES]
+        chain = equations.least_absolute(start, first)
+        residuals = equations.residuals(chain)
+        used = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals))
+        for number in range(_MOST_ROUNDS):
+            frames, agreeing = len(points.frames), len(np.unique(points.frame[used]))
+            if 2 * agreeing <= frames:
+                raise InsufficientDataError(
+                    f"expected most frames to agree on one calibration, got {agreeing} of {frames}: do the "
+                    "images and the sensor readings belong together, and is the phantom the one named?"
+                )
+            sigma = sigma_of(residuals[used])
+            chain = equations[used].least_squares(chain, self.free, self.prior, sigma)
+            residuals = equations.residuals(chain)
+            now = _within(residuals, points.frame, self.outlier_sigma * sigma_of(residuals[used]))
+            if number >= _FREE_ROUNDS:
+                now &= used
+            if (now == used).all():
+                break
+            used = now
+        return chain, used
+
+    def best(self, points: ImagePoints, starts: Sequence[Chain]) -> Solution:
+        """Solve from several starts and their discrete alternatives; the best solution, with its rival.
+
+        Where a motion is missing, an image turned by half about one of its axes shows nearly the same: the
+        lines of a plane that is always equally deep do not tell the image from its in-plane mirror.
+        """
+        few = points.of_some_frames(SOME_FRAMES)
+        chains = self._ends(few, starts)
+        if not chains:
+            return self.solve(points, starts[0])
+        chains += self._ends(few, half_turns(self._sorted(few, chains)[0], few, self.phantom))
+        best, *others = self._sorted(few, chains)
+        solution = self.solve(points, best)
+        nearest = [chain for chain in others if apart(best, chain, few, self.phantom)][:1]
+        for rival in self._ends(points, nearest):
+            if apart(solution.chain, rival, points, self.phantom):
+                ours, theirs = self._costs(solution.points_used, [solution.chain, rival])
+                if theirs < ours:
+                    solution = self.solve(points, rival)
+                return replace(solution, evidence=abs(float(theirs - ours)))
+        return solution
+
+    def _ends(self, points: ImagePoints, starts: Sequence[Chain]) -> list[Chain]:
+        """Where iterations from each start end, unless most points contradict it there."""
+        ends = []
+        for start in starts:
+            with suppress(InsufficientDataError):
+                ends.append(self.agreed(points, start)[0])
+        return ends
+
+    def _sorted(self, points: ImagePoints, chains: Sequence[Chain]) -> list[Chain]:
+        """The best first."""
+        return [chains[k] for k in np.argsort(self._costs(points, chains), kind="stable")]
+
+    def _costs(self, points: ImagePoints, chains: Sequence[Chain]) -> FloatArray:
+        """Sums of squared residuals, each cut off, in the variance of an independent one at the least sum."""
+        equations, lines = self.phantom.equations(points), self.phantom.seen_as == "line"
+        residuals = [equations.residuals(one) / (one.pixel_mm[1] if lines else 1.0) for one in chains]
+        cut = _CUT * min(sigma_of(one) for one in residuals)
+        sums = np.array([float(np.sum(np.minimum(one**2, cut**2))) for one in residuals])
+        best = np.clip(residuals[int(np.argmin(sums))], -cut, cut)
+        independent = best.size / together(best, points.frame)
+        sums *= independent / max(float(sums.min()), _SMALLEST_SIGMA**2)
+        if self.prior is not None:
+            sums += [np.sum(self.prior.deviation(one.pixel_mm) ** 2) for one in chains]
+        return sums
+
+
+def sigma_of(residuals: FloatArray) -> float:
+    """Robust standard deviation of residuals, not less than rounding."""
+    return robust_sigma(residuals, _SMALLEST_SIGMA)
+
+
+def _within(residuals: FloatArray, frame: IntArray, limit: float) -> BoolArray:
+    """Points of the frames none of whose residuals exceeds `limit`."""
+    return ~np.isin(frame, frame[(np.abs(residuals) > limit).any(axis=1)])
+
+
+def together(residuals: FloatArray, frame: IntArray) -> float:
+    """How many residuals, shape (n, r), count as one: a sensor's error moves all of a frame, and wanders."""
+    index = np.unique(frame, return_inverse=True)[1]
+    sums = np.stack([np.bincount(index, column) for column in residuals.T])
+    whole = float(np.sum(residuals**2))
+    times = [autocorrelation_time(one) * float(one @ one) for one in sums]
+    return max(1.0, sum(times) / whole) if whole > 0 else 1.0
+
+
+def half_turns(chain: Chain, points: ImagePoints, phantom: Phantom) -> list[Chain]:
+    """The image turned by half about each of its axes through the middle of what it shows.
+
+    About its z axis not where directions alone are known: they stay exactly as they are.
+    """
+    directions = phantom.seen_as == "direction"
+    middle = np.append(np.median(points.pixels, axis=0) * chain.pixel_mm, 0.0) * (not directions)
+    turns = [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)[: 2 if directions else 3]]
+    steps = [RigidTransform.from_components(middle - turn.apply(middle), turn) for turn in turns]
+    return [replace(chain, probe=chain.probe @ step.as_matrix()) for step in steps]
+
+
+def apart(one: Chain, other: Chain, points: ImagePoints, phantom: Phantom) -> bool:
+    """Whether two chains are two answers, not one."""
+
+    def angle(chain: Chain) -> float:
+        return float((one.sensor_from_image.rotation.inv() * chain.sensor_from_image.rotation).magnitude())
+
+    if phantom.seen_as == "direction":
+        return min(angle(other), angle(other.mirrored())) > _APART_RAD
+    corners = _corners(points)
+    places = [chain.probe[:3, :2] @ (corners * chain.pixel_mm).T + chain.probe[:3, 3:] for chain in (one, other)]
+    far = float(np.linalg.norm(places[0] - places[1], axis=0).max())
+    return angle(other) > _APART_RAD or far > _APART * float(np.linalg.norm(corners[2] * one.pixel_mm))
+
+
+def _corners(points: ImagePoints) -> FloatArray:
+    """Corners of the image, pixels, taken to reach as far as points are in it, shape (4, 2)."""
+    return np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * points.pixels.max(axis=0)
+
+
+def probe_parameters(
+    fixed_pixels: bool, pixel_mm: FloatArray | None
+) -> tuple[tuple[str, ...], FloatArray | None]:
+    """Which of `PROBE` to estimate, and the pixel size to hold, if any.
+
+    Raises
+    ------
+    InvalidInputError
+        If the pixel size is neither fitted nor given.
+    """
+    if not fixed_pixels:
+        return PROBE, None
+    if pixel_mm is None:
+        raise InvalidInputError("pixel_mm: expected the scanner's pixel size unless it is fitted, got none")
+    return POSE, np.asarray(pixel_mm, dtype=float)
