@@ -61,8 +61,6 @@ class Consensus:
 
     Attributes
     ----------
-    affine : (image, point), shapes (3, 3) and (3,)
-        See `nearest_candidates`: a start for the solver.
     nearest : ndarray of int, shape (f,)
         For each frame, ascending, the candidate nearest to where the point should be, as a row of the points.
     away_mm : ndarray, shape (f,)
@@ -72,7 +70,6 @@ class Consensus:
         Number of calibrations with as much agreement expected among chance candidates.
     """
 
-    affine: tuple[FloatArray, FloatArray]
     nearest: IntArray
     away_mm: FloatArray
     gate_mm: float
@@ -125,35 +122,16 @@ def find_consensus(points: ImagePoints, pixel_mm: FloatArray | None = None) -> C
             break
     log_alarms, gate, model = best
     axes = model[3:9].reshape(2, 3) / voters.spread
-    affine = np.vstack([model[:3] - voters.centre @ axes, axes]), model[9:] + voters.middle
-    nearest, away = nearest_candidates(points, *affine)
-    return Consensus(affine, nearest, away, gate, float(10.0 ** min(log_alarms, 300.0)))
+    place = model[:3] + (points.pixels - voters.centre) @ axes
+    away = np.linalg.norm(points.world_from_sensor.apply(place) - voters.middle - model[9:], axis=1)
+    nearest = nearest_of_frames(points.frame, away)
+    return Consensus(nearest, away[nearest], gate, float(10.0 ** min(log_alarms, 300.0)))
 
 
-def nearest_candidates(
-    points: ImagePoints, image: FloatArray, point_mm: FloatArray
-) -> tuple[IntArray, FloatArray]:
-    """Find the candidate of each frame nearest to a point.
-
-    Parameters
-    ----------
-    image : ndarray, shape (3, 3)
-        Origin, column axis and row axis of the image in the sensor's frame, as rows; mm, mm per pixel.
-    point_mm : ndarray, shape (3,)
-        In the world.
-
-    Returns
-    -------
-    nearest : ndarray of int, shape (f,)
-        Rows of `points`, for each frame in ascending order.
-    away_mm : ndarray, shape (f,)
-    """
-    place = image[0] + points.pixels @ image[1:]
-    away = np.linalg.norm(points.world_from_sensor.apply(place) - point_mm, axis=1)
-    frames, of_frame = np.unique(points.frame, return_inverse=True)
-    order = np.lexsort((away, of_frame))
-    first = order[np.searchsorted(of_frame[order], np.arange(len(frames)))]
-    return first, away[first]
+def nearest_of_frames(frame: IntArray, away_mm: FloatArray) -> IntArray:
+    """Of each frame, ascending, the candidate that is least away."""
+    order = np.lexsort((away_mm, frame))
+    return np.asarray(order[np.unique(frame[order], return_index=True)[1]])
 
 
 class _Candidates:
@@ -220,7 +198,7 @@ class _Candidates:
     def _refined(self, model: FloatArray) -> FloatArray:
         for gate in _TIGHTER_MM:
             squares = np.sum((self.rows @ model - self.wanted) ** 2, axis=1)
-            first = np.lexsort((squares, self.of_frame))[self.start]
+            first = nearest_of_frames(self.of_frame, squares)
             agreeing = first[squares[first] < gate**2]
             if len(agreeing) <= _SAMPLE:
                 break

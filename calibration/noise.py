@@ -34,17 +34,17 @@ from speckle3d.kernels.wander import innovations
 if TYPE_CHECKING:
     from calibration.plane import Chain, Equations, PixelPrior
 
-WANDER = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+WANDER = (0.3, 0.7, 1.6, 3.6, 8.0)
 """Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
-JITTER = (0.0, 0.5, 1.5)
+JITTER = (0.0, 1.0, 3.0)
 """Sizes tried of the error that is new in every frame and moves all its residuals together."""
 STEADY = 0.5
 """Probability, before anything is measured, that nothing wanders."""
-PROPORTIONS_MM = (0.5, 2.0, 8.0)
+PROPORTIONS_MM = (1.0, 4.0)
 """Errors of position over errors of rotation tried, mm per degree: trackers are specified at 0.25 mm with 0.5
 degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
 
-_TIMES = 4
+_TIMES = 3
 _SHORTEST, _LONGEST = 4.0, 2.0
 """Time constants tried: from four frames, of which fewer look like white noise, to twice the recording, which
 looks like a straight line."""
@@ -144,14 +144,15 @@ def fit_wandering(
     columns = np.ascontiguousarray(np.column_stack([jacobian / scale, residuals]))
     wandering, jitter, constant_s, before, units = *grid.T[:4], grid[:, 4:]
     pauses_s = np.maximum(np.diff(frame_time_s, prepend=frame_time_s[0]), 0.0)
-    normal, effects = np.empty((len(grid), columns.shape[1], columns.shape[1])), np.ascontiguousarray(effects)
+    effects = np.ascontiguousarray(effects)
 
-    def whitened(g: int) -> float:
-        kept = np.exp(-pauses_s / constant_s[g])
+    def whitened(g: int) -> tuple[FloatArray, float]:
+        kept, white = np.exp(-pauses_s / constant_s[g]), np.empty_like(columns)
         wander, shake = units[g] * wandering[g] ** 2, units[g] * jitter[g] ** 2
-        return float(innovations(columns, effects, starts, kept, wander, shake, normal[g]))
+        volume = float(innovations(columns, effects, starts, kept, wander, shake, white))
+        return white.T @ white, volume
 
-    log_determinant = np.array(list(ahead(whitened, range(len(grid)))))
+    normal, log_determinant = map(np.array, zip(*ahead(whitened, range(len(grid))), strict=True))
     matrix, pull, energy = normal[:, :-1, :-1], normal[:, :-1, -1], normal[:, -1, -1]
     free = max(len(residuals) - len(scale), 1)
     sizes, axes = np.linalg.eigh(matrix)

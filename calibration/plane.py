@@ -208,9 +208,9 @@ class Equations:
             [
                 in_image[..., :2] * self.points.pixels[:, None],
                 in_image,
-                np.cross(flat[:, None], in_image)[..., ::-1],
+                _cross_zyx(flat[:, None], in_image),
                 rows,
-                np.cross(place[:, None], rows)[..., ::-1],
+                _cross_zyx(place[:, None], rows),
             ],
             axis=2,
         )
@@ -294,6 +294,12 @@ class Equations:
             before, weights = size.mean(), np.sqrt(absolute_weights(size))
             chain = replace(self, weights=weights).least_squares(chain, free, tolerance=_ROUGHLY)
         return chain
+
+
+def _cross_zyx(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Cross product, its z component first; NumPy's own takes five times as long."""
+    first, second = [0, 2, 1], [1, 0, 2]
+    return np.asarray(one[..., first] * other[..., second] - one[..., second] * other[..., first])
 
 
 # 3. The plane in three stages (TR 303, appendix A)

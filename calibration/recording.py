@@ -13,10 +13,9 @@ from calibration.beam import BeamBias
 from calibration.clock.fitted import estimate_offset, with_uncertain_offset
 from calibration.clock.offset import ClockOffset, covered
 from calibration.consensus import GATES_MM, Consensus, find_consensus
-from calibration.solution import Solution
 from calibration.points import ImagePoints, Seen
-from calibration.registration import Choice
 from calibration.report import Shot, as_calibration
+from calibration.solution import Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.core.errors import InsufficientDataError
@@ -76,7 +75,6 @@ class Outcome:
     shots: tuple[Shot, ...]
     beam: tuple[BeamBias, ...] = ()
     offset: ClockOffset | None = None
-    choice: Choice | None = None
 
 
 def calibrate_recording(

@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.solution import Solution
 from calibration.points import ANGLES, CHAIN, SCALES
+from calibration.solution import Solution
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
 from speckle3d.core.geometry import roll_yaw_tilt, skew

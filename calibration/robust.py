@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.leastsquares import huber_weights, robust_sigma
 
-_ROUNDING = 1e-9
-"""Standard deviation below which residuals are rounding errors."""
-_ABSOLUTE, _SOLUTIONS = 0.6745, 4
-"""Limit of Huber's weights, standard deviations: residuals above the median count by their absolute value."""
+_SOLUTIONS = 4
 _NEARLY, _TINY = 0.1, 1e-12
 """Residuals above this share of the median count by their absolute value."""
 
@@ -42,8 +38,7 @@ def robust_linear(matrix: FloatArray, wanted: FloatArray) -> tuple[FloatArray, F
         parameters = np.linalg.lstsq(rows * root[:, None], values * root)[0]
         residuals = rows @ parameters - values
         size = np.linalg.norm(residuals.reshape(-1, group), axis=1)
-        weights = huber_weights(size / robust_sigma(size, _ROUNDING), _ABSOLUTE)
-        root = np.repeat(np.sqrt(weights), group)
+        root = np.repeat(np.sqrt(absolute_weights(size)), group)
     return np.asarray(parameters), np.asarray(residuals).reshape(wanted.shape)
 
 

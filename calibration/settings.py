@@ -11,7 +11,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Place = Literal["front", "slope", "peak"]
 Viewed = Literal["above", "below"]
-Registration = Literal["held", "turned", "free"]
 
 OUTLIER_SIGMA = 4.0
 """One in 16,000 Gaussian residuals is farther out."""

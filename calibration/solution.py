@@ -1,4 +1,4 @@
-"""From a start to a calibration: frames that contradict the others, errors that wander, and the other answer."""
+"""From a start to a calibration: frames that contradict the others, its certainty, and the other answer."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Solution:
         By how much the sum of squared residuals of another answer, far away, to which a discrete ambiguity
         leads, exceeds the solution's, in variances of an independent one.
     assumed : str
-        What no image tells, and was taken for granted.
+        What no image tells, and was taken for granted; how much of what was stated is believed.
     """
 
     chain: Chain
@@ -289,16 +289,19 @@ def apart(one: Chain, other: Chain, points: ImagePoints, phantom: Phantom) -> bo
         return float((one.sensor_from_image.rotation.inv() * chain.sensor_from_image.rotation).magnitude())
 
     if phantom.seen_as == "direction":
-        return min(angle(other), angle(other.mirrored())) > _APART_RAD
+        return bool(min(angle(other), angle(other.mirrored())) > _APART_RAD)
     corners = _corners(points)
-    places = [chain.probe[:3, :2] @ (corners * chain.pixel_mm).T + chain.probe[:3, 3:] for chain in (one, other)]
+    places = [
+        chain.probe[:3, :2] @ (corners * chain.pixel_mm).T + chain.probe[:3, 3:] for chain in (one, other)
+    ]
     far = float(np.linalg.norm(places[0] - places[1], axis=0).max())
-    return angle(other) > _APART_RAD or far > _APART * float(np.linalg.norm(corners[2] * one.pixel_mm))
+    return bool(angle(other) > _APART_RAD or far > _APART * np.linalg.norm(corners[2] * one.pixel_mm))
 
 
 def _corners(points: ImagePoints) -> FloatArray:
     """Corners of the image, pixels, taken to reach as far as points are in it, shape (4, 2)."""
-    return np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * points.pixels.max(axis=0)
+    shares = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    return np.asarray(shares * points.pixels.max(axis=0))
 
 
 def probe_parameters(

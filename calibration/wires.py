@@ -1,10 +1,18 @@
 """Calibration with wires: a crossing, three orthogonal wires, or N-shapes; solved as planes are.
 
+A place that is stated of a phantom is best held if it is good, for what is not estimated cannot be wrong; if
+wrong it spoils the calibration. Frames that were left out tell: a calibration that explains them better is
+nearer the truth, and one that follows the errors of its own frames is not.
+
 References
 ----------
 .. [1] Prager et al., CUED/F-INFENG/TR 303, 1997, sections 3.1 and 3.2.
 .. [2] P. R. Detmer et al., "3D ultrasonic image feature localization based on magnetic scanhead tracking",
    Ultrasound in Medicine and Biology, 1994 (the crossing).
+.. [3] P. Burman, E. Chow and D. Nolan, "A cross-validatory method for dependent data", Biometrika 81, 1994
+   (blocks in time).
+.. [4] L. Breiman, J. Friedman, C. J. Stone and R. A. Olshen, "Classification and regression trees", 1984,
+   section 3.4.3 (the simplest within one standard error of the best).
 """
 
 from __future__ import annotations
@@ -15,12 +23,12 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calibration.consensus import GATES_MM, find_consensus, nearest_candidates
+from calibration.consensus import GATES_MM, find_consensus, nearest_of_frames
 from calibration.motion import require_adequate
 from calibration.plane import Chain, Phantom
 from calibration.points import POSE, SOME_FRAMES, TARGET, ImagePoints, SeenAs, affine_equations
 from calibration.robust import robust_linear
-from calibration.settings import Registration, WireFit
+from calibration.settings import WireFit
 from calibration.solution import Problem, Solution, probe_parameters
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
@@ -28,10 +36,15 @@ from speckle3d.core.geometry import nearest_rotation
 from speckle3d.core.wires import WirePhantom
 
 _ESTIMATED: dict[str, tuple[str, ...]] = {"held": (), "turned": TARGET[3:], "free": TARGET}
-
+"""What is estimated of a stated place, simplest first."""
+_FOLDS = 8
+"""Blocks of successive frames, each left out once: a tracker's error wanders over seconds, and frames beside
+each other would vouch for each other."""
 _FEWEST_FRAMES = 6
 _STARTS = 6
-_TINY = np.finfo(float).tiny
+_TINY, _LEAST_PIXEL_MM = np.finfo(float).tiny, 1e-6
+_AS_IT_IS = Rotation.identity()
+"""A point has no orientation."""
 
 
 @dataclass(frozen=True)
@@ -88,25 +101,23 @@ def calibrate_cross_wire(
         If there are too few points, no more of them agree than chance candidates would, or the motion does
         not determine the answer.
     """
-    s = settings or WireFit()
-    _require_frames(points)
-    probe, held = probe_parameters(s.fixed_pixels, pixel_mm)
-    problem = Problem(CrossWire(), probe, s.outlier_sigma)
-    found = find_consensus(points, pixel_mm)
-    if not found.believed and len(points) == len(points.frames):
+    s, phantom = settings or WireFit(), CrossWire()
+    problem, held_mm = _problem(points, phantom, pixel_mm, s)
+    consensus = find_consensus(points, pixel_mm)
+    if not consensus.believed and len(points) == len(points.frames):
         # Poor motion, too, can leave no consensus; then that is said.
-        start, _ = wire_start(points, CrossWire(), Rotation.identity())
-        require_adequate(problem.best(points, [_sized(start, held)]))
-    found.require()
-    agreeing = points[found.nearest[found.agreed]]
-    first = problem.solve(agreeing, _sized(squared(*found.affine), held))
+        require_adequate(problem.best(points, [wire_start(points, phantom, _AS_IT_IS, held_mm)[0]]))
+    consensus.require()
+    agreeing = points[consensus.nearest[consensus.agreed]]
+    first = problem.solve(agreeing, wire_start(agreeing, phantom, _AS_IT_IS, held_mm)[0])
     # The rigid chain, from all that agree, tells candidates better than the sample did.
-    nearest, away = nearest_candidates(points, *_image_and_point(first.chain))
-    near, chosen = away <= GATES_MM[-1], points[nearest]
+    away_mm = np.linalg.norm(phantom.equations(points).residuals(first.chain), axis=1)
+    nearest = nearest_of_frames(points.frame, away_mm)
+    near, chosen = away_mm[nearest] <= GATES_MM[-1], points[nearest]
     solution = _beside(problem.best(chosen[near], [first.chain]), s.beside_mm)
     used = near.copy()
     used[near] = solution.used
-    residuals = CrossWire().equations(chosen).residuals(solution.chain)
+    residuals = phantom.equations(chosen).residuals(solution.chain)
     return require_adequate(replace(solution, points=chosen, used=used, residuals=residuals))
 
 
@@ -126,27 +137,11 @@ def _beside(solution: Solution, beside_mm: float) -> Solution:
     return replace(solution, covariance=solution.covariance + covariance)
 
 
-def _image_and_point(chain: Chain) -> tuple[FloatArray, FloatArray]:
-    """Origin and axes of the image in the sensor's frame, and the phantom's origin in the world."""
-    pose = chain.sensor_from_image
-    axes = pose.rotation.as_matrix().T[:2] * chain.pixel_mm[:, None]
-    return np.vstack([pose.translation, axes]), np.asarray(chain.target_from_world.inv().translation)
-
-
-def squared(image: FloatArray, point_mm: FloatArray) -> Chain:
-    """The chain whose axes are square and nearest to an image's origin and axes, shape (3, 3)."""
-    size = np.maximum(np.linalg.norm(image[1:], axis=1), 1e-6)
-    turn = Rotation.from_matrix(nearest_rotation((image[1:] / size[:, None]).T))
-    probe = RigidTransform.from_components(image[0], turn)
-    return Chain.of(size, probe, RigidTransform.from_translation(-point_mm))
-
-
 def calibrate_wires(
     points: ImagePoints,
     geometry: WirePhantom,
     pixel_mm: FloatArray | None = None,
     settings: WireFit | None = None,
-    registration: Registration = "turned",
 ) -> Solution:
     """Calibrate a 6-DOF sensor from dots on straight wires.
 
@@ -157,17 +152,47 @@ def calibrate_wires(
     geometry : WirePhantom
         Without its place in the tracker's world, that is estimated, too: fourteen parameters in all, as for
         the three-wire phantom.
-    registration : {"held", "turned", "free"}
-        What to do with the place stated in `geometry`: hold it; hold the wires' middle and estimate how the
-        phantom is turned about it; or estimate all. Stylus registrations find a place to half a millimetre,
-        and, over 50 mm, a turn only to a degree. `registration.calibrate_registered` chooses.
+    settings : WireFit, optional
+        `registration` says what to do with a place that is stated: hold it; hold the wires' middle and
+        estimate how the phantom is turned about it; or estimate all. Stylus registrations find a place to
+        half a millimetre, and, over 50 mm, a turn only to a degree. By default the simplest counts that
+        explains frames left out as well as any; the solution says which.
 
     Raises
     ------
     InsufficientDataError
         If there are too few points, they contradict each other, or the motion does not determine the answer.
     """
-    return require_adequate(solve_wires(points, geometry, pixel_mm, settings, registration))
+    s = settings or WireFit()
+    if geometry.world_from_phantom is None or s.registration != "auto":
+        return require_adequate(solve_wires(points, geometry, pixel_mm, s))
+    solutions, missed, refusal = dict[str, Solution](), dict[str, FloatArray](), list[InsufficientDataError]()
+    for name in _ESTIMATED:
+        try:
+            chosen = s.model_copy(update={"registration": name})
+            solutions[name] = require_adequate(solve_wires(points, geometry, pixel_mm, chosen))
+            missed[name] = _missed_mm(solutions[name])
+        except InsufficientDataError as error:
+            refusal.append(error)
+    if not solutions:
+        raise refusal[0]
+    best = min(missed.values(), key=lambda one: float(one.mean()))
+    worse = {name: one - best for name, one in missed.items()}
+    simplest = next(n for n, one in worse.items() if one.mean() <= np.std(one, ddof=1) / np.sqrt(len(one)))
+    sizes = ", ".join(f"{name} {one.mean():.3f} mm" for name, one in missed.items())
+    said = f"phantom's place {simplest}: frames left out miss their wires by {sizes}"
+    return replace(solutions[simplest], assumed=said)
+
+
+def _missed_mm(solution: Solution) -> FloatArray:
+    """Mean distance of the dots of each block of frames from their wires, by what the others say."""
+    points, phantom, missed = solution.points, solution.phantom, []
+    for frames in np.array_split(points.frames, _FOLDS):
+        out = np.isin(points.frame, frames)
+        chain = phantom.equations(points[solution.used & ~out]).least_squares(solution.chain, solution.free)
+        left = phantom.equations(points[out]).residuals(chain)
+        missed.append(float(np.linalg.norm(left, axis=1).mean()))
+    return np.array(missed)
 
 
 def solve_wires(
@@ -175,52 +200,40 @@ def solve_wires(
     geometry: WirePhantom,
     pixel_mm: FloatArray | None = None,
     settings: WireFit | None = None,
-    registration: Registration = "turned",
 ) -> Solution:
-    """As `calibrate_wires`, whether or not the motion determines the answer."""
-    s = settings or WireFit()
-    if registration not in _ESTIMATED:
-        raise InvalidInputError(
-            f"registration: expected one of {', '.join(_ESTIMATED)}, got {registration!r}"
-        )
-    _require_frames(points)
-    probe, held = probe_parameters(s.fixed_pixels, pixel_mm)
-    centred = _about_middle(geometry)
-    place = centred.world_from_phantom
+    """As `calibrate_wires`, whether or not the motion determines the answer; ``auto`` is ``turned``."""
+    s, middle, place = settings or WireFit(), geometry.points_mm.mean(axis=0), geometry.world_from_phantom
+    registration = "turned" if s.registration == "auto" else s.registration
     if place is not None:
-        phantom = Wires(centred, _ESTIMATED[registration])
-        starts = [wire_start(points, phantom, place.inv())[0]]
-    else:
-        phantom = Wires(centred)
-        few = points.of_some_frames(SOME_FRAMES)
-        # Rotations of an icosahedron, 36 degrees apart.
-        tried = [wire_start(few, phantom, turn) for turn in Rotation.create_group("I")]
-        tried.sort(key=lambda one: one[1])
-        starts = [chain for chain, _ in tried[:_STARTS]]
-    return Problem(phantom, probe, s.outlier_sigma).best(points, [_sized(start, held) for start in starts])
+        place = place * RigidTransform.from_translation(middle)
+    # In a frame whose origin is the wires' middle, about which the phantom may be turned.
+    centred = replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=place)
+    phantom = Wires(centred, TARGET if place is None else _ESTIMATED[registration])
+    problem, held_mm = _problem(points, phantom, pixel_mm, s)
+    few = points.of_some_frames(SOME_FRAMES)
+    # Without a place, the rotations of an icosahedron, 36 degrees apart.
+    tried = Rotation.create_group("I") if place is None else [place.inv()]
+    starts = sorted((wire_start(few, phantom, one, held_mm) for one in tried), key=lambda one: one[1])
+    return problem.best(points, [chain for chain, _ in starts[:_STARTS]])
 
 
-def _about_middle(geometry: WirePhantom) -> WirePhantom:
-    """The same wires in a frame whose origin is their middle, about which the phantom may be turned."""
-    middle = geometry.points_mm.mean(axis=0)
-    place = geometry.world_from_phantom
-    moved = None if place is None else place * RigidTransform.from_translation(middle)
-    return replace(geometry, ends_mm=geometry.ends_mm - middle, world_from_phantom=moved)
-
-
-def _sized(start: Chain, pixel_mm: FloatArray | None) -> Chain:
-    return start if pixel_mm is None else replace(start, pixel_mm=pixel_mm)
-
-
-def _require_frames(points: ImagePoints) -> None:
+def _problem(
+    points: ImagePoints, phantom: Phantom, pixel_mm: FloatArray | None, s: WireFit
+) -> tuple[Problem, FloatArray | None]:
+    """What is solved, and the pixel size to hold, if any."""
     if len(points.frames) < _FEWEST_FRAMES:
         raise InsufficientDataError(
             f"expected the wires in at least {_FEWEST_FRAMES} frames, got {len(points.frames)}"
         )
+    probe, held_mm = probe_parameters(s.fixed_pixels, pixel_mm)
+    return Problem(phantom, probe, s.outlier_sigma), held_mm
 
 
 def wire_start(
-    points: ImagePoints, phantom: Phantom, target_from_world: RigidTransform | Rotation
+    points: ImagePoints,
+    phantom: Phantom,
+    target_from_world: RigidTransform | Rotation,
+    pixel_mm: FloatArray | None = None,
 ) -> tuple[Chain, float]:
     """Find the image among wires from all frames of a recording, by robust linear least squares.
 
@@ -230,6 +243,8 @@ def wire_start(
     ----------
     target_from_world : RigidTransform or Rotation
         If a rotation, the translation is found too.
+    pixel_mm : ndarray, shape (2,), optional
+        In place of the axes' lengths.
 
     Returns
     -------
@@ -238,23 +253,21 @@ def wire_start(
         Of the residuals' magnitudes, before the axes are squared.
     """
     rows, offsets = phantom.vanishing(points)
-    shifted = isinstance(target_from_world, Rotation)
-    known = (
-        RigidTransform.from_rotation(target_from_world)
-        if isinstance(target_from_world, Rotation)
-        else target_from_world
-    )
+    target = np.eye(4)
+    if isinstance(target_from_world, Rotation):
+        target[:3, :3] = target_from_world.as_matrix()
+    else:
+        target = target_from_world.as_matrix()
     # Pixels are centred and scaled, for a well-conditioned matrix.
     centre, spread = points.pixels.mean(axis=0), float(points.pixels.std()) or 1.0
-    matrix = affine_equations(
-        (points.pixels - centre) / spread, rows @ known.rotation.as_matrix() @ points.turns
-    )
-    if shifted:
+    matrix = affine_equations((points.pixels - centre) / spread, rows @ target[:3, :3] @ points.turns)
+    if isinstance(target_from_world, Rotation):
         matrix = np.concatenate([matrix, rows], axis=2)
-    wanted = offsets - np.einsum("nri,ni->nr", rows, known.apply(points.shifts_mm))
-    found, left = robust_linear(matrix, wanted)
-    axes = found[3:9].reshape(2, 3) / spread
-    image = np.vstack([found[:3] - centre @ axes, axes])
-    shift = RigidTransform.from_translation(found[9:] if shifted else np.zeros(3))
-    chain = squared(image, np.zeros(3))
-    return replace(chain, target=(shift * known).as_matrix()), float(np.median(np.abs(left)))
+    in_target = points.shifts_mm @ target[:3, :3].T + target[:3, 3]
+    answer, left = robust_linear(matrix, offsets - np.einsum("nri,ni->nr", rows, in_target))
+    axes, probe = answer[3:9].reshape(2, 3) / spread, np.eye(4)
+    size = np.maximum(np.linalg.norm(axes, axis=1), _LEAST_PIXEL_MM)
+    probe[:3, :3], probe[:3, 3] = nearest_rotation((axes / size[:, None]).T), answer[:3] - centre @ axes
+    target[:3, 3] += answer[9:] if len(answer) > 9 else 0.0
+    chain = Chain(size if pixel_mm is None else pixel_mm, probe, target)
+    return chain, float(np.median(np.abs(left)))

@@ -109,7 +109,7 @@ def delay_from_images(
             whole_images(one, _middle(share[way], number), PIXEL_MM)
             for one, way in zip(placed, ways, strict=True)
         ]
-        comparison = Comparison((placed[0], placed[1]), (chosen[0], chosen[1]), gap_mm, None, LEAST_OVERLAP)
+        comparison = Comparison((placed[0], placed[1]), (chosen[0], chosen[1]), gap_mm, LEAST_OVERLAP)
         return comparison.at(Estimate(sensor_from_image, np.ones(2))).alike
 
     tried, rows = delays_around(around_s, search_s, STEP_S), []

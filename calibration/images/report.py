@@ -33,8 +33,8 @@ WEAK_SCALE = 0.01
 """Relative standard error of an estimated pixel size above which the scanner's own value is better."""
 
 _WORSE = 0.02
-"""Most that the correlation of held-out frames may fall below that at the start: twice what it varies between
-answers from different starts."""
+"""Most that the correlation may fall below that at the start: twice what it varies between answers from
+different starts."""
 
 
 def calibration_from_images(
@@ -42,8 +42,9 @@ def calibration_from_images(
 ) -> Calibration:
     """Turn an answer into a `Calibration`; the second sweep's frames are numbered after the first's."""
     counts = [len(each.frame_time_s) for each in sweeps]
-    first, second = result.sweeps.frames_used
-    pose = result.sensor_from_image
+    first, second = result.sweeps.frames
+    pose, numbers = result.sensor_from_image, (*first.tolist(), *(counts[0] + second).tolist())
+    uncovered = np.setdiff1d(np.arange(sum(counts)), numbers)
     return Calibration(
         method="images",
         sensor="tracker",
@@ -52,11 +53,11 @@ def calibration_from_images(
         pixel_mm=result.pixel_mm,
         covariance=result.covariance,
         parameters=_parameters(result),
-        rms=1.0 - result.held_out.after,
+        rms=1.0 - result.after,
         rms_unit="",
         condition_number=result.condition_number,
         frames=FramesUsed(
-            sum(counts), (*first.tolist(), *(counts[0] + second).tolist()), _uncovered(result, counts)
+            sum(counts), numbers, dict.fromkeys(uncovered.tolist(), "no reading of the sensor")
         ),
         time_offset_s=sweeps[0].time_offset_s,
         verdict=_verdict(result),
@@ -66,11 +67,10 @@ def calibration_from_images(
 def notes_of(result: ImageCalibration) -> list[str]:
     """Lines for the report that show whether the answer is right."""
     centre = np.sqrt(np.diag(result.covariance_of(result.sweeps.centre_mm)))
-    gained, angles, settings = result.held_out, result.angulation, result.settings
-    before = f"{gained.before:.3f}" if np.isfinite(gained.before) else "no overlap"
+    angles, settings = result.angulation, result.settings
+    before = f"{result.before:.3f}" if np.isfinite(result.before) else "no overlap"
     return [
-        f"correlation with the other sweep of {sum(map(len, result.sweeps.frames_held_out))} frames kept out "
-        f"of everything for this check: {before} before, {gained.after:.3f} after",
+        f"correlation of patches with the other sweep: {before} before, {result.after:.3f} after",
         f"image centre known to {centre[0]:.2f}, {centre[1]:.2f} and {centre[2]:.2f} mm across, along the "
         "beam and out of plane",
         f"sweeps at {angles.crossing_deg:.0f} degrees, fans of {angles.fan_deg[0]:.0f} and "
@@ -88,8 +88,8 @@ def figure_of(result: ImageCalibration, sweeps: tuple[TrackedImages, TrackedImag
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3)
     for k, (one, other) in enumerate((sweeps, sweeps[::-1])):
-        held = result.sweeps.frames_held_out[k]
-        _draw_images(panels[k], result, one, other, int(held[len(held) // 2]))
+        frames = result.sweeps.frames[k]
+        _draw_images(panels[k], result, one, other, int(frames[len(frames) // 2]))
     figure.suptitle(f"verdict: {_verdict(result)}", fontsize=10)
     return figure
 
@@ -141,15 +141,6 @@ def _parameters(result: ImageCalibration) -> tuple[Parameter, ...]:
     return tuple(rows)
 
 
-def _uncovered(result: ImageCalibration, counts: list[int]) -> dict[int, str]:
-    """Reasons of frames that were neither used nor held out, by number."""
-    reasons: dict[int, str] = {}
-    for k, before in enumerate((0, counts[0])):
-        known = {*result.sweeps.frames_used[k], *result.sweeps.frames_held_out[k]}
-        reasons |= {before + n: "no reading of the sensor" for n in range(counts[k]) if n not in known}
-    return reasons
-
-
 def _verdict(result: ImageCalibration) -> str:
     if result.scale_errors.max() > WEAK_SCALE:
         lateral, axial = 100.0 * result.scale_errors
@@ -158,9 +149,8 @@ def _verdict(result: ImageCalibration) -> str:
         )
     if not result.converged:
         return "did not converge: a better start or sweeps with more structure are needed"
-    gain = result.held_out.after - np.nan_to_num(result.held_out.before)
-    if gain < -_WORSE:
-        return "doubtful: frames that were not used are less alike than at the start"
+    if result.after - np.nan_to_num(result.before) < -_WORSE:
+        return "doubtful: the sweeps are less alike than at the start"
     if result.alike < SPECKLED_SIMILARITY:
         return (
             f"doubtful: the sweeps are little alike (correlation {result.alike:.2f}), which may displace the "

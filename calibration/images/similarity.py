@@ -24,9 +24,6 @@ USUAL_EXTENT_MM = 40.0
 LEAST_OVERLAP = 0.3
 """Part of an image that the other sweep must show for the image to count (Wein and Khamene 2008)."""
 
-_HELD_OUT_EVERY = 12
-_MOST_HELD_OUT = 8
-
 LEAST_SHARE = 0.5
 """Part of a patch that the other sweep must show."""
 
@@ -91,15 +88,11 @@ class Similarity(PatchScores):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two stacks, with patches on each that are compared with the other.
-
-    `sources` are the stacks that are cut; by default the stacks themselves.
-    """
+    """Two stacks, with patches on each that are compared with the other."""
 
     stacks: tuple[Stack, Stack]
     patches: tuple[PatchGrid, PatchGrid]
     max_gap_mm: float
-    sources: tuple[Stack, Stack] | None = None
     least_share: float = LEAST_SHARE
 
     def at(self, estimate: Estimate, derivatives: bool = False) -> Similarity:
@@ -127,8 +120,7 @@ class Comparison:
         return np.concatenate(rows)
 
     def _one_way(self, way: int, estimate: Estimate, derivatives: bool) -> PatchScores:
-        sample, patches = self.stacks[way], self.patches[way]
-        source = (self.sources or self.stacks)[1 - way]
+        sample, patches, source = self.stacks[way], self.patches[way], self.stacks[1 - way]
         matrix = estimate.sensor_from_image.as_matrix()
         count, pixels = len(patches.where), np.tile(estimate.scales, 2)
         size = count if derivatives else 0
@@ -216,12 +208,12 @@ class Level:
 
 @dataclass(frozen=True)
 class CrossingSweeps:
-    """Two sweeps' images, reduced, with some frames of each held out for a check.
+    """Two sweeps' images, reduced.
 
     Attributes
     ----------
-    used, held_out : tuple of Stack
-    frames_used, frames_held_out : tuple of ndarray of int
+    stacks : tuple of Stack
+    frames : tuple of ndarray of int
         Their frame numbers.
     pixel_mm : ndarray, shape (2,)
         Of the images as they were given, across and along the beams.
@@ -229,10 +221,8 @@ class CrossingSweeps:
         Size of the images relative to the usual; lengths of comparison scale with it.
     """
 
-    used: tuple[Stack, Stack]
-    held_out: tuple[Stack, Stack]
-    frames_used: tuple[IntArray, IntArray]
-    frames_held_out: tuple[IntArray, IntArray]
+    stacks: tuple[Stack, Stack]
+    frames: tuple[IntArray, IntArray]
     pixel_mm: FloatArray
     unit: float
     _blurred: dict[tuple[int, float, float], Stack] = field(default_factory=dict, repr=False, compare=False)
@@ -240,7 +230,7 @@ class CrossingSweeps:
     @property
     def centre_mm(self) -> FloatArray:
         """Centre of the first sweep's images, shape (3,)."""
-        return self.used[0].centre_mm
+        return self.stacks[0].centre_mm
 
     def level(self, level: Level, sensor_from_image: RigidTransform) -> Comparison:
         """Comparison of patches all over some images, for calibrations near the given one."""
@@ -252,19 +242,11 @@ class CrossingSweeps:
         ]
         return Comparison(thin, (patches[0], patches[1]), self._gap(sigma, thin, sensor_from_image))
 
-    def of_held_out(self, sigma_mm: float, sensor_from_image: RigidTransform) -> Comparison:
-        """Comparison of the whole blurred images that are held out, near a calibration."""
-        sigma = sigma_mm * self.unit
-        thin = self._thinned(sigma, sensor_from_image)
-        shown = self.held_out[0].blurred(sigma), self.held_out[1].blurred(sigma)
-        a, b = (whole_images(one, np.arange(len(one)), sigma) for one in shown)
-        return Comparison(shown, (a, b), self._gap(sigma, thin, sensor_from_image), thin, LEAST_OVERLAP)
-
     def _thinned(
         self, sigma_mm: float, sensor_from_image: RigidTransform, least_weight: float = WHOLE
     ) -> tuple[Stack, Stack]:
         stacks = []
-        for way, stack in enumerate(self.used):
+        for way, stack in enumerate(self.stacks):
             key, spacing = (way, sigma_mm, least_weight), frame_spacing(stack, sensor_from_image)
             if key not in self._blurred:
                 self._blurred[key] = stack.blurred(sigma_mm, least_weight)
@@ -279,7 +261,7 @@ class CrossingSweeps:
 
 
 def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | None = None) -> CrossingSweeps:
-    """Read two crossing sweeps and set some frames aside.
+    """Read two crossing sweeps.
 
     Raises
     ------
@@ -297,26 +279,16 @@ def prepare(first: TrackedImages, second: TrackedImages, progress: Progress | No
     )
     if not np.allclose(ours, theirs, rtol=1e-3, atol=1e-6):
         raise MismatchError(
-            f"{second.name}: expected the pixels of {first.name}, {ours[0]:g} x {ours[1]:g} mm from "
-            f"{ours[2]:g} mm, got {theirs[0]:g} x {theirs[1]:g} mm from {theirs[2]:g} mm"
+            f"{second.name}: expected the pixels of {first.name}, {{:g}} x {{:g}} mm from {{:g}} mm, got "
+            "{:g} x {:g} mm from {:g} mm".format(*ours, *theirs)
         )
     extent = float(np.sqrt(max(grid.width_mm, 1.0) * (grid.depth_mm - grid.first_sample_depth_mm)))
     unit = float(np.clip(extent / USUAL_EXTENT_MM, 0.5, 4.0))
-    stacks, numbers = [], []
-    for tracked in (first, second):
-        stack, frames = read_stack(tracked, BASE_PIXEL_MM * unit, progress)
-        stacks.append(stack)
-        numbers.append(frames)
-    aside = [_set_aside(len(stack)) for stack in stacks]
-    kept = [np.setdiff1d(np.arange(len(s)), out) for s, out in zip(stacks, aside, strict=True)]
-
-    def of(parts: list[IntArray]) -> tuple[tuple[Stack, Stack], tuple[IntArray, IntArray]]:
-        (a, b), (m, n) = parts, numbers
-        return (stacks[0][a], stacks[1][b]), (m[a], n[b])
-
-    (used, frames_used), (held_out, frames_held_out) = of(kept), of(aside)
+    (one, numbers), (other, more) = (
+        read_stack(tracked, BASE_PIXEL_MM * unit, progress) for tracked in (first, second)
+    )
     pixel_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    return CrossingSweeps(used, held_out, frames_used, frames_held_out, pixel_mm, unit)
+    return CrossingSweeps((one, other), (numbers, more), pixel_mm, unit)
 
 
 def evenly(count: int, wanted: int) -> IntArray:
@@ -337,8 +309,3 @@ def _inverted(matrices: FloatArray) -> FloatArray:
     out[:, :, :3] = np.swapaxes(matrices[:, :3, :3], 1, 2)
     out[:, :, 3] = -np.einsum("nij,nj->ni", out[:, :, :3], matrices[:, :3, 3])
     return out
-
-
-def _set_aside(count: int) -> IntArray:
-    wanted = min(_MOST_HELD_OUT, max(1, count // _HELD_OUT_EVERY))
-    return np.unique((np.arange(1, 2 * wanted, 2) * count / (2.0 * wanted)).astype(np.int64))

@@ -40,23 +40,9 @@ FINE = (Level(1.0, images=8), Level(0.7, images=24, overlap=0.25))
 """Resolutions at which the search's answer is refined. The last is still coarser than speckle; there many
 images are worth more than overlapping patches, since the errors of their poses are independent."""
 
-SHOWN_SIGMA_MM = 1.0
-"""Blur at which similarities are reported, in units of the crossing."""
-
 SPECKLED_SIMILARITY = 0.45
 """Correlation below which the verdict warns: shadows and reflections that the sweeps do not share
 displaced such answers by up to a millimetre and two degrees, more than the covariance says."""
-
-
-@dataclass(frozen=True)
-class Improvement:
-    """Mean correlation of images with cuts of the other sweep, at the start and at the answer.
-
-    NaN where the sweeps overlap in no image by three tenths.
-    """
-
-    before: float
-    after: float
 
 
 @shown
@@ -83,12 +69,12 @@ class ImageCalibration:
     alike : float
         Correlation of the two sweeps' patches at 1.2 mm of blur, times the root of the share of them with
         support; see `LEAST_SIMILARITY`.
-    held_out : Improvement
-        Of frames that were left out of everything.
+    before, after : float
+        Mean correlation of those patches at the start and at the answer; NaN where the sweeps do not overlap.
     angulation : Angulation
         How strongly each error of the answer would show.
     sweeps : CrossingSweeps
-        What was compared, with the numbers of the frames used and held out.
+        What was compared, with the numbers of the frames.
     """
 
     settings: ImageFit
@@ -100,7 +86,8 @@ class ImageCalibration:
     covariance: FloatArray
     condition_number: float
     alike: float
-    held_out: Improvement
+    before: float
+    after: float
     converged: bool
     angulation: Angulation
     sweeps: CrossingSweeps = field(repr=False)
@@ -158,7 +145,7 @@ def calibrate_from_sweeps(
         answer = refined.estimate
         if progress:
             progress(number + 1, len(FINE))
-    poses = [stack.world_from_sensor for stack in crossing.used]
+    poses = [stack.world_from_sensor for stack in crossing.stacks]
     decided = crossing.level(DECIDED, answer.sensor_from_image)
     alike = decided.at(answer).score
     if alike < LEAST_SIMILARITY:
@@ -167,7 +154,7 @@ def calibrate_from_sweeps(
             "expected sweeps that show the same structure, with a correlation of at least "
             f"{LEAST_SIMILARITY:g} over what both cover, got {got}"
         )
-    angles = angulation(poses[0], poses[1], answer.sensor_from_image, crossing.used[0].corners_mm)
+    angles = angulation(poses[0], poses[1], answer.sensor_from_image, crossing.stacks[0].corners_mm)
     angles.require()
     _, narrow = curvature_of(refined, APART_MM / LEVERS_MM)
     refined = refine(refined.comparison, answer, free, curvature=narrow)
@@ -177,7 +164,6 @@ def calibrate_from_sweeps(
     if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
         require_known(covariance, angles, crossing.centre_mm)
     require_one_answer(decided, answer, rivals, crossing.centre_mm)
-    check = crossing.of_held_out(SHOWN_SIGMA_MM, answer.sensor_from_image)
     return ImageCalibration(
         settings=chosen,
         start=start,
@@ -188,7 +174,8 @@ def calibrate_from_sweeps(
         covariance=covariance[:6, :6],
         condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, np.float64)),
         alike=alike,
-        held_out=Improvement(check.at(first).mean, check.at(answer).mean),
+        before=decided.at(first).mean,
+        after=decided.at(answer).mean,
         converged=refined.converged,
         angulation=angles,
         sweeps=crossing,

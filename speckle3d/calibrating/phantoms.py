@@ -15,9 +15,10 @@ from calibration.detection.crossings import crossings_in_frames
 from calibration.detection.dots import dots_in_frames
 from calibration.detection.labelling import label_dots
 from calibration.detection.lines import detect_lines
+from calibration.motion import require_adequate
 from calibration.nwires import label_by_wires, nwire_errors_mm, trimmed_mean_mm
 from calibration.orientation import calibrate_orientation
-from calibration.plane import Solution, calibrate_plane
+from calibration.plane import calibrate_plane
 from calibration.points import ImagePoints, Seen
 from calibration.recording import (
     CHOICE_STEP_S,
@@ -28,10 +29,10 @@ from calibration.recording import (
     choose_crossings,
     paired,
 )
-from calibration.registration import Choice, calibrate_registered
 from calibration.repeatability import validate
 from calibration.report import figure_report
-from calibration.wires import CrossWire, Wires, calibrate_cross_wire, calibrate_wires
+from calibration.solution import Solution
+from calibration.wires import CrossWire, Wires, calibrate_cross_wire, calibrate_wires, solve_wires
 from speckle3d.calibrating.recordings import open_recording
 from speckle3d.calibrating.settings import (
     OrientationSettings,
@@ -184,28 +185,21 @@ def _with_crossings(recording: Recording, seen: Seen, settings: WireSettings) ->
 
 
 def _with_wires(recording: Recording, seen: Seen, settings: WireSettings, phantom: WirePhantom) -> Outcome:
-    """Calibrate, and choose how much of the phantom's stated place to believe."""
-    size, stated, choices = recording.pixel_mm, settings.registration, list[Choice]()
-
-    def calibrate(points: ImagePoints) -> Solution:
-        # The clock is sought with what depends least on the place and yet is determined.
-        return calibrate_wires(points, phantom, size, settings, "turned" if stated == "auto" else stated)
-
-    def choose(points: ImagePoints) -> Solution:
-        solution, choice = calibrate_registered(points, phantom, size, settings)
-        choices.append(choice)
-        return solution
-
-    chosen = choose if stated == "auto" and phantom.world_from_phantom is not None else None
-    method = "n-wire" if phantom.n_shapes else "three-wire"
-    outcome = calibrate_recording(recording, seen, method, calibrate, settings.time_offset_s, chosen)
-    return replace(outcome, choice=choices[-1] if choices else None)
+    """Calibrate; the clock is sought with what depends least on the place and yet is determined."""
+    size = recording.pixel_mm
+    return calibrate_recording(
+        recording,
+        seen,
+        "n-wire" if phantom.n_shapes else "three-wire",
+        lambda points: require_adequate(solve_wires(points, phantom, size, settings)),
+        settings.time_offset_s,
+        lambda points: calibrate_wires(points, phantom, size, settings),
+    )
 
 
 def remarks(outcome: Outcome) -> list[str]:
-    """What the report says beside the numbers: the clock's offset, the choice of registration, 3-D errors."""
-    notes = [] if outcome.choice is None else [str(outcome.choice)]
-    notes += _nwire_notes(outcome, outcome.solution.points)
+    """What the report says beside the numbers: the clock's offset, 3-D errors."""
+    notes = _nwire_notes(outcome, outcome.solution.points)
     if (offset := outcome.offset) is not None:
         half_s = 1.96 * offset.standard_error_s
         notes.insert(0, f"clock offset {offset.seconds:+.4f} +- {half_s:.4f} s (95 %), estimated")

@@ -16,9 +16,9 @@ def innovations(
     kept: FloatArray,
     stationary: FloatArray,
     shaken: FloatArray,
-    normal: FloatArray,
+    white: FloatArray,
 ) -> float:
-    """Whiten columns by the covariance of a sensor's error and multiply them with each other.
+    """Whiten columns by the covariance of a sensor's error.
 
     Parameters
     ----------
@@ -32,8 +32,8 @@ def innovations(
     stationary, shaken : ndarray, shape (k,)
         Variances of the components that wander, and of those that are new in every frame; the rows' own white
         noise has a variance of one.
-    normal : ndarray, shape (c, c)
-        Filled: products of the innovations.
+    white : ndarray, shape (m, c)
+        Filled: the innovations.
 
     Returns
     -------
@@ -44,8 +44,7 @@ def innovations(
     for frame in range(starts.shape[0] - 1):
         rows = max(rows, starts[frame + 1] - starts[frame])
     variance, expected = np.zeros((size, size)), np.zeros((size, wide))
-    white, gain, root = np.empty((rows, wide)), np.empty((rows, size)), np.empty((rows, rows))
-    normal[:] = 0.0
+    gain, root = np.empty((rows, size)), np.empty((rows, rows))
     log_determinant = 0.0
     for i in range(size):
         variance[i, i] = stationary[i]
@@ -81,15 +80,12 @@ def innovations(
                 for i in range(size):
                     value -= effects[first + a, i] * expected[i, c]
                 for b in range(a):
-                    value -= root[a, b] * white[b, c]
-                white[a, c] = value / root[a, a]
+                    value -= root[a, b] * white[first + b, c]
+                white[first + a, c] = value / root[a, a]
         for a in range(n):
             for i in range(size):
                 for c in range(wide):
-                    expected[i, c] += gain[a, i] * white[a, c]
+                    expected[i, c] += gain[a, i] * white[first + a, c]
                 for j in range(size):
                     variance[i, j] -= gain[a, i] * gain[a, j]
-            for c in range(wide):
-                for d in range(wide):
-                    normal[c, d] += white[a, c] * white[a, d]
     return log_determinant

@@ -9,9 +9,10 @@ from scipy.spatial.transform import RigidTransform
 
 from calibration.motion import MOTIONS, require_adequate
 from calibration.orientation import calibrate_orientation
-from calibration.plane import Plane, Problem, calibrate_plane
+from calibration.plane import Plane, calibrate_plane
 from calibration.points import ImagePoints
 from calibration.settings import OrientationFit
+from calibration.solution import Problem
 from calibration.wires import calibrate_cross_wire
 from speckle3d.core.errors import InsufficientDataError
 

@@ -12,7 +12,7 @@ from scipy import optimize
 from vqf import VQF, offlineVQF
 
 from calibration.images.solver import calibrate_from_sweeps
-from calibration.plane import Equations, Plane, calibrate_plane, least_squares
+from calibration.plane import Plane, calibrate_plane
 from calibration.points import CHAIN, columns_of
 from calibration.settings import ImageFit
 from speed.rows import Row, timed
@@ -65,10 +65,10 @@ def differences(equations, start, free):
 def plane(runs: int) -> list[Row]:
     """All of a plane's calibration, and its least squares beside SciPy's with finite differences."""
     lines = scan_plane(np.random.default_rng(0), LINES, line_noise_mm=0.2).lines
-    solution, equations = calibrate_plane(lines), Equations.of(lines, Plane())
+    solution, equations = calibrate_plane(lines), Plane().equations(lines)
     start = solution.chain.displaced(np.append(np.full(5, 0.01), np.full(9, 0.02)))
     whole = timed(lambda: calibrate_plane(lines), runs)
-    ours = timed(lambda: least_squares(equations, start, solution.free), runs).seconds
+    ours = timed(lambda: equations.least_squares(start, solution.free), runs).seconds
     theirs = timed(lambda: differences(equations, start, solution.free), runs).seconds
     what = f"calibrate_plane, {LINES} lines"
     return [

@@ -5,8 +5,9 @@ import pytest
 from floor_scenes import Floor
 
 from calibration.clock.fitted import estimate_offset
-from calibration.plane import Chain, Plane, Problem
+from calibration.plane import Chain, Plane
 from calibration.points import POSE, ImagePoints
+from calibration.solution import Problem
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses
 
@@ -19,7 +20,7 @@ def found(seed, search_s):
     frame_s, sensor_s = floor.time_s, np.arange(-1.0, floor.time_s[-1] + 1.0, 1 / 50.0)
     readings = TimedPoses(sensor_s - OFFSET_S, floor.readings(sensor_s, drifts=False))
     pixels, inside = floor.lines(frame_s, 0.2), frame_s < frame_s[-1] - 2 * search_s
-    truth = Chain(floor.pixel_mm, floor.mounting, floor.world_from_floor.inv())
+    truth = Chain.of(floor.pixel_mm, floor.mounting, floor.world_from_floor.inv())
     frame_s, pixels = frame_s[inside], pixels[inside]
     points = ImagePoints.of_lines(np.arange(len(frame_s)), pixels, readings.at(frame_s), frame_s)
     return estimate_offset(

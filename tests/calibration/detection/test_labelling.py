@@ -31,7 +31,7 @@ def test_wires_are_told_apart_among_wrong_dots_however_the_image_lies(seed, degr
 
 
 def truth(shown):
-    return Chain(PIXEL_MM, shown.sensor_from_image, shown.phantom.world_from_phantom.inv())
+    return Chain.of(PIXEL_MM, shown.sensor_from_image, shown.phantom.world_from_phantom.inv())
 
 
 def test_a_calibration_finds_the_wires_that_show_and_no_others():

@@ -34,7 +34,7 @@ def test_far_starts_reach_the_truth(scene, crossing, found, seed):
     turned = (scene[2].inv() * result.sensor_from_image).rotation.magnitude()
     assert np.rad2deg(turned) < 0.5
     assert result.converged
-    assert result.held_out.after > 0.9
+    assert result.after > 0.9
 
 
 def test_errors_are_within_what_the_covariance_says(scene, found):
