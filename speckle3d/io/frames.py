@@ -50,6 +50,7 @@ class FileFrames:
         chosen: Sequence[int] | None = None,
     ) -> None:
         self.path, self.open_file = Path(path).absolute(), open_file
+        self._given = open_file, shape, dtype, stored_dtype
         self.chosen = range(shape[0]) if chosen is None else [int(i) for i in chosen]
         self.shape, self.dtype = (len(self.chosen), *shape[1:]), np.dtype(dtype)
         self.stored_dtype = self.dtype if stored_dtype is None else np.dtype(stored_dtype)
@@ -76,8 +77,7 @@ class FileFrames:
 
     def take(self, rows: npt.NDArray[Any], axis: int = 0) -> FileFrames:
         """Some of the frames, as `numpy.take` along the axis of frames."""
-        chosen = [self.chosen[i] for i in rows.tolist()]
-        return FileFrames(self.path, self.open_file, self.shape, self.dtype, self.stored_dtype, chosen)
+        return FileFrames(self.path, *self._given, [self.chosen[i] for i in rows.tolist()])
 
     def close(self) -> None:
         """Close the file; the next frame opens it again."""
@@ -85,14 +85,7 @@ class FileFrames:
             self._read = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (
-            self.path,
-            self.open_file,
-            self.shape,
-            self.dtype,
-            self.stored_dtype,
-            self.chosen,
-        )
+        return type(self), (self.path, *self._given, self.chosen)
 
 
 @dataclass(frozen=True)

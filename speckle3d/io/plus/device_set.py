@@ -35,12 +35,14 @@ _HAIR = 0.1
 """Pixels by which a rectangle is wider, so that rounding loses none of its own."""
 _ARC_POINTS = 128
 """Of a fan's arc in a polygon: 0.02 pixels off the circle at a radius of 1,000 pixels and 90 degrees."""
+_CONFIG = "--plus-config of convert"
 _DOCUMENTS = {
-    "PlusConfiguration": "a device set",
-    "ProbeCalibrationResult": "the result of a probe calibration",
-    "TemporalCalibrationResults": "a tracker's delay",
-    "LineSegmentationResults": "lines found in images",
+    "PlusConfiguration": ("a device set", _CONFIG),
+    "ProbeCalibrationResult": ("the result of a probe calibration", _CONFIG),
+    "TemporalCalibrationResults": ("a tracker's delay", "--time-offset-s of calibrate"),
+    "LineSegmentationResults": ("lines found in images", "comparison alone, as lines are found anew"),
 }
+"""What a document is, and what for, by its first element."""
 
 
 def read_xml(path: PathLike) -> Element:
@@ -288,45 +290,29 @@ def _attribute(root: Element, name: str) -> str | None:
     return values.pop() if len(values) == 1 else None
 
 
-def _device_rows(path: Path, root: Element) -> list[Row]:
-    device = read_device_set(path)
-    pixel = device.pixel_mm(device.output_size)
-    devices = [
-        f"{element.get('Id', 'one without a name')} ({element.get('Type')})".removesuffix(" (None)")
-        for element in root.iterfind(".//Device")
-    ]
-    wires = len(root.findall(".//PhantomDefinition/Geometry/Pattern/Wire"))
-    return [
-        ("devices", ", ".join(devices) or "none", ""),
-        *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
-        ("pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""),
-        ("image orientation", device.image_orientation or "not said", ""),
-        ("transducer", f"{device.probe} {device.geometry}".strip() or "not said", ""),
-        ("clip of volumes", "none" if device.clip is None else str(device.clip), ""),
-        ("wires of a phantom", str(wires), ""),
-        ("for", "--plus-config of convert" + (", --phantom of calibrate wires" if wires else ""), ""),
-    ]
-
-
 def _open(path: Path, settings: ImportSettings) -> Recording:
     root = read_xml(path)
-    if (what := _DOCUMENTS.get(root.tag)) is None:
+    if root.tag not in _DOCUMENTS:
         raise InvalidInputError(
             f"{path}: expected a document of PLUS ({', '.join(_DOCUMENTS)}), got {root.tag}"
         )
-    rows: list[Row]
+    what, use = _DOCUMENTS[root.tag]
+    rows: list[Row] = [("content", what, "")]
     if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
-        (lag_s,) = vector(root, "TrackerLagSec", 1)
-        rows = [("time offset of the tracker", f"{-lag_s:+.4f}", "s")]
-        rows.append(("for", "--time-offset-s of calibrate", ""))
-    elif root.tag == "LineSegmentationResults":
-        count = len(root.findall("Frame[@SegmentationStatus='OK']"))
-        rows = [("lines found", str(count), "frames")]
-        rows.append(("for", "comparison alone, as lines are found anew", ""))
-    else:
-        rows = _device_rows(path, root)
-    fault = InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {rows[-1][1]}")
-    return Recording(path, settings, rows=(("content", what, ""), *rows), fault=fault)
+        rows.append(("time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"))
+    if use == _CONFIG:
+        device = read_device_set(path)
+        pixel = device.pixel_mm(device.output_size)
+        if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
+            use += ", --phantom of calibrate wires"
+        rows += [
+            *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
+            ("pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""),
+            ("transducer", f"{device.probe} {device.geometry}".strip() or "not said", ""),
+            ("clip of volumes", "none" if device.clip is None else str(device.clip), ""),
+        ]
+    fault = InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {use}")
+    return Recording(path, settings, rows=(*rows, ("for", use, "")), fault=fault)
 
 
 def _claims(_: Path, start: bytes) -> bool:
