@@ -76,7 +76,6 @@ def package_files(sweep, packed=False, name=NAME, element_mm=ELEMENT_MM, yml=Non
     files = {
         f"{name}_{kind}.raw{'.lzo' if packed else ''}": lzop_bytes(raw) if packed else raw,
         f"{name}_{kind}.yml": (yml or yml_text(sweep, element_mm)).encode(),
-        f"{name}_{kind}.tgc": tgc_text(frame_times_ns(sweep)).encode(),
     }
     if sweep.orientation is not None:
         files[f"{name}_imu.yml"] = sensor_text(sweep.orientation).encode()
@@ -137,11 +136,6 @@ def yml_text(sweep, element_mm=ELEMENT_MM):
         f"type: {spoken}\ncompression: none\nsampling rate: {rate_hz / 1e6!r} MHz\ndelay samples: {delay!r}\n"
         f"lines:\n{lists}{focus}"
     )
-
-
-def tgc_text(times_ns):
-    rows = [f"timestamp: {t} " for t in times_ns]
-    return f"# tgc curves per frame\n\nframes: {len(rows)}\n\n" + "\n".join(rows) + " "
 
 
 def sensor_text(sensor):
