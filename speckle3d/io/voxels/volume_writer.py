@@ -10,10 +10,12 @@ References
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+import nibabel
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
@@ -26,7 +28,6 @@ from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.headers import GZIP, ZLIB, header_bytes, meta_start, meta_type, nrrd_type, packer
 from speckle3d.io.text import unescaped
-from speckle3d.io.voxels.nifti import write_nifti
 from speckle3d.io.voxels.segments import segment_fields
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
@@ -36,6 +37,13 @@ LABELS_ALONE = ".seg.nrrd"
 
 PREFIX = "Speckle3D_"
 """Before the names of a volume's fields, so that none is taken for one of the format's own."""
+
+RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""World of NIfTI from that of the other formats."""
+LABELS, OWN = "label", "speckle3d"
+"""NIfTI's intent of an image of labels, and the name of fields in its comment."""
+_LONGEST = 2**15
+"""Voxels along an axis that NIfTI-1 does not count."""
 
 
 def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
@@ -74,7 +82,7 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
     plain = segment_fields(volume.segments, volume.shape) if isinstance(volume, LabelMap) else {}
     with atomic_path(path) as part:
         if ".nii" in suffix:
-            write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
+            _write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
             return
         raw = volume.voxels.T.astype(volume.voxels.dtype.newbyteorder("<"), order="C", copy=False)
         content = raw.data.cast("B")
@@ -170,6 +178,21 @@ class VolumeWriter:
             raise MismatchError(f"{self._path}: expected {expected}, got {planes.shape}, {planes.dtype}")
         target[:] = planes
         self._planes += len(planes)
+
+
+def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_labels: bool) -> None:
+    """Write an image of NIfTI-1, or of NIfTI-2 where it is longer than that counts."""
+    kind: Any = nibabel.Nifti2Image if max(volume.shape) >= _LONGEST else nibabel.Nifti1Image
+    image = kind(volume.voxels, RAS_FROM_LPS @ volume.world_from_index)
+    image.set_qform(image.affine, 1)
+    image.set_sform(image.affine, 1)
+    image.header.set_xyzt_units("mm")
+    if is_labels:
+        image.header.set_intent(LABELS)
+    if fields:
+        text = json.dumps({OWN: dict(fields)}, ensure_ascii=False).encode("utf-8", "backslashreplace")
+        image.header.extensions.append(nibabel.nifti1.Nifti1Extension("comment", text))
+    nibabel.save(image, path)
 
 
 def _nrrd_header(volume: Volume, fields: Mapping[str, str], packed_size: int | None) -> bytes:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
@@ -15,12 +18,14 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.labels import LABEL_TYPES, LabelMap
 from speckle3d.core.volume import VOXEL_TYPES, Volume
-from speckle3d.io.headers import is_image, read_header
+from speckle3d.io.hdf5 import reading
+from speckle3d.io.headers import is_image, mm_per, read_header
 from speckle3d.io.readers import first_bytes
-from speckle3d.io.voxels.nifti import is_nifti, read_nifti
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
-from speckle3d.io.voxels.volume_writer import own_fields
+from speckle3d.io.voxels.volume_writer import LABELS, OWN, RAS_FROM_LPS, own_fields
 
+_SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
+"""First bytes of NIfTI-1 and NIfTI-2: the length of the header."""
 _SAME_PLACE_MM = 1e-3
 """Two grids are one if they differ by less: NIfTI keeps places to single precision."""
 
@@ -36,7 +41,7 @@ def is_volume(path: PathLike) -> bool:
     start = first_bytes(path)
     if is_image(start):
         return read_header(path).is_volume
-    return is_nifti(Path(path), start)
+    return _is_nifti(Path(path), start)
 
 
 def may_be_volume(path: PathLike) -> bool:
@@ -52,7 +57,7 @@ def may_be_volume(path: PathLike) -> bool:
     start = first_bytes(path)
     if is_image(start):
         return b"Seq_Frame" not in start
-    return is_nifti(Path(path), start)
+    return _is_nifti(Path(path), start)
 
 
 def read_volume(path: PathLike) -> Volume:
@@ -78,8 +83,8 @@ def read_volume(path: PathLike) -> Volume:
         If it is not a grey three-dimensional image.
     """
     start = first_bytes(path)
-    if is_nifti(Path(path), start):
-        voxels, matrix, fields, is_labels = read_nifti(Path(path))
+    if _is_nifti(Path(path), start):
+        voxels, matrix, fields, is_labels = _read_nifti(Path(path))
         own = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
     elif is_image(start):
         header = read_header(path)
@@ -144,8 +149,6 @@ def _placed(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is refused
         matrix = np.array(world_from_index, dtype=float)
         spacing = np.linalg.norm(matrix[:3, :3], axis=0)
-        if not (np.isfinite(spacing).all() and (spacing > 0).all()):
-            raise InvalidInputError(f"spacing: expected lengths above zero, got {spacing.tolist()}")
         if np.linalg.det(matrix[:3, :3]) < 0:
             matrix[:3, 3] += matrix[:3, 2] * (voxels.shape[2] - 1)
             matrix[:3, 2] *= -1.0
@@ -164,3 +167,40 @@ def _labels(voxels: npt.NDArray[Any]) -> npt.NDArray[Any]:
     if not np.array_equal(labels, voxels):
         raise InvalidInputError("labels: expected whole numbers from 0 to 65535, got others")
     return labels
+
+
+def _is_nifti(path: Path, start: bytes) -> bool:
+    """Whether a file is NIfTI by its first bytes; one packed by gzip, by its name."""
+    return start[:4] in _SIZES or (start.startswith(b"\x1f\x8b") and path.name.lower().endswith(".nii.gz"))
+
+
+def _read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str], bool]:
+    """Read an image of NIfTI-1 or NIfTI-2, of one file or two.
+
+    Returns
+    -------
+    voxels : ndarray
+    world_from_index : ndarray, shape (4, 4)
+        LPS, mm, by the header's unit; a header without one means mm.
+    fields : dict of str to str
+        Of this package's own comment.
+    is_labels : bool
+
+    Raises
+    ------
+    FileError
+        In nibabel's words, if it is truncated or damaged.
+    """
+    with reading(path, Exception):  # a damaged file shows in whatever nibabel happens to stumble over
+        image: Any = nibabel.load(path)
+        voxels = np.asanyarray(image.dataobj)
+        factor = mm_per(image.header.get_xyzt_units()[0], str(path))
+        is_labels = image.header.get_intent()[0] == LABELS
+    while voxels.ndim > 3 and voxels.shape[-1] == 1:
+        voxels = voxels[..., 0]
+    affine = np.diag([factor, factor, factor, 1.0]) @ RAS_FROM_LPS @ image.affine
+    fields: dict[str, str] = {}
+    for extension in image.header.extensions:
+        with suppress(ValueError, LookupError, TypeError, AttributeError):  # of somebody else
+            fields |= json.loads(bytes(extension.get_content()).rstrip(b"\0"))[OWN]
+    return voxels, affine, fields, is_labels
