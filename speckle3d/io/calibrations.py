@@ -11,14 +11,15 @@ where it is known, ``time_offset_s``. Data sets: ``/sensor_from_image`` (4, 4), 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import h5py
 import numpy as np
 
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, calibrated
 from speckle3d.core.errors import InvalidInputError, MismatchError, naming
-from speckle3d.core.geometry import require_finite, rotations_from_quaternions
+from speckle3d.core.geometry import rotations_from_quaternions
 from speckle3d.core.reconstruction import CalibrationFile
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.io.hdf5 import (
@@ -34,12 +35,12 @@ from speckle3d.io.hdf5 import (
     require_group,
     sha256_of,
 )
-from speckle3d.io.records import put, put_fields, put_text, read_record, written
+from speckle3d.io.records import put, put_fields, read_record, written
 
 FORMAT = "speckle3d.calibration"
 
-_WORDS, _NUMBERS = ("name", "unit"), ("value", "standard_error")
-"""Columns of /parameters."""
+_COLUMNS, _NUMBERS = tuple(field.name for field in fields(Parameter)), ("value", "standard_error")
+"""Data sets of /parameters, and those of them that are numbers."""
 
 
 def write_calibration(path: PathLike, calibration: Calibration) -> None:
@@ -61,13 +62,11 @@ def write_calibration(path: PathLike, calibration: Calibration) -> None:
         put_fields(file, calibration, skip=("rotation", "translation_mm", "parameters", "frames"))
         is_turn = calibration.translation_mm is None
         put(file, "sensor_from_image", calibration.rotation if is_turn else calibration.sensor_from_image)
-        columns = {name: np.array([getattr(row, name) for row in rows], float) for name in _NUMBERS}
-        put(file, "parameters", columns)
-        for name in _WORDS:
-            put_text(file["parameters"], name, [getattr(row, name) for row in rows])
+        columns: dict[str, Any] = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
+        put(file, "parameters", columns | {name: np.array(columns[name], float) for name in _NUMBERS})
         used, dropped = (np.array([*numbers], dtype=np.int64) for numbers in (frames.used, frames.dropped))
-        put(file, "frames", {"given": frames.given, "used": used, "dropped": dropped})
-        put_text(file["frames"], "reason", list(frames.dropped.values()))
+        reasons = list(frames.dropped.values())
+        put(file, "frames", {"given": frames.given, "used": used, "dropped": dropped, "reason": reasons})
 
 
 def read_calibration(path: PathLike) -> Calibration:
@@ -177,11 +176,9 @@ def resized(sweep: Sweep, sizes: dict[str, float]) -> Sweep:
 
 
 def _read_parameters(group: h5py.Group) -> tuple[Parameter, ...]:
-    value = read_checked(group, "value", ("p",))
-    require_finite(value, locate(group, "value"))
-    error = read_checked(group, "standard_error", value.shape)
-    name, unit = (read_texts(group, column, value.shape) for column in _WORDS)
-    return tuple(map(Parameter, name, value.tolist(), error.tolist(), unit))
+    value, error = (read_checked(group, name, ("p",)) for name in _NUMBERS)
+    names, units = (read_texts(group, name, value.shape) for name in ("name", "unit"))
+    return tuple(map(Parameter, names, value.tolist(), error.tolist(), units))
 
 
 def _read_frames(group: h5py.Group) -> FramesUsed:

@@ -11,8 +11,6 @@ _LEAST_COHERENCE = 0.1
 """Of neighbouring samples, below which they are noise and tell nothing."""
 _LEAST_SIGMAS = 4.0
 """Of the mean of so many phases of noise, below which coherence tells nothing either: of few samples."""
-_PARTS, _LEAST_SHARE = 10, 0.5
-"""Parts of the depth, of which those count that are so coherent, by the most coherent."""
 _FASTEST = 0.85 * np.pi
 """Turn of a carrier from sample to sample, above which it may seem to turn backwards."""
 _REMOVED, CARRIED, _REVERSED = (-0.5, 0.3), (0.5, 1.15), (-1.15, -0.7)
@@ -64,19 +62,13 @@ def carried_share(frames: Frames, frequency_hz: float, sampling_rate_hz: float) 
     turn = 2.0 * np.pi * frequency_hz / sampling_rate_hz
     if turn > _FASTEST:
         return None
-    lags, counts = np.zeros(_PARTS, dtype=complex), np.zeros(_PARTS)
+    lag, count = 0j, 0
     for i in sorted({0, frames.shape[0] // 2, frames.shape[0] - 1}):
         frame = np.asarray(frames[i], dtype=np.complex128)
         pairs = np.conj(frame[:, :-1]) * frame[:, 1:]
         # Each pair counts the same: a near field may be a thousand times as strong as the rest.
-        size = np.abs(pairs)
-        turns = np.divide(pairs, size, out=np.zeros_like(pairs), where=size > 0)
-        lags += [part.sum() for part in np.array_split(turns, _PARTS, axis=1)]
-        counts += [np.count_nonzero(part) for part in np.array_split(turns, _PARTS, axis=1)]
-    coherence = np.abs(lags) / np.maximum(counts, 1.0)
-    # Deep down there may be noise alone, whose own mean turn is another.
-    seen = coherence >= _LEAST_SHARE * coherence.max()
-    lag, count = lags[seen].sum(), counts[seen].sum()
+        turns = pairs[pairs != 0] / np.abs(pairs[pairs != 0])
+        lag, count = lag + turns.sum(), count + turns.size
     if not abs(lag) > max(_LEAST_COHERENCE * count, _LEAST_SIGMAS * count**0.5):
         return None
     return float(np.angle(lag)) / turn

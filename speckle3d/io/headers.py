@@ -16,7 +16,7 @@ import bz2
 import math
 import re
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -254,7 +254,7 @@ def read_header(path: PathLike) -> SequenceHeader:
         stream.seek(0)
         is_nrrd = start.startswith(b"NRRD")
         fields = (_nrrd_fields if is_nrrd else _meta_fields)(path, stream)
-        return _header(Path(path), fields, fields if is_nrrd else _in_words_of_nrrd(fields), stream.tell())
+        return _header(Path(path), fields, is_nrrd, stream.tell())
 
 
 def mm_per(unit: str, where: str) -> float:
@@ -307,44 +307,24 @@ def _nrrd_fields(path: PathLike, stream: BinaryIO) -> dict[str, str]:
     return fields
 
 
-def _in_words_of_nrrd(fields: dict[str, str]) -> dict[str, str]:
-    """What the fields of a MetaImage say."""
-
-    def first(*names: str) -> str:
-        return next((fields[name] for name in names if fields.get(name)), "")
-
-    def is_set(*names: str) -> bool:
-        return first(*names)[:1] in ("T", "t", "1")
-
-    is_text = "BinaryData" in fields and not is_set("BinaryData")
-    said = {
-        "sizes": first("DimSize"),
-        "kinds": first("Kinds"),
-        "type": first("ElementType"),
-        "endian": "big" if is_set("BinaryDataByteOrderMSB", "ElementByteOrderMSB") else "little",
-        "encoding": "text" if is_text else "gzip" if is_set("CompressedData") else "raw",
-        "spacings": first("ElementSpacing", "ElementSize"),
-        "units": len(first("DimSize").split()) * f'"{first("DistanceUnits")}" ',
-        "channels": first("ElementNumberOfChannels"),
-        "turn": first("TransformMatrix", "Rotation", "Orientation"),
-        "space origin": first("Offset", "Position", "Origin"),
-    }
-    data, skipped = fields["ElementDataFile"], first("HeaderSize") or "0"
-    if data.upper() != "LOCAL":
-        said["data file"] = data
-    if data.upper() != "LOCAL" or skipped.startswith("-"):
-        said["byte skip"] = skipped
-    return said
-
-
-def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int) -> SequenceHeader:
+def _header(path: Path, fields: dict[str, str], is_nrrd: bool, start: int) -> SequenceHeader:
     """Tell axes of the image, of frames and of colours by their kinds; without, as PLUS orders them."""
-    stored = tuple(map(int, said.get("sizes", "").split()))
-    told = said.get("kinds", "").lower().split()
+
+    def said(name: str, *meta_names: str) -> str:
+        """What a field of NRRD says, or the first of MetaImage's."""
+        names = [name] if is_nrrd else [other for other in meta_names if fields.get(other)]
+        return fields.get(next(iter(names), ""), "")
+
+    def is_set(*meta_names: str) -> bool:
+        return said("", *meta_names)[:1] in ("T", "t", "1")
+
+    stored = tuple(map(int, said("sizes", "DimSize").split()))
+    told = said("kinds", "Kinds").lower().split()
     kinds = told if len(told) == len(stored) else ["domain"] * len(stored)
     spatial = [i for i, kind in enumerate(kinds) if kind in _SPACE]
     frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
     colours = {*range(len(stored))} - {*spatial, frame_axis}
+    channels = math.prod(stored[i] for i in colours if i is not None)
     if frame_axis is None and len(spatial) == 3:
         frame_axis = spatial.pop()
     if len(spatial) == 3:  # images of 3D Slicer are a pixel thick
@@ -363,76 +343,73 @@ def _header(path: Path, fields: dict[str, str], said: dict[str, str], start: int
     own, frames = _split(fields)
     if len(frames) == (*size, 0)[2] + 1 and not frames[0]:
         frames = frames[1:]  # of a writer that counts from 1
-    word = said.get("type", "") if 0 not in stored else "uchar"  # a tracker's recording may name no type
-    encoding = said.get("encoding", "").lower()
+    word = said("type", "ElementType") if 0 not in stored else "uchar"  # a tracker's may name no type
+    is_big = said("endian").lower() == "big" or is_set("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
+    encoding = said("encoding").lower()
+    if not is_nrrd:
+        is_binary = "BinaryData" not in fields or is_set("BinaryData")
+        encoding = "gzip" if is_set("CompressedData") else "raw" if is_binary else "text"
     packing = _PACKINGS.get(encoding if encoding == "raw" else encoding[:2])
     if packing is None:
         raise InvalidInputError(f"{path}: encoding: expected raw, gzip, bzip2 or text, got {encoding!r}")
-    lines, skipped = (
-        int(said.get(f"{what} skip", said.get(f"{what}skip", "0"))) for what in ("line", "byte")
-    )
-    data, start = (_beside(path, said["data file"]), 0) if "data file" in said else (path, start)
-    number_type = _number_type(word, said.get("endian", "").lower() == "big", f"{path}: type")
-    channels = math.prod(stored[i] for i in colours if i is not None) * int(said.get("channels") or "1")
+    file = said("data file", "ElementDataFile")
+    skipped = int(said("byte skip", "HeaderSize") or said("byteskip") or "0")
+    if not is_nrrd and file.upper() == "LOCAL":
+        file, skipped = "", min(skipped, 0)
+    data, start = (_beside(path, file), 0) if file else (path, start)
     return SequenceHeader(
         str(path), own, frames, size, spacing, stored, frame_axis,
-        kinds is told and {*told} <= {"domain", "space"}, channels,
-        None if frame_axis is None else _frame_times(said, frame_axis, stored), axes, origin, number_type,
-        data, -1 if skipped < 0 else start + skipped, packing, lines,
+        kinds is told and {*told} <= {"domain", "space"},
+        channels * int(said("", "ElementNumberOfChannels") or "1"),
+        None if frame_axis is None else _frame_times(said, frame_axis, size[2]), axes, origin,
+        _number_type(word, is_big, f"{path}: type"), data,
+        -1 if skipped < 0 else start + skipped, packing, int(said("line skip") or said("lineskip") or "0"),
     )  # fmt: skip
 
 
-def _placed(path: Path, said: dict[str, str], count: int) -> tuple[FloatArray | None, FloatArray | None]:
-    """Steps along the axes and the place of the first pixel, where they are said; see `SequenceHeader`.
-
-    Raises
-    ------
-    InvalidInputError
-        If there is another number of steps than of axes, or a unit is not known.
-    """
-    axes: FloatArray | None = None
-    units = _quoted(said.get("units", ""))
-    if said.get("spacings"):
-        steps = [float(word) for word in said["spacings"].split()]
-        for i, unit in enumerate(units[: len(steps)]):
-            steps[i] *= 1.0 if unit in _S_PER else mm_per(unit, f"{path}: units")
-        axes = np.diag(steps)
-        if said.get("turn"):
-            axes = axes @ np.reshape(numbers(said["turn"], axes.size, f"{path}: TransformMatrix"), axes.shape)
-    lengths = (unit for unit in _quoted(said.get("space units", "")) or units if unit not in _S_PER)
-    scale: FloatArray = mm_per(next(lengths, ""), f"{path}: space units") * np.ones(max(count, 3))
-    space = said.get("space", "").lower()
+def _placed(path: Path, said: Callable[..., str], count: int) -> tuple[FloatArray | None, FloatArray | None]:
+    """Steps along the axes and the place of the first pixel, where they are said; see `SequenceHeader`."""
+    units = _quoted(said("units")) or [said("", "DistanceUnits").lower()] * count
+    steps = said("spacings", "ElementSpacing", "ElementSize").split()
+    spaces = [unit for unit in _quoted(said("space units")) or units if unit not in _S_PER]
+    scale: FloatArray = mm_per("".join(spaces[:1]), f"{path}: space units") * np.ones(max(count, 3))
+    space = said("space").lower()
     letters = "".join(word[0] for word in space.split("-")) if "-" in space else space
     scale[:2] *= [-1.0 if letters[:1] == "r" else 1.0, -1.0 if letters[1:2] == "a" else 1.0]
-    if axes is None and "space directions" in said:
-        rows = re.findall(r"\(([^)]*)\)|none", said["space directions"].lower())
+    axes: FloatArray | None = None
+    if steps:
+        of_space = [1.0 if unit in _S_PER else mm_per(unit, f"{path}: units") for unit in units]
+        axes = np.diag(np.array(steps, dtype=float) * (of_space or 1.0))
+        if turn := said("", "TransformMatrix", "Rotation", "Orientation"):
+            axes = axes @ np.reshape(numbers(turn, axes.size, f"{path}: TransformMatrix"), axes.shape)
+    elif directions := said("space directions").lower():
+        rows = re.findall(r"\(([^)]*)\)|none", directions)
         vectors = [_vector(row, f"{path}: space directions") if row else np.empty(0) for row in rows]
         axes = np.full((len(rows), max(map(len, vectors), default=0)), np.nan)
         for axis, vector in zip(axes, vectors, strict=True):
             axis[: len(vector)] = vector * scale[: len(vector)]
     if axes is not None and len(axes) != count:
         raise InvalidInputError(f"{path}: expected a spacing for each of {count} axes, got {len(axes)}")
-    if not said.get("space origin"):
-        return axes, None
-    origin = _vector(said["space origin"].strip("() "), f"{path}: space origin")
-    origin *= scale[: len(origin)]
+    origin = None
+    if place := said("space origin", "Offset", "Position", "Origin"):
+        origin = _vector(place.strip("() "), f"{path}: space origin")
+        origin *= scale[: len(origin)]
     return axes, origin
+
+
+def _frame_times(said: Callable[..., str], axis: int, count: int) -> FloatArray | None:
+    """Times of frames by their axis: its index, as 3D Slicer writes it, or its spacing in a unit of time."""
+    units, steps = _quoted(said("units")), said("spacings").split()
+    unit, index = "".join(units[axis : axis + 1]), said(f"axis {axis} index values").split()
+    if said(f"axis {axis} index type") in ("", "numeric") and len(index) == count:
+        return np.array(index, dtype=float) * _S_PER.get(unit, 1.0)
+    if unit in _S_PER and steps and float(steps[axis]) > 0:
+        return np.arange(float(count)) * float(steps[axis]) * _S_PER[unit]
+    return None
 
 
 def _vector(text: str, where: str) -> FloatArray:
     return np.array(numbers(text.replace(",", " "), None, where))
-
-
-def _frame_times(said: dict[str, str], axis: int, stored: tuple[int, ...]) -> FloatArray | None:
-    """Times of frames by their axis: its index, as 3D Slicer writes it, or its spacing in a unit of time."""
-    units, steps = _quoted(said.get("units", "")), said.get("spacings", "").split()
-    unit = units[axis] if len(units) == len(stored) else ""
-    values = said.get(f"axis {axis} index values", "").split()
-    if said.get(f"axis {axis} index type", "numeric") == "numeric" and len(values) == stored[axis]:
-        return np.array(values, dtype=float) * _S_PER.get(unit, 1.0)
-    if unit in _S_PER and len(steps) == len(stored) and float(steps[axis]) > 0:
-        return np.arange(float(stored[axis])) * float(steps[axis]) * _S_PER[unit]
-    return None
 
 
 def _quoted(text: str) -> list[str]:

@@ -48,28 +48,20 @@ class PickedPoints:
     wire: IntArray | None = None
 
     def __post_init__(self) -> None:
-        n = len(self.frame)
-        if self.pixels.shape != (n, 2) or (self.wire is not None and self.wire.shape != (n,)):
-            raise MismatchError(f"points: expected {n} of each, got pixels of shape {self.pixels.shape}")
         require_finite(self.pixels, "pixels")
-        if n and (self.frame.min() < 0 or (self.wire is not None and self.wire.min() < 0)):
-            raise InvalidInputError("points: expected frames and wires from 0, got a negative number")
 
     def __len__(self) -> int:
         return len(self.frame)
 
     def require_inside(self, shape: tuple[int, ...]) -> None:
         """Raise `MismatchError` unless all points lie in the frames of images of `shape` (n, column, row)."""
-        count, *size = shape
-        if len(self) and int(self.frame.max()) >= count:
-            raise MismatchError(f"expected frames from 0 to {count - 1}, got frame {int(self.frame.max())}")
-        outside = ((self.pixels < -0.5) | (self.pixels > np.array(size) - 0.5)).any(axis=1)
-        if outside.any():
-            first = int(np.argmax(outside))
-            column, row = self.pixels[first]
+        count, columns, rows = shape
+        places = np.column_stack([self.frame, self.pixels])
+        outside = ((places < [0, -0.5, -0.5]) | (places > np.array(shape) - [1, 0.5, 0.5])).any(axis=1)
+        for frame, column, row in places[outside]:
             raise MismatchError(
-                f"expected points within images of {size[0]} columns and {size[1]} rows, got column "
-                f"{column:g}, row {row:g} in frame {int(self.frame[first])}"
+                f"expected points within {count} frames of {columns} columns and {rows} rows, got column "
+                f"{column:g}, row {row:g} in frame {frame:g}"
             )
 
 
@@ -88,20 +80,27 @@ def read_points(path: PathLike, wire_names: Sequence[str] = ()) -> PickedPoints:
     InvalidInputError
         Naming the line.
     """
-    frames, pixels, wires = list[int](), list[tuple[float, float]](), list[int]()
+    numbered = {str(i): i for i in range(len(wire_names))} | {name: i for i, name in enumerate(wire_names)}
+    rows, wires = list[list[float]](), list[int]()
     for where, cell in table(path, _COLUMNS):
-        frame, column, row = (numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS)
-        if frame < 0 or frame != int(frame):
+        rows.append([numbers(cell[name], 1, f"{where}: {name}")[0] for name in _COLUMNS])
+        frame = rows[-1][0]
+        if frame < 0 or frame % 1:
             raise InvalidInputError(f"{where}: frame: expected a whole number from 0, got {cell['frame']}")
-        frames.append(int(frame))
-        pixels.append((column, row))
-        if _WIRE in cell:
-            wires.append(_wire(cell[_WIRE], wire_names, f"{where}: wire"))
-            if (frames[-1], wires[-1]) in [*zip(frames, wires, strict=True)][:-1]:
-                raise InvalidInputError(f"{where}: expected a wire once in a frame, got {cell[_WIRE]} again")
-    if not frames:
+        if (word := cell.get(_WIRE)) is None:
+            continue
+        if word not in numbered:
+            known = ", ".join(wire_names) or "no wire"
+            raise InvalidInputError(f"{where}: wire: expected {known} or its number, got {word!r}")
+        if any(
+            other[0] == frame and wire == numbered[word] for other, wire in zip(rows, wires, strict=False)
+        ):
+            raise InvalidInputError(f"{where}: expected a wire once in a frame, got {word} again")
+        wires.append(numbered[word])
+    if not rows:
         raise InvalidInputError(f"{path}: expected points below the heading, got none")
-    return PickedPoints(np.array(frames), np.array(pixels), np.array(wires) if wires else None)
+    places = np.array(rows)
+    return PickedPoints(places[:, 0].astype(int), places[:, 1:], np.array(wires) if wires else None)
 
 
 def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str] = ()) -> None:
@@ -112,16 +111,12 @@ def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str]
     FileError
         If the file cannot be written.
     InvalidInputError
-        If a name cannot be written, or a wire has none although names are given.
+        If a name cannot be written.
     """
     for name in wire_names:
         if name != name.strip() or not name or set(name) & set(",#\r\n"):
             raise InvalidInputError(f"wire: expected a name without comma, hash or line break, got {name!r}")
     named = _COLUMNS if points.wire is None else (*_COLUMNS, _WIRE)
-    if points.wire is not None and wire_names and points.wire.max(initial=0) >= len(wire_names):
-        raise InvalidInputError(
-            f"wire: expected one of {len(wire_names)} wires, got number {points.wire.max()}"
-        )
     lines = [",".join(named)]
     for i, (frame, (column, row)) in enumerate(zip(points.frame, points.pixels, strict=True)):
         line = f"{frame},{column:.3f},{row:.3f}"
@@ -132,12 +127,27 @@ def write_points(path: PathLike, points: PickedPoints, wire_names: Sequence[str]
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _wire(word: str, names: Sequence[str], where: str) -> int:
-    numbered = {str(number): number for number in range(len(names))}
-    wire = (numbered | {name: number for number, name in enumerate(names)}).get(word)
-    if wire is None:
-        known = (
-            f"one of {', '.join(names)} or its number from 0" if names else "no wire, the phantom having none"
-        )
-        raise InvalidInputError(f"{where}: expected {known}, got {word!r}")
-    return wire
+WORLD = ("x_mm", "y_mm", "z_mm")
+"""Columns of points of the world."""
+PICTURE = ("x_mm", "y_mm")
+"""Columns of points of a picture, by its axes."""
+
+
+def read_places(path: PathLike, columns: Sequence[str] = WORLD) -> FloatArray:
+    """Read points, shape (k, number of columns), mm; other columns, and what follows a hash, are ignored.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    InvalidInputError
+        Naming the line, if it is not as it must be.
+    """
+    rows = [" ".join(cells[name] for name in columns) for _, cells in table(path, columns)]
+    return parse_places(rows, columns, str(path))
+
+
+def parse_places(texts: Sequence[str], columns: Sequence[str] = WORLD, option: str = "--point") -> FloatArray:
+    """Points given as ``X,Y,Z``, or ``X,Y``, each; shape (k, number of columns)."""
+    places = [numbers(text.replace(",", " "), len(columns), option) for text in texts]
+    return np.array(places, dtype=float).reshape(-1, len(columns))

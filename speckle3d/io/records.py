@@ -75,18 +75,18 @@ def put_fields(group: h5py.Group, record: object, skip: Sequence[str] = ()) -> N
             put(group, name, value)
 
 
-def put_text(group: h5py.Group, name: str, text: str | Sequence[str]) -> None:
+def put_text(group: h5py.Group, name: str, text: str | list[str]) -> None:
     """Write a text, or a list of them, as a data set: it may be more than an attribute holds."""
-    plain = _unicode(text) if isinstance(text, str) else [_unicode(line) for line in text]
+    plain = _unicode(text) if isinstance(text, str) else list(map(_unicode, text))
     group.create_dataset(name, data=plain, dtype=h5py.string_dtype())
 
 
 def put(group: h5py.Group, name: str, value: Any) -> None:
     """Write a value under a name by its type.
 
-    Numbers, texts and tuples of numbers become attributes, arrays and rigid transforms data sets, rotations
-    a data set of quaternions with ``_wxyz`` behind its name, dataclasses and mappings groups. None is not
-    written.
+    Numbers, texts and tuples of numbers become attributes, arrays, lists of texts and rigid transforms data
+    sets, rotations a data set of quaternions with ``_wxyz`` behind its name, dataclasses and mappings
+    groups. None is not written.
     """
     if value is None:
         return
@@ -100,6 +100,8 @@ def put(group: h5py.Group, name: str, value: Any) -> None:
         group.attrs[name] = _unicode(value)
     elif isinstance(value, int | float | tuple):
         group.attrs[name] = value
+    elif isinstance(value, list):
+        put_text(group, name, value)
     elif isinstance(value, Rotation):
         put(group, f"{name}_wxyz", value.as_quat(scalar_first=True))
     else:

@@ -7,13 +7,14 @@ otherwise; poses in memory are in mm.
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import FileError, InvalidInputError, MismatchError
+from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.io.hdf5 import PathLike, atomic_path
 from speckle3d.io.pose_paths import usable
@@ -34,16 +35,11 @@ def write_tum(
 
     Raises
     ------
-    MismatchError
-        If times and poses differ in number.
     FileError
         If the file cannot be written.
     """
-    times = np.asarray(time_s, dtype=float)
-    if times.shape != (len(poses),):
-        raise MismatchError(f"{path}: expected {len(poses)} times, got shape {times.shape}")
     rows = np.column_stack(
-        [times, poses.translation / _mm_per(length_unit), poses.rotation.as_quat(canonical=True)]
+        [time_s, poses.translation / _MM_PER_UNIT[length_unit], poses.rotation.as_quat(canonical=True)]
     )
     lines = [f"# time_s x_{length_unit} y_{length_unit} z_{length_unit} qx qy qz qw"]
     lines += [" ".join(repr(value) for value in row) for row in rows.tolist()]
@@ -57,7 +53,7 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
     Parameters
     ----------
     length_unit : {"m", "mm"}, optional
-        By default what the file's own first comment says, else metres, as the format has it.
+        By default what a comment of the file says, else metres, as the format has it.
 
     Raises
     ------
@@ -67,12 +63,10 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         If the file says another unit, or most lines are not eight finite numbers. Lines of no use, and poses
         whose time is not after the one before, are left out with a warning that counts them.
     """
-    rows, said = list[list[float]](), None
-    for _, text in text_lines(path):
-        if text.startswith("#"):
-            said = said or (None if rows else _unit_of(text))
-        else:
-            rows.append(_eight(text))
+    lines = [text for _, text in text_lines(path)]
+    words = {word for text in lines if text.startswith("#") for word in text.split()}
+    said = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in words), None)
+    rows = [_eight(text) for text in lines if not text.startswith("#")]
     table = np.array(rows).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
     if 2 * np.count_nonzero(finite) <= len(table):
@@ -87,18 +81,16 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         raise InvalidInputError(f"{path}: expected poses with a time and a unit quaternion, got none")
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    places_mm = table[kept, 1:4] * _mm_per(length_unit or said or "m")
+    places_mm = table[kept, 1:4] * _MM_PER_UNIT[length_unit or said or "m"]
     poses = RigidTransform.from_components(places_mm, Rotation.from_quat(table[kept, 4:]))
     return TimedPoses(table[kept, 0].copy(), poses)
 
 
 def is_tum(path: PathLike) -> bool:
     """Whether a file's first line that is no comment is eight numbers."""
-    try:
-        first = next((text for _, text in text_lines(path) if not text.startswith("#")), "")
-    except (FileError, InvalidInputError):
-        return False
-    return bool(np.isfinite(_eight(first)).all())
+    with suppress(FileError, InvalidInputError, StopIteration):
+        return all(np.isfinite(next(_eight(text) for _, text in text_lines(path) if text[0] != "#")))
+    return False
 
 
 def _eight(text: str) -> list[float]:
@@ -108,14 +100,3 @@ def _eight(text: str) -> list[float]:
     except ValueError:
         values = []
     return values if len(values) == _COLUMNS else [np.nan] * _COLUMNS
-
-
-def _unit_of(comment: str) -> LengthUnit | None:
-    """Return the length unit that a comment like the one of `write_tum` names."""
-    return next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comment.split()), None)
-
-
-def _mm_per(length_unit: LengthUnit) -> float:
-    if length_unit not in _MM_PER_UNIT:
-        raise InvalidInputError(f"length unit: expected m or mm, got {length_unit!r}")
-    return _MM_PER_UNIT[length_unit]

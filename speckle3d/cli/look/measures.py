@@ -54,8 +54,8 @@ def measure(
     $ speckle3d measure out/reconstruction.h5 --point 3,10,1 --point 3,12,9
     """
     from speckle3d.io.load import kind_of
+    from speckle3d.io.points import PICTURE, WORLD, parse_places, read_places
     from speckle3d.io.reconstructions import FORMAT, read_reconstruction
-    from speckle3d.io.shapes.picks import PICTURE, WORLD, parse_places, read_places
     from speckle3d.scoring.modes import default_mode
     from speckle3d.scoring.trajectories import poses_of
     from speckle3d.study.pose_errors import PICKED, caution

@@ -98,7 +98,7 @@ def reslice(
     $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
     """
     from speckle3d.imaging.cuts.oblique import spanned_plane, three_point_plane
-    from speckle3d.io.shapes.picks import parse_places
+    from speckle3d.io.points import parse_places
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
     from speckle3d.io.voxels.volumes import may_be_volume, read_states, read_volume
     from speckle3d.study.figures import RANGE_DB
@@ -156,7 +156,7 @@ def reslice(
 
 def _curve(path: Path, picture: Path | None, opened: OpenedModes | None) -> FloatArray:
     """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
-    from speckle3d.io.shapes.picks import PICTURE, WORLD, read_places
+    from speckle3d.io.points import PICTURE, WORLD, read_places
     from speckle3d.study.posed import require_made_at
     from speckle3d.study.reslices.cut_geometry import read_plane
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -38,7 +37,7 @@ def write_surface(path: PathLike, surface: Surface) -> None:
     Raises
     ------
     InvalidInputError
-        If the suffix is not one of `SUFFIXES`, or there is no triangle.
+        If the suffix is not one of `SUFFIXES`.
     FileError
         If the file cannot be written.
 
@@ -52,8 +51,6 @@ def write_surface(path: PathLike, surface: Surface) -> None:
     1
     """
     suffix = require_suffix(path)
-    if not len(surface):
-        raise InvalidInputError(f"{path}: expected a surface of at least one triangle, got none")
     meshio = extra_module("meshio", "surface", "a surface's file")
     points, triangles = surface.vertices_mm.astype(np.float32), surface.triangles.astype(np.int32)
     mesh = meshio.Mesh(points, [("triangle", triangles)])
@@ -102,9 +99,6 @@ def read_surface(path: PathLike) -> Surface:
     triangles = [block.data for block in mesh.cells if block.type == "triangle"]
     if not triangles or any(block.dtype.kind not in "iu" for block in triangles):
         raise InvalidInputError(f"{path}: expected triangles by numbers of their vertices, got none")
-    count = re.search(rb"\nCELLS (\d+) ", Path(path).read_bytes())  # of VTK; others find missing cells
-    if count and int(count[1]) != sum(len(block.data) for block in mesh.cells):
-        raise FileError(f"{path}: cannot be read: it ends before its {int(count[1])} triangles do")
     # Not-a-numbers of a damaged file warn when they are cast; the surface refuses them.
     with naming(str(path)), np.errstate(invalid="ignore"):
         return Surface(np.asarray(mesh.points, dtype=float), np.concatenate(triangles).astype(np.int64))
