@@ -12,7 +12,7 @@ from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import RFSettings
 from speckle3d.io.hdf5 import PathLike, opened, read_text
 from speckle3d.io.records import put, put_fields, read_record, written
-from speckle3d.io.sweeps import SIGNALS
+from speckle3d.io.sweeps import read_signal
 
 FORMAT = "speckle3d.curves"
 
@@ -93,7 +93,7 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
         kind = read_text(file, "signal")
         if kind not in ("rf", "bmode"):
             raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-        key = read_record(file, CurveKey, signal=read_record(file, SIGNALS[kind]))
+        key = read_record(file, CurveKey, signal=read_signal(file, kind))
         curves = read_record(file, DecorrelationCurves, key=key)
         require_finite(curves.depth_mm, "/depth_mm")
         if not curves.depth_mm.size or (np.diff(curves.depth_mm) <= 0).any():

@@ -11,7 +11,6 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
@@ -84,7 +83,7 @@ class _FrameSet:
         if isinstance(signal, RFSettings):
             name, version = ("iq", IQ_VERSION) if signal.are_complex else ("rf", VERSION)
             sizes = {"vector_pitch_mm": grid.vector_pitch_mm}
-        kind, self._where = SAMPLE_TYPES[name][0] if dtype is None else np.dtype(dtype), f"{path}: /{name}"
+        kind, self._where = np.dtype(dtype or SAMPLE_TYPES[name][0]), f"{path}: /{name}"
         require_sample_type(name, kind, self._where)
         self._shape, self._are_complex, self.count = (grid.vectors, grid.samples), name == "iq", 0
         shape = (*self._shape, *((2,) if self._are_complex and kind == np.int16 else ()))
@@ -308,32 +307,51 @@ class GrowingSweep:
         sensor_from_image: RigidTransform | Rotation | None = None,
         time_offset_s: float = 0.0,
     ) -> None:
-        self.path, self._images = Path(path), (grid, signal, dtype, compression)
-        self._probe, self._mounting, self._offset_s = probe, sensor_from_image, time_offset_s
-        self._file: h5py.File | None = None
-
-    def __enter__(self) -> Self:
-        target = require_target(self.path)
+        self.path = require_target(path)
         with self._writing():
             try:
-                file = h5py.File(target, "x", libver="latest")
+                self._file = file = h5py.File(self.path, "x", libver="latest")
             except FileExistsError as error:
-                raise FileError(f"{self.path}: there already; expected a new file") from error
+                raise FileError(f"{path}: there already; expected a new file") from error
             try:
                 reserve(file.id)
-                self._begin(file)
+                file.attrs["format"] = FORMAT
+                put(file, "probe", probe or None)
+                self._frames = _FrameSet(file, path, grid, signal, dtype, compression)
+                # Times last: what has a time is whole.
+                self._clock = _Stream(file, {"frame_time_s": ()})
+                tracker, orientation = (file.create_group(name) for name in ("tracker", "orientation"))
+                self._tracker = _Stream(tracker, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
+                self._orientation = _Stream(orientation, {"quaternion_wxyz": (4,), "time_s": ()})
+                for group in (tracker, orientation):
+                    group.attrs["time_offset_s"] = time_offset_s
+                is_pose = isinstance(sensor_from_image, RigidTransform)
+                _put_mounting(tracker if is_pose else orientation, sensor_from_image)
+                file[GROWING] = np.uint8(1)
+                label(file)
                 file.swmr_mode = True
             except BaseException:
                 file.close()
-                target.unlink(missing_ok=True)
+                self.path.unlink(missing_ok=True)
                 raise
-            self._file = file
+
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close(complete=kind is None)
+        try:
+            with self._writing():
+                self._file[GROWING][...] = kind is not None
+        except FileError:
+            if kind is None:
+                raise
+        finally:
+            self._file.close()
+            trim(self.path)
+            if not len(self):  # no sweep is without frames
+                self.path.unlink(missing_ok=True)
 
     def __len__(self) -> int:
         """Frames in the file."""
@@ -381,38 +399,6 @@ class GrowingSweep:
         rotations_from_quaternions(np.asarray(quaternion_wxyz)[None], where)
         with self._writing():
             self._orientation.append(quaternion_wxyz, time_s)
-
-    def close(self, complete: bool = True) -> None:
-        """End the file; closing twice does nothing."""
-        file, self._file = self._file, None
-        if file is None:
-            return
-        try:
-            with self._writing():
-                file[GROWING][...] = not complete
-        except FileError:
-            if complete:
-                raise
-        finally:
-            file.close()
-            trim(self.path)
-            if not len(self):  # no sweep is without frames
-                self.path.unlink(missing_ok=True)
-
-    def _begin(self, file: h5py.File) -> None:
-        file.attrs["format"] = FORMAT
-        put(file, "probe", self._probe or None)
-        self._frames = _FrameSet(file, self.path, *self._images)
-        # Times last: what has a time is whole.
-        self._clock = _Stream(file, {"frame_time_s": ()})
-        tracker, orientation = (file.create_group(name) for name in ("tracker", "orientation"))
-        self._tracker = _Stream(tracker, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
-        self._orientation = _Stream(orientation, {"quaternion_wxyz": (4,), "time_s": ()})
-        for group in (tracker, orientation):
-            group.attrs["time_offset_s"] = self._offset_s
-        _put_mounting(tracker if isinstance(self._mounting, RigidTransform) else orientation, self._mounting)
-        file[GROWING] = np.uint8(1)
-        label(file)
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -26,6 +26,7 @@ from speckle3d.core.streams import TimedPoses, TimedRotations
 from speckle3d.core.sweep import INERTIAL, BModeSettings, OrientationSensor, RFSettings, Sweep, Tracker
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
+    Node,
     file_format,
     find_member,
     has_member,
@@ -55,19 +56,8 @@ GROWING = "unfinished"
 KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker", "truth", "fan", GROWING})
 """Members of the root that these versions of the format give a meaning to."""
 
-SAMPLE_TYPES: dict[str, tuple[np.dtype[Any], ...]] = {
-    "rf": (np.dtype(np.int16), np.dtype(np.float32)),
-    "iq": (np.dtype(np.complex64), np.dtype(np.int16)),
-    "bmode": (np.dtype(np.uint8),),
-}
+SAMPLE_TYPES = {"rf": ("int16", "float32"), "iq": ("complex64", "int16"), "bmode": ("uint8",)}
 """Types that the samples of each kind may have in the file; int16 of I/Q in pairs, I first."""
-
-SIGNALS: dict[str, type[RFSettings] | type[BModeSettings]] = {
-    "rf": RFSettings,
-    "iq": RFSettings,
-    "bmode": BModeSettings,
-}
-"""What tells how the samples of each kind were made."""
 
 
 class SweepSlices(HDF5Slices):
@@ -138,7 +128,7 @@ class _Clock:
 def _read_image(clock: _Clock) -> tuple[FileFrames, ImageGrid, RFSettings | BModeSettings]:
     """Frames of a file, as many as it has times for."""
     file = clock.group
-    name = next((name for name in SIGNALS if has_member(file, name)), None)
+    name = next((name for name in SAMPLE_TYPES if has_member(file, name)), None)
     if name is None:
         raise InvalidInputError(f"{locate(file)}: expected a data set rf, iq or bmode, got none of them")
     node, where = require_dataset(file, name), locate(file, name)
@@ -152,7 +142,7 @@ def _read_image(clock: _Clock) -> tuple[FileFrames, ImageGrid, RFSettings | BMod
     with naming(where):
         if name == "iq":
             read_attribute(node, "demodulation_frequency_hz")
-        signal: RFSettings | BModeSettings = read_record(node, SIGNALS[name])
+        signal = read_signal(node, name)
         first_mm = read_attribute(node, "first_sample_depth_mm")
         if isinstance(signal, RFSettings):
             sizes = read_attribute(node, "vector_pitch_mm"), signal.sample_spacing_mm
@@ -165,9 +155,14 @@ def _read_image(clock: _Clock) -> tuple[FileFrames, ImageGrid, RFSettings | BMod
 
 def require_sample_type(name: str, dtype: np.dtype[Any], where: str) -> None:
     """Raise `InvalidInputError` unless /rf, /iq or /bmode may hold samples of a type."""
-    if dtype not in SAMPLE_TYPES[name]:
-        expected = " or ".join(str(kind) for kind in SAMPLE_TYPES[name])
+    if dtype.name not in SAMPLE_TYPES[name]:
+        expected = " or ".join(SAMPLE_TYPES[name])
         raise InvalidInputError(f"{where}: expected samples of type {expected}, got {dtype}")
+
+
+def read_signal(node: Node, kind: str) -> RFSettings | BModeSettings:
+    """Read how samples of a kind, rf, iq or bmode, were made."""
+    return read_record(node, BModeSettings) if kind == "bmode" else read_record(node, RFSettings)
 
 
 def _read_orientation(file: h5py.File) -> OrientationSensor | None:
