@@ -64,8 +64,8 @@ def read_tum(path: PathLike, length_unit: LengthUnit | None = None) -> TimedPose
         whose time is not after the one before, are left out with a warning that counts them.
     """
     lines = [text for _, text in text_lines(path)]
-    words = {word for text in lines if text.startswith("#") for word in text.split()}
-    said = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in words), None)
+    comments = {word for text in lines if text.startswith("#") for word in text.split()}
+    said = next((unit for unit in _MM_PER_UNIT if f"x_{unit}" in comments), None)
     rows = [_eight(text) for text in lines if not text.startswith("#")]
     table = np.array(rows).reshape(-1, _COLUMNS)
     finite = np.isfinite(table).all(axis=1)
