@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,10 +25,11 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.examine.disagreements import disagreements
 from speckle3d.examine.images import examine_images
-from speckle3d.examine.recording import examine_recording
+from speckle3d.examine.processing import processing_doubts, shortening, structure_openness
+from speckle3d.examine.recording import examine_recording, unrefuted
 from speckle3d.examine.sensors import examined_sensors
 from speckle3d.io.curves import curves_beside, read_curves, trust_words
 from speckle3d.matching.frames import ImageSink, MatchedSweep, match_sweep
@@ -38,7 +39,8 @@ from speckle3d.matching.schedule import PairSchedule
 from speckle3d.motion.attenuation import Attenuation, estimate_attenuation
 from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.direction import sensed_orientation, settle_direction
-from speckle3d.motion.estimate import estimate_motion, frame_pairs
+from speckle3d.motion.estimate import Motion, estimate_motion, frame_pairs
+from speckle3d.motion.lens import stretched
 from speckle3d.motion.planes import MotionProblem
 from speckle3d.motion.subset import consistent_poses
 
@@ -224,6 +226,7 @@ def track(
     require_kind(curves, DecorrelationCurves, "curves", "load_curves(path)")
     if len(sweep) < 2:
         raise InsufficientDataError(f"{sweep.name}: expected at least 2 frames, got {len(sweep)}")
+    sweep = _with_known_range(sweep, curves)
     matcher = matcher_for(sweep, curves, settings)
     doubts = examine_recording(sweep, matcher, curves)
 
@@ -234,6 +237,9 @@ def track(
     require_placed(flags, sweep.name)
 
     attenuation = estimate_attenuation(curves, matches.texture.spectra(flags == 0))
+    structure = 0.0 if curves.of_tissue else structure_openness(matches)
+    if structure:
+        curves = replace(stretched(curves, np.array(structure)), of_tissue=True)
     problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)
     bad = (flags & ~FrameFlag.UNMATCHED) != 0
     motion = estimate_motion(problem, matches.table, ~bad[matches.table.first] & ~bad[matches.table.second])
@@ -246,9 +252,14 @@ def track(
     )
     motion = motion.mirrored() if direction < 0 else motion
     mismatch = motion.problem.curves.mismatch(settings.curves.same_probe, attenuation.log_length_sigma)
-    shared, covariance = motion.claims(mismatch)
+    short, compression = shortening(matches), _compression_error(sweep, curves, settings, motion)
+    open_sigma = float(np.linalg.norm([mismatch, short, compression]))
+    shared, covariance = motion.claims(float(np.hypot(open_sigma, structure)))
     doubts += attenuation.doubts
-    doubts += examine_images(sweep, matcher, matches, motion, covariance, curves, flags == 0)
+    doubts += unrefuted(processing_doubts(structure, short), sweep.name, InsufficientDataError)
+    # What structure leaves open is told by itself.
+    known = motion.claims(open_sigma)[1]
+    doubts += examine_images(sweep, matcher, matches, motion, known, curves, flags == 0)
     doubts += sensors.doubts
     doubts += disagreements(sensors.trusted, motion.poses, covariance, shared.length_sigma)
 
@@ -299,6 +310,35 @@ def require_kind(value: Any, kind: type, name: str, made_by: str) -> None:
         raise InvalidInputError(f"{name}: expected a {kind.__name__}, as {made_by} gives it, got {got}")
 
 
+def _with_known_range(sweep: Sweep, curves: DecorrelationCurves) -> Sweep:
+    """The sweep with the curves' dynamic range where its own is estimated."""
+    own, known = sweep.signal, curves.key.signal
+    if isinstance(own, BModeSettings) and own.dynamic_range_sigma_db and isinstance(known, BModeSettings):
+        return replace(sweep, signal=replace(known, full_scale=own.full_scale))
+    return sweep
+
+
+def _compression_error(sweep: Sweep, curves: DecorrelationCurves, config: Config, motion: Motion) -> float:
+    """Relative standard deviation of distances by a dynamic range that is estimated.
+
+    One that is wider by its deviation is tried. Curves measured with images compressed alike have its error
+    in them.
+    """
+    signal = sweep.signal
+    if not isinstance(signal, BModeSettings) or curves.origin != "data sheet":
+        return 0.0
+    if not signal.dynamic_range_sigma_db:
+        return 0.0
+    wider = replace(signal, dynamic_range_db=signal.dynamic_range_db + signal.dynamic_range_sigma_db)
+    other = replace(sweep, signal=wider)
+    matcher, schedule = matcher_for(other, curves, config), PairSchedule(config.trajectory)
+    matches = match_sweep(other, matcher, schedule, config.quality)
+    table, bad = matches.table, flag_frames(matches.features, config.quality) != 0
+    read = estimate_motion(motion.problem, table, ~bad[table.first] & ~bad[table.second])
+    spans = [np.ptp(each.poses.apply(sweep.grid.centre_mm)[:, 2]) for each in (motion, read)]
+    return abs(float(np.log(spans[1] / spans[0])))
+
+
 def _curves_beside(sweep: Sweep, same_probe: bool) -> DecorrelationCurves:
     """Read the curves that lie beside a sweep's recording."""
     if sweep.path is None:
@@ -328,7 +368,8 @@ def motion_problem(
     curves: DecorrelationCurves, matcher: FrameMatcher, frames: int, config: Config
 ) -> MotionProblem:
     """Gather what correlations are read with."""
-    planes, trajectory, adapt = config.planes, config.trajectory, config.coherence.adapt
+    planes, trajectory = config.planes, config.trajectory
+    adapt = config.coherence.adapt and not curves.of_tissue
     return MotionProblem(curves, matcher.patches, matcher.centre_mm, frames, planes, trajectory, adapt)
 
 

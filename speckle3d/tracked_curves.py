@@ -15,7 +15,7 @@ import numpy as np
 
 from speckle3d.config import Config
 from speckle3d.core.curves import ATTENUATION_SIGMA, DecorrelationCurves, curve_widths
-from speckle3d.core.errors import InsufficientDataError
+from speckle3d.core.errors import InsufficientDataError, MismatchError, Speckle3DError
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import Sweep
@@ -25,8 +25,8 @@ from speckle3d.pipeline import Tracked, track
 
 LENGTH_SIGMA = 0.005
 """Of a tracker's millimetres and of how well its mounting is known, beside its jitter."""
-ALIKE_FRAMES = 10
-"""Frames over which the images' departure from the tracker stays the same."""
+ALIKE_FRAMES, ALIKE_MM = 10, 1.0
+"""Frames, or travel if that is less, over which the images' departure from the tracker stays the same."""
 LEAST_FRAMES = 8
 """Frames with readings from which a length and its error are estimated."""
 LEAST_SURE = 0.3
@@ -62,10 +62,37 @@ def tracked_curves(
     """
     settings = config or Config()
     bare = [replace(sweep, truth=None) for sweep in sweeps]
-    curves = start if start is not None else calibrate_curves(bare, settings, progress)
-    for _ in range(ROUNDS):
-        tracked = [track(sweep, curves, settings, progress) for sweep in bare]
-        lengths = [tracker_scale(sweep, found) for sweep, found in zip(bare, tracked, strict=True)]
+    if start is None:
+        return _corrected(bare, calibrate_curves(bare, settings, progress), settings, progress)
+    if start.key.correlation_of == "echo":
+        return _corrected(bare, start, settings, progress)
+    # Of images without phase structure cannot be told from speckle: it goes into the curves. A path that is
+    # read without adapting to it may fold back, one that is adapted to what is no speckle bends depths.
+    candidates: list[DecorrelationCurves] = []
+    reason: Speckle3DError = InsufficientDataError("expected sweeps, got none")
+    for is_adapted in (True, False):
+        try:
+            curves = _corrected(bare, start, settings, progress, 1) if is_adapted else start
+            tissue = replace(curves, of_tissue=True)
+            candidates.append(_corrected(bare, tissue, settings, progress))
+        except (InsufficientDataError, MismatchError) as error:
+            reason = error
+    if not candidates:
+        raise reason
+    return min(candidates, key=lambda each: each.scale_sigma)
+
+
+def _corrected(
+    sweeps: Sequence[Sweep],
+    curves: DecorrelationCurves,
+    config: Config,
+    progress: Progress | None,
+    rounds: int = ROUNDS,
+) -> DecorrelationCurves:
+    """Curves with which the images of some sweeps have the length that the tracker has."""
+    for _ in range(rounds):
+        tracked = [track(sweep, curves, config, progress) for sweep in sweeps]
+        lengths = [tracker_scale(sweep, found) for sweep, found in zip(sweeps, tracked, strict=True)]
         curves = corrected_curves(curves, [found.curves for found in tracked], lengths)
     return replace(curves, origin="tracked")
 
@@ -107,7 +134,8 @@ def tracker_scale(sweep: Sweep, tracked: Tracked) -> Length:
     scale = abs(float(z @ seen)) / float(seen @ seen)
     left = z - np.sign(z @ seen) * scale * seen
     variance = float(left @ left) / (left.size - 2)
-    sigma = float(np.sqrt(min(ALIKE_FRAMES, left.size) * variance / (seen @ seen))) / scale
+    alike = float(np.clip(ALIKE_MM * left.size / np.ptp(z), 1.0, min(ALIKE_FRAMES, left.size)))
+    sigma = float(np.sqrt(alike * variance / (seen @ seen))) / scale
     sigma = float(np.hypot(sigma, LENGTH_SIGMA))
     if not sigma < LEAST_SURE:
         raise InsufficientDataError(

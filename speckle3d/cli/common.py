@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from speckle3d.config import Config
+    from speckle3d.core.sweep import Sweep
 
     Model = TypeVar("Model", bound=BaseModel)
 
@@ -138,6 +139,16 @@ def load_settings(path: Path | None) -> Config:
     from speckle3d.config import Config, load_config
 
     return load_config(path) if path else Config()
+
+
+def part_of(sweep: Sweep, frames: str | None, option: str) -> Sweep:
+    """Frames FIRST-LAST of a sweep; by default all."""
+    if frames is None:
+        return sweep
+    first, dash, last = frames.partition("-")
+    if not (dash and first.isdecimal() and last.isdecimal()):
+        raise InvalidInputError(f"{option}: expected FIRST-LAST, two frame numbers, got {frames!r}")
+    return sweep.part(int(first), int(last) + 1)
 
 
 def require_finite(option: str, *values: float | None) -> None:

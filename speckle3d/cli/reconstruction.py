@@ -21,6 +21,7 @@ from speckle3d.cli.common import (
     load_settings,
     note,
     notes,
+    part_of,
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, MismatchError
@@ -28,7 +29,6 @@ from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from speckle3d.config import Config
-    from speckle3d.core.sweep import Sweep
     from speckle3d.study.job import JobResult
 
 
@@ -116,7 +116,7 @@ def reconstruct(
     crossing = None
     if crossing_file is not None or crossing_frames is not None:
         whole = sweep if crossing_file is None else load_sweep(crossing_file)
-        crossing = _part(whole, crossing_frames, "--crossing-frames"), crossing_file or sweep_file
+        crossing = part_of(whole, crossing_frames, "--crossing-frames"), crossing_file or sweep_file
         if not {"crossed", "fused"}.intersection(modes):
             modes.append("crossed")
     read = (sweep_file, crossing_file, config_file, used, *calibrations)
@@ -131,7 +131,7 @@ def reconstruct(
             raise InvalidInputError(
                 f"--volume-mode: expected one of image, {', '.join(modes)}, got {volume_mode!r}"
             )
-    sweep = _part(sweep, frames, "--frames")
+    sweep = part_of(sweep, frames, "--frames")
     with progress_bar(f"reconstructing {sweep_file.name}") as progress:
         result = run_job(
             sweep, sweep_file, curves, out, modes, reference, settings, progress, calibrations, crossing
@@ -163,15 +163,6 @@ def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | No
     notes(posed.notes())
     with progress_bar(f"compounding {out.name}"):
         note(write_voxels(posed, VolumeRequest(out, settings.volume)).line)
-
-
-def _part(sweep: Sweep, frames: str | None, option: str) -> Sweep:
-    if frames is None:
-        return sweep
-    first, dash, last = frames.partition("-")
-    if not (dash and first.isdecimal() and last.isdecimal()):
-        raise InvalidInputError(f"{option}: expected FIRST-LAST, two frame numbers, got {frames!r}")
-    return sweep.part(int(first), int(last) + 1)
 
 
 def _tell(result: JobResult) -> None:

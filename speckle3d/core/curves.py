@@ -72,6 +72,8 @@ class CurveKey:
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
         others = _settings(other)
+        if any(getattr(key.signal, "dynamic_range_sigma_db", 0.0) for key in (self, other)):
+            others["dynamic_range_db"] = _settings(self).get("dynamic_range_db")
         if self.probe and other.probe and self.probe != other.probe:
             raise MismatchError(f"{what}: probe is {self.probe!r} and {other.probe!r}")
         if self.lines and other.lines and self.lines != other.lines:
@@ -214,6 +216,9 @@ class DecorrelationCurves:
     spectrum : EchoSpectra or None
         Of the phantom's echoes, by which `speckle3d.motion.attenuation` tells tissue that attenuates
         otherwise; None for B-mode, other origins and files that older versions wrote.
+    of_tissue : bool
+        Whether the structure of what is scanned is in them, and is not to be adapted to: curves corrected
+        by a tracker over what is no phantom, of images without phase.
     key : CurveKey
         Signal, vector pitch and patches that the curves are for.
     pairs_used : int
@@ -232,6 +237,7 @@ class DecorrelationCurves:
     origin: Origin = "phantom"
     nominal: NominalProbe | None = None
     spectrum: EchoSpectra | None = None
+    of_tissue: bool = False
 
     def __post_init__(self) -> None:
         if self.origin not in get_args(Origin):
@@ -300,6 +306,6 @@ def _settings(key: CurveKey) -> dict[str, Any]:
         del numbers["vector_pitch_mm"]
         numbers |= {name: getattr(key, name) for name in ("array_radius_mm", "line_step_rad")}
     # How finely the echo was sampled, real or as I/Q, is no property of the beam, and matching resamples it.
-    left_out = ("demodulation_frequency_hz", *(("sampling_rate_hz",) if kind == "RF" else ()))
+    left_out = ["demodulation_frequency_hz", "dynamic_range_sigma_db", *["sampling_rate_hz"] * (kind == "RF")]
     signal = {name: value for name, value in vars(key.signal).items() if name not in left_out}
     return {"signal": kind, "correlation_of": key.correlation_of} | signal | numbers

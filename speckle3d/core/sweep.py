@@ -158,10 +158,17 @@ class RFSettings:
 
 @dataclass(frozen=True)
 class BModeSettings:
-    """How log-compressed grey levels were made: full scale is 0 dB, zero is `-dynamic_range_db`."""
+    """How log-compressed grey levels were made: full scale is 0 dB, zero is `-dynamic_range_db`.
+
+    Attributes
+    ----------
+    dynamic_range_sigma_db : float
+        Standard deviation of the range where it is estimated from speckle; 0 where it is given.
+    """
 
     dynamic_range_db: float
     full_scale: float = 255.0
+    dynamic_range_sigma_db: float = 0.0
 
     def __post_init__(self) -> None:
         require_positive(self, ("dynamic_range_db", "full_scale"))

@@ -17,6 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
+from speckle3d.core.compression import estimate_dynamic_range
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.printable import printable
@@ -35,6 +36,9 @@ Row = tuple[str, str, str]
 
 SPREAD = 1e-3
 """How far steps of an axis may be from their mean, as a share: rounding of single precision in metres."""
+
+USUAL_PIXEL_MM = 0.1
+"""Of images of which nobody says how far apart their pixels are, and of fans."""
 
 CONTRADICTION = 0.01
 """Difference, as a share, above which a number that is given contradicts what a file says."""
@@ -212,7 +216,21 @@ class Recording:
         spacing = own.get("row_spacing_mm", Value())
         if "sampling_rate_hz" not in own and spacing.value is not None:
             own["sampling_rate_hz"] = rate_by_spacing(spacing, self.settings, own)
+        if "dynamic_range_db" in names and own.get("dynamic_range_db", Value()).value is None and self._range:
+            source = f"{_ASSUMED}, +- {self._range[1]:.1f} dB by its speckle"
+            own["dynamic_range_db"] = Value(round(self._range[0], 1), source)
         return {name: own.get(name, Value()) for name in names}
+
+    @cached_property
+    def _range(self) -> tuple[float, float] | None:
+        """Dynamic range by the images' speckle where nobody gives it, and its standard deviation, dB."""
+        if self.settings.dynamic_range_db is not None:
+            return None
+        names, own = ("column_pitch_mm", "row_spacing_mm"), {**self.values}
+        own.setdefault("column_pitch_mm", own.get("vector_pitch_mm", Value()))
+        known = [getattr(self.settings, name) or own.get(name, Value()).value for name in names]
+        pitch_mm, spacing_mm = (one or USUAL_PIXEL_MM for one in known)
+        return estimate_dynamic_range(self.frames, pitch_mm, spacing_mm, self.full_scale)
 
     @cached_property
     def _timed(self) -> tuple[FloatArray | None, Any, list[str]]:
@@ -250,7 +268,9 @@ class Recording:
             times = np.arange(frames.shape[0]) / float(rate_hz)
         signal: RFSettings | BModeSettings
         if "dynamic_range_db" in values:
-            signal = BModeSettings(values["dynamic_range_db"], self.full_scale)
+            is_assumed = self.needed["dynamic_range_db"].is_assumed
+            sigma_db = self._range[1] if self._range and is_assumed else 0.0
+            signal = BModeSettings(values["dynamic_range_db"], self.full_scale, sigma_db)
             pitch, spacing = values.get("column_pitch_mm"), values["row_spacing_mm"]
         else:
             names = ("speed_of_sound_m_s", *_RATES, "demodulation_frequency_hz")

@@ -148,6 +148,8 @@ def _read_value(group: h5py.Group, name: str, hint: Any) -> Any:
     """Read an attribute, an array or a group by the type of the field that it is for."""
     if is_dataclass(hint):
         return read_record(require_group(group, name), hint)  # type: ignore[arg-type]
+    if hint is bool:
+        return bool(group.attrs[name])
     if hint in (int, float):
         return hint(read_attribute(group, name))
     origin, parts = get_origin(hint), get_args(hint)

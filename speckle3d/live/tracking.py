@@ -26,10 +26,10 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.relative import RelativePoses
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.threads import on_one_thread
 from speckle3d.matching.frames import FrameByFrame, ImageSink, ready_frame
-from speckle3d.matching.quality import FrameFeatures, FrameFlag, flag_frames
+from speckle3d.matching.quality import DrawnOver, FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion.estimate import Motion, alike_pairs, elevation_of, estimate_motion, strangers
@@ -123,6 +123,7 @@ class LiveTracker:
         matcher = matcher_for(example, curves, self._config)
         self.image_grid = matcher.grid
         self._example, self._matcher = example, matcher
+        self._drawn, self._clear = DrawnOver(matcher.patches), np.ones(len(matcher.patches), dtype=bool)
         self._matched = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
         self._problem = motion_problem(curves, matcher, 1, self._config)
         self._features: list[FrameFeatures] = []
@@ -195,6 +196,8 @@ class LiveTracker:
         ready = ready_frame(frame, self._example, self._matcher, self._config.quality)
         if self.images:
             self.images(number, ready.echo.intensity)
+        if isinstance(self._example.signal, BModeSettings):
+            self._drawn.keep(frame)
         table = self._matched.advance(number, ready.frame)
         with self._lock:
             self._keep(ready.features, table)
@@ -238,7 +241,7 @@ class LiveTracker:
             return
         frames = np.unique([*range(max(0, number - BEFORE), number + 1), *self._tables[number].first])
         table = replace(
-            self._tables[number],
+            self._tables[number].among(self._clear),
             first=np.searchsorted(frames, self._tables[number].first),
             second=np.full(len(self._tables[number]), frames.size - 1),
         )
@@ -275,7 +278,8 @@ class LiveTracker:
         if count - begin < 2:
             return
         every = CorrelationTable.joined(tables[begin + 1 :])
-        table = every.where(every.first >= begin, -begin)
+        self._clear = ~self._drawn.patches
+        table = every.where(every.first >= begin, -begin).among(self._clear)
         bad = (flags[begin:] & ~FrameFlag.UNMATCHED) != 0
         sound = ~bad[table.first] & ~bad[table.second]
         if not sound.any():

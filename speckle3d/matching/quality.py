@@ -120,6 +120,8 @@ class FrameFeatures:
     """Share of patches with speckle; columns all black do not count."""
     noise_share: float
     """Share of patches that vary as speckle does but have nothing in common from vector to vector."""
+    grey_spread: FloatArray
+    """Logarithm of the standard deviation of each patch's grey levels, shape (p,); NaN of echoes."""
     usable: BoolArray
     """Patches that hold an echo which varies as speckle or structure does, shape (p,): no shadow, no noise
     alone, none without contact or saturated."""
@@ -159,8 +161,13 @@ def inspect_frame(
     def share(chosen: BoolArray) -> float:
         return float((echo & chosen & counted).sum() / max(int(counted.sum()), 1))
 
+    usable, spread = echo & together & inside, np.full(len(patches), np.nan)
+    if is_bmode:
+        grey = np.empty_like(statistics)
+        patch_statistics(np.asarray(frame, dtype=np.float32), patches.first, patches.size, step, grey)
+        spread[usable] = np.log(grey[usable, 0] * grey[usable, 1])
     return FrameFeatures(
-        mean, _clipped(frame, is_bmode, s), share(together & fine), share(~together), echo & together & inside
+        mean, _clipped(frame, is_bmode, s), share(together & fine), share(~together), spread, usable
     )
 
 

@@ -27,6 +27,8 @@ PHANTOM_FRAMES = 48
 CONTRAST = (0.75, 1.15)
 """Standard deviation over mean of intensity in patches that count: 1 for speckle, scattered by its 50 to 90
 cells. Coherent structure is above; its patches look coarser than speckle."""
+SPECKLE_BALANCE = 1.57
+"""Distance of the 10th over that of the 90th percentile from the median, of speckle's decibels."""
 LEAST_PATCHES = 8
 """Patches, over all frames, that a row's size is taken from at least."""
 
@@ -45,6 +47,7 @@ class Texture:
         self._edge_fraction = matcher.key.edge_fraction
         self._sizes: dict[int, FloatArray] = {}
         self._powers: dict[int, FloatArray] = {}
+        self._levels: dict[int, FloatArray] = {}
 
     def keep(self, frame: int, echo: Echo, usable: BoolArray | None = None) -> None:
         """Measure the usable patches of one frame, on any thread; by default all."""
@@ -52,6 +55,9 @@ class Texture:
         self._sizes[frame] = np.where(kept, _sizes(echo.intensity, self._patches), np.nan)
         if echo.analytic is not None:
             self._powers[frame] = np.where(kept, _patch_powers(echo.analytic, self._patches), np.nan)
+        elif usable is not None and usable.any():
+            tiles = self._patches.tiles(echo.intensity)[usable].reshape(int(usable.sum()), -1)
+            self._levels[frame] = np.log(np.percentile(tiles, (10, 50, 90), axis=1))
 
     def speckle_size(self, usable: BoolArray | None = None) -> SpeckleSize:
         """Lateral and axial size of speckle in each row of patches.
@@ -71,6 +77,13 @@ class Texture:
         size = np.full(known.shape, np.nan)
         size[known] = np.nanmedian(rows[known], axis=(1, 2))
         return SpeckleSize(*size)
+
+    def balance(self) -> float:
+        """Spread of dark over that of bright decibels, about the median; of echoes that of speckle."""
+        if not self._levels:
+            return SPECKLE_BALANCE
+        low, middle, high = np.concatenate(list(self._levels.values()), axis=1)
+        return float(np.median(middle - low) / max(float(np.median(high - middle)), 1e-9))
 
     def spectra(self, usable: BoolArray | None = None) -> EchoSpectra | None:
         """Power spectrum within the band that is matched, at each row of patches; None without phase.

@@ -1,7 +1,10 @@
 """Tutorials run as written, in order, each in an empty folder."""
 
+import json
+import shutil
+
 import pytest
-from pages import run_tutorial
+from pages import ROOT, run_page, run_tutorial
 
 pytestmark = pytest.mark.slow
 
@@ -37,3 +40,17 @@ def test_a_plane_calibrates_both_sensors_for_a_sweep_that_knew_neither(tmp_path)
     assert errors["pose"] < 10.0
     assert (folder / "calibrated.h5").exists()
     assert not (folder / "stiff-tracker.h5").exists()
+
+
+@pytest.mark.realdata
+def test_a_real_sweep_is_read_within_its_claims(realdata, tmp_path):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    for path in (realdata / "plus").glob("BoneUltrasound_L14*"):
+        shutil.copy(path, folder)
+    run_page(ROOT / "docs" / "tutorials" / "real-sweep.md", folder)
+    for name, most_claim in (("by-sheet", 0.7), ("first-half", 0.12), ("second-half", 0.12)):
+        image = json.loads((folder / name / "summary.json").read_text())["sweeps"][0]["rows"][0]
+        sigma_mm = image["sigma_mm"]
+        assert abs(image["length_error_mm"]) < 1.96 * sigma_mm
+        assert sigma_mm < most_claim * image["estimate_mm"]

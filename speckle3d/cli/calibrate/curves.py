@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from speckle3d.cli.common import Json, MaybePath, MaybeText, Out, emit, emit_json, load_settings, note
+from speckle3d.cli.common import (
+    Json,
+    MaybePath,
+    MaybeText,
+    Out,
+    emit,
+    emit_json,
+    load_settings,
+    note,
+    part_of,
+)
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.progress import progress_bar
@@ -23,6 +33,7 @@ def curves(
     like: MaybePath = None,
     start: MaybePath = None,
     region: MaybeText = None,
+    frames: MaybeText = None,
     config_file: MaybePath = None,
     as_json: Json = False,
 ) -> None:
@@ -43,6 +54,8 @@ def curves(
     like
         With --probe: sweep whose signal, depths and echoes to calculate for.
     region
+    frames
+        FIRST-LAST: these frames of each sweep only.
     as_json
 
     Other Parameters
@@ -69,7 +82,10 @@ def curves(
             sheet = load_toml(ProbeSheet, probe)
             found = data_sheet_curves(sheet, load_sweep(like) if like else None, settings)
     else:
-        known, loaded = read_curves(start) if start else None, [load_sweep(path) for path in sweeps or []]
+        known, loaded = (
+            read_curves(start) if start else None,
+            [part_of(load_sweep(path), frames, "--frames") for path in sweeps or []],
+        )
         with progress_bar("correlating frames") as progress:
             if known is not None or all(jitters(sweep) for sweep in loaded):
                 found = tracked_curves(loaded, known, settings, progress)
@@ -92,7 +108,10 @@ def _show(curves: DecorrelationCurves, as_json: bool) -> None:
         about = {"pairs": curves.pairs_used, "origin": curves.origin, "scale_sigma": curves.scale_sigma}
         emit_json(by_depth | tilt | about)
         return
-    seen = f"{curves.pairs_used} frame pairs" if curves.pairs_used else "calculated, not measured"
+    made = (
+        "calculated, not measured" if curves.origin == "data sheet" else "corrected to the tracker's length"
+    )
+    seen = f"{curves.pairs_used} frame pairs" if curves.pairs_used else made
     emit(f"{seen}; correlation falls to one half at")
     for depth, distance, cells in zip(curves.depth_mm, half, curves.cells, strict=True):
         width = f"{distance:.2f}" if np.isfinite(distance) else f"more than {curves.distance_mm[-1]:.2f}"

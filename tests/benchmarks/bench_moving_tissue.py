@@ -1,0 +1,101 @@
+"""Length over tissue that is not at rest: pressed, sliding along with the probe, pulsating.
+
+python tests/benchmarks/bench_moving_tissue.py [--seeds 3] [--length-mm 6] [--vectors 36] [--signal rf|bmode]
+"""
+
+import argparse
+import os
+from dataclasses import dataclass, replace
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from speckle3d.pipeline import track
+from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
+from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.simulation.receiver import received
+
+FIRST_SEED = 5001
+SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
+STRAIN, SLIDING, PULSE_MM, PULSE_HZ, VESSEL_MM = 0.01, 0.05, 0.1, 1.2, 4.0
+"""Strain at the end of the sweep; share of the probe's way that tissue goes along; pulse; depth over which it
+falls to 1/e on either side of a vessel in the middle of the image."""
+
+
+@dataclass(frozen=True)
+class Deformed:
+    """A medium whose scatterers have moved along the beam by some share or depth since the first frame."""
+
+    medium: object
+    poses: RigidTransform
+    shift_mm: object
+    """Of depths, at a frame: (depth_mm, frame) to mm."""
+
+    def seen(self, medium_from_image, box):
+        apart = self.poses.translation - medium_from_image.translation
+        frame = int(np.argmin((apart**2).sum(axis=1)))
+        for position, strength in self.medium.seen(medium_from_image, box):
+            moved = position.copy()
+            moved[:, 1] += self.shift_mm(position[:, 1], frame)
+            yield moved, strength
+
+
+def cases(sweep):
+    """Frames of the same sweep over tissue at rest and in motion."""
+    frames, time_s = sweep.frames, sweep.frame_time_s - sweep.frame_time_s[0]
+    poses, count = frames.medium_from_image, len(sweep)
+    way = poses.translation[:, 2] - poses.translation[0, 2]
+    pulse = PULSE_MM * np.sin(2 * np.pi * PULSE_HZ * time_s)
+    middle = sweep.grid.depth_mm / 2
+
+    def along_beam(shift_mm):
+        return replace(frames, medium=Deformed(frames.medium, poses, shift_mm))
+
+    def along_sweep(moved_mm):
+        back = np.column_stack([np.zeros((count, 2)), -moved_mm])
+        return replace(frames, medium_from_image=RigidTransform.from_translation(back) * poses)
+
+    return {
+        "at rest": frames,
+        "pressed by 1 %": along_beam(lambda y, k: -STRAIN * y * k / count),
+        "sliding along by 5 %": along_sweep(SLIDING * way),
+        "pulsating 0.1 mm along the sweep": along_sweep(pulse),
+        "pulsating 0.1 mm along the beam": along_beam(
+            lambda y, k: pulse[k] * np.exp(-np.abs(y - middle) / VESSEL_MM)
+        ),
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--length-mm", type=float, default=6.0)
+    parser.add_argument("--vectors", type=int, default=36)
+    parser.add_argument("--signal", choices=("rf", "bmode"), default="rf")
+    given = parser.parse_args()
+    rows = {}
+    for seed in range(FIRST_SEED, FIRST_SEED + given.seeds):
+        settings = SimulationSettings(
+            preset="tissue", seed=seed, length_mm=given.length_mm, vectors=given.vectors, samples=2600
+        )
+        sweep = simulate(settings)[0].sweep
+        true = np.ptp((sweep.truth[0].inv() * sweep.truth).apply(sweep.grid.centre_mm)[:, 2])
+        for name, frames in cases(sweep).items():
+            case = replace(sweep, frames=frames, truth=None, tracker=None, orientation=None)
+            case = received(case, dynamic_range_db=60.0) if given.signal == "bmode" else case
+            case = replace(case, frames=np.stack([case.frames[k] for k in range(len(case))]))
+            tracked = track(case, data_sheet_curves(SHEET, case))
+            length = np.ptp(tracked.image.apply(sweep.grid.centre_mm)[:, 2])
+            sigma = np.sqrt(tracked.covariance[:, 2, 2].max())
+            rows.setdefault(name, []).append((length / true - 1, sigma / length, (length - true) / sigma))
+    print(f"{'':34s} length, %                claim, %   error over claim")
+    for name, values in rows.items():
+        error, claim, score = np.array(values).T
+        shown = " ".join(f"{100 * e:+6.1f}" for e in error)
+        print(f"{name:34s} {shown}     {100 * claim.mean():6.1f}     {np.abs(score).max():.1f}")
+
+
+if __name__ == "__main__":
+    main()

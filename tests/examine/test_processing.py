@@ -1,0 +1,58 @@
+"""Averaged frames shorten a sweep, and are found; single ones are not taken for them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from speckle3d.config import Config
+from speckle3d.core.errors import InsufficientDataError
+from speckle3d.examine.processing import shortening, structure_openness
+from speckle3d.matching.frames import match_sweep
+from speckle3d.matching.schedule import PairSchedule
+from speckle3d.pipeline import matcher_for, track
+from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
+from speckle3d.simulation.receiver import received
+
+SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
+
+
+@pytest.fixture(scope="module")
+def grey(sweep):
+    """B-mode of the shipped phantom, in memory."""
+    made = received(sweep.part(0, 64), dynamic_range_db=60.0)
+    return replace(made, frames=np.stack([made.frames[k] for k in range(len(made))]))
+
+
+def averaged(sweep, count):
+    """Each frame the mean of some, as scanners in persistence show them."""
+    sums = np.cumsum(sweep.frames.astype(float), axis=0)
+    means = (sums[count:] - sums[:-count]) / count
+    times = sweep.frame_time_s[count:]
+    return replace(
+        sweep,
+        frames=np.rint(means).astype(np.uint8),
+        frame_time_s=times,
+        truth=None,
+        tracker=None,
+        orientation=None,
+    )
+
+
+def matched(sweep):
+    config = Config()
+    matcher = matcher_for(sweep, data_sheet_curves(SHEET, sweep), config)
+    return match_sweep(sweep, matcher, PairSchedule(config.trajectory), config.quality)
+
+
+def test_frames_of_one_moment_each_are_not_doubted(grey):
+    matches = matched(grey)
+    assert shortening(matches) == 0.0
+    assert structure_openness(matches) == 0.0
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_means_of_frames_are_refused(grey, count):
+    sweep = averaged(grey, count)
+    with pytest.raises(InsufficientDataError):
+        track(sweep, data_sheet_curves(SHEET, sweep))
