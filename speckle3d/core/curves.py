@@ -244,13 +244,11 @@ class DecorrelationCurves:
             raise InvalidInputError(f"origin: expected one of {get_args(Origin)}, got {self.origin!r}")
         if not 0.0 <= self.scale_sigma < 1.0:
             raise InvalidInputError(f"scale_sigma: expected a share from 0 to 1, got {self.scale_sigma}")
-        if self.correlation.shape != (self.depth_mm.size, self.distance_mm.size):
-            raise InvalidInputError(
-                f"correlation: expected shape ({self.depth_mm.size}, {self.distance_mm.size}), "
-                f"got {self.correlation.shape}"
-            )
-        steps = np.diff(self.distance_mm)
-        if not steps.size or self.distance_mm[0] != 0 or not steps[0] > 0 or not np.allclose(steps, steps[0]):
+        rho, shape = self.correlation, (self.depth_mm.size, self.distance_mm.size)
+        if rho.shape != shape:
+            raise InvalidInputError(f"correlation: expected shape {shape}, got {rho.shape}")
+        even = np.linspace(0.0, self.distance_mm[-1], shape[1])
+        if shape[1] < 2 or not (even[-1] > 0 and np.allclose(self.distance_mm, even)):
             raise InvalidInputError("distance_mm: expected equal steps from zero, got others")
         sizes = {"cells": self.cells, **(vars(self.speckle) if self.speckle else {})}
         for name, values in (sizes | (vars(self.tilt) if self.tilt else {})).items():
@@ -258,12 +256,8 @@ class DecorrelationCurves:
             if not usable or (name in sizes and (values <= 0).any()):
                 least = " above zero" if name in sizes else ""
                 raise InvalidInputError(f"{name}: expected a number{least} for each depth, got others")
-        if not ((self.correlation > 0) & (self.correlation <= 1)).all():
-            raise InvalidInputError("correlation: expected values in (0, 1], got some outside")
-        if (np.diff(self.correlation, axis=1) > 0).any():
-            raise InvalidInputError(
-                "correlation: expected curves that fall with distance, got one that rises"
-            )
+        if not ((rho > 0) & (rho <= 1)).all() or (np.diff(rho, axis=1) > 0).any():
+            raise InvalidInputError("correlation: expected values in (0, 1] that fall, got others")
 
     def at(self, depth_mm: FloatArray) -> DecorrelationCurves:
         """Curves at other depths, shape (p,), by linear interpolation of sqrt(-ln rho)."""

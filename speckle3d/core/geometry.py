@@ -123,11 +123,10 @@ def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:
         raise InvalidInputError(f"{where}: expected shape (m, 4), got {q.shape}")
     require_finite(q, where)
     with np.errstate(over="ignore"):
-        norms = np.linalg.norm(q, axis=1)
-    bad = np.flatnonzero(np.abs(norms - 1.0) > RIGID_TOLERANCE)
-    if bad.size:
-        norm = norms[bad[0]]
-        raise InvalidInputError(f"{where}[{bad[0]}]: expected a unit quaternion, got norm {norm:.6g}")
+        off = np.abs(np.linalg.norm(q, axis=1) - 1.0) > RIGID_TOLERANCE
+    if off.any():
+        first = int(off.argmax())
+        raise InvalidInputError(f"{where}[{first}]: expected a unit quaternion, got {q[first]}")
     return Rotation.from_quat(q, scalar_first=True)
 
 
@@ -143,15 +142,13 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
     if m.ndim != 3 or m.shape[1:] != (4, 4):
         raise InvalidInputError(f"{where}: expected shape (m, 4, 4), got {m.shape}")
     require_finite(m, where)
-    r = m[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        skewed = ~(np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE)
-        mirrored = np.linalg.det(r) < 0
-    affine = np.abs(m[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > RIGID_TOLERANCE
-    bad = np.flatnonzero(skewed | mirrored | affine)
-    if bad.size:
-        raise InvalidInputError(f"{where}[{bad[0]}]: expected a rigid 4x4 matrix, got one that is not")
-    m[:, 3] = [0.0, 0.0, 0.0, 1.0]  # SciPy wants it exact
+    r, last = m[:, :3, :3], [0.0, 0.0, 0.0, 1.0]
+    with np.errstate(all="ignore"):
+        square = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE
+        rigid = square & (np.linalg.det(r) > 0) & np.isclose(m[:, 3], last, 0, RIGID_TOLERANCE).all(axis=1)
+    if not rigid.all():
+        raise InvalidInputError(f"{where}[{rigid.argmin()}]: expected a rigid 4x4 matrix, got another")
+    m[:, 3] = last  # SciPy wants it exact
     return RigidTransform.from_matrix(m)
 
 
@@ -159,11 +156,9 @@ def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
     """Raise `InvalidInputError` naming the first entry of `values` that is NaN or infinite."""
     finite = np.isfinite(values)
     if not finite.all():
-        first = tuple(int(i) for i in np.argwhere(~finite)[0])
-        index = first[0] if len(first) == 1 else first
-        with np.errstate(invalid="ignore"):  # some NaN of single precision are signals
-            shown = str(values[first])
-        raise InvalidInputError(f"{where}[{index}]: expected a finite value, got {shown}")
+        first = tuple(np.argwhere(~finite)[0].tolist())
+        index = first if len(first) > 1 else first[0]
+        raise InvalidInputError(f"{where}[{index}]: expected a finite value, got {values.item(first)}")
 
 
 def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:

@@ -38,12 +38,11 @@ class Segment:
     colour: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        colour = tuple(float(part) for part in self.colour)
-        if not (0 < self.value < 2**16 and self.name.strip()):
-            raise InvalidInputError(f"segment: expected a label from 1 to 65535 and a name, got {self}")
-        if len(colour) != 3 or not all(0 <= part <= 1 for part in colour):
-            raise InvalidInputError(f"segment {self.value}: expected a colour of three parts, got {colour}")
-        object.__setattr__(self, "colour", colour)
+        shown = len(self.colour) == 3 and all(0 <= part <= 1 for part in self.colour)
+        if not (0 < self.value < 2**16 and self.name.strip() and shown):
+            raise InvalidInputError(
+                f"segment: expected a label from 1 to 65535, a name and a colour of three parts, got {self}"
+            )
 
 
 EMPTY, MEASURED, FILLED = 0, 1, 2

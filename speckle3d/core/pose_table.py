@@ -16,12 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _NAMES = ("x_mm", "y_mm", "z_mm", "tilt_deg", "yaw_deg", "roll_deg")
-_PANELS = {
-    "length / mm": ("length_mm", "sigma_z_mm"),
-    "tilt / degrees": ("tilt_deg", "sigma_tilt_deg"),
-    "yaw / degrees": ("yaw_deg", "sigma_yaw_deg"),
-    "roll / degrees": ("roll_deg", "sigma_roll_deg"),
-}
+_PANELS = ("length_mm", *_NAMES[3:])
 _WITHIN = 1.96
 """Standard deviations to either side that hold 95 %."""
 
@@ -85,15 +80,14 @@ def plot_poses(
     pyplot.close(figure)  # it is shown by whom it is returned to, once
     for mode, world_from_image in poses.items():
         columns = _columns(world_from_image, centre_mm, covariance if mode == "image" else None)
-        for panel, (label, (name, sigma)) in zip(axes, _PANELS.items(), strict=True):
+        for panel, name in zip(axes, _PANELS, strict=True):
             values = columns[name]
             (line,) = panel.plot(values, label=f"mode {mode}")
-            panel.set(xlabel="frame", ylabel=label)
-            if sigma in columns:
-                half = _WITHIN * columns[sigma]
-                frame, label = np.arange(values.size), f"95 % interval of mode {mode}"
-                panel.fill_between(
-                    frame, values - half, values + half, label=label, color=line.get_color(), alpha=0.15, lw=0
-                )
+            panel.set(xlabel="frame", ylabel=name.replace("_deg", " / degrees").replace("_mm", " / mm"))
+            half = columns.get(f"sigma_{name}".replace("length", "z"))
+            if half is not None:
+                low, high = values - _WITHIN * half, values + _WITHIN * half
+                within = {"label": f"95 % interval of mode {mode}", "color": line.get_color(), "alpha": 0.15}
+                panel.fill_between(np.arange(values.size), low, high, lw=0, **within)
     axes[0].legend(fontsize="small", frameon=False)
     return figure

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.shown import shown
 
 
@@ -42,17 +43,11 @@ class Surface:
     fields: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
-        for name, shape in (
-            ("vertices_mm", np.shape(self.vertices_mm)),
-            ("triangles", np.shape(self.triangles)),
-        ):
-            if len(shape) != 2 or shape[1] != 3:
-                raise InvalidInputError(f"{name}: expected shape (n, 3), got {shape}")
-        if not np.isfinite(self.vertices_mm).all():
-            raise InvalidInputError("vertices_mm: expected finite values, got others")
-        if len(self.triangles) and not (
-            self.triangles.min() >= 0 and self.triangles.max() < len(self.vertices_mm)
-        ):
+        for name, values in (("vertices_mm", self.vertices_mm), ("triangles", self.triangles)):
+            if values.ndim != 2 or values.shape[1] != 3:
+                raise InvalidInputError(f"{name}: expected shape (n, 3), got {values.shape}")
+        require_finite(self.vertices_mm, "vertices_mm")
+        if ((self.triangles < 0) | (self.triangles >= len(self.vertices_mm))).any():
             raise InvalidInputError(f"triangles: expected vertices 0 to {len(self.vertices_mm) - 1}")
 
     def __len__(self) -> int:
@@ -81,16 +76,6 @@ class Surface:
         """Volume inside, less that of cavities; of an open surface it means nothing."""
         middles = self.vertices_mm[self.triangles].sum(axis=1) / 3.0 - self.vertices_mm.mean(axis=0)
         return float((self.normals_mm2 * middles).sum() / 3.0)
-
-    def volume_gradient(self) -> FloatArray:
-        """Derivative of the volume with respect to each triangle's corners, shape (m, 3, 3), mm2."""
-        return np.repeat(self.normals_mm2[:, None] / 3.0, 3, axis=1)
-
-    def area_gradient(self) -> FloatArray:
-        """Derivative of the area with respect to each triangle's corners, shape (m, 3, 3), mm."""
-        corners = self.vertices_mm[self.triangles]
-        opposite = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
-        return np.cross(self.normals[:, None], opposite) / 2.0
 
     def open_edges(self) -> IntArray:
         """Edges that only one triangle has, vertices of each, shape (e, 2): the border of an open surface."""

@@ -35,10 +35,7 @@ def text_table(lines: Sequence[Sequence[str]], left: Collection[int] = (0,), hea
     text = ""
     for line in body:
         pads = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
-        cells = [
-            cell + pad if k in left else pad + cell
-            for k, (cell, pad) in enumerate(zip(line, pads, strict=True))
-        ]
+        cells = (cell + pads[k] if k in left else pads[k] + cell for k, cell in enumerate(line))
         text += "  ".join(cells).rstrip() + "\n"
     return text
 

@@ -15,8 +15,6 @@ from speckle3d.core.geometry import require_finite
 _PARALLEL_SINE = 0.02
 """Sine of about one degree, within which the outer wires of an N are parallel. Holes are drilled to 0.1 mm
 over tens of millimetres, a quarter of that."""
-_FLAT_MM = 0.5
-"""Largest distance at which two wires of one layer still cross: about half a wire's thickness."""
 
 
 @dataclass(frozen=True)
@@ -87,25 +85,19 @@ class WirePhantom:
 
     def _is_n(self, three: tuple[int, int, int]) -> bool:
         left, middle, right = self.directions[list(three)]
-        parallel = np.linalg.norm(np.cross(left, right)) < _PARALLEL_SINE
-        oblique = np.linalg.norm(np.cross(left, middle)) > _PARALLEL_SINE
-        crossings = (self._nearest(three[1], outer) for outer in (three[0], three[2]))
-        passing_mm = max(float(np.linalg.norm(p - q)) for p, q in crossings)
-        return bool(parallel and oblique and passing_mm < _FLAT_MM)
-
-    def _nearest(self, one: int, other: int) -> tuple[FloatArray, FloatArray]:
-        """Points of two wires that are nearest to each other."""
-        axes = np.column_stack([self.directions[one], -self.directions[other]])
-        along = np.linalg.lstsq(axes, self.points_mm[other] - self.points_mm[one], rcond=None)[0]
-        return (
-            self.points_mm[one] + along[0] * self.directions[one],
-            self.points_mm[other] + along[1] * self.directions[other],
-        )
+        beside = np.linalg.norm(np.cross(left, [right, middle]), axis=1)
+        return bool(beside[0] < _PARALLEL_SINE < beside[1])
 
     def crossings_mm(self) -> FloatArray:
         """Where the middle wire of each N meets the first and the last wire, shape (n_shapes, 2, 3)."""
-        meets = [[self._nearest(n[1], outer)[0] for outer in (n[0], n[2])] for n in self.n_shapes]
+        meets = [[self._nearest(n[1], outer) for outer in (n[0], n[2])] for n in self.n_shapes]
         return np.reshape(meets, (len(self.n_shapes), 2, 3))
+
+    def _nearest(self, one: int, other: int) -> FloatArray:
+        """Point of a wire that is nearest to another."""
+        axes = np.column_stack([self.directions[one], -self.directions[other]])
+        along = np.linalg.lstsq(axes, self.points_mm[other] - self.points_mm[one], rcond=None)[0]
+        return np.asarray(self.points_mm[one] + along[0] * self.directions[one])
 
     @cached_property
     def normals(self) -> FloatArray:

@@ -6,7 +6,6 @@ lie in that plane and cross at the origin.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -102,12 +101,6 @@ class Level(NamedTuple):
         along = 2.0 * float(self.normal @ mirror.normal)
         return Level(along * mirror.normal - self.normal, along * mirror.offset_mm - self.offset_mm)
 
-    def facing(self) -> Level:
-        """Return the plane through the same line of the image that is perpendicular to the image."""
-        flat = self.normal * [1.0, 1.0, 0.0]
-        length = float(np.linalg.norm(flat))
-        return Level(flat / length, self.offset_mm / length)
-
     @property
     def image_from_sheet(self) -> RigidTransform:
         """A frame on the plane: x along its line in the image, y its normal; the origin is on the line."""
@@ -145,50 +138,40 @@ class WaterBath:
 
     def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Reflector, its reverberations and the haze in a box of the image."""
-        floor = Level.floor(medium_from_image)
-        if self.reflector == "wall":
-            image_from_sheet, medium_from_sheet = medium_from_image.inv(), RigidTransform.identity()
-        else:
-            floor = floor.facing()
-            image_from_line = floor.image_from_sheet
-            # The bar stays where it is: the probe sees other parts of it as it slides over it.
-            place = medium_from_image * image_from_line
-            slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
-            image_from_sheet = image_from_line * RigidTransform.from_translation([-slid, 0.0, 0.0])
-            medium_from_sheet = medium_from_image * image_from_sheet
-        position = self._surface(image_from_sheet, box)
-        blocks = [*self.haze.seen(medium_from_image, box)]
-        blocks.append(self._scatterers(medium_from_sheet.apply(position)))
-        for level, amplitude in _reverberations(floor):
-            position = self._surface(level.image_from_sheet, box) * [1.0, 0.0, 1.0]
+        level, strength = Level.floor(medium_from_image), _STRENGTH_PER_MM2 * _SPACING_MM**2
+        image_from_sheet, medium_from_sheet = medium_from_image.inv(), RigidTransform.identity()
+        if self.reflector == "bar":
+            # Perpendicular to the image. It stays where it is: the probe sees other parts of it as it slides.
+            strength *= _BEAM_MM / _BAR_MM
+            flat = level.normal * [1.0, 1.0, 0.0]
+            length = float(np.linalg.norm(flat))
+            level = Level(flat / length, level.offset_mm / length)
             place = medium_from_image * level.image_from_sheet
-            blocks.append(self._scatterers(place.apply(position), amplitude))
-        return blocks
+            slid = float(place.translation @ place.rotation.as_matrix()[:, 0])
+            image_from_sheet = level.image_from_sheet * RigidTransform.from_translation([-slid, 0.0, 0.0])
+            medium_from_sheet = medium_from_image * image_from_sheet
+        position = self._near(image_from_sheet, box)
+        sheets = [(medium_from_sheet.apply(position), 1.0)]
+        # Virtual reflectors of the second and later round trips. Unfolding the path, the probe's face is
+        # mirrored in the floor, the floor in that, and so on: from straight above these lie at twice and
+        # three times the depth; elsewhere they seem turned further too.
+        before = Level(np.array([0.0, 1.0, 0.0]), 0.0)
+        for count in range(1, _REPEATS + 1):
+            before, level = level, before.mirrored_in(level)
+            if level.normal[1] < _STEEPEST:
+                break
+            position = self._near(level.image_from_sheet, box) * [1.0, 0.0, 1.0]
+            place = medium_from_image * level.image_from_sheet
+            sheets.append((place.apply(position), _REVERBERATION**count))
+        return [
+            *self.haze.seen(medium_from_image, box),
+            *((place, np.full(len(place), amplitude * strength, np.float32)) for place, amplitude in sheets),
+        ]
 
-    def _surface(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
+    def _near(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
         """Those of the sheet's scatterers that the reflector has near a box of the image."""
         position = _sheet_near(self.entropy, image_from_sheet, box)
         return position if self.reflector == "wall" else position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
-
-    def _scatterers(self, position: FloatArray, amplitude: float = 1.0) -> Scatterers:
-        strength = amplitude * _STRENGTH_PER_MM2 * _SPACING_MM**2
-        if self.reflector == "bar":
-            strength *= _BEAM_MM / _BAR_MM
-        return position, np.full(len(position), strength, np.float32)
-
-
-def _reverberations(floor: Level) -> Iterator[tuple[Level, float]]:
-    """Virtual reflectors of the second and later round trips, with their amplitudes.
-
-    Unfolding the path, the probe's face is mirrored in the floor, the floor in that, and so on: from
-    straight above these lie at twice and three times the depth; elsewhere they seem turned further too.
-    """
-    before, level = Level(np.array([0.0, 1.0, 0.0]), 0.0), floor
-    for count in range(1, _REPEATS + 1):
-        before, level = level, before.mirrored_in(level)
-        if level.normal[1] < _STEEPEST:
-            return
-        yield level, _REVERBERATION**count
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,8 @@ import sweep_examples
 from calibration_files import ROTATION, made
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.calibration import FramesUsed, calibrated, mounting_difference, pixel_difference
+from speckle3d.core.calibration import FramesUsed, calibrated, mounting_difference
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.grid import ImageGrid
 
 
 def test_a_pixel_is_where_the_readings_and_the_calibration_put_it():
@@ -39,16 +38,6 @@ def test_a_sweep_without_the_sensor_is_refused(sensor):
     sweep = replace(sweep_examples.rf_sweep(), **{sensor: None})
     with pytest.raises(MismatchError):
         calibrated(sweep, made(sensor))
-
-
-@pytest.mark.parametrize(
-    ("pixel_mm", "expected"),
-    [((0.1, 0.2), 0.0), ((0.103, 0.2), 0.03), ((0.1, 0.19), 0.05)],
-)
-def test_pixels_are_compared_by_the_worse_axis(pixel_mm, expected):
-    grid = ImageGrid(10, 20, 0.1, 0.2)
-    assert pixel_difference(grid, made(pixel_mm=np.array(pixel_mm))) == pytest.approx(expected, abs=1e-12)
-    assert pixel_difference(grid, made("orientation")) == 0.0
 
 
 @pytest.mark.parametrize("sensor", ["tracker", "orientation"])

@@ -43,11 +43,6 @@ def test_the_lowest_point_of_a_fan_is_in_its_image():
     np.testing.assert_allclose(lateral_line(CURVED, lowest[0])[1], lowest)
 
 
-def test_lines_of_a_phased_array_begin_at_one_point():
-    first, last = PHASED.mm([0, 64], -10)  # 2 mm before the first sample
-    np.testing.assert_allclose(first, last, atol=1e-9)
-
-
 def test_lines_beyond_the_horizon_are_refused():
     with pytest.raises(InvalidInputError, match="90 degrees"):
         ImageGrid.of_fan(10, 100, 0.1, 10.0, (-1.6, 1.6))

@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import (
     nearest_rotation,
-    relative_poses,
-    require_increasing,
     roll_yaw_tilt,
     rotation_from_fixed_angles,
     rotations_from_quaternions,
@@ -34,17 +32,6 @@ def test_matrix_is_equation_2_of_housden_2008_and_angles_come_back(psi, phi, the
     np.testing.assert_allclose(rotation.as_matrix(), expected, atol=1e-14)
     # A milliradian from the singularity, rounding of 1e-16 grows as 1/cos(yaw) squared, to 1e-10.
     np.testing.assert_allclose(roll_yaw_tilt(rotation), [psi, phi, theta], atol=1e-9)
-
-
-def test_relative_poses_compose_back_to_the_chain_whatever_the_world():
-    rng = np.random.default_rng(0)
-    poses = RigidTransform.from_components(rng.normal(0, 100, (6, 3)), Rotation.random(6, rng=rng))
-    steps = relative_poses(poses[3] * poses)
-    assert len(steps) == 5
-    chained = poses[0]
-    for step in steps:
-        chained = chained * step
-    np.testing.assert_allclose(chained.as_matrix(), poses[5].as_matrix(), atol=1e-10)
 
 
 def test_quaternions_are_scalar_first_and_a_bad_one_is_named():
@@ -77,12 +64,6 @@ def test_single_precision_is_rigid_enough_and_what_is_not_rigid_is_named(spoil):
     matrices[2] = spoil
     with pytest.raises(InvalidInputError, match=r"tracker\[\(?2"):
         transforms_from_matrices(matrices, "tracker")
-
-
-@pytest.mark.parametrize("times", [[0.0, 0.1, 0.1], [0.0, 0.2, 0.1], [0.0, 0.1, np.nan]])
-def test_times_that_do_not_increase_are_named_by_index(times):
-    with pytest.raises(InvalidInputError, match=r"t\[2\]"):
-        require_increasing(times, "t")
 
 
 @settings(deadline=None, max_examples=30)

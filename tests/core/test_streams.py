@@ -26,12 +26,6 @@ def test_poses_slerp_and_move_linearly_between_uneven_samples():
         assert (rotation.inv() * steady(rate, asked)).magnitude().max() < 1e-7
 
 
-def test_interpolation_takes_the_short_way_whatever_the_quaternion_sign():
-    q = np.array([[1.0, 0, 0, 0], [-np.cos(0.1), -np.sin(0.1), 0, 0]])
-    stream = TimedRotations(np.array([0.0, 0.1]), Rotation.from_quat(q, scalar_first=True))
-    np.testing.assert_allclose(stream.at([0.05]).as_rotvec(), [[0.1, 0, 0]], atol=1e-12)
-
-
 def test_gaps_and_times_outside_the_samples_are_not_covered():
     times = np.array([0.0, 0.1, 0.2, 0.6, 0.7])
     stream = TimedRotations(times, steady([1.0, 0, 0], times), max_gap_s=0.2)

@@ -2,8 +2,6 @@ import numpy as np
 import pytest
 from sweep_examples import rf_sweep
 
-from speckle3d.core.errors import InvalidInputError
-
 
 def test_a_part_has_its_own_frames_times_and_truth_and_all_readings():
     whole = rf_sweep(frames=6)
@@ -18,9 +16,3 @@ def test_a_part_has_its_own_frames_times_and_truth_and_all_readings():
     assert part.tracker is whole.tracker
     with pytest.raises(IndexError):
         part.frames[3]
-
-
-@pytest.mark.parametrize(("first", "stop"), [(-1, 3), (4, 2), (0, 7)])
-def test_a_part_that_is_not_there_is_refused(first, stop):
-    with pytest.raises(InvalidInputError):
-        rf_sweep(frames=6).part(first, stop)

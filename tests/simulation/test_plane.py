@@ -89,19 +89,6 @@ def test_the_walls_first_echo_is_shallower_by_half_the_beams_thickness_times_the
     np.testing.assert_allclose(half_height(wall) * [-1.0, 1.0], 0.98 * expected, rtol=0.2)
 
 
-def test_the_wall_fades_when_seen_from_the_side(beam):
-    wall = posed(beam, "wall", [(tilt, 0.0, 20.0) for tilt in (0.0, 6.0, 15.0, 25.0)])
-    brightest = [np.median(envelopes(frame).max(axis=1)) for frame in wall]
-    level, slight, oblique, steep = 20.0 * np.log10(brightest)
-    # The lens is 5 mm high, 20 mm away: beyond atan(1 / 8) = 7 deg no mirrored ray comes back, and what is
-    # left is diffuse, which hardly depends on the angle.
-    assert 3.0 < level - slight < 20.0
-    assert 20.0 < level - oblique < 35.0
-    assert abs(oblique - steep) < 3.0
-    # Still well above the electronic noise of 3.5 counts.
-    assert brightest[-1] > 100.0
-
-
 def test_a_level_wall_reverberates_at_twice_the_depth(beam):
     wall = posed(beam, "wall", [(0.0, 0.0, 14.0), (15.0, 0.0, 14.0)])
     spacing = wall.image.sample_spacing_mm

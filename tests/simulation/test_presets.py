@@ -45,13 +45,6 @@ def test_a_rotation_turns_as_far_as_asked():
     assert np.rad2deg(turned - plain)[1] == pytest.approx(6.0, abs=0.1)
 
 
-def test_crossed_sweeps_cross():
-    first, second = (item.sweep for item in simulate(small("crossed")))
-    middle = [s.truth.rotation[len(s) // 2].apply([0, 0, 1]) for s in (first, second)]
-    # Within the few degrees that a hand wanders.
-    assert abs(middle[0] @ middle[1]) < np.sin(np.deg2rad(8.0))
-
-
 def test_sweeps_are_stored_as_i_and_q_or_as_grey_levels_where_asked_for():
     given = {"preset": "phantom", "vectors": 8, "samples": 600, "frames": 3, "seed": 4}
     made = [simulate(SimulationSettings(signal=kind, **given))[0].sweep for kind in ("rf", "iq", "bmode")]

@@ -188,9 +188,11 @@ def measures_of(
     volume = closed.volume_mm3 if len(closed) else None
     area_sigma = volume_sigma = None
     if errors is not None and grid is not None:
-        area_sigma = _sigma(surface, surface.area_gradient(), errors, grid)
+        corners = surface.vertices_mm[surface.triangles]
+        opposite = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)
+        area_sigma = _sigma(surface, np.cross(surface.normals[:, None], opposite) / 2.0, errors, grid)
         if volume is not None:
-            volume_sigma = _sigma(closed, closed.volume_gradient(), errors, grid)
+            volume_sigma = _sigma(closed, np.repeat(closed.normals_mm2 / 3.0, 3, axis=0), errors, grid)
     return PartMeasures(len(surface), surface.area_mm2, volume, open_mm, area_sigma, volume_sigma)
 
 
@@ -219,6 +221,7 @@ def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
 
 
 def _sigma(surface: Surface, gradient: FloatArray, errors: PosedErrors, grid: ImageGrid) -> float:
+    """Standard error of what has this derivative with respect to each triangle's corners."""
     near = belonging_of(surface.vertices_mm, grid, errors.world_from_image)
     corners = surface.triangles.ravel()
     by_errors = errors.of_gradient(surface.vertices_mm[corners], gradient.reshape(-1, 3), near[corners])

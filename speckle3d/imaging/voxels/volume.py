@@ -23,7 +23,7 @@ from speckle3d.imaging.images import Images, PosedImages
 from speckle3d.imaging.nearest import NearestImages, look_up
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
 from speckle3d.imaging.voxels.holes import fill_holes
-from speckle3d.imaging.voxels.settings import CompoundingSettings, Rule, Splat, VoxelType
+from speckle3d.imaging.voxels.settings import CompoundingSettings, VoxelType
 from speckle3d.imaging.voxels.splatting import splat_images
 from speckle3d.io.toml import validated
 
@@ -52,15 +52,10 @@ def compound(
     voxel_mm: float | None = None,
     *,
     voxel_grid: VoxelGrid | None = None,
-    splat: Splat = "nearest",
-    rule: Rule = "mean",
     weights: FloatArray | None = None,
     region: BoolArray | None = None,
-    fill_radius: int = 3,
-    backward_mm: float = 0.0,
-    voxel_type: VoxelType = "float32",
     world_from_axes: Rotation | None = None,
-    max_memory_gb: float = 8.0,
+    **settings: Any,
 ) -> CompoundedVolume:
     """Compound a sweep's images into voxels, cubic ones that hold all of it or those of a grid.
 
@@ -83,27 +78,19 @@ def compound(
         Side of cubic voxels; or give `voxel_grid`.
     voxel_grid : VoxelGrid, optional
         Where voxels lie; samples elsewhere are left out.
-    splat : {"nearest", "linear"}
-    rule : {"mean", "maximum", "latest", "weighted", "plus"}
-        With "plus" images and voxels must be of uint8.
     weights : ndarray, shape (n,), optional
         Of the frames, zero or more, for the rule "weighted".
     region : ndarray of bool, shape (vector, sample), optional
         Samples that count; by default all.
-    fill_radius : int
-        Half the edge of the largest such cube, in voxels; beyond it, and with 0 everywhere, empty voxels
-        stay empty. The volume also grows by so many voxels beyond the first and the last frame.
-    backward_mm : float
-        For sparse sweeps: if above zero, each voxel is interpolated between the images nearest on either
-        side, up to this far from it, without `splat`, `rule` and `fill_radius`; see
-        `speckle3d.imaging.nearest`.
-    voxel_type : {"float32", "uint8", "int16", "uint16"}
-        With "float32" empty voxels are NaN. With others levels are rounded and clipped, and empty voxels
-        are 0.
     world_from_axes : Rotation, optional
         Directions of the axes of cubic voxels; without it, the world's.
-    max_memory_gb : float
-        For the volume and the work on it.
+    **settings
+        Fields of `CompoundingSettings`: `splat` ("nearest", "linear"), `rule` ("mean", "maximum", "latest",
+        "weighted", or "plus", whose images and voxels must be of uint8), `fill_radius` (half the edge of the
+        largest such cube, in voxels; by default 3), `fill_mm`, `max_memory_gb`, `voxel_type` (by default
+        "float32", in which empty voxels are NaN; in others levels are rounded and clipped, and empty voxels
+        0), and `backward_mm` for sparse sweeps: above zero, each voxel is interpolated between the images
+        nearest on either side, up to this far from it, without splat, rule and filling.
 
     Returns
     -------
@@ -139,9 +126,7 @@ def compound(
     source = PosedImages(images, grid, world_from_image)
     if voxel_grid is None:
         voxel_grid = grid_around(grid, world_from_image, float(voxel_mm or 0.0), world_from_axes)
-    settings = {"splat": splat, "rule": rule, "fill_radius": fill_radius, "backward_mm": backward_mm,
-                "voxel_type": voxel_type, "max_memory_gb": max_memory_gb}  # fmt: skip
-    checked = validated(settings, "compound", CompoundingSettings)
+    checked = validated({"voxel_type": "float32", **settings}, "compound", CompoundingSettings)
     return compound_onto(voxel_grid, source, checked, weights, region)
 
 

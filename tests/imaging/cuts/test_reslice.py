@@ -2,12 +2,10 @@
 
 import numpy as np
 import oracles
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.planes import ReslicePlane, lateral_line, planes_from_first_frame
 from speckle3d.imaging.cuts.reslice import reslice_frames
@@ -82,13 +80,3 @@ def test_tilted_bright_plane_appears_where_it_is():
     assert full.sum() > 80
     # Half the closest sampling step, the 0.1 mm pixel: blending frames must not move it more.
     assert np.abs(crest_mm).max() < 0.05
-
-
-def test_images_that_do_not_fit_are_refused():
-    two, plane = RigidTransform.identity(2), ReslicePlane(RigidTransform.identity(), 1.0, 1.0, 0.5)
-    with pytest.raises(MismatchError):
-        reslice_frames(np.ones((3, 9, 14)), GRID, two, plane, 1.0)
-    with pytest.raises(InvalidInputError):
-        reslice_frames(np.ones((2, 9, 14), dtype=np.complex64), GRID, two, plane, 1.0)
-    with pytest.raises(InvalidInputError):
-        lateral_line(GRID, 4.5)

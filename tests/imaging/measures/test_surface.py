@@ -74,20 +74,6 @@ def test_labels_have_a_surface_each_open_where_the_grid_ends():
     assert cut.open_mm > 0.0
 
 
-def test_zeros_at_the_border_are_empty_and_those_inside_are_black():
-    """A black ball in grey, and nothing beyond the sweep: the surface is the ball's, not the sweep's."""
-    volume, centre = ball(2.0)
-    grey = np.where(volume.voxels > 0, 0, 100).astype(np.uint8)
-    grey[:6] = 0
-    seen = Volume(grey, volume.spacing_mm, PLACED)
-    surface = surface_of(seen, 50.0, "below")
-    assert np.linalg.norm(surface.vertices_mm - centre, axis=1).max() < 2.3
-    assert not len(surface.open_edges())
-    # All known, as by a state that says so: the sweep's end is a surface, too.
-    whole = surface_of(seen, 50.0, "below", known=np.ones(seen.shape, dtype=bool))
-    assert len(whole) > len(surface)
-
-
 def test_smoothing_evens_noise_out_and_keeps_the_volume():
     volume, centre = ball(4.0)
     rng = np.random.default_rng(0)

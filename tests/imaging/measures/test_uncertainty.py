@@ -24,16 +24,6 @@ def scaled(frames=41, turn_deg=0.0, sigma=0.05):
     return PosedErrors(PoseErrors(factors), poses, GRID.centre_mm)
 
 
-def test_an_error_of_scale_grows_along_the_sweep():
-    errors = PosedErrors(PoseErrors(scaled().errors.factors[:1]), scaled().world_from_image, GRID.centre_mm)
-    grid = grid_around(GRID, errors.world_from_image, 0.5)
-    found = deviation_volume(errors, GRID, grid)
-    assert found.shape == grid.shape[::-1]
-    assert found.dtype == np.float32
-    z = grid.world_from_grid.translation[2] + 0.5 * np.arange(grid.shape[2])
-    np.testing.assert_allclose(found, np.broadcast_to(0.05 * z[:, None, None], found.shape), atol=1e-5)
-
-
 def test_interpolated_deviations_are_those_of_the_voxels_themselves():
     """A turning sweep: at voxels in it against the exact value there, to a hundredth of the largest."""
     errors = scaled(turn_deg=8.0)

@@ -1,13 +1,11 @@
 """Grids: as asked for to the last bit, around all images, and small."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from posed_sweeps import GRID, KINDS, corners_in, sweep
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.voxels.grid import grid_around, spacing_within
 
@@ -73,13 +71,3 @@ def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
     if found > 0.4:  # the samples' spacing, than which none is finer
         rounds = [float(f"{step}e{power}") for power in range(-2, 3) for step in steps]
         assert memory(max(spacing for spacing in rounds if spacing < found)) > gigabytes
-
-
-def test_wrong_input_is_refused():
-    poses, _ = sweep(np.random.default_rng(4), 3)
-    both, beyond = {"shape": (1, 1, 1), "size_mm": (1.0, 1.0, 1.0)}, {"origin_mm": (1e5, 0.0, 0.0)}
-    for spacing, how in ((0.0, {}), (1.0, both), (1.0, beyond)):
-        with pytest.raises(InvalidInputError):
-            grid_around(GRID, poses, spacing, **how)
-    with pytest.raises(InvalidInputError):
-        spacing_within(GRID, poses, 0.0)

@@ -87,16 +87,6 @@ def test_samples_on_a_border_belong_to_the_voxel_above():
         np.testing.assert_array_equal(volume.voxels[0, :, 0], [0, 1.5, 3.5, 5.5])
 
 
-def test_levels_beyond_a_type_are_clipped_and_empty_voxels_are_zero():
-    kind, limits = "int16", np.iinfo("int16")
-    levels = [limits.min - 10.0, limits.max + 10.0, 12.6]
-    poses = RigidTransform.from_translation([[0.0, 0, 0], [0, 0, 2.0], [0, 0, 4.0]])
-    images = [np.full((GRID.vectors, GRID.samples), level) for level in levels]
-    volume = compound(images, GRID, poses, 1.0, fill_radius=0, voxel_type=kind)
-    assert volume.voxels.dtype == kind
-    np.testing.assert_array_equal(volume.voxels[2, 2], [limits.min, 0, limits.max, 0, 13])
-
-
 def test_what_cannot_be_compounded_is_refused():
     images, poses, voxel_grid = any_scene(np.random.default_rng(0), "uint8")
     scene = {"images": images, "grid": GRID, "world_from_image": poses, "voxel_grid": voxel_grid}
