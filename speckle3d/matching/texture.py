@@ -7,12 +7,11 @@ on what is scanned as long as it scatters as a phantom does; patches whose contr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 from scipy import fft
 
-from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray
+from speckle3d.core.arrays import BoolArray, Complex64Array, Float32Array, FloatArray, IntArray
 from speckle3d.core.curves import EchoSpectra, SpeckleSize
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, read_frame
 from speckle3d.core.threads import ahead
@@ -158,8 +157,8 @@ def _sizes(intensity: Float32Array, patches: PatchGrid) -> FloatArray:
     return np.where(fair, size, np.nan)
 
 
-def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -> FloatArray:
-    """Share of each patch's power that is the same in all of `frames`: median over their pairs.
+def standing_share(sweep: Sweep, matcher: FrameMatcher, pairs: IntArray) -> FloatArray:
+    """Share of each patch's power that is the same in all frames: median over their pairs.
 
     Echoes that stay where they are while the probe moves are reverberation, side lobes, electronics. Speckle
     of places a beam's width and more apart has nothing in common, so that the product of two such frames'
@@ -169,9 +168,9 @@ def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -
 
     Parameters
     ----------
-    frames : sequence of int
-        At least two, far apart, read anew and all held at once. The median lets some of them see what
-        others do, as on the way back.
+    pairs : ndarray of int, shape (m, 2)
+        Frames far apart, read anew and all held at once. The median lets some of them see what others do, as
+        on the way back.
 
     Returns
     -------
@@ -189,5 +188,7 @@ def standing_share(sweep: Sweep, matcher: FrameMatcher, frames: Sequence[int]) -
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(tiles / np.linalg.norm(tiles, axis=1, keepdims=True))
 
-    shared = [np.einsum("pk,pk->p", a, b) for a, b in combinations(ahead(look, frames), 2)]
-    return np.asarray(np.median(shared, axis=0), dtype=float)
+    frames, at = np.unique(pairs, return_inverse=True)
+    tiles = np.stack(list(ahead(look, frames.tolist())), axis=1)
+    shared = tiles @ tiles.transpose(0, 2, 1)
+    return np.asarray(np.median(shared[:, *at.reshape(-1, 2).T], axis=1), dtype=float)

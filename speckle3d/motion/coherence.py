@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import theilslopes
+from scipy.stats import siegelslopes
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.leastsquares import robust_sigma
@@ -28,7 +28,7 @@ from speckle3d.core.shown import shown
 from speckle3d.kernels.plane_misfit import EchoModels
 from speckle3d.kernels.statistics import INTERPOLATION, correlation_variance
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.planes import WELL_FALLEN, MotionProblem
+from speckle3d.motion.planes import WELL_FALLEN, MotionProblem, fully_developed
 
 CURVES_SIGMA = 0.002
 """Relative error of all distances that curves from some twenty independent blocks of phantom have."""
@@ -51,6 +51,9 @@ for the most part. Sweeps without such patches do not depend on it; halved, it m
 LEAST_BINS = 4
 """Distances at which a patch must have been seen to tell its own scale, gain and structure: as many as these
 and the structure's power are."""
+UNADAPTED_SIGMA = 0.15
+"""Relative error of distances by a phantom's curves where no patch tells its own scale, as in two frames:
+tissue reads 5 to 25 % short with them."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
 ROUNDS, SETTLED = 30, 1e-3
@@ -243,7 +246,7 @@ def _binned(
         (1 - floor) * np.sqrt(count / variance),
         np.tile(amplitude, (pieces, 1)),
         curves.step_mm,
-        determined if determined.any() else np.ones_like(determined),
+        determined,
     )
     return binned, (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
 
@@ -252,6 +255,23 @@ def _median(values: FloatArray) -> float:
     """Median of the finite values; NaN of none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")
+
+
+def _standard_error(logarithm: FloatArray, depth_mm: FloatArray, prior: int) -> float:
+    """Standard error of a median, from the deviations of its values from a line over depth: tilt makes one.
+
+    Parameters
+    ----------
+    prior : int
+        Number of values with a scatter of `ROW_SIGMA` that count with the median's own.
+    """
+    known = np.isfinite(logarithm)
+    count, spread, depth, values = int(known.sum()), ROW_SIGMA, depth_mm[known], logarithm[known]
+    if count > 2:
+        line = siegelslopes(values, depth)
+        spread = robust_sigma(values - line.intercept - line.slope * depth)
+    spread = np.sqrt((count * spread**2 + prior * ROW_SIGMA**2) / (count + prior))
+    return float(1.2533 * spread / np.sqrt(max(count, 1)))
 
 
 def estimate_coherence(
@@ -272,6 +292,8 @@ def estimate_coherence(
     """
     binned, centres = _binned(problem, table, sound, path)
     determined, of_echo = binned.determined, problem.at_patches.of_echo
+    if not determined.any():
+        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=UNADAPTED_SIGMA)
     most_share = MOST_SHARE["echo" if of_echo else "intensity"]
 
     def row_medians(values: FloatArray) -> FloatArray:
@@ -285,22 +307,19 @@ def estimate_coherence(
     fits = [binned.fit(most_share, MOST_POWER), *([frozen] if most_share and not of_echo else [])]
     # Where noise is most of the correlation, its course tells nothing of the scale.
     clear = determined & (frozen[:, 1] >= LEAST_GAIN)
-    medians = [_median(fit[clear if clear.any() else determined, 0]) for fit in fits]
+    clear = clear if clear.any() else determined
+    medians = [_median(fit[clear, 0]) for fit in fits]
     log_scale = float(np.mean(medians))
     gain, share = binned.fit(most_share, 0.0, log_scale, max(typical, NO_STRUCTURE))[:, 1:3].T
     # Patches that tell nothing are taken for the sweep's typical ones.
     gain, share = (np.where(determined, v, _median(v[determined])) for v in (gain, share))
-    logarithm = row_medians(np.mean(fits, axis=0)[:, 0]) - log_scale
-    rows = RowScales(problem.patches.row_depth_mm, logarithm, row_medians(gain))
-    # Standard error of a median of rows, by their median absolute deviation from a line: tilt makes one.
-    finite = np.isfinite(logarithm)
-    count, spread = int(finite.sum()), ROW_SIGMA
-    if count > 2:
-        line = theilslopes(logarithm[finite], rows.depth_mm[finite])
-        spread = robust_sigma(logarithm[finite] - line.intercept - line.slope * rows.depth_mm[finite])
-    if typical >= NO_STRUCTURE:
-        spread = np.sqrt((count * spread**2 + PRIOR_ROWS * ROW_SIGMA**2) / (count + PRIOR_ROWS))
-    errors = 1.2533 * spread / np.sqrt(count), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
+    own = np.mean(fits, axis=0)[:, 0] - log_scale
+    rows = RowScales(problem.patches.row_depth_mm, row_medians(own), row_medians(gain))
+    by_row = _standard_error(rows.logarithm, rows.depth_mm, PRIOR_ROWS if most_share else 0)
+    # Of few frames and rows, patches scatter more than structure's layers.
+    depth_mm = np.tile(problem.patches.depth_mm, centres.size)
+    by_patch = _standard_error(np.where(clear, own, np.nan), depth_mm, 0)
+    errors = max(by_row, by_patch), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
     shape = centres.size, -1
     return Coherence(

@@ -144,7 +144,7 @@ def share_of(frames):
     signal = speckle.RF
     grid = replace(speckle.GRID, vectors=36, samples=900, sample_spacing_mm=signal.sample_spacing_mm)
     sweep = Sweep(frames.astype(np.float32), grid, signal, np.arange(len(frames)) / 25)
-    return standing_share(sweep, matcher_of(sweep), range(5))
+    return standing_share(sweep, matcher_of(sweep), np.column_stack(np.triu_indices(5, 1)))
 
 
 @pytest.mark.parametrize("power", [0.0, 0.1, 1.0])
