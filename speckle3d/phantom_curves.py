@@ -8,16 +8,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+from scipy.interpolate import make_smoothing_spline
+from scipy.spatial.transform import RigidTransform
+
 from speckle3d.config import Config
-from speckle3d.core.curves import DecorrelationCurves
+from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.curves import DecorrelationCurves, SpeckleSize
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.progress import Progress, after
 from speckle3d.core.sweep import Sweep
 from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.matcher import FrameMatcher
+from speckle3d.matching.patches import PatchGrid
 from speckle3d.matching.schedule import KnownSchedule
-from speckle3d.matching.texture import PHANTOM_FRAMES, mean_spectra
-from speckle3d.motion.phantom import fit_curves, phantom_pairs, phantom_samples, phantom_speckle
+from speckle3d.matching.table import CorrelationTable
+from speckle3d.matching.texture import PHANTOM_FRAMES, Texture, mean_spectra
+from speckle3d.motion.phantom import CurveSettings, PhantomSamples, fit_curves
+
+SMOOTHED_FRAMES = 8
+"""Frames from which a tracker's path is smoothed: a spline through fewer is none."""
 
 
 def calibrate_curves(
@@ -47,30 +57,110 @@ def calibrate_curves(
     settings = config or Config()
     if not sweeps:
         raise InsufficientDataError("expected at least one phantom sweep, got none")
-    samples, keys, sizes, spectra = [], [], [], []
-    total, before = sum(len(sweep) for sweep in sweeps), 0
+    keys, samples, textures, before = [], [], [], 0
+    total = sum(len(sweep) for sweep in sweeps)
     for sweep in sweeps:
         matcher = FrameMatcher(
             sweep, settings.intensity, settings.patches, settings.inplane, settings.matching
         )
         keys.append(matcher.key)
         keys[0].require_same(matcher.key, "the phantom sweeps do not match each other")
-        wanted = phantom_pairs(sweep, settings.curves)
+        poses = known_positions(sweep)
+        pairs = phantom_pairs(sweep, poses, settings.curves)
         matches = match_sweep(
             sweep,
             matcher,
-            KnownSchedule(wanted),
+            KnownSchedule(pairs),
             settings.quality,
             after(progress, before, total),
             textures=PHANTOM_FRAMES,
         )
-        samples.append(phantom_samples(sweep, matcher.patches, matches.table, wanted))
-        sizes.append((matcher.patches.row_depth_mm, matches.texture.speckle_size()))
-        spectra.append(matches.texture.spectra())
+        samples.append(phantom_samples(poses, matcher.patches, matches.table, pairs))
+        textures.append((matcher.patches.row_depth_mm, matches.texture))
         before += len(sweep)
     curves = fit_curves(keys[0], samples, settings.curves)
+    spectra = [texture.spectra() for _, texture in textures]
     return replace(
         curves,
-        speckle=phantom_speckle(curves.depth_mm, sizes),
+        speckle=_mean_speckle(curves.depth_mm, textures),
         spectrum=mean_spectra([each for each in spectra if each is not None]),
     )
+
+
+def known_positions(sweep: Sweep) -> RigidTransform:
+    """Poses of a phantom sweep's frames: the stored truth, or the tracker's, smoothed.
+
+    A tracker's jitter is a good part of the distances wanted here. The probe moves more smoothly: a smoothing
+    spline, its stiffness from generalised cross-validation, takes the jitter out.
+
+    Raises
+    ------
+    InsufficientDataError
+        If there is neither, or the tracker does not cover every frame.
+    """
+    if sweep.truth is not None:
+        return sweep.truth
+    if sweep.tracker is None:
+        raise InsufficientDataError(
+            f"{sweep.name}: expected a phantom sweep with known positions (/truth or /tracker), got neither"
+        )
+    poses, time_s = sweep.tracker.world_from_image(sweep.frame_time_s), sweep.frame_time_s
+    if len(poses) < SMOOTHED_FRAMES:
+        return poses
+    motion = (poses[0].inv() * poses).as_exp_coords()
+    smooth = np.stack([make_smoothing_spline(time_s, values)(time_s) for values in motion.T], axis=1)
+    return poses[0] * RigidTransform.from_exp_coords(smooth)
+
+
+def phantom_pairs(sweep: Sweep, poses: RigidTransform, settings: CurveSettings) -> IntArray:
+    """Choose frame pairs of a phantom sweep that are within the curves' reach, shape (m, 2).
+
+    Raises
+    ------
+    InsufficientDataError
+        If no frames are near enough to each other.
+    """
+    centres, normals = poses.apply(sweep.grid.centre_mm), poses.rotation.apply([0.0, 0.0, 1.0])
+    first, second = np.triu_indices(len(poses), 1)
+    separation = np.abs(((centres[second] - centres[first]) * normals[first]).sum(axis=1))
+    order = np.argsort(separation, kind="stable")[: int((separation <= settings.largest_mm).sum())]
+    if not order.size:
+        raise InsufficientDataError(
+            f"{sweep.name}: expected phantom frames closer than {settings.largest_mm:g} mm, got none"
+        )
+    # Thinned evenly over separation.
+    kept = order[np.linspace(0, order.size - 1, min(order.size, settings.pairs)).astype(int)]
+    return np.asarray(np.column_stack([first, second])[np.sort(kept)])
+
+
+def phantom_samples(
+    poses: RigidTransform, patches: PatchGrid, table: CorrelationTable, pairs: IntArray
+) -> PhantomSamples:
+    """Set the correlations of matched phantom frames beside their known distances.
+
+    Parameters
+    ----------
+    table : CorrelationTable
+    pairs : ndarray, shape (m, 2)
+        Those of the table that count.
+    """
+    counted = np.isin(table.first * len(poses) + table.second, pairs @ [len(poses), 1])
+    first, second, correlation = table.first[counted], table.second[counted], table.correlation[counted]
+    normal = (poses[first].inv() * poses[second]).as_matrix()[:, 2]
+    at = patches.centre_mm - table.inplane[counted, None, :2]
+    offset = (at * normal[:, None, :2]).sum(axis=2) + normal[:, 3:]
+    tilt = normal[:, :1] * np.sin(patches.angle_rad) + normal[:, 1:2] * np.cos(patches.angle_rad)
+    columns = np.broadcast_to(patches.depth_mm, tilt.shape), offset, tilt, correlation.astype(float)
+    return PhantomSamples(*(column.ravel() for column in columns), len(first))
+
+
+def _mean_speckle(depth_mm: FloatArray, textures: Sequence[tuple[FloatArray, Texture]]) -> SpeckleSize | None:
+    """Mean speckle size of phantom sweeps at the depths of the curves; None if unknown."""
+    means, sizes = [], [(depths, texture.speckle_size()) for depths, texture in textures]
+    for name in ("lateral_mm", "axial_mm"):
+        known = [(depths, getattr(size, name)) for depths, size in sizes]
+        known = [(depths[fair], size[fair]) for depths, size in known if (fair := np.isfinite(size)).any()]
+        if not known:
+            return None
+        means.append(np.mean([np.interp(depth_mm, *sweep) for sweep in known], axis=0))
+    return SpeckleSize(*means)

@@ -115,14 +115,6 @@ def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
         yield Doubt(sensor.label, "heading drift, or a gyroscope's bias", evidence, False)
 
 
-def turns_confirmed(sensor: OrientationSensor) -> bool:
-    """Whether the gyroscope turns enough to tell, and the readings with it."""
-    turns = GyroscopeTurns.of(sensor)
-    return turns is not None and (
-        turns.misfit(sensor.readings.world_from_sensor) - turns.misfit(None) < -LEAST_GAIN
-    )
-
-
 def doubts_of_gravity(sensor: OrientationSensor) -> Iterator[Doubt]:
     """At most one: gravity is not along the world's z; refuted if a convention brings it there."""
     readings = sensor.readings.world_from_sensor

@@ -15,7 +15,7 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.examine.conventions import doubts_of_gravity, doubts_of_gyroscope, turns_confirmed
+from speckle3d.examine.conventions import doubts_of_gravity, doubts_of_gyroscope
 from speckle3d.examine.readings import (
     Sensor,
     frames_at,
@@ -75,7 +75,11 @@ def examined_sensors(sweep: Sweep, image: RigidTransform, examine: bool = True) 
         if sensor is not None:
             doubts += tuple(_doubts_of(sensor, sweep, image))
     trusted = believed(left, doubts)
-    confirmed = trusted.orientation is not None and _turn_confirmed(trusted.orientation, sweep, image)
+    sensor, doubted = trusted.orientation, {doubt.about for doubt in doubts}
+    confirmed = sensor is not None and (
+        (sensor.gyroscope_rad_s is not None and sensor.label not in doubted)
+        or _roll_agrees(sensor, sweep, image)
+    )
     return ExaminedSensors(trusted, confirmed, doubts)
 
 
@@ -171,10 +175,8 @@ ROLL_EXPLAINED = 0.6
 FEWEST_FRAMES = 20
 
 
-def _turn_confirmed(sensor: OrientationSensor, sweep: Sweep, image: RigidTransform) -> bool:
-    """Whether a gyroscope, or roll, which images know well, confirm the turns that are read."""
-    if turns_confirmed(sensor):
-        return True
+def _roll_agrees(sensor: OrientationSensor, sweep: Sweep, image: RigidTransform) -> bool:
+    """Whether roll, which images know well, is the sensor's."""
     covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
     if sensor.sensor_from_image is None or covered.size < FEWEST_FRAMES:
         return False

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import siegelslopes
+from scipy.stats import theilslopes
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.leastsquares import robust_sigma
@@ -257,20 +257,11 @@ def _median(values: FloatArray) -> float:
     return float(np.median(finite)) if finite.size else float("nan")
 
 
-def _standard_error(logarithm: FloatArray, depth_mm: FloatArray, prior: int) -> float:
-    """Standard error of a median, from the deviations of its values from a line over depth: tilt makes one.
-
-    Parameters
-    ----------
-    prior : int
-        Number of values with a scatter of `ROW_SIGMA` that count with the median's own.
-    """
-    known = np.isfinite(logarithm)
-    count, spread, depth, values = int(known.sum()), ROW_SIGMA, depth_mm[known], logarithm[known]
-    if count > 2:
-        line = siegelslopes(values, depth)
-        spread = robust_sigma(values - line.intercept - line.slope * depth)
-    spread = np.sqrt((count * spread**2 + prior * ROW_SIGMA**2) / (count + prior))
+def _standard_error(values: FloatArray, prior: int) -> float:
+    """Standard error of the median of finite values, by their own scatter and `prior` more of `ROW_SIGMA`."""
+    finite = values[np.isfinite(values)]
+    count, spread = finite.size, robust_sigma(finite) if finite.size > 2 else ROW_SIGMA
+    spread = np.sqrt((count * spread**2 + prior * ROW_SIGMA**2) / max(count + prior, 1))
     return float(1.2533 * spread / np.sqrt(max(count, 1)))
 
 
@@ -315,10 +306,16 @@ def estimate_coherence(
     gain, share = (np.where(determined, v, _median(v[determined])) for v in (gain, share))
     own = np.mean(fits, axis=0)[:, 0] - log_scale
     rows = RowScales(problem.patches.row_depth_mm, row_medians(own), row_medians(gain))
-    by_row = _standard_error(rows.logarithm, rows.depth_mm, PRIOR_ROWS if most_share else 0)
+    # Deviations from a line over depth: tilt makes one.
+    known, line = np.isfinite(rows.logarithm), (0.0, 0.0)
+    if known.sum() > 2:
+        line = theilslopes(rows.logarithm[known], rows.depth_mm[known])[:2]
+    by_row = _standard_error(
+        rows.logarithm - np.polyval(line, rows.depth_mm), PRIOR_ROWS if most_share else 0
+    )
     # Of few frames and rows, patches scatter more than structure's layers.
-    depth_mm = np.tile(problem.patches.depth_mm, centres.size)
-    by_patch = _standard_error(np.where(clear, own, np.nan), depth_mm, 0)
+    left = own - np.polyval(line, np.tile(problem.patches.depth_mm, centres.size))
+    by_patch = _standard_error(left[clear], 0)
     errors = max(by_row, by_patch), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
     shape = centres.size, -1

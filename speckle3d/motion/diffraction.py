@@ -114,11 +114,10 @@ def tilt_pivot(
     frequency_hz: FloatArray,
     power: FloatArray,
     speed_m_s: float = SPEED_M_S,
-    tilt_rad: float = 0.004,
 ) -> FloatArray:
     """Where speckle of each depth seems to turn about when the probe tilts, mm from the patch, shape (y,).
 
-    By the distance at which tilted speckle correlates best; see `speckle3d.core.curves.TiltResponse`.
+    By the distance at which slightly tilted speckle correlates best; see `TiltResponse`.
 
     Parameters
     ----------
@@ -127,16 +126,12 @@ def tilt_pivot(
     """
     fields, z = _two_way_fields(probe, depth_mm, frequency_hz, speed_m_s)
     two_way = 4e-3 * np.pi * frequency_hz / speed_m_s
-    turned = fields * np.exp(1j * two_way[:, None] * tilt_rad * z)
-    size = 2 * z.size
-    cross = fft.ifft(fft.fft(turned, size, axis=-1) * fft.fft(fields, size, axis=-1).conj(), axis=-1)
-    energy = (np.abs(fields) ** 2).sum(axis=-1)
-    kept = np.abs(((power / energy)[..., None] * cross).sum(axis=1))
-    best = kept.argmax(axis=1)
-    around = np.log(np.stack([kept[np.arange(best.size), (best + k) % size] for k in (-1, 0, 1)]))
-    vertex = (around[0] - around[2]) / (2.0 * (around[0] - 2.0 * around[1] + around[2]))
-    lag = np.where(best > z.size, best - size, best) + vertex
-    return np.asarray(lag * STEP_MM / tilt_rad)
+    # Of the phase's slope across the beam, its variance, and its covariance with the place.
+    slope = fft.ifft(2j * np.pi * fft.fftfreq(z.size, STEP_MM) * fft.fft(fields, axis=-1), axis=-1)
+    weight = power / (np.abs(fields) ** 2).sum(axis=-1)
+    variance = (weight * (np.abs(slope) ** 2).sum(axis=-1)).sum(axis=1)
+    along = (weight * two_way * (z * (fields.conj() * slope).imag).sum(axis=-1)).sum(axis=1)
+    return np.asarray(-along / variance)
 
 
 def _two_way_fields(

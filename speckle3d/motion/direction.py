@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.sweep import Sweep, image_orientation
+from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker, image_orientation
 
 _LEAST_CORRELATION, _LEAST_DEVIATIONS = 0.5, 2.5
 """Correlation of turns that tells the direction, in itself and over what chance gives."""
@@ -77,19 +77,19 @@ def settle_direction(
     """
     if settings.direction:
         return settings.direction, "setting"
-    tracker, sensor, time_s = sweep.tracker, sweep.orientation, sweep.frame_time_s
-    if tracker is not None and tracker.sensor_from_image is not None:
-        covered = np.flatnonzero(tracker.covers(time_s))
-        if covered.size > 1:
-            measured = tracker.world_from_image(time_s[covered])
-            return _same_way(measured, image[covered], sweep.grid.centre_mm), "tracker"
-    if sensor is not None and sensor.sensor_from_image is not None and turn_confirmed:
+    time_s = sweep.frame_time_s
+    for sensor in (sweep.tracker, sweep.orientation if turn_confirmed else None):
+        if sensor is None or sensor.sensor_from_image is None:
+            continue
         covered = np.flatnonzero(sensor.covers(time_s))
-        if covered.size >= LEAST_FRAMES:
-            both = sensor.world_from_image(time_s[covered]), image.rotation[covered]
+        if isinstance(sensor, Tracker) and covered.size > 1:
+            measured = sensor.world_from_image(time_s[covered])
+            return _same_way(measured, image[covered], sweep.grid.centre_mm), sensor.label
+        if isinstance(sensor, OrientationSensor) and covered.size >= LEAST_FRAMES:
+            both = sensor.world_from_image(time_s[covered]), image[covered].rotation
             sign = same_turns(*((turn[0].inv() * turn).as_rotvec()[:, :2] for turn in both))
             if sign is not None:
-                return sign, "orientation sensor"
+                return sign, sensor.label
     if sweep.truth is not None:
         return _same_way(sweep.truth, image, sweep.grid.centre_mm), "truth"
     return 1, "assumed"

@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, make_interp_spline
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.curves import DecorrelationCurves, NominalProbe, TiltResponse
@@ -25,15 +25,12 @@ def stretched(curves: DecorrelationCurves, log_factor: FloatArray) -> Decorrelat
     """Multiply the distances of curves at each depth by exp(log_factor), shape (r,) or ()."""
     factor = np.broadcast_to(np.exp(log_factor), curves.depth_mm.shape)
     grid, roots = curves.distance_mm, np.sqrt(-np.log(curves.correlation))
-    rows = [_extended(grid / f, grid, row) for f, row in zip(factor, roots, strict=True)]
+    # Beyond its end a curve goes on along its last slope.
+    rows = [make_interp_spline(grid, row, k=1)(grid / f) for f, row in zip(factor, roots, strict=True)]
     tilt = curves.tilt and TiltResponse(curves.tilt.pivot_mm, factor**2 * curves.tilt.spread_mm)
-    return replace(curves, correlation=np.exp(-(np.stack(rows) ** 2)), tilt=tilt)
-
-
-def _extended(at: FloatArray, grid: FloatArray, values: FloatArray) -> FloatArray:
-    """Interpolate a rising curve, beyond its end along its last slope."""
-    slope = max((values[-1] - values[-6]) / (grid[-1] - grid[-6]), 0.0)
-    return np.asarray(np.interp(at, grid, values) + slope * np.maximum(at - grid[-1], 0.0))
+    return replace(
+        curves, correlation=np.exp(-(np.maximum.accumulate(np.stack(rows), axis=1) ** 2)), tilt=tilt
+    )
 
 
 def with_fitted_lens(

@@ -12,19 +12,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.interpolate import make_smoothing_spline
 from scipy.optimize import least_squares
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.curves import CurveKey, DecorrelationCurves, SpeckleSize, TiltResponse, curve_widths
+from speckle3d.core.curves import CurveKey, DecorrelationCurves, TiltResponse, curve_widths
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.leastsquares import robust_sigma
-from speckle3d.core.sweep import RFSettings, Sweep
+from speckle3d.core.sweep import RFSettings
 from speckle3d.kernels.statistics import correlation_variance
 from speckle3d.matching.intensity import two_way_wavenumber
-from speckle3d.matching.patches import PatchGrid
-from speckle3d.matching.table import CorrelationTable
 
 TILT_ROUNDS = 4
 """Fits of curves and of the response to tilt, each from the other."""
@@ -74,103 +70,6 @@ class PhantomSamples:
     tilt_rad: FloatArray
     correlation: FloatArray
     pairs: int
-
-
-def known_positions(sweep: Sweep) -> RigidTransform:
-    """Poses of a phantom sweep's frames: the stored truth, or the tracker's, smoothed.
-
-    A tracker's jitter is a good part of the distances wanted here. The probe moves more smoothly: a smoothing
-    spline, its stiffness from generalised cross-validation, takes the jitter out.
-
-    Raises
-    ------
-    InsufficientDataError
-        If there is neither, or the tracker does not cover every frame.
-    """
-    if sweep.truth is not None:
-        return sweep.truth
-    if sweep.tracker is None:
-        raise InsufficientDataError(
-            f"{sweep.name}: expected a phantom sweep with known positions (/truth or /tracker), got neither"
-        )
-    poses = sweep.tracker.world_from_image(sweep.frame_time_s)
-    if len(poses) < 8:
-        return poses
-    first = poses[0]
-    motion = (first.inv() * poses).as_matrix()
-    values = np.hstack([motion[:, :3, 3], Rotation.from_matrix(motion[:, :3, :3]).as_rotvec()])
-    smooth = np.stack(
-        [make_smoothing_spline(sweep.frame_time_s, v)(sweep.frame_time_s) for v in values.T], axis=1
-    )
-    moved = RigidTransform.from_components(smooth[:, :3], Rotation.from_rotvec(smooth[:, 3:]))
-    return first * moved
-
-
-def phantom_pairs(sweep: Sweep, settings: CurveSettings | None = None) -> IntArray:
-    """Choose frame pairs of a phantom sweep that are within the curves' reach, shape (m, 2).
-
-    Raises
-    ------
-    InsufficientDataError
-        If positions are not known, or no frames are near enough to each other.
-    """
-    s, poses = settings or CurveSettings(), known_positions(sweep)
-    centres, normals = poses.apply(sweep.grid.centre_mm), poses.rotation.apply([0.0, 0.0, 1.0])
-    first, second = np.triu_indices(len(poses), 1)
-    separation = np.abs(((centres[second] - centres[first]) * normals[first]).sum(axis=1))
-    order = np.argsort(separation, kind="stable")[: int((separation <= s.largest_mm).sum())]
-    if not order.size:
-        raise InsufficientDataError(
-            f"{sweep.name}: expected phantom frames closer than {s.largest_mm:g} mm, got none"
-        )
-    # Thinned evenly over separation.
-    kept = order[np.linspace(0, order.size - 1, min(order.size, s.pairs)).astype(int)]
-    return np.asarray(np.column_stack([first, second])[np.sort(kept)])
-
-
-def phantom_samples(
-    sweep: Sweep, patches: PatchGrid, table: CorrelationTable, pairs: IntArray
-) -> PhantomSamples:
-    """Set the correlations of matched phantom frames beside their known distances.
-
-    Parameters
-    ----------
-    table : CorrelationTable
-    pairs : ndarray, shape (m, 2)
-        Those of the table that count.
-    """
-    poses = known_positions(sweep)
-    counted = np.isin(table.first * len(poses) + table.second, pairs @ [len(poses), 1])
-    first, second, correlation = table.first[counted], table.second[counted], table.correlation[counted]
-    normal = (poses[first].inv() * poses[second]).as_matrix()[:, 2]
-    at = patches.centre_mm - table.inplane[counted, None, :2]
-    offset = (at * normal[:, None, :2]).sum(axis=2) + normal[:, 3:]
-    tilt = normal[:, :1] * np.sin(patches.angle_rad) + normal[:, 1:2] * np.cos(patches.angle_rad)
-    depth = np.broadcast_to(patches.depth_mm, tilt.shape)
-    return PhantomSamples(
-        depth.ravel(), offset.ravel(), tilt.ravel(), correlation.ravel().astype(float), len(first)
-    )
-
-
-def phantom_speckle(
-    depth_mm: FloatArray, seen: Iterable[tuple[FloatArray, SpeckleSize]]
-) -> SpeckleSize | None:
-    """Mean speckle size of phantom sweeps at each depth of the curves; None if no depth has any.
-
-    Parameters
-    ----------
-    depth_mm : ndarray, shape (r,)
-    seen : iterable of (ndarray, SpeckleSize)
-        Depths of a sweep's rows of patches, and the sizes there, NaN where they are not known.
-    """
-    some, sizes = list(seen), []
-    for name in ("lateral_mm", "axial_mm"):
-        known = [(depths, getattr(size, name)) for depths, size in some]
-        known = [(depths[fair], size[fair]) for depths, size in known if (fair := np.isfinite(size)).any()]
-        if not known:
-            return None
-        sizes.append(np.mean([np.interp(depth_mm, *sweep) for sweep in known], axis=0))
-    return SpeckleSize(*sizes)
 
 
 def _means(label: FloatArray, *values: FloatArray) -> list[FloatArray]:

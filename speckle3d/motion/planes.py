@@ -43,6 +43,8 @@ SENSED_SLOPE = 5e-4
 """Standard deviation of slopes between near frames from a smoothed orientation sensor: 0.03 degrees."""
 WELL_FITTED = 0.9
 """Squared deviations per patch below which no other hypothesis can do better by enough to matter."""
+LEAST_SIGMA_MM = 1e-3
+"""Of a patch's distance where the curve is flat: a hundredth of what it is known to elsewhere."""
 ROUNDS = 12
 LEAST_PATCHES = 6
 NEAR_MM = 0.15
@@ -214,7 +216,7 @@ def pair_planes(
     models : EchoModels
         How echoes depart from fully developed speckle, by pair or for all.
     start_mm : ndarray, shape (e,), optional
-        About how far apart the frames are; by default by the pair's median correlation.
+        About how far apart the frames are; by default as the pair's median correlation has it.
     subset : ndarray of bool, shape (e, p), optional
         Patches allowed to take part.
     slopes : ndarray, shape (e, 2), optional
@@ -230,13 +232,13 @@ def pair_planes(
         comes to lie farther away than the curves were measured, or might.
     """
     correlation = table.correlation[rows]
-    used = _measured(problem, correlation, models)
+    end = problem.end_amplitude
+    least = models.gain * (models.share + (1 - models.share) * end) ** 2
+    used = np.isfinite(correlation) & ((end == 0.0) | (correlation > least))
     used = used if subset is None else used & subset
     used &= (used.sum(axis=1) >= LEAST_PATCHES)[:, None]
     if start_mm is None:
-        share = models.share.mean(axis=1)
-        left = (np.sqrt(np.maximum(table.median[rows], 0.0)) - share) / np.maximum(1.0 - share, 0.1)
-        start = problem.typical_distance(left)
+        start = problem.typical_distance(np.sqrt(np.maximum(table.median[rows], 0.0)))
     else:
         start = np.maximum(start_mm, NEAR_MM)
     sensed = slopes is not None
@@ -282,13 +284,6 @@ def pair_planes(
     return planes, determined
 
 
-def _measured(problem: MotionProblem, correlation: Float32Array, echo: EchoModels) -> BoolArray:
-    """Patches that correlate more than at their curve's last distance."""
-    end = problem.end_amplitude
-    least = echo.gain * (echo.share + (1 - echo.share) * end) ** 2
-    return np.asarray(np.isfinite(correlation) & ((end == 0.0) | (correlation > least)))
-
-
 def _lost(problem: MotionProblem, moved_mm: FloatArray) -> FloatArray:
     """What in-plane motion takes from the patches' lateral positions and levers, shape (e, 2)."""
     return np.ascontiguousarray(moved_mm * [1.0, float(problem.curves.tilt is not None)])
@@ -313,21 +308,19 @@ def patch_distances(
 ) -> tuple[FloatArray, FloatArray]:
     """Unsigned elevational distance of each patch of each pair and its standard deviation, shape (e, p), mm.
 
-    NaN where a patch holds no distance. The deviation is the correlation's over the curve's slope; near zero,
-    where the slope vanishes, it is the squared distance whose deviation stays finite.
+    NaN where a patch holds no distance. The deviation is by how much the distance changes over the
+    correlation's.
     """
-    curves, grid = problem.at_patches, problem.curves.distance_mm
-    share, gain = models
-    amplitude = (np.sqrt(np.maximum(correlation, 0.0) / gain) - share) / (1.0 - share)
+    curves, (share, gain) = problem.at_patches, models
     least = np.sqrt(np.maximum(LEAST_CORRELATION, curves.amplitude[:, -1] ** 2))
-    amplitude = np.where(amplitude > least, amplitude, np.nan)
-    distance, slope = np.empty(correlation.shape), np.empty(correlation.shape)
-    falling = -np.gradient(curves.amplitude, curves.step_mm, axis=1)
-    for patch, row in enumerate(curves.amplitude):
-        distance[:, patch] = np.interp(-amplitude[:, patch], -row, grid)
-        slope[:, patch] = np.interp(distance[:, patch], grid, falling[patch])
-    echo = share + (1.0 - share) * amplitude
-    noise = correlation_variance(np.minimum(gain * echo**2, 0.999), curves.cells, curves.of_echo)
-    by_distance = 2.0 * gain * echo * (1.0 - share) * slope
-    sigma = np.sqrt(noise + INTERPOLATION**2) / np.maximum(by_distance, 1e-9)
-    return distance, np.minimum(sigma, np.sqrt(2.0 * np.maximum(distance, 1e-3) * sigma))
+
+    def distances(rho: FloatArray) -> FloatArray:
+        amplitude = (np.sqrt(np.maximum(rho, 0.0) / gain) - share) / (1.0 - share)
+        columns = zip(np.where(amplitude > least, amplitude, np.nan).T, curves.amplitude, strict=True)
+        return np.stack([np.interp(-own, -row, problem.curves.distance_mm) for own, row in columns], axis=1)
+
+    variance = correlation_variance(np.clip(correlation, 0.0, 0.999), curves.cells, curves.of_echo)
+    noise = np.sqrt(variance + INTERPOLATION**2)
+    nearer, distance, farther = (distances(correlation - side * noise) for side in (-1.0, 0.0, 1.0))
+    sigma = np.where(np.isfinite(farther), (farther - nearer) / 2.0, distance - nearer)
+    return distance, np.maximum(sigma, LEAST_SIGMA_MM)

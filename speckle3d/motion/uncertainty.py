@@ -46,37 +46,30 @@ def claimed_covariance(
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
     """Covariance of every frame's pose by what all pairs have wrong together, shape (n, 6, 6)."""
-    common = common_factors(poses, centre_mm, shared)
-    changing = changing_variance(poses, centre_mm, shared)
+    common, way = _common_factors(poses, centre_mm, shared), _travel(poses, centre_mm)[:, None]
+    changing = np.zeros((len(poses), 6))
+    changing[:, 2:3] = shared.scale_sigma**2 * SCALE_CHANGE_MM * way
+    changing[:, [4, 3]] = np.square(shared.turn_sigma_per_mm) * TURN_CHANGE_MM * way
     return np.asarray(np.einsum("mia,mib->iab", common, common) + changing[:, :, None] * np.eye(6))
 
 
-def common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
+def _common_factors(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
     """Errors of poses for one deviation of the scale, of yaw and of tilt per mm, shape (3, n, 6)."""
-    centres = poses.apply(centre_mm)
-    z = centres[:, 2] - centres[0, 2]
+    z = poses.apply(centre_mm)[:, 2]
+    z = z - z[0]
+    yaw, tilt = shared.turn_sigma_per_mm
     factors = np.zeros((3, len(z), 6))
     factors[0, :, 2] = shared.length_sigma * z
-    yaw, tilt = shared.turn_sigma_per_mm
-    for number, angle, shift, rate, sign in ((1, 4, 0, yaw, 1.0), (2, 3, 1, tilt, -1.0)):
-        # A turn that grows with z moves the centre sideways by half of it times z.
-        factors[number, :, angle], factors[number, :, shift] = rate * z, sign * rate * z**2 / 2
+    # A turn that grows with z moves the centre sideways by half of it times z.
+    factors[1, :, 4], factors[1, :, 0] = yaw * z, yaw * z**2 / 2
+    factors[2, :, 3], factors[2, :, 1] = tilt * z, -tilt * z**2 / 2
     return factors
 
 
-def changing_variance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:
-    """Variance of poses by the parts of scale, yaw and tilt that change along the way, shape (n, 6)."""
-    travel = travelled(poses, centre_mm)
-    variance = np.zeros((len(travel), 6))
-    variance[:, 2] = shared.scale_sigma**2 * SCALE_CHANGE_MM * travel
-    variance[:, [4, 3]] = np.square(shared.turn_sigma_per_mm) * TURN_CHANGE_MM * travel[:, None]
-    return variance
-
-
-def travelled(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
+def _travel(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     """Way that the image's centre has gone up to every frame, shape (n,), mm."""
     steps = np.linalg.norm(np.diff(poses.apply(centre_mm), axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return np.append(0.0, np.cumsum(steps))
 
 
 WAY_STEPS = 40
@@ -104,12 +97,12 @@ def joint_errors(
         Which part of `covariance` all frames have in common; without it, none.
     """
     poses = world_from_image[0].inv() * world_from_image
-    common = common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
+    common = _common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
     rest = covariance - np.einsum("mia,mib->iab", common, common)
     size = np.sqrt(np.maximum(np.diagonal(rest, axis1=1, axis2=2), 1e-24))
     value, axes = np.linalg.eigh(rest / (size[:, :, None] * size[:, None, :]))
     root = size[:, :, None] * (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
-    way = np.maximum(travelled(poses, centre_mm), 1e-6)
+    way = np.maximum(_travel(poses, centre_mm), 1e-6)
     begin, width = np.linspace(0.0, way[-1], WAY_STEPS, endpoint=False), way[-1] / WAY_STEPS
     share = np.sqrt(np.clip(way - begin[:, None], 0.0, width) / way)
     grown = np.einsum("ki,iam->kmia", share, root).reshape(-1, len(poses), 6)

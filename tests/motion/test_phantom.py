@@ -17,13 +17,8 @@ from speckle3d.matching.matcher import FrameMatcher, InPlaneSettings
 from speckle3d.matching.patches import PatchSettings
 from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import KnownSchedule
-from speckle3d.motion.phantom import (
-    CurveSettings,
-    fit_curves,
-    known_positions,
-    phantom_pairs,
-    phantom_samples,
-)
+from speckle3d.motion.phantom import CurveSettings, fit_curves
+from speckle3d.phantom_curves import known_positions, phantom_pairs, phantom_samples
 
 SIGMA_MM, FRAMES = 0.3, 44
 GRID = ImageGrid(48, 260, 0.3, 0.06)
@@ -53,10 +48,10 @@ def matcher_of(sweep):
 
 
 def samples_of(sweep, settings, progress=None):
-    matcher = matcher_of(sweep)
-    pairs = phantom_pairs(sweep, settings)
+    matcher, poses = matcher_of(sweep), known_positions(sweep)
+    pairs = phantom_pairs(sweep, poses, settings)
     matches = match_sweep(sweep, matcher, KnownSchedule(pairs), QualitySettings(), progress)
-    return phantom_samples(sweep, matcher.patches, matches.table, pairs)
+    return phantom_samples(poses, matcher.patches, matches.table, pairs)
 
 
 def test_the_curve_comes_back(phantom):
@@ -97,7 +92,7 @@ def test_frames_too_far_apart_or_without_positions_are_refused(phantom):
     with pytest.raises(InsufficientDataError, match=r"^phantom: .*1\.2 mm"):
         samples_of(far, SETTINGS)
     with pytest.raises(InsufficientDataError, match="/truth or /tracker"):
-        phantom_pairs(replace(phantom, truth=None), SETTINGS)
+        known_positions(replace(phantom, truth=None))
 
 
 def test_a_trackers_jitter_is_smoothed_away(phantom):
