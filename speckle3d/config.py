@@ -22,7 +22,6 @@ from speckle3d.matching.matcher import InPlaneSettings, MatchingSettings
 from speckle3d.matching.patches import PatchSettings
 from speckle3d.matching.quality import QualitySettings
 from speckle3d.matching.schedule import TrajectorySettings
-from speckle3d.motion.coherence import CoherenceSettings
 from speckle3d.motion.direction import SensorSettings
 from speckle3d.motion.phantom import CurveSettings
 from speckle3d.motion.planes import PlaneSettings
@@ -45,9 +44,7 @@ _UNITS = {
 """Units of quantities, by how their names end."""
 REMOVED_SETTINGS = {
     "curves.straighten": "measured curves stay as they are, and a data sheet's lens is always fitted",
-    "coherence.block_frames": "patches are fitted over at least 10 mm of travel",
-    "coherence.evidence": "no patch is judged to hold structure or not",
-    "coherence.redundancy": "errors come from the scatter of rows of patches",
+    "coherence": "echoes are always adapted to, patch by patch over at least 10 mm of travel",
     "inplane.interpolate": "correlations are always read between samples",
     "inplane.passes": "lags are centred twice",
     "trajectory.block_frames": "a sweep is matched in one go",
@@ -78,7 +75,6 @@ class Config(BaseModel):
     inplane: InPlaneSettings = InPlaneSettings()
     matching: MatchingSettings = MatchingSettings()
     curves: CurveSettings = CurveSettings()
-    coherence: CoherenceSettings = CoherenceSettings()
     planes: PlaneSettings = PlaneSettings()
     quality: QualitySettings = QualitySettings()
     trajectory: TrajectorySettings = TrajectorySettings()

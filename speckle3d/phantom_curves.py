@@ -150,8 +150,10 @@ def phantom_samples(
     at = patches.centre_mm - table.inplane[counted, None, :2]
     offset = (at * normal[:, None, :2]).sum(axis=2) + normal[:, 3:]
     tilt = normal[:, :1] * np.sin(patches.angle_rad) + normal[:, 1:2] * np.cos(patches.angle_rad)
-    columns = np.broadcast_to(patches.depth_mm, tilt.shape), offset, tilt, correlation.astype(float)
-    return PhantomSamples(*(column.ravel() for column in columns), len(first))
+    depth = np.broadcast_to(patches.depth_mm, tilt.shape)
+    return PhantomSamples(
+        depth.ravel(), offset.ravel(), tilt.ravel(), correlation.ravel().astype(float), len(first)
+    )
 
 
 def _mean_speckle(depth_mm: FloatArray, textures: Sequence[tuple[FloatArray, Texture]]) -> SpeckleSize | None:

@@ -261,7 +261,7 @@ def track(
     known = motion.claims(open_sigma)[1]
     doubts += examine_images(sweep, matcher, matches, motion, known, curves, flags == 0)
     doubts += sensors.doubts
-    doubts += disagreements(sensors.trusted, motion.poses, covariance, shared.length_sigma)
+    doubts += disagreements(sensors.trusted, motion.poses, covariance)
 
     sensed = sensed_orientation(sensors.trusted, settings.sensors)
     subset, used = (None, motion.pairs.used) if sensed is None else consistent_poses(motion, sensed)
@@ -368,9 +368,7 @@ def motion_problem(
     curves: DecorrelationCurves, matcher: FrameMatcher, frames: int, config: Config
 ) -> MotionProblem:
     """Gather what correlations are read with."""
-    planes, trajectory = config.planes, config.trajectory
-    adapt = config.coherence.adapt and not curves.of_tissue
-    return MotionProblem(curves, matcher.patches, matcher.centre_mm, frames, planes, trajectory, adapt)
+    return MotionProblem(curves, matcher.patches, matcher.centre_mm, frames, config.planes, config.trajectory)
 
 
 def frame_flags(matches: MatchedSweep, config: Config) -> IntArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,52 +37,6 @@ def conventions(turned: Rotation) -> Iterator[tuple[str, Rotation]]:
         yield f"handedness: {axis} mirrored", Rotation.from_matrix(flip @ turned.as_matrix() @ flip)
 
 
-@dataclass(frozen=True)
-class GyroscopeTurns:
-    """Turns over `TURN_S` by a sensor's gyroscope, from some readings to others.
-
-    Attributes
-    ----------
-    lag : int
-        Readings from one end to the other.
-    degrees : ndarray, shape (m - lag, 3)
-    """
-
-    lag: int
-    seconds: float
-    degrees: FloatArray
-
-    @classmethod
-    def of(cls, sensor: OrientationSensor) -> GyroscopeTurns | None:
-        """None without a gyroscope, or with too few readings."""
-        rate, time_s = sensor.gyroscope_rad_s, sensor.readings.time_s
-        if rate is None or len(time_s) < FEWEST_READINGS:
-            return None
-        pause = np.diff(time_s)
-        lag = max(1, round(TURN_S / float(np.median(pause))))
-        if len(time_s) <= 2 * lag:
-            return None
-        angle = np.cumsum((rate[1:] + rate[:-1]) / 2 * pause[:, None], axis=0)
-        angle = np.concatenate([np.zeros((1, 3)), angle])
-        return cls(lag, lag * float(np.median(pause)), np.rad2deg(angle[lag:] - angle[:-lag]))
-
-    def difference(self, turned: Rotation | None, sign: float = 1.0) -> FloatArray:
-        """The gyroscope's turns, or the opposite ones, less the readings', or none; degrees, (m - lag, 3)."""
-        if turned is None:
-            return self.degrees
-        return sign * self.degrees - (turned[: -self.lag].inv() * turned[self.lag :]).as_rotvec(degrees=True)
-
-    @property
-    def noise_deg(self) -> float:
-        """By how much turns and readings honestly differ."""
-        return LEAST_TURN_DEG + SCALE_ERROR * float(_spread(self.degrees).max())
-
-    def misfit(self, turned: Rotation | None, sign: float = 1.0) -> float:
-        """Negative log likelihood of readings, but for a bias; overlapping turns count once."""
-        variance = _spread(self.difference(turned, sign)) ** 2 + self.noise_deg**2
-        return float(len(self.degrees) / self.lag * np.log(variance).sum())
-
-
 def _spread(values: FloatArray) -> FloatArray:
     """Standard deviation by column, from the median distance to the median."""
     return np.asarray(1.4826 * np.median(np.abs(values - np.median(values, axis=0)), axis=0))
@@ -91,27 +44,45 @@ def _spread(values: FloatArray) -> FloatArray:
 
 def doubts_of_gyroscope(sensor: OrientationSensor) -> Iterator[Doubt]:
     """At most one: the convention in which readings turn as the gyroscope, or that they do not."""
-    turns, readings = GyroscopeTurns.of(sensor), sensor.readings.world_from_sensor
-    if turns is None:
+    rate, time_s, readings = sensor.gyroscope_rad_s, sensor.readings.time_s, sensor.readings.world_from_sensor
+    if rate is None or len(time_s) < FEWEST_READINGS:
         return
-    difference, misfit = turns.difference(readings), turns.misfit(readings)
+    pause = np.diff(time_s)
+    lag = max(1, round(TURN_S / float(np.median(pause))))
+    if len(time_s) <= 2 * lag:
+        return
+    angle = np.cumsum((rate[1:] + rate[:-1]) / 2 * pause[:, None], axis=0)
+    angle = np.concatenate([np.zeros((1, 3)), angle])
+    turns = np.rad2deg(angle[lag:] - angle[:-lag])
+    noise = LEAST_TURN_DEG + SCALE_ERROR * float(_spread(turns).max())
+
+    def difference(turned: Rotation, sign: float = 1.0) -> FloatArray:
+        """Turns by the gyroscope, or the opposite ones, less those by readings, degrees."""
+        return sign * turns - (turned[:-lag].inv() * turned[lag:]).as_rotvec(degrees=True)
+
+    def misfit(left: FloatArray) -> float:
+        """Negative log likelihood but for a bias; overlapping turns count once."""
+        return float(len(turns) / lag * np.log(_spread(left) ** 2 + noise**2).sum())
+
+    left = difference(readings)
     upright = [
-        (misfit - turns.misfit(other), name)
+        (misfit(left) - misfit(difference(other)), name)
         for name, other in conventions(readings)
         if not _gravity_from_vertical(sensor, other) > UPRIGHT_DEG
     ]
     gain, name = max(upright, default=(0.0, ""))
-    still, bias = misfit - turns.misfit(None), float(np.linalg.norm(np.median(difference, axis=0)))
-    contradicted = float(_spread(difference).max()) > turns.noise_deg
+    still = misfit(left) - misfit(turns)
+    bias = float(np.linalg.norm(np.median(left, axis=0))) / (lag * float(np.median(pause)))
+    contradicted = float(_spread(left).max()) > noise
     # The gyroscope's sign may be the mistaken one.
-    if contradicted and gain > max(LEAST_GAIN, misfit - turns.misfit(readings, -1.0)):
+    if contradicted and gain > max(LEAST_GAIN, misfit(left) - misfit(difference(readings, -1.0))):
         evidence = f"expected turns as its gyroscope's, so they fit better by {gain:.0f} in log likelihood"
         yield Doubt(sensor.label, name, evidence, True)
     elif contradicted and still > LEAST_GAIN:
         evidence = f"expected turns as its gyroscope's, no turn fits better by {still:.0f} in log likelihood"
         yield Doubt(sensor.label, "gyroscope on other axes, or quaternions of another kind", evidence, False)
-    elif bias > MOST_BIAS_DEG_S * turns.seconds:
-        evidence = f"expected turns as its gyroscope's, got {bias / turns.seconds:.1f} degrees/s more"
+    elif bias > MOST_BIAS_DEG_S:
+        evidence = f"expected turns as its gyroscope's, got {bias:.1f} degrees/s more"
         yield Doubt(sensor.label, "heading drift, or a gyroscope's bias", evidence, False)
 
 

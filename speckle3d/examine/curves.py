@@ -48,9 +48,11 @@ def examine_curves(sweep: Sweep, texture: Texture, motion: Motion, usable: BoolA
     MismatchError
         If they are refuted.
     """
-    problem, size = motion.problem, texture.speckle_size(usable)
+    rows, patches = rows_without_tilt(motion), motion.problem.patches
+    gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain, nan=1.0)
     doubts = (
-        *doubt_curves(size, rows_without_tilt(motion), problem.curves, problem.patches),
+        *doubt_size(texture.speckle_size(usable), motion.problem.curves, patches, gain),
+        doubt_bend(rows),
         doubt_sign(texture.spectra(usable), sweep),
     )
     return unrefuted(doubts, sweep.name, MismatchError)
@@ -68,28 +70,15 @@ def rows_without_tilt(motion: Motion) -> RowScales | None:
     return replace(rows, logarithm=rows.logarithm + explained - np.median(explained))
 
 
-def doubt_curves(
-    seen: SpeckleSize, rows: RowScales | None, curves: DecorrelationCurves, patches: PatchGrid
-) -> tuple[Doubt, ...]:
-    """Doubts that a sweep's own speckle raises: by its size, and by depths that disagree.
+def doubt_bend(rows: RowScales | None) -> Doubt | None:
+    """Doubt curves by which depths of one image are not as far from the next.
 
-    They say so independently of each other: both at once refute the curves.
+    By the standard deviation of a parabola over depth through rows without noise: a lens or a depth that is
+    wrong bends all rows smoothly; rows that stand out alone hold structure.
     """
-    gain = np.ones(patches.row_depth_mm.size) if rows is None else np.nan_to_num(rows.gain, nan=1.0)
-    sizes, depths = doubt_size(seen, curves, patches, gain), doubt_bend(rows)
-    if depths is None:
-        return sizes
-    return tuple(replace(each, refuted=each.refuted or bool(sizes)) for each in (*sizes, depths))
-
-
-def bend(rows: RowScales) -> float:
-    """Weighted standard deviation of the logarithm's smooth course over depth: a parabola through clear rows.
-
-    A lens or a depth that is wrong bends all rows smoothly; rows that stand out alone hold structure.
-    """
+    if rows is None or (rows.gain >= NOISY_GAIN).sum() < ENOUGH_ROWS:
+        return None
     clear = rows.gain >= NOISY_GAIN
-    if clear.sum() < ENOUGH_ROWS:
-        return 0.0
     depth, logarithm = rows.depth_mm[clear], rows.logarithm[clear]
     design = np.vander((depth - depth.mean()) / np.ptp(depth), 3)
 
@@ -97,13 +86,8 @@ def bend(rows: RowScales) -> float:
         return np.asarray(design @ values - logarithm)
 
     fit = least_squares(misfit, np.zeros(3), loss="soft_l1", f_scale=_ROW_ERROR)
-    return float(np.std(design @ fit.x))
-
-
-def doubt_bend(rows: RowScales | None) -> Doubt | None:
-    """Doubt curves by which depths of one image are not as far from the next."""
-    size = 0.0 if rows is None else bend(rows)
-    if rows is None or size < BENT:
+    size = float(np.std(design @ fit.x))
+    if size < BENT:
         return None
     ratio = np.exp(np.nanmax(rows.logarithm) - np.nanmin(rows.logarithm))
     evidence = (

@@ -32,9 +32,7 @@ SIDEWAYS = 0.05
 """Motion along x or y that images see for each mm of travel where structure of tissue runs across."""
 
 
-def disagreements(
-    sweep: Sweep, image: RigidTransform, covariance: FloatArray, length_sigma: float
-) -> tuple[Doubt, ...]:
+def disagreements(sweep: Sweep, image: RigidTransform, covariance: FloatArray) -> tuple[Doubt, ...]:
     """Compare what the images and each sensor say of length, of motion in the image's plane, and of roll.
 
     Parameters
@@ -45,8 +43,6 @@ def disagreements(
         Image-based poses, of the sign that was settled.
     covariance : ndarray, shape (n, 6, 6)
         Claimed for them.
-    length_sigma : float
-        Relative standard deviation of their length.
     """
     found: list[Doubt] = []
     for sensor in (sweep.tracker, sweep.orientation):
@@ -54,7 +50,7 @@ def disagreements(
             continue
         covered = np.flatnonzero(sensor.covers(sweep.frame_time_s))
         if covered.size >= FEWEST_FRAMES:
-            found += _compared(sensor, sweep, image[covered], covariance[covered], covered, length_sigma)
+            found += _compared(sensor, sweep, image[covered], covariance[covered], covered)
     return tuple(found)
 
 
@@ -64,7 +60,6 @@ def _compared(
     image: RigidTransform,
     covariance: FloatArray,
     covered: IntArray,
-    length_sigma: float,
 ) -> Iterator[Doubt]:
     centre, about = sweep.grid.centre_mm, f"images and {sensor.label}"
     poses = rigid(sensor.world_from_image(sweep.frame_time_s[covered]))
@@ -76,8 +71,6 @@ def _compared(
         if axis < 3 and not isinstance(sensor, Tracker):
             continue
         own = np.hypot(np.sqrt(covariance[:, axis, axis]), SIDEWAYS * travel if axis < 2 else 0.0)
-        if axis == 2:
-            own = np.hypot(own, length_sigma * travel)
         least = LEAST_SIGMA_MM if axis < 3 else LEAST_SIGMA_RAD
         its = np.full_like(own, np.hypot(noise[int(axis > 2)] / np.sqrt(SMOOTH_FRAMES), least))
         size = np.abs(by_images[:, axis] - by_sensor[:, axis]) / np.hypot(own, its)
@@ -103,11 +96,6 @@ def _motion(poses: RigidTransform, centre_mm: FloatArray) -> FloatArray:
     path = np.concatenate([np.zeros((1, 6)), np.cumsum(moved, axis=0)])
     path = median_filter(path, (SMOOTH_FRAMES, 1), mode="mirror")
     return np.asarray(path - path[0])
-
-
-def apart(numbers: tuple[float, float], sigmas: tuple[float, float]) -> bool:
-    """Whether two numbers differ by more than their joint claims allow."""
-    return abs(numbers[0] - numbers[1]) > JOINT_CLAIMS * float(np.hypot(*sigmas))
 
 
 def unit_of_length(image: RigidTransform, tracker: Tracker, poses: RigidTransform) -> str:
@@ -144,7 +132,7 @@ def differing_lengths(lengths: Mapping[str, tuple[float, float]]) -> tuple[Doubt
     """
     found = []
     for (one, (first, own)), (other, (second, its)) in combinations(lengths.items(), 2):
-        if not {one, other} <= BY_IMAGES and apart((first, second), (own, its)):
+        if not {one, other} <= BY_IMAGES and abs(first - second) > JOINT_CLAIMS * float(np.hypot(own, its)):
             words = (
                 f"length {first:.2f} +- {1.96 * own:.2f} mm in mode {one}, {second:.2f} +- "
                 f"{1.96 * its:.2f} mm in {other} (95 %)"

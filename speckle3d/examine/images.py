@@ -17,6 +17,7 @@ from speckle3d.core.doubts import Doubt
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.sweep import Sweep
 from speckle3d.examine.curves import examine_curves
+from speckle3d.examine.readings import runs_of
 from speckle3d.examine.recording import unrefuted
 from speckle3d.matching.frames import MatchedSweep
 from speckle3d.matching.matcher import FrameMatcher
@@ -53,12 +54,10 @@ PATCH_LOST = 0.2
 """Share from which a patch is lost to what stands still; without, patches scatter by 0.02."""
 
 OUT_OF_TURN = 0.1
-"""By how much a frame must be less like the last one than like the one before that: ten times what the median
+"""By how much a frame must be less like the last one than like an earlier one: ten times what the median
 over fifty patches scatters by."""
 MOST_OUT_OF_TURN = 0.6
 """Share of such frames. A wobble of 3 Hz at 25 frames a second has a quarter of them, at its turns."""
-MOST_STRANGERS = 0.3
-"""Share of frames like neither of the last two, but like an earlier one."""
 
 ALIKE = (0.2, 0.9)
 """Median correlations between which distances are compared: more hides in noise, less in what stays."""
@@ -166,21 +165,17 @@ def undetermined(position_mm: FloatArray, sigma_mm: FloatArray, reach_mm: float)
 
 def interleaved(table: CorrelationTable, frames: int, least_correlation: float) -> Doubt | None:
     """Doubt a sweep whose frames resemble earlier ones more than the last: not recorded in this order."""
-    last, before = np.full((2, frames), np.nan)
-    for lag, median in (1, last), (2, before):
-        rows = table.second - table.first == lag
-        median[table.second[rows]] = table.median[rows]
-    known = np.isfinite(last) & np.isfinite(before) & ~table.unmatched(frames, least_correlation)
-    if known.sum() < 4:
+    last, before = np.full((2, frames), -1.0)
+    lag = table.second - table.first
+    for best, rows in ((last, lag == 1), (before, lag > 1)):
+        np.maximum.at(best, table.second[rows], table.median[rows])
+    known = (np.minimum(last, before) >= 0.0) & ~table.unmatched(frames, least_correlation)
+    swapped = float(np.mean(before[known] > last[known] + OUT_OF_TURN)) if known.sum() > 3 else 0.0
+    if swapped <= MOST_OUT_OF_TURN:
         return None
-    swapped = float(np.mean(before[known] > last[known] + OUT_OF_TURN))
-    strangers = float(np.mean(np.maximum(last, before)[known] < least_correlation))
-    if swapped <= MOST_OUT_OF_TURN and strangers <= MOST_STRANGERS:
-        return None
-    share, what = max((swapped, "the one before the last"), (strangers, "frames before the last two"))
     evidence = (
-        f"expected frames most like the one just before, got {share:.0%} of them ({int(known.sum())}) more "
-        f"like {what}"
+        f"expected frames most like the one just before, got {swapped:.0%} of them ({int(known.sum())}) more "
+        "like earlier ones"
     )
     return Doubt(IMAGES, "sweeps interleaved, or frames out of order", evidence, True)
 
@@ -293,13 +288,12 @@ def severed(first: IntArray, second: IntArray, usable: BoolArray) -> Doubt | Non
         Frames of the pairs that the trajectory was solved from.
     usable : ndarray of bool, shape (n,)
     """
-    spans = np.zeros(usable.size + 1, dtype=int)
-    np.add.at(spans, first + 1, 1)
-    np.add.at(spans, second + 1, -1)
-    open_before = np.flatnonzero(np.cumsum(spans)[:-1] == 0)
-    cuts = [k for k in open_before[open_before > 0].tolist() if usable[:k].any() and usable[k:].any()]
+    joined, sound = np.zeros(usable.size, dtype=bool), np.flatnonzero(usable)
+    for begin, end in zip(first.tolist(), second.tolist(), strict=True):
+        joined[begin + 1 : end + 1] = True
+    joined[: sound[0] + 1] = joined[sound[-1] + 1 :] = True
     # Lost frames are open on both sides; one cut at each run of them.
-    cuts = [k for k in cuts if k - 1 not in cuts]
+    cuts = [begin for begin, _ in runs_of(np.flatnonzero(~joined))]
     if not cuts:
         return None
     evidence = (

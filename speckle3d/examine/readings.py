@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -77,9 +77,9 @@ def without(sensor: Sensor, left_out: BoolArray) -> Sensor:
     keep = ~left_out
     readings = sensor.readings
     less = replace(readings, time_s=readings.time_s[keep], world_from_sensor=readings.world_from_sensor[keep])
-    names = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
-    vectors = {name: getattr(sensor, name, None) for name in names}
-    kept = {name: value[keep] for name, value in vectors.items() if value is not None}
+    kept: dict[str, Any] = {
+        name: value[keep] for name, value in vars(sensor).items() if isinstance(value, np.ndarray)
+    }
     return replace(sensor, readings=less, **kept)
 
 

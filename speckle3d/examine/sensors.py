@@ -94,10 +94,10 @@ def _doubts_of(sensor: OrientationSensor | Tracker, sweep: Sweep, image: RigidTr
 def cleaned_readings(sweep: Sweep) -> tuple[Sweep, tuple[Doubt, ...]]:
     """Leave out single wild readings, and count them and jumps."""
     doubts: list[Doubt] = []
-    if sweep.tracker is not None:
-        sweep = replace(sweep, tracker=_cleaned(sweep.tracker, sweep.frame_time_s, doubts))
-    if sweep.orientation is not None:
-        sweep = replace(sweep, orientation=_cleaned(sweep.orientation, sweep.frame_time_s, doubts))
+    for name in ("tracker", "orientation"):
+        sensor = getattr(sweep, name)
+        if sensor is not None:
+            sweep = replace(sweep, **{name: _cleaned(sensor, sweep.frame_time_s, doubts)})
     return sweep, tuple(doubts)
 
 

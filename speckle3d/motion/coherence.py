@@ -19,7 +19,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.stats import theilslopes
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
@@ -64,14 +63,6 @@ curve of another width, and tells no scale; of intensity, structure's share is l
 not count."""
 
 
-class CoherenceSettings(BaseModel):
-    """Whether structure and noise are adapted to."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    adapt: bool = Field(True, description="Adapt to coherent echoes and noise; false: phantom curves alone.")
-
-
 @dataclass(frozen=True)
 class RowScales:
     """Scale that each row of patches asks for, over that of the path.
@@ -102,7 +93,7 @@ class Coherence:
     scale_sigma : float
         Standard deviation of its logarithm.
     rows : RowScales or None
-        None if not adapted to the sweep.
+        None where too few distances tell them.
     """
 
     frame: FloatArray
@@ -285,7 +276,8 @@ def estimate_coherence(
     determined, of_echo = binned.determined, problem.at_patches.of_echo
     if not determined.any():
         return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=UNADAPTED_SIGMA)
-    most_share = MOST_SHARE["echo" if of_echo else "intensity"]
+    # Curves of tissue hold its structure.
+    most_share = 0.0 if problem.curves.of_tissue else MOST_SHARE["echo" if of_echo else "intensity"]
 
     def row_medians(values: FloatArray) -> FloatArray:
         by_piece = np.where(determined, values, np.nan).reshape(centres.size, -1)
@@ -318,6 +310,8 @@ def estimate_coherence(
     by_patch = _standard_error(left[clear], 0)
     errors = max(by_row, by_patch), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
+    if problem.curves.of_tissue:
+        return Coherence(np.zeros(1), *fully_developed(len(problem.patches)), scale_sigma=sigma)
     shape = centres.size, -1
     return Coherence(
         centres, share.reshape(shape), gain.reshape(shape), float(np.exp(log_scale)), sigma, rows

@@ -11,11 +11,10 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coherence
+from speckle3d.motion.coherence import Coherence, estimate_coherence
 from speckle3d.motion.lens import with_fitted_lens
 from speckle3d.motion.planes import (
     LEAST_CORRELATION,
@@ -126,43 +125,27 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
         If no pair determines a plane.
     """
     models = fully_developed(table.correlation.shape[1])
-    phantom = Coherence(np.zeros(1), *models)
     alike, determined = pair_planes(problem, table, alike_pairs(problem, table), models)
     path = likeliest_path(alike[determined], problem.frames, strangers(problem, table))
     sheet, tilt = problem.curves.nominal, problem.curves.tilt
-    lens_rounds = LENS_ROUNDS if problem.adapt and sheet and problem.curves.origin == "data sheet" else 0
+    lens_rounds = LENS_ROUNDS if sheet and problem.curves.origin == "data sheet" else 0
     for left in range(lens_rounds, -1, -1):
         # Tilt bends rows as a lens does: it is left out until the lens is known.
         problem = replace(problem, curves=replace(problem.curves, tilt=None if left else tilt))
-        coherence = estimate_coherence(problem, table, sound, path) if problem.adapt else phantom
         for _ in range(ROUNDS):
+            coherence = estimate_coherence(problem, table, sound, path)
             pairs = _signed_planes(problem, table, sound, path * coherence.scale, coherence)
             slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
             _, solved = _solved(problem, table, slopes.applied(pairs))
             path = elevation_of(solved.poses, problem.centre_mm)
-            coherence = estimate_coherence(problem, table, sound, path) if problem.adapt else phantom
+        coherence = estimate_coherence(problem, table, sound, path)
         if left and sheet and coherence.rows:
             path = path * coherence.scale
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
-    if not problem.adapt:
-        coherence = replace(phantom, scale_sigma=_disagreement(problem, table, pairs))
     slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
     pairs = pairs.scaled(coherence.scale)
     edges, solved = _solved(problem, table, slopes.applied(pairs), with_covariance=True)
     return Motion(problem, table, pairs, coherence, slopes, edges, solved.poses, solved.covariance)
-
-
-def _disagreement(problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes) -> float:
-    """Standard error of the scale of distances read as they are, by what rows of patches disagree."""
-    correlation = table.correlation[pairs.row]
-    distance, _ = patch_distances(problem, correlation, fully_developed(correlation.shape[1]))
-    offset, yaw, tilt = pairs.coefficients.T[:, :, None]
-    plane = np.abs(offset + yaw * problem.levers.lateral_mm + tilt * problem.levers.lever_mm)
-    with np.errstate(divide="ignore"):
-        logarithm = np.where(pairs.used, np.log(distance / plane), np.nan)
-    by_row = np.moveaxis(problem.patches.rows_of(logarithm), 1, 0)
-    rows = np.array([np.nanmedian(row) for row in by_row if np.isfinite(row).any()])
-    return float(np.hypot(CURVES_SIGMA, 1.2533 * robust_sigma(rows) / np.sqrt(rows.size)))
 
 
 def _solved(

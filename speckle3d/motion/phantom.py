@@ -158,11 +158,10 @@ def _fit_row(
 
 def _fitted_fall(grid: FloatArray, centre: FloatArray, rho: FloatArray, terms: int) -> FloatArray:
     """Rise of -ln(rho) with distance on `grid`: a polynomial in squared distance, then a straight line."""
-    reach, powers = centre[-1], 2 * np.arange(terms + 1)
-    design, weight = (centre[:, None] / reach) ** powers, rho / (1 - rho**2 + 0.01)
-    coefficients = np.linalg.lstsq(design * weight[:, None], -np.log(rho) * weight, rcond=None)[0]
-    coefficients[0] = max(coefficients[0], 1e-6)
-    fall = (np.minimum(grid, reach)[:, None] / reach) ** powers @ coefficients
+    reach = centre[-1]
+    coefficients = np.polyfit((centre / reach) ** 2, -np.log(rho), terms, w=rho / (1 - rho**2 + 0.01))
+    coefficients[-1] = max(coefficients[-1], 1e-6)
+    fall = np.polyval(coefficients, (np.minimum(grid, reach) / reach) ** 2)
     last = int(np.searchsorted(grid, reach, side="right")) - 1
     slope = max((fall[last] - fall[last - 5]) / (grid[1] * 5), 1e-3)
     fall = fall[np.minimum(np.arange(grid.size), last)] + slope * np.maximum(grid - grid[last], 0.0)
@@ -214,8 +213,7 @@ def _fit_tilt(
         )
         return np.asarray((rho - expected) / np.sqrt(variance))
 
-    starts = [np.append(np.zeros(design.shape[1] - 1), pivot_mm) for pivot_mm in (-8.0, 0.0, 8.0)]
-    fit = min((least_squares(misfit, start, loss="soft_l1") for start in starts), key=lambda f: float(f.cost))
+    fit = least_squares(misfit, np.zeros(design.shape[1]), loss="soft_l1")
     jacobian = np.asarray(fit.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian)
     deviation = np.sqrt(np.einsum("ri,ij,rj->r", design, covariance, design))

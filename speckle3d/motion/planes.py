@@ -91,8 +91,6 @@ class MotionProblem:
         Of the sweep.
     planes : PlaneSettings
     trajectory : TrajectorySettings
-    adapt : bool
-        Whether structure and noise are adapted to.
     """
 
     curves: DecorrelationCurves
@@ -101,7 +99,6 @@ class MotionProblem:
     frames: int
     planes: PlaneSettings
     trajectory: TrajectorySettings
-    adapt: bool = True
 
     @cached_property
     def at_patches(self) -> PatchCurves:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 from scipy.sparse import bsr_array
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import RigidTransform
@@ -120,9 +121,7 @@ def _marginals(normal: Any, frames: int) -> FloatArray:
         unit = np.zeros((6 * (frames - 1), 6))
         unit[own] = np.eye(6)
         blocks.append(normal.solve(unit)[own])
-    at = np.append(0, known)
-    columns = [np.interp(np.arange(frames), at, column) for column in np.reshape(blocks, (-1, 36)).T]
-    covariance = np.stack(columns, axis=1).reshape(frames, 6, 6)
+    covariance = make_interp_spline(np.append(0, known), np.array(blocks), k=1)(np.arange(frames))
     return np.asarray(covariance + covariance.transpose(0, 2, 1)) / 2
 
 

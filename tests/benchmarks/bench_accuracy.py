@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,11 +31,15 @@ from speckle3d.config import Config
 from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
+from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import Sweep
 from speckle3d.corrections import correct
 from speckle3d.io.load import load_sweep
-from speckle3d.motion import trajectory
+from speckle3d.motion import estimate, subset
+from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.direction import settle_direction
+from speckle3d.motion.planes import fully_developed
+from speckle3d.motion.trajectory import solve_trajectory
 from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.pipeline import track
 from speckle3d.scoring.lengths import accumulated, compare_modes
@@ -58,7 +62,6 @@ PARTS = ("x", "y", "z", "tilt", "yaw", "roll")
 
 PLAIN = {
     "matching": {"correlate": "intensity"},
-    "coherence": {"adapt": False},
     "planes": {"turn_deg_per_mm": 100.0},
 }
 METHODS: Mapping[str, dict[str, object]] = {
@@ -143,12 +146,28 @@ def align_sign(poses: RigidTransform, truth: RigidTransform, centre_mm: np.ndarr
     return poses[0] * mirrored(poses[0].inv() * poses)
 
 
+def of_phantom(problem, *_others) -> Coherence:
+    """Fully developed speckle, whatever the sweep shows."""
+    return Coherence(np.zeros(1), *fully_developed(len(problem.patches)))
+
+
+def chained(pairs: RelativePoses, *others, **named):
+    """Trajectory from each frame's surest pair alone."""
+    _, best = np.unique(pairs.second[order := np.argsort(pairs.covariance[:, 2, 2])], return_index=True)
+    columns = (pairs.first, pairs.second, pairs.poses, pairs.covariance)
+    return solve_trajectory(RelativePoses(*(column[order[best]] for column in columns)), *others, **named)
+
+
 def measure(case: Case, method: str, seed: int, curves: DecorrelationCurves, folder: Path) -> Result:
     """Reconstruct and score one sweep of a case."""
     sweep = load_sweep(simulated(_settings({"preset": case.preset, "seed": seed, **case.options}), folder))
     config = Config.model_validate(METHODS[method])
     pairs: list[FramePairs] = []
-    with patch.object(trajectory, "ROUNDS", 0) if method in CHAINED else nullcontext():
+    with ExitStack() as patches:
+        for module in (estimate, subset) if method in CHAINED else ():
+            patches.enter_context(patch.object(module, "solve_trajectory", chained))
+        if method == "plain":
+            patches.enter_context(patch.object(estimate, "estimate_coherence", of_phantom))
         tracked = track(sweep, curves, config, sink=pairs.append)
     centre = sweep.grid.centre_mm
     poses = {"image": align_sign(tracked.image, sweep.truth, centre)}

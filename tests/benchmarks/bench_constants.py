@@ -23,7 +23,7 @@ from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import track
 
-STAGES = ("coherence", "planes", "trajectory")
+STAGES = ("planes", "trajectory")
 NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
 """Modules of curves, which change no estimate."""
 

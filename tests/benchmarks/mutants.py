@@ -48,12 +48,11 @@ class Mutant:
     tests: str
 
 
-def unadapted(function, sweep, curves, config=None, **others):
-    from speckle3d.config import Config
+def unadapted(function, problem, *others):
+    from speckle3d.motion.coherence import Coherence
+    from speckle3d.motion.planes import fully_developed
 
-    config = config or Config()
-    off = config.coherence.model_copy(update={"adapt": False})
-    return function(sweep, curves, config.model_copy(update={"coherence": off}), **others)
+    return Coherence(np.zeros(1), *fully_developed(len(problem.patches)))
 
 
 def bent(function, sweep, curves, *others, **named):
@@ -122,8 +121,9 @@ def wrong_sign(function, *arguments, **named):
 
 
 TRACK, DIRECTION = "speckle3d.pipeline:track", "speckle3d.motion.direction:settle_direction"
+COHERENCE = "speckle3d.motion.coherence:estimate_coherence"
 MUTANTS = {
-    "tissue correction off": Mutant(TRACK, unadapted, "tilt and tissue and not independent"),
+    "tissue correction off": Mutant(COHERENCE, unadapted, "tilt and tissue and not independent"),
     "straightening as it is": Mutant(TRACK, bent, "tilt or length"),
     "claims halved": Mutant(TRACK, claimed(lambda tracked: tracked.covariance / 4.0), "claim"),
     "claim without the curves' part": Mutant(TRACK, claimed(without_curves), "claim"),

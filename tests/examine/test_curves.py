@@ -12,7 +12,6 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.examine.curves import (
     doubt_bend,
-    doubt_curves,
     doubt_size,
 )
 from speckle3d.examine.recording import doubt_depths, doubt_widths, unrefuted
@@ -97,12 +96,3 @@ def test_speckle_of_another_size_doubts_the_curves(seen, refuted):
 def test_noise_excuses_finer_speckle_but_not_coarser():
     assert doubt_size(scaled(0.7, 0.5), CURVES, PATCHES, 0.5 * CLEAR) == ()
     assert len(doubt_size(scaled(1.4, 1.6), CURVES, PATCHES, 0.5 * CLEAR)) == 2
-
-
-@pytest.mark.parametrize(
-    ("lateral", "by", "refuted"),
-    [(1.0, 0.0, []), (1.16, 0.0, [False]), (1.0, 0.25, [False]), (1.16, 0.25, [True, True])],
-)
-def test_two_independent_doubts_at_once_refute(lateral, by, refuted):
-    found = doubt_curves(scaled(lateral), bent(by), CURVES, PATCHES)
-    assert [d.refuted for d in found] == refuted

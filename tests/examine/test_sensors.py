@@ -49,8 +49,7 @@ REFUTED = (
 
 def doubts_of(sweep, tracked):
     examined = examined_sensors(sweep, tracked.image)
-    claims = tracked.covariance, tracked.scale_sigma
-    return examined, disagreements(examined.trusted, tracked.image, *claims)
+    return examined, disagreements(examined.trusted, tracked.image, tracked.covariance)
 
 
 def test_good_sensors_are_not_doubted(sweep, tracked):
