@@ -60,8 +60,8 @@ def compare(
     Other Parameters
     ----------------
     paper
-        The eleven sweeps of Housden 2008, simulated; tables beside theirs. Not with --drift or --reference
-        or --calibration or --config.
+        The eleven sweeps of Housden 2008, simulated; tables beside theirs. With --curves: of that probe, as
+        data/curves.h5. Not with --drift or --reference or --calibration or --config.
     workers
         Run in so many processes on this machine, instead of in one.
     scheduler
@@ -83,7 +83,7 @@ def compare(
         raise InvalidInputError("expected sweeps to compare, or --paper, one of them")
     table = ""
     with scheduler_for(scheduler, workers) as where, progress_bar("comparing") as bar:
-        if paper:
+        if curves_file is not None and paper:
             study, table = paper_study(
                 out, curves_file, where, bar, lambda n, total: note(f"{n} of {total} sweeps simulated")
             )

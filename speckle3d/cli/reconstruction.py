@@ -138,7 +138,7 @@ def reconstruct(
         )
     if as_json:
         emit((result.directory / "summary.json").read_text(encoding="utf-8"))
-        notes(result.summary.doubt_lines)
+        notes(result.summary.lines)
     else:
         emit(result.table)
     _tell(result)
@@ -162,7 +162,7 @@ def _write_volume(result: JobResult, sweep_file: Path, out: Path, mode: str | No
     posed = open_posed(result.directory / "reconstruction.h5", mode, sweep_file)
     notes(posed.notes())
     with progress_bar(f"compounding {out.name}"):
-        note(write_voxels(posed, VolumeRequest(out, settings.volume)).line)
+        note(write_voxels(posed, VolumeRequest(settings.volume), out).line)
 
 
 def _tell(result: JobResult) -> None:

@@ -23,7 +23,7 @@ from speckle3d.report import tables
 from speckle3d.report.data import SweepView, load_view
 from speckle3d.scoring.displacements import MEANINGS
 from speckle3d.study.figures import save_figure
-from speckle3d.study.overall import Row, counted, means_table
+from speckle3d.study.overall import Row, means_table
 from speckle3d.study.results import Study, SweepOutcome
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def _page(study: Study, overview: PageFigure | None, sections: Sequence[Section]
     keys, (intervals, paired) = ("name", "path", "sha256", "key", "seconds"), study.statistics
     drifts = {key for row in study.drift for key, value in row.items() if value is not None}
     return environment.get_template("page.html").render(
-        shown=counted(len(study.done) or len(study.broken), "sweep"),
+        shown=tables.counted(len(study.done) or len(study.broken), "sweep"),
         lead=tables.summary_lines(study),
         doubts=tables.records_table([_said(each) for each in study.doubts], (), anchors),
         broken=tables.records_table([each.record() for each in study.broken], ("name", "status", "reason")),

@@ -13,7 +13,6 @@ from speckle3d.study.figures import colour_of
 from speckle3d.study.overall import (
     ERRORS,
     Row,
-    counted,
     number,
     reference_words,
     told_apart,
@@ -24,6 +23,11 @@ from speckle3d.study.results import Study
 
 Table = Sequence[Sequence[str]]
 """Cells, the first line the heads; markup of our own is `Markup`."""
+
+
+def counted(count: int, what: str) -> str:
+    """Number and noun."""
+    return f"{count} {what}{'s' * (count != 1)}"
 
 
 def parts_table(rows: Sequence[Row], anchors: Mapping[str, str]) -> Table:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.signal import find_peaks
 from scipy.spatial.transform import RigidTransform
 from scipy.stats import theilslopes
 
@@ -145,7 +146,8 @@ def monotone_parts(length_mm: npt.ArrayLike) -> list[Part]:
     require_finite(length, "length_mm")
     width = min(JITTER_FRAMES, length.size)
     smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
-    edges = [0, *_turning_frames(smooth), length.size - 1]
+    turns = [find_peaks(sign * smooth, prominence=HYSTERESIS_MM)[0] for sign in (1, -1)]
+    edges = [0, *sorted(np.concatenate(turns).tolist()), length.size - 1]
     names = [("f", "r")[i % 2] + (str(i // 2 + 1) if i > 1 else "") for i in range(len(edges) - 1)]
     return [Part(name, a, b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)]
 
@@ -192,7 +194,8 @@ def compare_modes(
 
     >>> import numpy as np
     >>> import speckle3d as s3
-    >>> from scipy.spatial.transform import RigidTransform
+    >>> from scipy.signal import find_peaks
+    from scipy.spatial.transform import RigidTransform
     >>> along_z = np.outer(np.linspace(0, 10, 51), [0, 0, 1])
     >>> truth, image = (RigidTransform.from_translation(k * along_z) for k in (1.0, 1.05))
     >>> (row,) = s3.compare_modes({"image": image}, truth, centre_mm=[19, 20, 0], end_frames=1)
@@ -281,20 +284,3 @@ def _changes(motion: Accumulated, part: Part, end_frames: int) -> tuple[list[flo
     variance = _LINE_EXCESS * (4 * width - 2) / (width * (width + 1)) if width > 2 else 1.0
     jitter = 0.0 if end_frames == 1 else jitter_mm(motion.length_mm)
     return changes, jitter * float(np.sqrt(2.0 * variance))
-
-
-def _turning_frames(length: FloatArray) -> list[int]:
-    """Frames of the extremes after which `length` comes back by more than `HYSTERESIS_MM`."""
-    turns: list[int] = []
-    highest = lowest = 0
-    direction = 0
-    for i, value in enumerate(length):
-        highest = i if value > length[highest] else highest
-        lowest = i if value < length[lowest] else lowest
-        if direction >= 0 and length[highest] - value > HYSTERESIS_MM:
-            turns += [highest] if direction else []
-            direction, lowest = -1, i
-        elif direction <= 0 and value - length[lowest] > HYSTERESIS_MM:
-            turns += [lowest] if direction else []
-            direction, highest = 1, i
-    return turns

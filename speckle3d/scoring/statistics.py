@@ -13,8 +13,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from speckle3d.core.errors import InsufficientDataError
-
 FEWEST = 3
 """Sweeps that an interval needs: below, a bootstrap only repeats the values themselves."""
 
@@ -38,50 +36,27 @@ class MeanInterval:
 def mean_interval(values: npt.ArrayLike) -> MeanInterval:
     """Mean of one value per sweep, with its 95 % percentile bootstrap interval [1]_; seeded, so it repeats.
 
-    NaN stands for a sweep without a value and is left out.
-
-    Raises
-    ------
-    InsufficientDataError
-        If no sweep has a value.
-
     References
     ----------
     .. [1] B. Efron and R. J. Tibshirani, "An Introduction to the Bootstrap", 1993, chapter 13.
     """
-    present = np.asarray(values, dtype=float)
-    present = present[np.isfinite(present)]
-    if not present.size:
-        raise InsufficientDataError("statistics over sweeps: expected at least one value, got none")
-    low = high = None
-    if present.size >= FEWEST and np.ptp(present) > 0:
+    sample, low, high = np.asarray(values, dtype=float), None, None
+    if sample.size >= FEWEST and np.ptp(sample) > 0:
         rng = np.random.default_rng(_SEED)
-        bootstrap = stats.bootstrap((present,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=rng)
+        bootstrap = stats.bootstrap((sample,), np.mean, n_resamples=_RESAMPLES, method="percentile", rng=rng)
         low, high = map(float, bootstrap.confidence_interval)
-    return MeanInterval(present.size, float(present.mean()), low, high)
+    return MeanInterval(sample.size, float(sample.mean()), low, high)
 
 
-def paired_comparison(first: npt.ArrayLike, second: npt.ArrayLike) -> tuple[MeanInterval, float | None]:
-    """Compare two modes by their differences, sweep by sweep; sweeps that lack either are left out.
+def signed_rank_p(differences: npt.ArrayLike) -> float | None:
+    """Wilcoxon's two-sided signed-rank test of differences, sweep by sweep, of two modes.
 
-    Returns
-    -------
-    difference : MeanInterval
-        Of the first mode's values less the second's.
-    wilcoxon_p : float or None
-        Two-sided signed-rank test; None where `difference` has no interval. With n sweeps it cannot be below
-        2 / 2**n, so that five sweeps never reach 0.05.
-
-    Raises
-    ------
-    InsufficientDataError
-        If no sweep has both values.
+    None where they are too few or all alike. With n sweeps it cannot be below 2 / 2**n, so that five sweeps
+    never reach 0.05.
     """
-    differences = np.asarray(first, dtype=float) - np.asarray(second, dtype=float)
-    mean = mean_interval(differences)
-    if mean.low is None:
-        return mean, None
-    return mean, float(stats.wilcoxon(differences[np.isfinite(differences)]).pvalue)
+    sample = np.asarray(differences, dtype=float)
+    enough = sample.size >= FEWEST and np.ptp(sample) > 0
+    return float(stats.wilcoxon(sample).pvalue) if enough else None
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:

@@ -75,22 +75,6 @@ class PoseError:
         return cls(*(float(v) for e in sizes for v in (np.sqrt(np.mean(e**2)), e.mean(), e.max())))
 
 
-def absolute_pose_error(poses: RigidTransform, reference: RigidTransform) -> PoseError:
-    """APE: the poses of ``T_i^-1 T^_i``, with the first frames laid on each other, over all frames.
-
-    References
-    ----------
-    .. [1] M. Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
-    """
-    estimate, true = (each[0].inv() * each for each in (poses, reference))
-    return PoseError.of(true.inv() * estimate)
-
-
-def relative_pose_error(poses: RigidTransform, reference: RigidTransform) -> PoseError:
-    """RPE: the poses of ``t_i^-1 t^_i`` from each frame to the next, over all steps."""
-    return PoseError.of(relative_poses(reference).inv() * relative_poses(poses))
-
-
 def kind_of(path: Path) -> str:
     """Kind of a file by its content: "reconstruction", "sweep" or "text" (anything unknown)."""
     try:
@@ -180,15 +164,19 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     -------
     dict
         ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, how they were matched
-        (``association``) and laid on each other (``alignment``), ``same_sweep``
-        (whether both are of the same bytes, None where a file does not say), ``APE`` and ``RPE`` as
-        `PoseError`, what `speckle3d.scoring.displacements.score_row` gives, and the TUS-REC ``score``, None
-        without landmarks.
+        (``association``) and laid on each other (``alignment``), ``same_sweep`` (whether both are of the same
+        bytes, None where a file does not say), as `PoseError` [1]_ ``APE``, of poses with the first frames
+        laid on each other, and ``RPE``, from each frame to the next, what
+        `speckle3d.scoring.displacements.score_row` gives, and the TUS-REC ``score``, None without landmarks.
 
     Raises
     ------
     MismatchError
         If the two share fewer than two times, or their images differ in size.
+
+    References
+    ----------
+    .. [1] M. Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
     """
     grid = estimate.grid or reference.grid
     if estimate.grid and reference.grid and estimate.grid != reference.grid:
@@ -213,8 +201,8 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
         "association": "the reference interpolated at the estimate's times",
         "alignment": "first poses on each other, lengths as they are",
         "same_sweep": of[0] == of[1] if all(of) else None,
-        "APE": absolute_pose_error(estimated, true),
-        "RPE": relative_pose_error(estimated, true),
+        "APE": PoseError.of((true[0].inv() * true).inv() * (estimated[0].inv() * estimated)),
+        "RPE": PoseError.of(relative_poses(true).inv() * relative_poses(estimated)),
         **errors,
         "score": score,
     }

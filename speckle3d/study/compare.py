@@ -17,20 +17,16 @@ from importlib.metadata import version
 from pathlib import Path
 
 from speckle3d.config import Config, config_from_toml
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Speckle3DError
+from speckle3d.core.errors import InsufficientDataError, Speckle3DError
 from speckle3d.core.printable import printable
 from speckle3d.core.progress import Progress
-from speckle3d.correction.modes import DRIFT_MODES
 from speckle3d.io.calibrations import apply_calibrations
 from speckle3d.io.curves import read_curves
 from speckle3d.io.hdf5 import make_folder, one_line, sha256_of
 from speckle3d.io.load import load_sweep, recording_sha256
-from speckle3d.scoring.references import require_reference
-from speckle3d.study.job import RESULTS, SUBSET, available_modes, run_job
+from speckle3d.study.job import RESULTS, available_modes, run_job
 from speckle3d.study.results import FILES, Study, SweepOutcome, read_summary, require_own, write_study
 from speckle3d.study.schedulers import Scheduler
-
-KNOWN_MODES = ("image", SUBSET, *DRIFT_MODES)
 
 
 @dataclass(frozen=True)
@@ -145,14 +141,7 @@ def compare_sweeps(
     FileError
         If the folder cannot be written.
     """
-    if not paths:
-        raise InvalidInputError("expected at least one sweep, got none")
     chosen = None if modes is None else tuple(dict.fromkeys(modes))
-    # What is wrong for one sweep is wrong for all: refused before any work is done.
-    for mode in chosen or ():
-        if mode not in KNOWN_MODES:
-            raise InvalidInputError(f"expected a mode among {', '.join(KNOWN_MODES)}; got {mode!r}")
-    require_reference(reference)
     require_own(directory, FILES)
     if curves is not None:
         read_curves(curves)
@@ -169,10 +158,8 @@ def compare_sweeps(
     # The longest first, so that no worker is left with it while the others have nothing to do.
     todo = sorted((each for each in outcomes.values() if each.folder), key=lambda each: -each.frames)
     if not todo:
-        one = next(iter(outcomes.values()))
-        raise InsufficientDataError(
-            f"expected a sweep that can be compared, got none of {len(outcomes)}; {one.name}: {one.reason}"
-        )
+        why = "; ".join(f"{each.name}: {each.reason}" for each in outcomes.values())
+        raise InsufficientDataError(f"expected a sweep that can be compared, got none: {why or 'no file'}")
     make_folder(directory / "sweeps")
     done, total, tell = 0, sum(each.frames for each in todo), progress or (lambda done, total: None)
     tell(done, total)

@@ -7,10 +7,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from speckle3d.core.doubts import Doubt
-from speckle3d.core.reconstruction import ModeErrors, Provenance, Trust
+from speckle3d.core.reconstruction import Provenance
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.drift import DriftCorrection
 from speckle3d.correction.modes import sensor_of
@@ -73,12 +71,6 @@ def details_of(
     }
 
 
-def trust_of(tracked: Tracked, corrections: Mapping[str, Correction]) -> Trust:
-    """What a reconstruction's file says of its poses' errors."""
-    modes = {mode: ModeErrors(each.covariance, each.length_sigma) for mode, each in corrections.items()}
-    return Trust(tracked.covariance, tracked.flags, tracked.shared, modes)
-
-
 def _correction_details(correction: Correction) -> dict[str, Any]:
     if not isinstance(correction, DriftCorrection):
         return {
@@ -87,12 +79,8 @@ def _correction_details(correction: Correction) -> dict[str, Any]:
             "rests_on": [each.source for each in correction.evidence],
             **correction.details,
         }
-    fit = correction.fit
     return {
         "curves": correction.settings.curves,
         "coverage": correction.coverage,
-        "rms": float(np.sqrt(np.mean(fit.fun**2))),
-        "evaluations": int(fit.nfev),
-        "converged": bool(fit.success),
-        "parameters": dict(zip(correction.names, fit.x.tolist(), strict=True)),
+        "parameters": dict(zip(correction.names, correction.fit.x.tolist(), strict=True)),
     }

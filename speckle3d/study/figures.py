@@ -8,12 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from speckle3d.core.arrays import IntArray
 from speckle3d.core.printable import printable
@@ -93,18 +89,6 @@ def name_figure(figure: Figure, title: str) -> None:
     """Put a name over a figure as it is, on one line: a dollar in the name of a file begins no formula."""
     letters = max(1.0, len(title) * 0.11 / figure.get_figwidth())
     figure.suptitle(printable(title), parse_math=False, fontsize=12 / letters)
-
-
-def show_grey(
-    axes: Axes,
-    image: npt.NDArray[np.floating],
-    extent_mm: tuple[float, float, float, float],
-    levels: tuple[float, float],
-) -> AxesImage:
-    """Draw an image in grey from the first of the levels (black) to the second; blue-grey where it is NaN."""
-    greys = colormaps["gray"].with_extremes(bad=UNSEEN)
-    return axes.imshow(image, cmap=greys, vmin=levels[0], vmax=levels[1], aspect="equal", extent=extent_mm,
-                       interpolation="nearest")  # fmt: skip
 
 
 def save_figure(figure: Figure, path: Path, words: Mapping[str, str] | None = None) -> Path:

@@ -18,7 +18,14 @@ from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InsufficientDataError, MismatchError
 from speckle3d.core.printable import written_path
 from speckle3d.core.progress import Progress, after
-from speckle3d.core.reconstruction import FramePairs, Provenance, Reconstruction, SourceFile
+from speckle3d.core.reconstruction import (
+    FramePairs,
+    ModeErrors,
+    Provenance,
+    Reconstruction,
+    SourceFile,
+    Trust,
+)
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.correction.crossing.pair import CrossedPair, crossed
@@ -45,7 +52,7 @@ from speckle3d.scoring.references import (
     sweep_curves,
     tracker_alone,
 )
-from speckle3d.study.details import details_of, doubted_modes, trust_of
+from speckle3d.study.details import details_of, doubted_modes
 from speckle3d.study.figures import RANGE_DB, figure_drift, save_figure
 from speckle3d.study.images import GreyImages
 from speckle3d.study.posed import OpenedModes, PosedSweep, pose_mark
@@ -174,7 +181,8 @@ def run_job(
             second_file,
             import_record(source),
         )
-        trust = trust_of(tracked, corrections)
+        errors = {mode: ModeErrors(each.covariance, each.length_sigma) for mode, each in corrections.items()}
+        trust = Trust(tracked.covariance, tracked.flags, tracked.shared, errors)
         made = Reconstruction(
             sweep.frame_time_s, sweep.grid, poses, provenance, settings.to_toml(), trust=trust
         )
@@ -182,13 +190,8 @@ def run_job(
         # The tracker alone is shown beside the modes, but is none of the reconstruction's.
         trusted = believed(sweep, tracked.doubts)
         alone, centre = tracker_alone(trusted), sweep.grid.centre_mm
-        if (
-            reference is None
-            and compared is not None
-            and compared.name == TRACKER
-            and trusted.tracker is None
-        ):
-            compared = None
+        if reference is None and trusted.tracker is None:
+            compared = find_reference(trusted)
         every = poses if alone is None else {**poses, TRACKER: alone}
         shown, last = dict(every), "image"
         if compared is not None and compared.covered.all():

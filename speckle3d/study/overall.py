@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.tables import text_table
 from speckle3d.scoring.displacements import MEANINGS
-from speckle3d.scoring.statistics import FEWEST, holm, mean_interval, paired_comparison
+from speckle3d.scoring.statistics import FEWEST, holm, mean_interval, signed_rank_p
 
 LEVEL = 0.05
 
@@ -85,30 +84,30 @@ def over_sweeps(
     for quantity in QUANTITIES:
         values = _by_mode(quantity, rows if quantity in ERRORS else drift)
         for mode, each in values.items():
-            intervals.append({"quantity": quantity, "mode": mode, **asdict(mean_interval(each))})
+            intervals.append({"quantity": quantity, "mode": mode, **asdict(mean_interval([*each.values()]))})
         paired += _pairs(quantity, values)
     return intervals, paired
 
 
-def overall_text(
-    intervals: Sequence[Row], paired: Sequence[Row], references: Mapping[str, str] | None = None
-) -> str:
+def overall_text(intervals: Sequence[Row], paired: Sequence[Row], references: Mapping[str, str]) -> str:
     """Table of means and intervals, what they are, and the modes that are told apart; empty without any.
 
     Parameters
     ----------
-    references : mapping of str to str, optional
+    references : mapping of str to str
         What each sweep was compared with.
     """
     if not intervals:
         return ""
-    lines = text_table(means_table(intervals), (0, 1, 2)).splitlines()
-    lines.append("[..]: 95 % interval over sweeps, by bootstrap")
     shown = {row["quantity"] for row in intervals}
-    lines += [f"{key.partition('_')[0]}: {words}" for key, words in MEANINGS.items() if key in shown]
-    lines += [line for text in told_apart(paired) for line in _wrapped(text)]
-    lines += _wrapped(reference_words({row["mode"] for row in intervals}, references or {}))
-    return "\n".join(lines) + "\n"
+    words = [
+        "[..]: 95 % interval over sweeps, by bootstrap",
+        *(f"{key.partition('_')[0]}: {meaning}" for key, meaning in MEANINGS.items() if key in shown),
+        *told_apart(paired),
+        reference_words({row["mode"] for row in intervals}, references),
+    ]
+    filled = (textwrap.fill(each, 100, subsequent_indent="  ") for each in words if each)
+    return text_table(means_table(intervals), (0, 1, 2)) + "".join(f"{each}\n" for each in filled)
 
 
 def means_table(intervals: Sequence[Row]) -> list[list[str]]:
@@ -136,11 +135,6 @@ def told_apart(paired: Sequence[Row]) -> list[str]:
     return [*apart, f"(told apart sweep by sweep: signed-rank p <= {LEVEL:g} after Holm's correction)"]
 
 
-def counted(count: int, what: str) -> str:
-    """Number and noun."""
-    return f"{count} {what}{'s' * (count != 1)}"
-
-
 def reference_words(modes: Collection[str], references: Mapping[str, str]) -> str:
     """What the sweeps were compared with, and which mode was fitted to it; empty without any reference."""
     names = sorted({*references.values()} - {"none"})
@@ -152,31 +146,25 @@ def reference_words(modes: Collection[str], references: Mapping[str, str]) -> st
     return words
 
 
-def _wrapped(text: str) -> list[str]:
-    return textwrap.wrap(text, 100, subsequent_indent="  ")
-
-
-def _by_mode(quantity: str, rows: Sequence[Row]) -> dict[str, FloatArray]:
-    """One value per sweep, NaN where a mode has none; modes of fewer than `FEWEST` sweeps are left out."""
-    sweeps, modes = (list(dict.fromkeys(row[key] for row in rows)) for key in ("sweep", "mode"))
-    sizes: dict[tuple[str, str], list[float]] = {}
+def _by_mode(quantity: str, rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """Mean magnitude by mode and sweep; modes of fewer than `FEWEST` sweeps are left out."""
+    sizes: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         value = row.get(quantity)
         if value is not None and np.isfinite(value):
-            sizes.setdefault((row["mode"], row["sweep"]), []).append(abs(value))
-    by_mode = {m: np.array([np.mean(sizes.get((m, s), [np.nan])) for s in sweeps]) for m in modes}
-    return {mode: each for mode, each in by_mode.items() if np.isfinite(each).sum() >= FEWEST}
+            sizes.setdefault(row["mode"], {}).setdefault(row["sweep"], []).append(abs(value))
+    means = {m: {s: float(np.mean(each)) for s, each in some.items()} for m, some in sizes.items()}
+    return {mode: some for mode, some in means.items() if len(some) >= FEWEST}
 
 
-def _pairs(quantity: str, values: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
+def _pairs(quantity: str, values: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for one, other in combinations(values, 2):
-        if np.isfinite(values[one] - values[other]).sum() < FEWEST:
-            continue
-        difference, wilcoxon_p = paired_comparison(values[one], values[other])
-        row = {"quantity": quantity, "mode": one, "against": other, **asdict(difference)}
-        row["difference"] = row.pop("mean")
-        rows.append(row | {"wilcoxon_p": wilcoxon_p})
+    for (one, first), (other, second) in combinations(values.items(), 2):
+        differences = [first[sweep] - second[sweep] for sweep in first if sweep in second]
+        if len(differences) >= FEWEST:
+            found = asdict(mean_interval(differences))
+            found |= {"difference": found.pop("mean"), "wilcoxon_p": signed_rank_p(differences)}
+            rows.append({"quantity": quantity, "mode": one, "against": other, **found})
     for row, corrected in zip(rows, holm([row["wilcoxon_p"] for row in rows]), strict=True):
         row["holm_p"] = corrected
         apart = corrected is not None and corrected <= LEVEL and not row["low"] <= 0 <= row["high"]

@@ -29,12 +29,10 @@ from speckle3d.core.progress import Progress
 from speckle3d.core.streams import TimedRotations
 from speckle3d.core.sweep import OrientationSensor, Sweep
 from speckle3d.core.tables import text_table
-from speckle3d.io.curves import write_curves
 from speckle3d.io.hdf5 import make_folder
 from speckle3d.io.load import load_sweep
 from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.phantom_curves import calibrate_curves
 from speckle3d.scoring.lengths import TRACKER, ModeError
 from speckle3d.scoring.references import error_rows, find_reference, tracker_alone
 from speckle3d.scoring.statistics import mean_interval
@@ -55,15 +53,6 @@ SWEEPS: Mapping[str, SimulationSettings] = {
 """By data set. The published sweeps of beef are 1.5 to 4 mm long; these are 10 and 20 mm, in which the
 tracker's jitter of 0.15 mm is less than one per cent."""
 
-_STEPPED = SimulationSettings(preset="stepped", vectors=48, steps=27, step_mm=0.06, blocks=6)
-CURVE_SWEEPS: Mapping[str, SimulationSettings] = {
-    **{f"stepped-{k}": _STEPPED.model_copy(update={"seed": k}) for k in (11, 12, 13)},
-    **{f"turning-{k}": _TURNING.model_copy(update={"seed": k}) for k in (14, 15)},
-    "turning-16": _TURNING.model_copy(update={"seed": 16, "turn_deg": 20.0, "length_mm": 2.0, "frames": 160}),
-}
-"""Phantom sweeps, of other seeds, from which decorrelation curves are measured if none are given."""
-
-
 QUANTITIES = ("length_error_percent", "tilt_error_deg")
 MODES = ("image", "pose", "orientation")
 """In the order of the paper's tables 3 and 4: image-based, six DOF correction, orientation correction."""
@@ -71,8 +60,8 @@ MODES = ("image", "pose", "orientation")
 Rows = Mapping[str, Mapping[str, Sequence[ModeError]]]
 """Errors by reference, then by data set."""
 
-_Input = tuple[Path, SimulationSettings, bool]
-"""File of a sweep to be simulated, its settings, and whether its orientation is the tracker's."""
+_Input = tuple[Path, SimulationSettings]
+"""File of a sweep to be simulated, and its settings."""
 
 
 def published() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
@@ -91,7 +80,7 @@ def published() -> dict[tuple[str, str], dict[str, tuple[float, float]]]:
 
 def paper_study(
     directory: Path,
-    curves: Path | None = None,
+    curves: Path,
     scheduler: Scheduler | None = None,
     progress: Progress | None = None,
     simulated: Progress | None = None,
@@ -103,8 +92,8 @@ def paper_study(
 
     Parameters
     ----------
-    curves : path, optional
-        Decorrelation curves of the simulated probe; by default they are measured, which takes as long again.
+    curves : path
+        Decorrelation curves of the simulated probe.
     simulated : callable, optional
         Called with the number of sweeps simulated and their total.
 
@@ -121,33 +110,22 @@ def paper_study(
         If a sweep cannot be simulated.
     """
     where, tell = scheduler or Scheduler(), simulated or (lambda done, total: None)
-    wanted = SWEEPS if curves is not None else {**SWEEPS, **CURVE_SWEEPS}
-    settings = "".join(each.model_dump_json() for each in {**SWEEPS, **CURVE_SWEEPS}.values())
+    settings = "".join(each.model_dump_json() for each in SWEEPS.values())
     key = hashlib.sha256(f"{settings}{version('speckle3d')}".encode()).hexdigest()[:8]
-    inputs = {name: directory / "inputs" / key / f"{name}.h5" for name in wanted}
-    make_folder(directory / "inputs" / key)
-    missing = [(path, wanted[name], name in SWEEPS) for name, path in inputs.items() if not path.is_file()]
-    tell(len(inputs) - len(missing), len(inputs))
-    for done, _ in enumerate(where.run(_write_input, missing, _lost), len(inputs) - len(missing) + 1):
-        tell(done, len(inputs))
-    if curves is None:
-        curves = directory / "inputs" / key / "curves.h5"
-        if not curves.is_file():
-            write_curves(curves, calibrate_curves([load_sweep(inputs[name]) for name in CURVE_SWEEPS]))
-    paths = [inputs[name] for name in SWEEPS]
+    folder = directory / "inputs" / key
+    make_folder(folder)
+    paths = [folder / f"{name}.h5" for name in SWEEPS]
+    missing = [each for each in zip(paths, SWEEPS.values(), strict=True) if not each[0].is_file()]
+    tell(len(paths) - len(missing), len(paths))
+    for done, _ in enumerate(where.run(_write_input, missing, _lost), len(paths) - len(missing) + 1):
+        tell(done, len(paths))
     study = compare_sweeps(paths, directory, None, TRACKER, curves, scheduler=where, progress=progress)
     rows: Rows = {
         TRACKER: {each.sweep: each.rows for each in study.summaries},
         "truth": {each.name: _against_truth(study.directory, each) for each in study.done},
     }
     table = text_beside(rows)
-    records = [
-        {"reference": name, "sweep": sweep, **asdict(row)}
-        for name, by_sweep in rows.items()
-        for sweep, some in by_sweep.items()
-        for row in some
-    ]
-    numbers = json_text({"means": beside(rows), "rows": records})
+    numbers = json_text({"means": beside(rows), "rows": rows})
     write_texts(directory, {"paper.txt": table, "paper.json": numbers})
     return study, table
 
@@ -182,12 +160,11 @@ def beside(rows: Rows) -> list[dict[str, Any]]:
 def text_beside(rows: Rows) -> str:
     """Both tables, part by part, published | ours, and the means of absolute errors below.
 
-    The first reference's errors are listed part by part.
+    Of ours, the errors against the tracker are listed part by part.
     """
-    first = next(iter(rows))
     lines = [["data set", *(f"{mode} {unit}" for unit in ("%", "°") for mode in MODES)]]
     for (name, part), theirs in published().items():
-        ours = {row.mode: _error(row) for row in rows[first].get(name, ()) if row.part == part}
+        ours = {row.mode: _error(row) for row in rows[TRACKER].get(name, ()) if row.part == part}
         cells = [
             " | ".join(
                 number(key, each[mode][k], signed=True) if mode in each else "-" for each in (theirs, ours)
@@ -203,7 +180,7 @@ def text_beside(rows: Rows) -> str:
     ]
     return (
         "Errors of length (%) and tilt (°), published (Housden 2008, tables 3 and 4) | simulated, against "
-        f"the {first}.\nThe published sweeps of beef are 1.5 to 4 mm long, these 10 or 20 mm.\n\n"
+        "the tracker.\nThe published sweeps of beef are 1.5 to 4 mm long, these 10 or 20 mm.\n\n"
         f"{text_table(lines)}\n{text_table(means, (0, 1, 2, 3))}"
     )
 
@@ -214,10 +191,9 @@ def _error(row: ModeError) -> tuple[float, float]:
 
 def _write_input(job: _Input) -> None:
     """Simulate one sweep into its file."""
-    path, settings, as_published = job
+    path, settings = job
     made = simulate(settings)[0]
-    sweep = _with_tracked_orientation(made.sweep) if as_published else made.sweep
-    write_sweep(path, sweep, simulation=made.description())
+    write_sweep(path, _with_tracked_orientation(made.sweep), simulation=made.description())
 
 
 def _lost(job: _Input, reason: str) -> None:

@@ -16,7 +16,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic_core import to_json
 
 from speckle3d.core.doubts import Doubt
@@ -91,16 +90,12 @@ class Summary:
     drift: Sequence[Mapping[str, Any]] = ()
 
     @property
-    def doubt_lines(self) -> list[str]:
-        """What a reader must know of the recording, a line each."""
-        lines = [f"{self.sweep}: {doubt.consequence}" for doubt in self.doubts]
-        return lines + [f"{self.sweep}: mode {mode} is left out" for mode in self.left_out]
-
-    @property
     def lines(self) -> list[str]:
-        """What stands below the table: doubts, and remarks on rows."""
-        remarks = {f"{row.mode}: {self.remark(row)}": None for row in self.rows if self.remark(row)}
-        return [*self.doubt_lines, *(f"{self.sweep}: {each}" for each in remarks)]
+        """What stands below the table: doubts, modes left out, and remarks on rows."""
+        remarks = dict.fromkeys(f"{row.mode}: {self.remark(row)}" for row in self.rows if self.remark(row))
+        left_out = (f"mode {mode} is left out" for mode in self.left_out)
+        words = (*(doubt.consequence for doubt in self.doubts), *left_out, *remarks)
+        return [f"{self.sweep}: {each}" for each in words]
 
     def remark(self, row: ModeError) -> str:
         """What a reader of a row must know beside its numbers; empty for nothing."""
@@ -264,12 +259,10 @@ def write_study(study: Study) -> None:
         "intervals": intervals,
         "paired": paired,
     }
-    paths = {each.name: each.path for each in study.outcomes}
-    lines = [row | {"path": paths[row["sweep"]]} for row in study.rows]
-    lines += [{"sweep": each.name, "path": each.path, "reason": each.reason} for each in study.broken]
+    lines = [*study.rows, *({"sweep": each.name, "reason": each.reason} for each in study.broken)]
     texts = {"study.json": json_text(contents), "table.txt": study.table}
     with FILES.replaced(study.directory) as part:
-        write_texts(part, texts | {"table.csv": csv_text(lines, "path", "reason")})
+        write_texts(part, texts | {"table.csv": csv_text(lines, "reason")})
 
 
 def require_own(directory: Path, files: FileSet) -> None:
@@ -289,17 +282,8 @@ def require_own(directory: Path, files: FileSet) -> None:
 
 
 def json_text(value: Any) -> str:
-    """Dataclasses, arrays and numbers as strict JSON in ASCII: a value that is not finite becomes null.
-
-    Raises
-    ------
-    InvalidInputError
-        If there is anything else in it.
-    """
-    try:
-        text = to_json(value, inf_nan_mode="null", fallback=_listed)
-    except ValueError as error:
-        raise InvalidInputError(f"summary: expected what JSON can hold: {error}") from error
+    """Dataclasses, arrays and numbers as strict JSON in ASCII: a value that is not finite becomes null."""
+    text = to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist())
     return f"{json.dumps(json.loads(text), indent=2)}\n"
 
 
@@ -322,10 +306,3 @@ def write_texts(directory: Path, texts: Mapping[str, str]) -> list[Path]:
         with atomic_path(directory / name) as part:
             part.write_text(text, encoding="utf-8")
     return [directory / name for name in texts]
-
-
-def _listed(value: Any) -> Any:
-    """Arrays and NumPy scalars as lists and numbers of Python's own, for `to_json`."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise ValueError(f"got {type(value)}")

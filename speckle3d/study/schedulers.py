@@ -10,8 +10,7 @@ import importlib
 import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -45,41 +44,23 @@ class Scheduler:
     def run(
         self, function: Callable[[Job], Result], jobs: Sequence[Job], lost: Callable[[Job, str], Result]
     ) -> Iterator[Result]:
-        """Yield the result of each job as it comes; of a job whose worker died what `lost` makes of it.
-
-        A process that dies takes the whole pool with it: its jobs are tried again, each in a process of its
-        own, which shows the one that was the cause.
-        """
+        """Yield the result of each job as it comes; of one whose worker dies what `lost` makes of it."""
         if self.client is None and self.workers == 1:
             yield from map(function, jobs)
             return
-        again = []
-        with self._executor() as executor:
-            futures = {executor.submit(_alone, function, job): job for job in jobs}
+        # Not pure: a job's key must not be taken for that of an earlier study that is still held.
+        threads = self.client is None and ThreadPoolExecutor(self.workers)
+        call = _in_process if threads else _alone
+        with threads or self.client.get_executor(pure=False) as executor:
+            futures = {executor.submit(call, function, job): job for job in jobs}
             try:
                 for future in as_completed(futures):
-                    job, error = futures[future], future.exception()
-                    if error is None:
-                        yield future.result()
-                    elif isinstance(error, BrokenProcessPool) and len(jobs) > 1:
-                        again.append(job)
-                    else:
-                        died = "its worker died: killed, crashed or out of memory"
-                        yield lost(job, died if isinstance(error, BrokenProcessPool) else one_line(error))
+                    error = future.exception()
+                    died = error and f"its worker died or failed: {one_line(error)}"
+                    yield lost(futures[future], died) if died else future.result()
             finally:
                 for future in futures:
                     future.cancel()
-        for job in again:
-            yield from self.run(function, [job], lost)
-
-    def _executor(self) -> Any:
-        if self.client is not None:
-            # Not pure: a job's key must not be taken for that of an earlier study that is still held.
-            return self.client.get_executor(pure=False)
-        # Spawned: threads of this process, which a fork would not take along, may hold locks. Ctrl-C, which a
-        # terminal sends to every process, ends a worker without a traceback.
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self.workers, context, signal.signal, (signal.SIGINT, signal.SIG_DFL))
 
 
 @contextmanager
@@ -109,6 +90,15 @@ def scheduler_for(address: str | None, workers: int | None) -> Iterator[Schedule
         if not client.nthreads():
             raise FileError(f"{address}: expected workers on the cluster, got none")
         yield Scheduler(client=client)
+
+
+def _in_process(function: Callable[[Job], Result], job: Job) -> Result:
+    """Run a job in a process of its own, which takes no other with it if it dies."""
+    # Spawned: threads of this process, which a fork would not take along, may hold locks. Ctrl-C, which a
+    # terminal sends to every process, ends it without a traceback.
+    context, quiet = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_DFL)
+    with ProcessPoolExecutor(1, context, signal.signal, quiet) as process:
+        return process.submit(_alone, function, job).result()
 
 
 def _alone(function: Callable[[Job], Result], job: Job) -> Result:

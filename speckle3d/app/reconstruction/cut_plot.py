@@ -70,7 +70,7 @@ class CutPlot:
         """Show a cut at the poses of one mode, or of another (magenta) laid over it (green)."""
         drawn = picture.cuts[mode]
         assert isinstance(drawn.cut, ReslicePlane)  # only along a curve there is another kind
-        low, high = picture.levels or (0.0, 255.0)
+        low, high = picture.levels
         if other is None:
             greys = colormaps["gray"].with_extremes(bad=UNSEEN)
             colours = greys(np.clip((drawn.image - low) / (high - low), 0.0, 1.0), bytes=True)

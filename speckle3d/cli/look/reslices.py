@@ -9,7 +9,6 @@ from speckle3d.cli.calibrations import files_of, given_settings
 from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Paths, notes
 from speckle3d.cli.look.volumes import Imported, region_of
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -38,7 +37,6 @@ def reslice(
     straight: bool = False,
     pixel_mm: float = 0.2,
     reach_mm: float = 0.5,
-    state: MaybePath = None,
     region: MaybeText = None,
     sweep_file: MaybePath = None,
     dynamic_range_db: MaybeNumber = None,
@@ -46,7 +44,7 @@ def reslice(
     transform: MaybeText = None,
     imported: Imported,
 ) -> None:
-    """Cut a plane or along a curve, straight from the frames at the poses of one or more modes, or a volume.
+    """Cut a plane or along a curve, straight from the frames at the poses of one or more modes.
 
     Parameters
     ----------
@@ -83,8 +81,6 @@ def reslice(
         With --origin or --curve: direction of its columns (curve: depth).
     straight
         Join the curve's points by straight lines, not by a spline.
-    state
-        Of a volume, what `volume --state` wrote: empty voxels are not shown.
     pixel_mm
         Side of a pixel (0.2).
     reach_mm
@@ -100,61 +96,46 @@ def reslice(
     from speckle3d.imaging.cuts.oblique import spanned_plane, three_point_plane
     from speckle3d.io.points import parse_places
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
-    from speckle3d.io.voxels.volumes import may_be_volume, read_states, read_volume
     from speckle3d.study.figures import RANGE_DB
     from speckle3d.study.posed import at_modes, open_posed
-    from speckle3d.study.reslices.cuts import cut_as_volume, cut_posed, cut_voxels
+    from speckle3d.study.reslices.cuts import cut_as_volume, cut_posed
     from speckle3d.study.reslices.places import along_curve, along_sweep, in_frame, in_world
     from speckle3d.study.reslices.reslice_figures import save_reslices
 
     as_volume = out.name.lower().endswith(SUFFIXES)
-    read = (input_file, sweep_file, curve, on, state, *files_of(imported, calibration))
+    read = (input_file, sweep_file, curve, on, *files_of(imported, calibration))
     require_own_place(out, "volume" if as_volume else "picture", *read)
     plane = None
     if points is not None:
         plane = three_point_plane(parse_places(points.split(), option="--points"))
     elif origin is not None and right is not None and down is not None:
         plane = spanned_plane(origin, right, down)
-    of_sweeps = {**imported, "mode": mode, "sweep": sweep_file, "region": region, "calibration": calibration,
-                 "transform": transform, "difference_to": difference_to, "lateral_mm": lateral_mm,
-                 "depth_mm": depth_mm, "frame": frame, "dynamic_range_db": dynamic_range_db}  # fmt: skip
-    is_volume = input_file.is_file() and may_be_volume(input_file)
-    for name, value in (of_sweeps if is_volume else {"state": state}).items():
-        if value or value == 0:
-            flag, kind = name.replace("_", "-"), "a sweep" if is_volume else "a volume"
-            raise InvalidInputError(f"--{flag}: expected {kind} with it, got {input_file.name}")
-    if is_volume:
-        voxels = read_volume(input_file)
-        states = None if state is None else read_states(state, voxels)
-        points_mm = None if curve is None else _curve(curve, on, None)
-        picture = cut_voxels(voxels, input_file.name, states, plane, points_mm, down, not straight, pixel_mm)
+    imports = given_settings(input_file, imported, transform)
+    stated = sweep_file, imports, calibration or (), dynamic_range_db
+    first = open_posed(input_file, mode[0] if mode else None, *stated)
+    opened = at_modes(first, mode or (), difference_to)
+    notes(opened.posed.notes())
+    part = region_of(region, input_file, stated, first)
+    range_db = dynamic_range_db or RANGE_DB
+    images, grid = opened.posed.images(range_db)
+    if curve is not None:
+        points_mm = _curve(curve, on, opened)
+        place = along_curve(opened, grid, points_mm, down, not straight, pixel_mm)
+    elif plane is not None:
+        place = in_world(opened, grid, plane, pixel_mm, reach_mm)
+    elif frame is not None:
+        place = in_frame(opened, grid, frame, angle_deg, lateral_mm, pixel_mm, reach_mm)
     else:
-        imports = given_settings(input_file, imported, transform)
-        stated = sweep_file, imports, calibration or (), dynamic_range_db
-        first = open_posed(input_file, mode[0] if mode else None, *stated)
-        opened = at_modes(first, mode or (), difference_to)
-        notes(opened.posed.notes())
-        part = region_of(region, input_file, stated, first)
-        range_db = dynamic_range_db or RANGE_DB
-        images, grid = opened.posed.images(range_db)
-        if curve is not None:
-            points_mm = _curve(curve, on, opened)
-            place = along_curve(opened, grid, points_mm, down, not straight, pixel_mm)
-        elif plane is not None:
-            place = in_world(opened, grid, plane, pixel_mm, reach_mm)
-        elif frame is not None:
-            place = in_frame(opened, grid, frame, angle_deg, lateral_mm, pixel_mm, reach_mm)
-        else:
-            place = along_sweep(opened, grid, lateral_mm, depth_mm, pixel_mm)
-        with progress_bar(f"reslicing {out.name}"):
-            picture = cut_posed(opened, place, range_db, (images, grid), part, reach_mm)
+        place = along_sweep(opened, grid, lateral_mm, depth_mm, pixel_mm)
+    with progress_bar(f"reslicing {out.name}"):
+        picture = cut_posed(opened, place, range_db, (images, grid), part, reach_mm)
     if as_volume:
         write_volume(out, cut_as_volume(picture))
     else:
         save_reslices(picture, out)
 
 
-def _curve(path: Path, picture: Path | None, opened: OpenedModes | None) -> FloatArray:
+def _curve(path: Path, picture: Path | None, opened: OpenedModes) -> FloatArray:
     """Points of a curve in the world, read as such or as points of a picture of the mode that is cut."""
     from speckle3d.io.points import PICTURE, WORLD, read_places
     from speckle3d.study.posed import require_made_at
@@ -162,7 +143,6 @@ def _curve(path: Path, picture: Path | None, opened: OpenedModes | None) -> Floa
 
     if picture is None:
         return read_places(path, WORLD)
-    shown = read_plane(picture, None if opened is None else opened.reference)
-    if opened is not None:
-        require_made_at(shown.mark, opened.marks[opened.reference], str(picture))
+    shown = read_plane(picture, opened.reference)
+    require_made_at(shown.mark, opened.marks[opened.reference], str(picture))
     return shown.world_mm(read_places(path, PICTURE))

@@ -135,7 +135,8 @@ def volume(
     within_gb
         The finest round one of a volume no larger than this. Not with --voxel-mm or --spacing-mm or --shape.
     like
-        A volume whose grid to take. Not with --voxel-mm.
+        A volume whose grid to take. Not with --voxel-mm or --axes or --spacing-mm or --origin-mm or --shape
+        or --size-mm or --within-gb.
     region
     state
         Write which voxels are measured and filled, as labels.
@@ -161,9 +162,9 @@ def volume(
     stated = sweep_file, imports, calibration or (), settings.get("dynamic_range_db")
     (posed,) = open_sweep_at([mode], input_file, stated)
     part = region_of(region, input_file, stated, posed)
-    request = VolumeRequest(out, checked, GridRequest(**grid), part, state, deviation)
+    request = VolumeRequest(checked, GridRequest(**grid), part)
     with progress_bar(f"compounding {out.name}"):
-        report = write_voxels(posed, request)
+        report = write_voxels(posed, request, out, state, deviation)
     if as_json:
         emit_json(report.summary())
     made = posed.reconstruction
@@ -210,7 +211,8 @@ def scene(
     --------
     $ speckle3d scene out/reconstruction.h5 -o scene --images
     """
-    from speckle3d.study.scenes.scene import SceneRequest, require_scene_place, write_scene
+    from speckle3d.study.scenes.scene import require_scene_place, write_scene
+    from speckle3d.study.scenes.voxels import VolumeRequest
 
     require_scene_place(out, input_file, sweep_file, *files_of(imported, calibration))
     imports = given_settings(input_file, imported, transform)
@@ -218,8 +220,8 @@ def scene(
     checked = compounding_settings(config_file, settings)
     posed = open_sweep_at(mode or [None], input_file, stated)
     part = region_of(region, input_file, stated, posed[0])
-    request = SceneRequest(checked, region=part, with_images=images, with_deviation=deviation)
+    request = VolumeRequest(checked, region=part)
     with progress_bar(f"writing {out.name}") as progress:
-        reports = write_scene(out, posed, request, progress)
+        reports = write_scene(out, posed, request, images, deviation, progress)
     for report in reports:
         note(report.line)

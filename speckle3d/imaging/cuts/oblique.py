@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
@@ -95,43 +94,15 @@ def covering_plane(
         If no frame comes near the plane; says where the sweep is.
     """
     outlines = frame_outlines(grid, world_from_image)
-    return _covering(placed, outlines, reach_mm, pixel_mm, f"a frame within {reach_mm:g} mm")
-
-
-def covering_box(placed: RigidTransform, corners_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
-    """Plane placed anywhere, as large as its section of a box.
-
-    Parameters
-    ----------
-    placed : RigidTransform, single
-        Its x and y are the plane; the picture's axes count from its origin.
-    corners_mm : ndarray, shape (8, 3)
-        The box's, in the order of `itertools.product`, in the world.
-    pixel_mm : float
-
-    Raises
-    ------
-    InvalidInputError
-        If the plane misses the box; says where that is.
-    """
-    faces = corners_mm[[[0, 1, 3, 2, 0], [4, 5, 7, 6, 4], [0, 1, 5, 4, 0], [2, 3, 7, 6, 2]]]
-    touching_mm = 1e-6 * float(np.ptp(corners_mm, axis=0).max())
-    return _covering(placed, faces, touching_mm, pixel_mm, "the volume")
-
-
-def _covering(
-    placed: RigidTransform, outlines_mm: FloatArray, reach_mm: float, pixel_mm: float, what: str
-) -> ReslicePlane:
-    """Plane as large as where it crosses outlines, shape (n, 5, 3), or passes their corners."""
-    corners = placed.inv().apply(outlines_mm.reshape(-1, 3))
+    corners = placed.inv().apply(outlines.reshape(-1, 3))
     away = np.abs(corners[:, 2])
-    lines = crossings(outlines_mm, placed).reshape(-1, 2)
+    lines = crossings(outlines, placed).reshape(-1, 2)
     points = np.concatenate([corners[away <= reach_mm, :2], lines[np.isfinite(lines[:, 0])]])
     if not len(points):
-        low, high = outlines_mm.min(axis=(0, 1)), outlines_mm.max(axis=(0, 1))
+        low, high = outlines.min(axis=(0, 1)), outlines.max(axis=(0, 1))
         raise InvalidInputError(
-            f"plane: expected one that meets {what}, all between {vector_words(low)} and "
-            f"{vector_words(high)} mm, got one {away.min():.1f} mm from there"
+            f"plane: expected one that meets a frame within {reach_mm:g} mm, all between {vector_words(low)} "
+            f"and {vector_words(high)} mm, got one {away.min():.1f} mm from there"
         )
     return plane_around(placed, points, pixel_mm)
 

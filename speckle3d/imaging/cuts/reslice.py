@@ -1,4 +1,4 @@
-"""Reslices: any plane or curved sheet through a sweep, straight from its frames or from voxels.
+"""Reslices: any plane or curved sheet through a sweep, straight from its frames.
 
 Resliced from the frames, each pixel blends the two images nearest to it, one on either side, sampled
 bilinearly where the pixel projects onto them: no voxels, no hole filling, and the images' own resolution.
@@ -7,18 +7,12 @@ bilinearly where the pixel projects onto them: no voxels, no hole filling, and t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, ByteArray, Float32Array
-from speckle3d.core.errors import MismatchError
+from speckle3d.core.arrays import BoolArray, Float32Array
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.labels import EMPTY
-from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.planes import Cut, image_plane
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.nearest import NearestImages, look_up
@@ -99,54 +93,3 @@ def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float)
     plane = image_plane(RigidTransform.identity(), grid, pixel_mm)
     alone = ChosenImages(images, np.array([frame]))
     return reslice_frames(alone, grid, RigidTransform.identity(1), plane, 1.0)
-
-
-def reslice_volume(volume: Volume, cut: Cut, state: ByteArray | None = None) -> Float32Array:
-    """Cut a plane or a curved sheet through voxels, linear between them.
-
-    Voxels that hold nothing do not count: a pixel is the mean of its other neighbours by their weights, and
-    nothing if those have less than half of all.
-
-    Parameters
-    ----------
-    volume : Volume
-    cut : ReslicePlane or CurvedSheet
-    state : ndarray of uint8, shape (n_i, n_j, n_k), optional
-        0 where a voxel holds nothing. Without it, those hold nothing that are NaN; in volumes of integers
-        all count, a level of 0 as well.
-
-    Returns
-    -------
-    ndarray of float32, shape (rows, columns)
-        NaN outside the volume, and where it holds nothing.
-
-    Raises
-    ------
-    MismatchError
-        If voxels and their states differ in shape.
-    """
-    if state is not None and state.shape != volume.shape:
-        raise MismatchError(f"state: expected shape {volume.shape}, got {state.shape}")
-    rows = np.arange(cut.shape[0]) * cut.pixel_mm
-    points = cut.base_mm + rows[:, None, None] * cut.down
-    index_from_world, last = np.linalg.inv(volume.world_from_index), np.array(volume.shape) - 1
-    at = points @ index_from_world[:3, :3].T + index_from_world[:3, 3]
-    inside = (np.abs(at - last / 2) <= last / 2 + _EDGE).all(axis=-1)
-    if not inside.any():
-        return np.full(cut.shape, np.nan, np.float32)
-    at = np.clip(at, 0, last)
-    low, high = at[inside].min(axis=0).astype(int), at[inside].max(axis=0).astype(int) + 2
-    part = tuple(map(slice, low, high))
-    voxels = volume.voxels[part]
-    held = np.isfinite(voxels) if state is None else state[part] != EMPTY
-
-    def sample(values: npt.NDArray[Any]) -> Float32Array:
-        return np.asarray(map_coordinates(values, (at - low)[inside].T, np.float32, 1, "nearest"))
-
-    out = np.full(cut.shape, np.nan, np.float32)
-    if held.all():
-        out[inside] = sample(voxels)
-    else:
-        weights, total = sample(held.view(np.uint8)), sample(np.where(held, voxels, 0))
-        out[inside] = np.where(weights >= 0.5 - _EDGE, total / np.maximum(weights, _EDGE), np.nan)
-    return out

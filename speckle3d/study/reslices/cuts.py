@@ -4,29 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
+from speckle3d.core.arrays import Float32Array, FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.region import Region
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.cuts.curved import CurvedSheet
-from speckle3d.imaging.cuts.oblique import covering_box, vector_words
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
-from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM
-from speckle3d.imaging.cuts.reslice import reslice_at, reslice_volume
+from speckle3d.imaging.cuts.reslice import reslice_at
 from speckle3d.imaging.images import Images
 from speckle3d.scoring.lengths import ModeError
 from speckle3d.scoring.references import Reference, error_rows
 from speckle3d.study.figures import RANGE_DB
 from speckle3d.study.posed import OpenedModes
-from speckle3d.study.reslices.places import REACH_MM, AnyCut, Place, Vector, swept
+from speckle3d.study.reslices.places import REACH_MM, AnyCut, Place
 
 
 @dataclass(frozen=True)
@@ -62,11 +57,11 @@ class CutPicture:
     place : str
         Where the cut is.
     unit : str
-        Of the images: dB below the maximum, or "level", and of what.
-    levels : tuple of float, optional
+        Of the images: dB below the maximum, or "level".
+    levels : tuple of float
         Black and white.
     name : str
-        Of the sweep or the volume.
+        Of the sweep.
     marks : mapping of str to str
         Of the poses of each mode, by `pose_mark`.
     lengths : mapping of str to str
@@ -77,7 +72,7 @@ class CutPicture:
     axes: tuple[str, str] = ("along the sweep", "depth")
     place: str = ""
     unit: str = "dB, 0: maximum"
-    levels: tuple[float, float] | None = None
+    levels: tuple[float, float] = (-RANGE_DB, 0.0)
     name: str = ""
     marks: Mapping[str, str] = field(default_factory=dict)
     lengths: Mapping[str, str] = field(default_factory=dict)
@@ -143,56 +138,18 @@ def frame_lines(cut: AnyCut, grid: ImageGrid, world_from_image: RigidTransform) 
 
 def length_words(rows: Sequence[ModeError], reference: str) -> dict[str, str]:
     """How long each mode is by its rows, and how far from the reference; of all parts of the sweep."""
-    words: dict[str, list[str]] = {}
+    words: dict[str, dict[str, str]] = {}
     for row in rows:
         percent = "" if np.isnan(row.length_error_percent) else f" {row.length_error_percent:+.1f} %"
-        words.setdefault(row.mode, []).append(f"{row.estimate_mm:.2f} mm{percent}")
-    parts = {row.part: row.reference_mm for row in rows if np.isfinite(row.reference_mm)}
-    if reference not in words:
-        words[reference] = [f"{length_mm:.2f} mm" for length_mm in parts.values()]
-    return {mode: ", ".join(each) for mode, each in words.items()}
-
-
-def cut_voxels(
-    volume: Volume,
-    name: str = "",
-    state: ByteArray | None = None,
-    plane: RigidTransform | None = None,
-    curve_mm: FloatArray | None = None,
-    down: Vector | None = None,
-    smooth: bool = True,
-    pixel_mm: float = DEFAULT_PIXEL_MM,
-) -> CutPicture:
-    """Cut a volume in a plane of the world, by default across the middle of its third axis, or along a curve.
-
-    Raises
-    ------
-    InvalidInputError
-        If the cut misses the volume.
-    """
-    corners = np.array(list(product(*([0, n - 1] for n in volume.shape))), dtype=float)
-    corners = corners @ volume.world_from_index[:3, :3].T + volume.world_from_index[:3, 3]
-    cut: AnyCut
-    if curve_mm is not None:
-        words, axes = f"along a curve through {len(curve_mm)} points", ("along the curve", "down")
-        down = volume.world_from_index[:3, 1] if down is None else down
-        cut = swept(curve_mm, down, corners, pixel_mm, smooth)
-    elif plane is not None:
-        words, axes = f"plane from {vector_words(plane.translation)} mm", ("in the cut", "in the cut")
-        cut = covering_box(plane, corners, pixel_mm)
-    else:
-        words, axes = "middle plane of i and j", ("i", "j")
-        middle = RigidTransform.from_translation([0, 0, (volume.shape[2] - 1) / 2 * volume.spacing_mm[2]])
-        cut = covering_box(volume.world_from_grid * middle, corners, pixel_mm)
-    drawn = DrawnCut(reslice_volume(volume, cut, state), cut)
-    unit = ", ".join(filter(None, ["level", volume.fields.get("levels")]))
-    return CutPicture({"volume": drawn}, axes, words, unit, name=name)
+        words.setdefault(row.mode, {})[row.part] = f"{row.estimate_mm:.2f} mm{percent}"
+    for row in rows:
+        if np.isfinite(row.reference_mm):
+            words.setdefault(reference, {}).setdefault(row.part, f"{row.reference_mm:.2f} mm")
+    return {mode: ", ".join(parts.values()) for mode, parts in words.items()}
 
 
 def cut_as_volume(picture: CutPicture) -> Volume:
-    """The only cut as a volume of one plane at its place.
-
-    Of frames, levels are 1 to 255, and 0 where nothing was seen; of voxels they stay as they are, NaN there.
+    """The only cut as a volume of one plane at its place: levels 1 to 255, and 0 where nothing was seen.
 
     Raises
     ------
@@ -204,13 +161,9 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     ((mode, drawn),) = picture.cuts.items()
     if isinstance(drawn.cut, CurvedSheet):
         raise InvalidInputError("expected a picture (.png) of a curved cut, which lies in no one plane")
+    low, high = picture.levels
+    level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
     fields = {"cut": picture.place, "of": picture.name, "mode": mode}
-    voxels: npt.NDArray[Any] = drawn.image
-    if picture.levels is not None:
-        low, high = picture.levels
-        level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
-        voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
-        what = f"log-compressed, {high - low:g} dB" if high == 0 else "grey levels of the B-mode"
-        fields["levels"] = f"{what} from 1 to 255; 0 where nothing was seen"
-    spacing = (drawn.cut.pixel_mm,) * 3
-    return Volume(voxels[None].T, spacing, drawn.cut.world_from_plane, fields)
+    fields["levels"] = f"1 to 255: {low:g} to {high:g} {picture.unit}; 0 where nothing was seen"
+    voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
+    return Volume(voxels[None].T, (drawn.cut.pixel_mm,) * 3, drawn.cut.world_from_plane, fields)

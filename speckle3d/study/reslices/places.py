@@ -93,9 +93,8 @@ def in_frame(
     numbers, there = opened.posed.frames, opened.poses[opened.reference]
     at = np.flatnonzero(numbers == frame)
     if not at.size:
-        gaps = ", with gaps" if np.ptp(numbers) >= len(numbers) else ""
         raise InvalidInputError(
-            f"--frame: expected one with a pose, {numbers[0]} to {numbers[-1]}{gaps}, got {frame}"
+            f"--frame: expected one with a pose, of {numbers[0]} to {numbers[-1]}, got {frame}"
         )
     lateral = float(grid.extent_mm[:, 0].mean()) if lateral_mm is None else lateral_mm
     placed = turned_frame_plane(there[at[0]], lateral_line(grid, lateral)[0, 0], angle_deg)

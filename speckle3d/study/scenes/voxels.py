@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray, IntArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, LabelMap
 from speckle3d.core.pose_errors import PosedErrors
@@ -72,16 +72,11 @@ class GridRequest:
         Raises
         ------
         InvalidInputError
-            If a grid like another's is asked for and anything else beside it, a size in both voxels and mm, a
-            spacing and a bound of it, or a value is not what it must be.
+            If a size is given in both voxels and mm, or a value is not what it must be.
         """
         if self.like is not None:
-            if self != GridRequest(like=self.like):
-                raise InvalidInputError("--like: expected no other option of the grid beside it")
             like = read_volume(self.like)
             return VoxelGrid(like.shape, like.spacing_mm, like.world_from_grid)
-        if self.within_gb is not None and (self.spacing_mm or self.shape):
-            raise InvalidInputError("--within-gb: expected no --spacing-mm and no --shape beside it")
         axes = Rotation.identity()
         if self.axes != "world":
             is_smallest = self.axes == "principal"
@@ -103,28 +98,19 @@ class GridRequest:
 
 @dataclass(frozen=True)
 class VolumeRequest:
-    """A volume to make of a sweep.
+    """How a volume is to be made of a sweep.
 
     Attributes
     ----------
-    path : path
-        With a suffix of `speckle3d.io.voxels.volume_writer.SUFFIXES`.
     settings : CompoundingSettings
     grid : GridRequest
     region : Region, optional
         Of the images; samples outside it do not count.
-    state_path : path, optional
-        Where to write which voxels are measured and filled, as labels.
-    deviation_path : path, optional
-        Where to write each voxel's standard deviation of position along the sweep, mm.
     """
 
-    path: Path
     settings: CompoundingSettings = field(default_factory=CompoundingSettings)
     grid: GridRequest = GridRequest()
     region: Region | None = None
-    state_path: Path | None = None
-    deviation_path: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -135,8 +121,6 @@ class VolumeReport:
     ----------
     counts : ndarray of int, shape (3,)
         Voxels that are empty, measured and filled.
-    size_bytes : int
-        Of the file.
     seconds : float
         It took.
     """
@@ -145,7 +129,6 @@ class VolumeReport:
     mode: str
     grid: VoxelGrid
     counts: IntArray
-    size_bytes: int
     seconds: float
 
     @property
@@ -158,7 +141,7 @@ class VolumeReport:
         """Everything as JSON has it."""
         return {
             "file": str(self.path),
-            "size_bytes": self.size_bytes,
+            "size_bytes": self.path.stat().st_size,
             "mode": self.mode,
             "shape": list(self.grid.shape),
             "spacing_mm": list(self.grid.spacing_mm),
@@ -171,17 +154,29 @@ class VolumeReport:
     def line(self) -> str:
         """File, size, voxels, and the share of each state in one line."""
         named = ", ".join(f"{100 * share:.1f} % {word}" for word, share in self.shares.items())
-        size = f"{self.size_bytes / 1e6:.3g} MB"
+        size = f"{self.path.stat().st_size / 1e6:.3g} MB"
         return f"{self.path}: {size}, mode {self.mode}, {self.grid}: {named}; {self.seconds:.1f} s"
 
 
-def write_voxels(posed: PosedSweep, request: VolumeRequest) -> VolumeReport:
-    """Compound a sweep's images and write the volume as it is made.
+def write_voxels(
+    posed: PosedSweep,
+    request: VolumeRequest,
+    out: Path,
+    state_path: Path | None = None,
+    deviation_path: Path | None = None,
+) -> VolumeReport:
+    """Compound a sweep's images and write the volume.
 
     Parameters
     ----------
     posed : PosedSweep
     request : VolumeRequest
+    out : path
+        With a suffix of `speckle3d.io.voxels.volume_writer.SUFFIXES`.
+    state_path : path, optional
+        Where to write which voxels are measured and filled, as labels.
+    deviation_path : path, optional
+        Where to write each voxel's standard deviation of position along the sweep, mm.
 
     Raises
     ------
@@ -199,22 +194,18 @@ def write_voxels(posed: PosedSweep, request: VolumeRequest) -> VolumeReport:
     grid = request.grid.grid(part, source.world_from_image, settings)
     mask = None if request.region is None else request.region.mask(source.grid)
     weights = confidence(posed, grid) if settings.rule == "weighted" and settings.backward_mm == 0 else None
-    fields = fields_of(posed, request, meaning)
+    fields = fields_of(posed, settings, meaning)
     volume = compound_onto(grid, source, settings, weights, mask)
     place, state = (grid.spacing_mm, grid.world_from_grid), volume.state.T
-    made: dict[Path | None, Volume] = {
-        request.path: Volume(volume.voxels, *place, fields),
-        request.state_path: LabelMap(volume.state, *place, fields, STATE_SEGMENTS),
-    }
-    if request.deviation_path is not None:
+    write_volume(out, Volume(volume.voxels, *place, fields))
+    if state_path is not None:
+        write_volume(state_path, LabelMap(volume.state, *place, fields, STATE_SEGMENTS))
+    if deviation_path is not None:
         errors = _errors(posed, "the deviation of position")
         deviation, words = deviation_volume(errors, source.grid, grid, state), fields | {"levels": _DEVIATION}
-        made[request.deviation_path] = Volume(deviation.T, *place, words)
-    for path, voxels in made.items():
-        if path is not None:
-            write_volume(path, voxels)
+        write_volume(deviation_path, Volume(deviation.T, *place, words))
     counts, seconds = np.bincount(state.ravel(), minlength=3), time.perf_counter() - began
-    return VolumeReport(request.path, posed.mode, grid, counts, request.path.stat().st_size, seconds)
+    return VolumeReport(out, posed.mode, grid, counts, seconds)
 
 
 def _errors(posed: PosedSweep, purpose: str) -> PosedErrors:
@@ -249,9 +240,8 @@ def confidence(posed: PosedSweep, grid: VoxelGrid) -> FloatArray:
     return np.asarray(place.min() / place)
 
 
-def fields_of(posed: PosedSweep, request: VolumeRequest, meaning: str) -> dict[str, str]:
+def fields_of(posed: PosedSweep, settings: CompoundingSettings, meaning: str) -> dict[str, str]:
     """What a volume's file says of it."""
-    settings = request.settings
     method = {"method": f"between the nearest images, up to {settings.backward_mm:g} mm away"}
     if settings.backward_mm == 0:
         filled = f"{settings.fill_mm:g} mm" if settings.fill_mm > 0 else f"{settings.fill_radius} voxels"

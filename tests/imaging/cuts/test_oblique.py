@@ -7,13 +7,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.oblique import (
-    covering_box,
     covering_plane,
 )
 from speckle3d.imaging.cuts.planes import lateral_line, planes_from_first_frame
 
 GRID = ImageGrid(11, 21, 0.5, 0.5, 1.0)
-BOX = np.array([[x, y, z] for x in (0.0, 4.0) for y in (0.0, 6.0) for z in (0.0, 8.0)])
 
 
 def test_a_covering_plane_is_as_large_as_what_frames_show():
@@ -27,17 +25,6 @@ def test_a_covering_plane_is_as_large_as_what_frames_show():
     np.testing.assert_allclose(plane.world_from_plane.translation, [0, 4, 0], atol=1e-9)
     with pytest.raises(InvalidInputError, match=r"49\.0 mm"):
         covering_plane(RigidTransform.from_translation([0, 0, 57.0]), GRID, poses, 0.5)
-
-
-def test_a_section_of_a_box_reaches_its_faces():
-    turned = Rotation.from_euler("Y", 45, degrees=True)
-    plane = covering_box(RigidTransform.from_components([2.0, 3.0, 4.0], turned), BOX, 0.1)
-    # From face to face of the shorter side, 4 mm, at 45 degrees.
-    assert (plane.width_mm, plane.height_mm) == pytest.approx((4.0 * np.sqrt(2), 6.0))
-    face = covering_box(RigidTransform.from_translation([0, 0, 8.0]), BOX, 0.1)
-    assert (face.width_mm, face.height_mm) == pytest.approx((4.0, 6.0))
-    with pytest.raises(InvalidInputError, match=r"2\.0 mm"):
-        covering_box(RigidTransform.from_translation([0, 0, 10.0]), BOX, 0.1)
 
 
 def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer():

@@ -12,7 +12,8 @@ from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.study.posed import PosedSweep
-from speckle3d.study.scenes.scene import SceneRequest, write_scene
+from speckle3d.study.scenes.scene import write_scene
+from speckle3d.study.scenes.voxels import VolumeRequest
 
 NAME = 'Größe <&> "1"; a:b\n'
 """Of a sweep: what XML, attributes of a scene and file systems would stumble over."""
@@ -30,14 +31,14 @@ def posed_sweep(mode="image", frames=8):
     return PosedSweep(sweep, np.arange(frames), poses, mode)
 
 
-REQUEST = SceneRequest(CompoundingSettings(voxel_mm=0.25, splat="nearest"), with_images=True)
+REQUEST = VolumeRequest(CompoundingSettings(voxel_mm=0.25, splat="nearest"))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     target = tmp_path_factory.mktemp("scene") / "a scene"
     other = replace(posed_sweep("pose"), world_from_image=posed_sweep().world_from_image.inv())
-    write_scene(target, [posed_sweep(), other], REQUEST)
+    write_scene(target, [posed_sweep(), other], REQUEST, with_images=True)
     return target
 
 
@@ -60,9 +61,9 @@ def test_volume_labels_outlines_and_pose_are_at_one_place(folder):
 
 def test_a_scene_replaces_a_scene_with_all_its_files(tmp_path):
     target = tmp_path / "s"
-    write_scene(target, [posed_sweep("image"), posed_sweep("pose")], REQUEST)
+    write_scene(target, [posed_sweep("image"), posed_sweep("pose")], REQUEST, with_images=True)
     (target / "volume-crop.nrrd").write_bytes(b"somebody's own")
-    write_scene(target, [posed_sweep("image")], replace(REQUEST, with_images=False))
+    write_scene(target, [posed_sweep("image")], REQUEST)
     (target / "volume-crop.nrrd").unlink()
     stems = ("first-frame", "outlines", "scene", "state", "volume")
     assert sorted(path.name.split(".")[0].removesuffix("-image") for path in target.iterdir()) == [*stems]

@@ -17,7 +17,7 @@ def posed(shipped):
 
 
 def written(posed, path, **request):
-    write_voxels(posed, VolumeRequest(path, request.pop("settings", COARSE), **request))
+    write_voxels(posed, VolumeRequest(request.pop("settings", COARSE), **request), path)
     return pytest.importorskip("SimpleITK").ReadImage(path)
 
 
