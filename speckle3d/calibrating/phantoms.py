@@ -120,13 +120,13 @@ def found(
     FileError, InvalidInputError
         If the region, the points or the frames left out do not fit the recording.
     """
-    require_frames(settings.leave_out, recording.images.shape[0])
+    require_frames(settings.frames_left_out, recording.images.shape[0])
     if isinstance(settings, WireSettings):
         seen = _seen_wires(recording, settings, points, progress)
     else:
         assert isinstance(settings, PlaneSettings | OrientationSettings)
-        seen = detect_lines(recording.images, recording.pixel_mm, settings, settings.region, progress)
-    return seen.without(settings.leave_out, BY_HAND)
+        seen = detect_lines(recording.images, recording.pixel_mm, settings, settings.corners, progress)
+    return seen.without(settings.frames_left_out, BY_HAND)
 
 
 def require_frames(frames: Sequence[int], count: int) -> None:
@@ -144,7 +144,7 @@ def picked(recording: Recording, points: PickedPoints, settings: ScanSettings) -
         If a point lies in no image of the recording.
     """
     points.require_inside(recording.images.shape)
-    return Seen(points.frame, points.pixels, points.wire).without(settings.leave_out, BY_HAND)
+    return Seen(points.frame, points.pixels, points.wire).without(settings.frames_left_out, BY_HAND)
 
 
 def solved(recording: Recording, seen: Seen, settings: ScanSettings) -> Outcome:
@@ -211,7 +211,7 @@ def validated(outcome: Outcome, settings: ScanSettings, progress: Progress | Non
     path = settings.validation
     if path is None:
         return []
-    settings = settings.model_copy(update={"leave_out": ()})
+    settings = settings.model_copy(update={"leave_out": ""})
     other = opened(path, settings, None)
     with naming(str(path)):
         seen = found(other, settings, getattr(settings, "validation_points", None), progress)
@@ -266,11 +266,11 @@ def _seen_wires(
             f"--phantom {settings.phantom}: expected --points (of --validation: --validation-points), a CSV "
             "that says on which wire each dot lies, got none"
         )
-    size, region = recording.pixel_mm, settings.region
+    size, region = recording.pixel_mm, settings.corners
     if wired.phantom is None:
         return crossings_in_frames(recording.images, size, region, progress)
     clip: npt.ArrayLike | None = wired.clip_px if region is None else region
-    dots = dots_in_frames(recording.images, size, clip, progress).without(settings.leave_out, BY_HAND)
+    dots = dots_in_frames(recording.images, size, clip, progress).without(settings.frames_left_out, BY_HAND)
     times, offset_s = recording.frame_time_s, recording.time_offset_s
     if isinstance(recording.readings, TimedPoses) and covered(recording.readings, times, offset_s).all():
         # A calibration from the frames that show all wires finds those of the other frames.

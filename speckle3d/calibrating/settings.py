@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import shlex
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat
 
 from calibration.settings import LineSettings, OrientationFit, PlaneFit, WireFit
 from speckle3d.core.errors import InvalidInputError
@@ -17,15 +16,8 @@ from speckle3d.io.toml import validated
 Model = TypeVar("Model", bound="ScanSettings")
 Corners = tuple[tuple[float, float], ...]
 
-_MOST_FRAMES = 2**31
-"""Two years at 30 frames/s."""
-_MOST_LEFT_OUT = 10**6
-
-
-class AsText(NamedTuple):
-    """How a setting is written that is one word of a command."""
-
-    write: Callable[[Any], str]
+_MOST_FRAMES = 10**6
+"""Nine hours at 30 frames/s."""
 
 
 def region_of(text: str) -> Corners | None:
@@ -36,34 +28,15 @@ def region_of(text: str) -> Corners | None:
     InvalidInputError
         If it is none.
     """
-    if not text:
+    try:
+        corners = [tuple(map(float, corner.split(","))) for corner in text.split()]
+    except ValueError:
+        corners = [()]
+    if not corners:
         return None
-    try:
-        corners = [[float(x) for x in corner.split(",")] for corner in text.split()]
-    except ValueError:
-        corners = []
     if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
-        raise InvalidInputError(f'--region: expected at least three "column,row", got {text!r}')
+        raise InvalidInputError('expected at least three "column,row"')
     return tuple((column, row) for column, row in corners)
-
-
-def offset_of(text: str) -> float | Literal["estimate"] | None:
-    """Parse a clock offset: seconds, or ``estimate``; nothing is the recording's own.
-
-    Raises
-    ------
-    InvalidInputError
-        If it is neither.
-    """
-    if text in ("", "estimate"):
-        return "estimate" if text else None
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not math.isfinite(seconds):
-        raise InvalidInputError(f"--time-offset-s: expected seconds or `estimate`, got {text!r}")
-    return seconds
 
 
 def frames_of(text: str) -> tuple[int, ...]:
@@ -74,43 +47,27 @@ def frames_of(text: str) -> tuple[int, ...]:
     InvalidInputError
         If they are none.
     """
-    found: set[int] = set()
+    frames: set[int] = set()
     for part in filter(str.strip, text.split(",")):
-        first, dash, last = (word.strip() for word in part.partition("-"))
-        ends = (first, last if dash else first)
-        if not all(end.isascii() and end.isdigit() and len(end) < 11 for end in ends):
-            raise InvalidInputError(f"--leave-out: expected frames as 3,17-20, got {text!r}")
-        low, high = (int(end) for end in ends)
-        if not low <= high < _MOST_FRAMES or high - low >= _MOST_LEFT_OUT:
-            raise InvalidInputError(f"--leave-out: expected frames as 3,17-20, got {part.strip()!r}")
-        found.update(range(low, high + 1))
-    return tuple(sorted(found))
+        first, _, last = part.partition("-")
+        try:
+            low, high = int(first), int(last or first)
+        except ValueError:
+            low, high = 1, 0
+        if not 0 <= low <= high < _MOST_FRAMES:
+            raise InvalidInputError("expected frames as 3,17-20")
+        frames.update(range(low, high + 1))
+    return tuple(sorted(frames))
 
 
-def frames_text(frames: Iterable[int]) -> str:
-    """Numbers of frames as `frames_of` reads them."""
-    runs: list[list[int]] = []
-    for frame in sorted(set(frames)):
-        if runs and frame == runs[-1][-1] + 1:
-            runs[-1].append(frame)
-        else:
-            runs.append([frame])
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+def _readable(parse: Callable[[str], object]) -> AfterValidator:
+    """Refuse text that cannot be parsed; it stays text."""
 
+    def check(text: str) -> str:
+        parse(text)
+        return text
 
-def number_text(value: float) -> str:
-    """A number in the fewest digits that read as the same."""
-    return repr(float(value)).removesuffix(".0") if isinstance(value, float) else str(value)
-
-
-def region_text(corners: Corners) -> str:
-    """The polygon as `region_of` reads it."""
-    return " ".join(f"{number_text(column)},{number_text(row)}" for column, row in corners)
-
-
-def _parsed(parse: Callable[[str], Any]) -> BeforeValidator:
-    """Take text, as in a command, or the value itself."""
-    return BeforeValidator(lambda value: parse(value) if isinstance(value, str) else value)
+    return AfterValidator(check)
 
 
 class ScanSettings(BaseModel):
@@ -129,18 +86,28 @@ class ScanSettings(BaseModel):
     pixel_mm: tuple[float, float] | None = Field(
         None, description="Distance between columns and rows, mm, if IMAGES does not say."
     )
-    time_offset_s: Annotated[float | Literal["estimate"] | None, _parsed(offset_of), AsText(number_text)] = (
-        Field(None, description="Seconds to add to the sensor's clock, or `estimate`.")
+    time_offset_s: FiniteFloat | Literal["estimate"] | None = Field(
+        None, description="Seconds to add to the sensor's clock, or `estimate`."
     )
-    region: Annotated[Corners | None, _parsed(region_of), AsText(region_text)] = Field(
-        None, description='Polygon "column,row column,row ..." outside which nothing counts.'
+    region: Annotated[str, _readable(region_of)] = Field(
+        "", description='Polygon "column,row column,row ..." outside which nothing counts.'
     )
-    leave_out: Annotated[tuple[int, ...], _parsed(frames_of), AsText(frames_text)] = Field(
-        (), description="Frames to leave out, from 0, as 3,17-20."
+    leave_out: Annotated[str, _readable(frames_of)] = Field(
+        "", description="Frames to leave out, from 0, as 3,17-20."
     )
     validation: Path | None = Field(
         None, description="Another recording of the phantom, on which the calibration is checked."
     )
+
+    @property
+    def corners(self) -> Corners | None:
+        """Of the region, as `region_of`."""
+        return region_of(self.region)
+
+    @property
+    def frames_left_out(self) -> tuple[int, ...]:
+        """Numbers, as `frames_of`."""
+        return frames_of(self.leave_out)
 
 
 class PlaneSettings(PlaneFit, LineSettings, ScanSettings):
@@ -201,15 +168,7 @@ def command_line(settings: ScanSettings, images: Path, out: Path) -> str:
     words = ["speckle3d", "calibrate", settings.method, str(images), "-o", str(out)]
     for name, field in type(settings).model_fields.items():
         value, option = getattr(settings, name), f"--{name.replace('_', '-')}"
-        if value == field.default and name != "phantom":
-            continue
-        if isinstance(value, list):
-            words += [word for one in value for word in (option, number_text(one))]
-        elif texts := [one for one in field.metadata if isinstance(one, AsText)]:
-            words += [option, texts[0].write(value)]
-        else:
-            words += [
-                option,
-                *map(number_text, value if isinstance(value, tuple) else () if value is True else (value,)),
-            ]
+        if value != field.default or name == "phantom":
+            for one in value if isinstance(value, list) else [value]:
+                words += [option, *map(str, one if isinstance(one, tuple) else [] if one is True else [one])]
     return shlex.join(words)

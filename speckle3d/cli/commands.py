@@ -199,12 +199,11 @@ def _of_field(name: str, field: FieldInfo, words: Words) -> inspect.Parameter:
     if get_origin(kind) in (Union, UnionType):
         members = [member for member in get_args(kind) if member is not type(None)]
         choices = tuple(value for member in members for value in get_args(member))
-        kind = members[0] if len(members) == 1 else Literal[choices]
+        are_literals = all(get_origin(member) is Literal for member in members)
+        kind = members[0] if len(members) == 1 else Literal[choices] if are_literals else str
     if get_origin(kind) is tuple:
         kind = tuple.__class_getitem__(tuple(map(_unbounded, get_args(kind))))
     kind = _unbounded(kind)
-    if field.metadata and any(hasattr(each, "write") for each in field.metadata):
-        kind = str
     shown = "" if isinstance(default, bool | tuple) or default in (None, "") else f" ({default})"
     text = (field.description or "").removesuffix(".")
     info = typer.Option(help=f"{text[:1].upper()}{text[1:]}{shown}.")

@@ -180,4 +180,5 @@ def naming_options() -> Iterator[None]:
         from speckle3d.io.toml import first_fault
 
         name, fault = first_fault(error)
-        raise InvalidInputError(f"--{name.replace('_', '-')}: {fault}") from None
+        option = name.partition(".")[0].replace("_", "-")
+        raise InvalidInputError(f"--{option}: {fault}") from None

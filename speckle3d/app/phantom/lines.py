@@ -59,10 +59,10 @@ class LinesViewer(PhantomViewer):
         self._line.data = self._inliers.data = {"column": [], "row": []}
         assert isinstance(settings, PlaneSettings | OrientationSettings)
         # What is looked at depends on these alone; the rest must follow the slider at once.
-        key = settings.columns, settings.smoothing_mm, settings.region
+        key = settings.columns, settings.smoothing_mm, settings.corners
         if self._finder is None or self._finder[0] != key:
             images, size = self.recording.images, self.recording.pixel_mm
-            self._finder = key, LineFinder.of_frames(images, size, settings, settings.region)
+            self._finder = key, LineFinder.of_frames(images, size, settings, settings.corners)
         line = replace(self._finder[1], settings=settings).line(image)
         (u, v), (w, x) = line.points_px
         across = np.array([-0.5, image.shape[0] / 2 - 0.5, image.shape[0] - 0.5])

@@ -56,5 +56,5 @@ def phantom_pages(images: Path, settings: ScanSettings) -> Sequence[Page]:
     recording = opened(images, settings, settings.poses)
     if not recording.images.shape[0]:
         raise InvalidInputError(f"{images}: expected frames to look at, got none")
-    require_frames(settings.leave_out, recording.images.shape[0])
+    require_frames(settings.frames_left_out, recording.images.shape[0])
     return [PhantomPage(recording, images, settings)]

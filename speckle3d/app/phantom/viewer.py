@@ -19,11 +19,8 @@ from speckle3d.app.phantom.run import RunPane, Solved, sentence
 from speckle3d.app.phantom.widgets import widget
 from speckle3d.calibrating.phantoms import BY_HAND, found, require_frames
 from speckle3d.calibrating.settings import (
-    Corners,
     PlaneSettings,
     ScanSettings,
-    frames_text,
-    region_text,
     with_values,
 )
 from speckle3d.core.errors import InvalidInputError, Speckle3DError
@@ -112,9 +109,13 @@ class PhantomViewer:
         """
         values: dict[str, Any] = {name: each.value for name, each in self.widgets.items()}
         # A slider at zero, and what is not chosen yet.
-        unset = {name for name in ("threshold", "reflector") if name in values and not values[name]}
+        unset = {
+            name
+            for name in ("threshold", "reflector", "time_offset_s")
+            if name in values and not values[name]
+        }
         settings = with_values(self._given, {name: values[name] for name in values if name not in unset})
-        require_frames(settings.leave_out, self.recording.images.shape[0])
+        require_frames(settings.frames_left_out, self.recording.images.shape[0])
         return settings
 
     def changed(self, *_: Any) -> None:
@@ -150,9 +151,9 @@ class PhantomViewer:
         except Speckle3DError as error:
             self.tell(str(error), DROPPED)
             return
-        left_out = dict.fromkeys(settings.leave_out, BY_HAND)
+        left_out = dict.fromkeys(settings.frames_left_out, BY_HAND)
         self._strip.show(self.frame, self._used, self._dropped, left_out)
-        image = self.frame_plot.show(self.frame, settings.region)
+        image = self.frame_plot.show(self.frame, settings.corners)
         try:
             self.tell(self.show(image, settings))
         except Speckle3DError as error:
@@ -165,12 +166,12 @@ class PhantomViewer:
 
     def _toggle(self, frame: int) -> None:
         with suppress(Speckle3DError):  # which is shown
-            self.widgets["leave_out"].value = frames_text({*self.settings().leave_out} ^ {frame})
+            frames = {*self.settings().frames_left_out} ^ {frame}
+            self.widgets["leave_out"].value = ",".join(map(str, sorted(frames)))
 
     def _draw_region(self, corners: npt.NDArray[Any]) -> None:
         # A mouse knows no more than a tenth of a pixel, and a command can be given that.
-        places: Corners = tuple((float(column), float(row)) for column, row in corners.round(1))
-        self.widgets["region"].value = region_text(places)
+        self.widgets["region"].value = " ".join(f"{column:.1f},{row:.1f}" for column, row in corners)
 
     @batched
     def _solved(self, run: Solved) -> None:

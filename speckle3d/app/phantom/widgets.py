@@ -7,8 +7,6 @@ from typing import Any, Literal, get_args, get_origin
 import panel as pn
 from pydantic import BaseModel
 
-from speckle3d.calibrating.settings import AsText
-
 _WIDTH_PX = 285
 _SLIDERS: dict[str, tuple[str, float, float, float]] = {
     "columns": ("n, columns", 5, 240, 1),
@@ -37,8 +35,5 @@ def widget(settings: BaseModel, name: str) -> Any:
         return pn.widgets.Select(name=label, options=list(get_args(field.annotation)), value=value, **options)
     if isinstance(field.default, float):
         return pn.widgets.FloatInput(name=f"{label} (default {field.default:g})", value=value, **options)
-    texts = [
-        part.write(value) for part in field.metadata if isinstance(part, AsText) and value not in (None, ())
-    ]
-    text = texts[0] if texts else ""
+    text = "" if value is None else str(value)
     return pn.widgets.TextInput(name=label, value=text, placeholder=field.description, **look)

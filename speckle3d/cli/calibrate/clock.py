@@ -85,10 +85,9 @@ def clock(
             delay = delay_from_images(tracked, mounting, search_s, progress=progress)
         frames, words = len(tracked.frame_time_s), f"images of the two ways correlate by {delay.followed:.2f}"
     else:
-        recording, corners = (
-            open_recording(images, poses, pixel_mm, sensor, transform),
-            region_of(region or ""),
-        )
+        recording = open_recording(images, poses, pixel_mm, sensor, transform)
+        with naming("--region"):
+            corners = region_of(region or "")
         with progress_bar(f"finding lines in {images.name}") as progress, naming(str(images)):
             seen = detect_lines(recording.images, recording.pixel_mm, None, corners, progress)
         frames, times = len(seen), recording.frame_time_s
