@@ -68,7 +68,10 @@ def test_every_setting_is_printed_with_what_it_is_and_its_default(run):
     [
         (("reconstruct", "{sweep}", "-o", "x", "--curves", "none.h5"), "--curves: none.h5: expected a file"),
         (("calibrate", "plane", "{sweep}", "-o", "{sweep}/t.h5"), "expected an existing folder"),
-        (("compare", "-o", "x", "--paper", "--drift", "pose"), "--paper: expected no --drift"),
+        (
+            ("compare", "-o", "x", "--paper", "--curves", "{sweep}", "--drift", "pose"),
+            "--paper: expected no --drift",
+        ),
         (("imu", "orient", "{sweep}", "--into", "{sweep}"), "--replace replaces it"),
     ],
 )
