@@ -33,7 +33,10 @@ _SHORTER = 0.6
 _MOST_PERIODS = 2.0**53
 
 _LATE = 64
-"""A sample that comes at most so many samples late was overtaken; one further back shows a new start."""
+"""A sample that comes at most so many samples late was overtaken, whatever follows."""
+
+_OVERTAKINGS = 100
+"""Steps far back that are looked at, each in a time that grows with the log; more are new starts."""
 
 _AGREES = 1.1
 """Ratio up to which a stated rate and that of the times agree: clocks of sensors are good to 1 %."""
@@ -113,64 +116,70 @@ def timeline(stamps: Stamps) -> Timeline:
         raise InvalidInputError(
             f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
         )
-    notes, rows = [], _order(stamps)
-    if rows is not None:
-        stamps, rank = stamps[rows], np.argsort(rows)
+    key, segment = _rising(stamps)
+    notes, rows = list[str](), None
+    if (np.diff(key) < 0).any():
+        rows = np.argsort(key, kind="stable")
+        rank = np.argsort(rows)
         late = int((rank < np.maximum.accumulate(rank)).sum())
         notes.append(f"{late} samples came out of order and were sorted")
-    kept = np.append(True, ~_repeats(stamps))
+        key = key[rows]
+    kept = np.append(True, np.diff(key) > 0)
     if left_out := int((~kept).sum()):
-        stamps, rows = stamps[kept], (np.arange(kept.size) if rows is None else rows)[kept]
+        rows = (np.arange(kept.size) if rows is None else rows)[kept]
         notes.append(f"{left_out} samples at the time of another were left out")
-    line = _unwrapped(stamps, notes)
-    return line if rows is None else replace(line, rows=rows)
+        key = key[kept]
+    if rows is None:
+        return _spaced(stamps, key, np.diff(segment) > 0, notes)
+    return replace(_spaced(stamps[rows], key, np.diff(segment[rows]) > 0, notes), rows=rows)
 
 
-def _repeats(stamps: Stamps) -> BoolArray:
-    """Steps from a sample to the same one."""
+def _rising(stamps: Stamps) -> tuple[Any, IntArray]:
+    """Times, or else ticks, or else counts, made to rise by their span and at new starts; starts before each.
+
+    A step far back shows a new start, unless those overtaken were followed by a jump forward to where it was.
+    """
     if stamps.time_s is not None:
-        return np.asarray(np.diff(stamps.time_s) == 0.0)
-    same = [np.diff(values) == 0 for values in (stamps.counter, stamps.ticks) if values is not None]
-    if stamps.starts is not None:
-        same.append(~stamps.starts[1:])
-    return np.asarray(np.logical_and.reduce(same))
+        return stamps.time_s, np.zeros(stamps.time_s.size, dtype=np.int64)
+    values, span = (
+        (stamps.counter, stamps.counter_span) if stamps.ticks is None else (stamps.ticks, _TICK_SPAN)
+    )
+    assert values is not None
+    steps = (np.diff(values) + span // 2) % span - span // 2
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    anew, key = np.zeros(values.size, dtype=bool), np.append(0, np.cumsum(steps))
+    back = np.flatnonzero(steps < -_LATE * usual)
+    anew[back + 1] = True
+    for i in back[:_OVERTAKINGS].tolist():
+        there = key[i + 1 :] > key[i]
+        anew[i + 1] = not there.any() or steps[i + int(np.argmax(there))] < _LONGER * usual
+    if stamps.ticks is None and stamps.starts is not None:
+        anew |= stamps.starts
+    elif stamps.computer_s is not None:
+        anew |= np.isfinite(stamps.computer_s)
+    anew[0] = False
+    steps[anew[1:]] = int(_LATE * usual)
+    return np.append(0, np.cumsum(steps)), np.cumsum(anew)
 
 
-def _order(stamps: Stamps) -> IntArray | None:
-    """Indices that put samples which came late, by time, counter or clock, in order; None if none did."""
-    key: Any = stamps.time_s
-    if key is None:
-        values: Any = stamps.counter if stamps.counter is not None else stamps.ticks
-        span = stamps.counter_span if stamps.counter is not None else _TICK_SPAN
-        steps = (np.diff(values) + span // 2) % span - span // 2
-        late = int(_LATE * (np.median(steps[steps > 0]) if (steps > 0).any() else 0))
-        steps[(steps < -late) | (steps > span // 4)] = late
-        if stamps.starts is not None:
-            steps[stamps.starts[1:]] = late
-        key = np.append(0, np.cumsum(steps))
-    return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
-
-
-def _unwrapped(stamps: Stamps, notes: list[str]) -> Timeline:
+def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timeline:
     """Times, rising counter and gaps of samples in order, without repeats."""
-    span, period_s = stamps.counter_span, stamps.period_s
-    counts = None if stamps.counter is None else np.diff(stamps.counter) % span
-    seconds, anew = _clock_steps(stamps), _starts_anew(stamps, counts)
-    if seconds is not None and (stamps.time_s is not None or not period_s > 0.0):
-        period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
-    irregular = False
-    if counts is None:
-        assert seconds is not None  # one of the two is there
-        taken, irregular = _by_clock(seconds, anew)
-    else:
+    period_s, irregular, counts = stamps.period_s, False, None
+    if stamps.counter is not None:
+        counts = np.diff(stamps.counter) % stamps.counter_span
+    if stamps.time_s is None and stamps.ticks is None:
+        assert counts is not None  # one of the three is there
         taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
-        if seconds is None:
-            seconds = taken * period_s
+        seconds = taken * period_s
+    else:
+        seconds = np.diff(key) * (1.0 if stamps.time_s is not None else stamps.tick_s)
+        if stamps.time_s is not None or not period_s > 0.0:
+            period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
+        if counts is None:
+            taken, irregular = _by_clock(seconds, anew)
         else:
+            taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
             _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
-        if stamps.ticks is not None:  # the clock tells how often the counter went all the way round
-            rounds = np.nan_to_num(np.maximum(np.round((seconds / period_s - taken) / span), 0.0))
-            counts, taken = counts + rounds.astype(np.int64) * span, taken + rounds * span
     if irregular:
         shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
         notes.append(
@@ -198,13 +207,6 @@ def _unwrapped(stamps: Stamps, notes: list[str]) -> Timeline:
     return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
 
 
-def _clock_steps(stamps: Stamps) -> FloatArray | None:
-    """Seconds from each sample to the next by their clock; None without one."""
-    if stamps.time_s is not None:
-        return np.diff(stamps.time_s)
-    return None if stamps.ticks is None else np.diff(stamps.ticks) % _TICK_SPAN * stamps.tick_s
-
-
 def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) -> None:
     """Raise if a stated rate is neither that of the samples nor that of the counter by their clock."""
     going = (seconds > 0.0) & (counts > 0)
@@ -215,21 +217,6 @@ def _require_agreement(seconds: FloatArray, counts: IntArray, stated_hz: float) 
         raise InvalidInputError(
             f"expected times at the stated rate, {stated_hz:g} Hz, got {rates[0]:.4g} Hz by their clock"
         )
-
-
-def _starts_anew(stamps: Stamps, counts: IntArray | None) -> BoolArray:
-    """Mark steps over which the sensor's clock, or else its counter, went back or was reset."""
-    starts = stamps.starts
-    if stamps.time_s is not None:
-        return np.zeros(stamps.time_s.size - 1, dtype=bool)
-    if stamps.ticks is not None:
-        ticks = np.diff(stamps.ticks) % _TICK_SPAN
-        anew = (ticks > _TICK_SPAN // 2) | (ticks == 0)
-        starts = None if stamps.computer_s is None else np.isfinite(stamps.computer_s)
-    else:
-        assert counts is not None
-        anew = counts > stamps.counter_span // 2
-    return anew if starts is None else np.asarray(anew | starts[1:])
 
 
 def _by_counter(counts: IntArray, anew: BoolArray) -> FloatArray:
