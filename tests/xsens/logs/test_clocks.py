@@ -42,6 +42,15 @@ def test_a_message_that_was_overtaken_is_put_in_its_place():
     assert line.notes == ("2 samples came out of order and were sorted",)
 
 
+@pytest.mark.parametrize("at", [[*range(300), *range(301, 1500), 300], [*range(800), *range(600, 700)]])
+def test_samples_that_come_far_too_late_are_no_new_start(at):
+    counter = (65000 + np.array([*at, *range(max(at) + 1, 2000)])) % 65536
+    line = timeline(Stamps(counter=counter, period_s=0.01))
+    np.testing.assert_allclose(line.time_s, 0.01 * np.arange(2000), atol=1e-9)
+    assert "out of order" in line.notes[0]
+    assert line.gaps == ()
+
+
 def trembling(samples=2000, lost=()):
     """Times at 100 Hz that are off by up to 4 ms, some samples lost."""
     taken = np.setdiff1d(np.arange(samples), lost)

@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from imu_logs import calibration, calibration_message, framed, mtdata_payloads, raw_values
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.orient import orient
 from xsens.logs.faults import measured
+from xsens.logs.read import parse_stream
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.textlogs import parse_text
+from xsens.messages.framing import encode
+from xsens.messages.mtdata import DataLayout, OutputMode
 
 RATE_HZ = 100.0
 SWING_RAD, SWING_HZ = np.deg2rad(34.4), 0.5
@@ -87,6 +91,7 @@ def test_half_of_each_second_gone_is_missing_and_costs_certainty(names, kind, no
         (VECTORS[1], lambda rows: with_every(97, rows, [25.0, -25.0, 25.0]), "spikes"),
         (VECTORS[0], lambda rows: with_every(97, rows, [300.0, -300.0, 20.0]), "spikes"),
         (VECTORS[2], lambda rows: with_every(97, rows, [1e4, 0.0, 0.0]), "out of range"),
+        (VECTORS[2], lambda rows: with_every(97, rows, [9.0, 0.0, 0.0]), "spikes"),
     ],
 )
 @pytest.mark.parametrize("method", ["smoother", "filter"])
@@ -103,6 +108,22 @@ def test_saturation_and_values_no_hand_makes_are_missing(name, spoil, words, met
     assert tilt < claim
     assert heading < heading_claim
     assert worst < 8.0
+
+
+def test_raw_counts_at_the_end_of_their_range_are_missing():
+    log, _ = swinging()
+    made = {"world_from_sensor": None, **{name: getattr(log, name) for name in VECTORS}}
+    unit = calibration()
+    values = raw_values(made, unit)
+    counts = values["raw_gyroscope"][:, 0]
+    middle = np.median(counts)
+    wrong = np.abs(counts - middle) > 1000
+    values["raw_gyroscope"][:, 0] = np.clip(counts, middle - 1000, middle + 1000)
+    records = framed(mtdata_payloads(DataLayout(OutputMode.MT9), values))
+    spoiled = parse_stream(encode(calibration_message(unit)) + b"".join(records))
+    missing = np.isnan(spoiled.gyroscope_rad_s).any(axis=1)
+    assert missing[wrong].mean() > 0.9 > 0.02 > missing[~wrong].mean()
+    assert "gyroscope" in spoiled.notes[-1]
 
 
 def with_every(step, rows, value):
