@@ -27,9 +27,6 @@ from speckle3d.core.tables import text_table
 ANGLES = ("roll", "yaw", "tilt")
 """Turns about the image's z, y and x, in this order everywhere."""
 
-MOST_ERRORS = 5_000_000
-"""Largest number of frame pairs times calibrations: they take some 400 MB while they are computed."""
-
 ENOUGH_FRAMES = 77
 """Frames taken from a recording unless told otherwise: as many as orientations in [1]_."""
 
@@ -144,8 +141,6 @@ def pair_errors(
         If there is not one reading per reference.
     InsufficientDataError
         If there are fewer than two frames or no calibration.
-    InvalidInputError
-        If pairs times calibrations exceed `MOST_ERRORS`.
 
     Examples
     --------
@@ -162,7 +157,7 @@ def pair_errors(
     matrices = sensor_from_image.as_matrix().reshape(-1, 3, 3)
     if not len(matrices):
         raise InsufficientDataError("sensor_from_image: expected at least one calibration, got none")
-    turns, reference = _turns(world_from_sensor, reference_from_image, len(matrices))
+    turns, reference = _turns(world_from_sensor, reference_from_image)
     # (S C)^-1 (T C) = C^-1 (S^-1 T) C turns by the rotation vector of S^-1 T in the image's axes, so that
     # each pair's rotation vector is computed once for all calibrations.
     measured = np.einsum("kji,pj->kpi", matrices, turns)
@@ -235,7 +230,7 @@ def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
     InsufficientDataError
         If the frames turn about one axis only, or hardly at all.
     """
-    image, target = _turns(measured, reference, 1)
+    image, target = _turns(measured, reference)
     _, second, _ = np.sqrt(np.linalg.eigvalsh(target.T @ target / len(target)).clip(0.0))
     if second < _MOUNTING_LIMIT:
         raise InsufficientDataError(
@@ -246,18 +241,13 @@ def mounting_from_motion(measured: Rotation, reference: Rotation) -> Rotation:
     return Rotation.align_vectors(target, image)[0]
 
 
-def _turns(measured: Rotation, reference: Rotation, calibrations: int) -> tuple[FloatArray, FloatArray]:
+def _turns(measured: Rotation, reference: Rotation) -> tuple[FloatArray, FloatArray]:
     """Rotation vectors between the frames of all pairs by each, in the axes of the body, shape (p, 3)."""
     n, found = (0 if each.single else len(each) for each in (measured, reference))
     if found != n:
         raise MismatchError(f"expected one reference per reading, got {found} and {n}")
     if n < 2:
         raise InsufficientDataError(f"expected at least 2 orientations, got {n}")
-    if (pairs := n * (n - 1) // 2) * calibrations > MOST_ERRORS:
-        raise InvalidInputError(
-            f"expected at most {MOST_ERRORS} frame pairs times calibrations, got {pairs} pairs of "
-            f"{n} orientations times {calibrations}: take fewer orientations"
-        )
     first, second = np.triu_indices(n, 1)
     turned = [(each[first].inv() * each[second]).as_rotvec() for each in (measured, reference)]
     return turned[0], turned[1]

@@ -12,12 +12,12 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
-from xsens.fusion.readings import PAUSE_S, UNKNOWN_HEADING_RAD, Estimate, Samples, usable_samples
+from xsens.fusion.readings import PAUSE_S, Estimate, Samples, usable_samples
 from xsens.fusion.settings import DEFAULT_METHOD, FusionSettings, Method, method_of
 from xsens.logs.samples import ImuLog
 
 _FORESEEN = 3
-"""Standard deviations of the gyroscope's bias that are foreseen."""
+"""Standard deviations of the gyroscope's bias that are foreseen; a larger one widens them."""
 
 _SHORTEST_S = 3.0
 """Shorter stretches are filtered, not smoothed: most of their time is the filter's start."""
@@ -129,47 +129,31 @@ def orient(
     breaks = np.flatnonzero(samples.step_s > PAUSE_S)
     if breaks.size:
         notes.append(f"{breaks.size} pauses over {PAUSE_S:g} s: orientation found anew after each")
-    results = _stretches(samples, breaks, settings, method, notes)
-    joined = _joined(results)
-    bias = float(np.abs(joined.bias_rad_s).max())
+    estimate = _estimate(samples, breaks, settings, method)
+    bias = float(np.abs(estimate.bias_rad_s).max())
     if bias > _FORESEEN * settings.bias_sd_rad_s:
-        notes.append(
-            f"a gyroscope bias of {np.rad2deg(bias):.1f} deg/s, over {_FORESEEN} standard deviations: "
-            "claimed errors do not foresee it"
-        )
-    heading_sd = float(np.median(joined.sd_rad[:, 2]))
-    if heading_sd > UNKNOWN_HEADING_RAD:
-        notes.append(f"the heading is not known: standard deviation {np.rad2deg(heading_sd):.0f} degrees")
-    rotations = TimedRotations(log.time_s[used], Rotation.from_quat(joined.xyzw))
+        notes.append(f"a gyroscope bias of {np.rad2deg(bias):.1f} deg/s: found again, foreseen so large")
+        estimate = _estimate(samples, breaks, replace(settings, bias_sd_rad_s=bias), method)
     return Orientation(
-        rotations,
-        joined.sd_rad,
-        joined.bias_rad_s,
-        joined.disturbed,
-        joined.resting,
+        TimedRotations(log.time_s[used], Rotation.from_quat(estimate.xyzw)),
+        estimate.sd_rad,
+        estimate.bias_rad_s,
+        estimate.disturbed,
+        estimate.resting,
         method,
         tuple(notes),
         settings.use_magnetometer,
-        joined.field_stray,
-        joined.field_iron,
+        estimate.field_stray,
+        estimate.field_iron,
     )
 
 
-# -- stretches
-
-
-def _stretches(
-    samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method, notes: list[str]
-) -> list[Estimate]:
+def _estimate(samples: Samples, breaks: IntArray, settings: FusionSettings, method: Method) -> Estimate:
     """Each stretch by the method asked for, or by its on-line twin if it is short."""
     from xsens.fusion.engines import Filter, smoothed  # which loads numba
+    from xsens.fusion.vqf_engine import by_vqf
 
-    engine = None
-    if method.is_vqf:
-        from xsens.fusion.vqf_engine import VqfEngine
-
-        engine = VqfEngine(settings.use_magnetometer)
-    results: list[Estimate] = []
+    estimates: list[Estimate] = []
     kept = Filter(settings)
     step_s = float(np.median(samples.step_s))
     for first, last in pairwise([0, *breaks.tolist(), len(samples)]):
@@ -181,14 +165,6 @@ def _stretches(
             stretch = replace(stretch, step_s=np.append(step_s, stretch.step_s[1:]))
         offline = method.offline and float(stretch.step_s.sum()) > _SHORTEST_S
         own = smoothed(stretch, settings) if offline else kept.run(stretch, to_end=True)
-        results.append(own if engine is None else engine.run(stretch, own, offline))
-    if engine is not None:
-        notes += engine.notes
-    return results
-
-
-def _joined(results: list[Estimate]) -> Estimate:
-    if len(results) == 1:
-        return results[0]
-    columns = zip(*(vars(each).values() for each in results), strict=True)
-    return Estimate(*map(np.concatenate, columns))
+        estimates.append(by_vqf(stretch, own, offline, settings.use_magnetometer) if method.is_vqf else own)
+    columns = zip(*(vars(estimate).values() for estimate in estimates), strict=True)
+    return Estimate(*map(np.concatenate, columns)) if len(estimates) > 1 else estimates[0]

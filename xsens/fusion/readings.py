@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,9 +22,6 @@ PAUSE_S = 1.25 * BRIDGED_S
 FASTEST_RAD_S = 60.0
 """The widest range of the sensors' gyroscopes ends at 35 rad/s about an axis, and a hand's ordinary movement
 in deg/s exceeds 60."""
-
-UNKNOWN_HEADING_RAD = math.radians(45.0)
-"""A heading with a larger standard deviation is unknown."""
 
 _SHOWN_BY = 99.0
 """Percentile of the gyroscope's rates that shows another unit."""

@@ -16,15 +16,18 @@ from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from xsens.fusion.readings import Estimate, Samples, turned
 
-_EVEN = 0.05
-"""Largest distance of a sample from its place on an even clock, in steps, that is not told."""
 
-
-class VqfEngine:
-    """VQF over the stretches of a log, each by itself.
+def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Estimate:
+    """Orientation of a stretch by VQF.
 
     Parameters
     ----------
+    stretch : Samples
+    own : Estimate
+        The same by this package's engine: its variances, plus the squared distance of VQF from it about each
+        of the world's axes, are VQF's variances.
+    offline : bool
+        Use later readings as well.
     magnetic : bool
         Let the magnetic field tell the heading.
 
@@ -33,81 +36,54 @@ class VqfEngine:
     InvalidInputError
         If VQF is not installed.
     """
-
-    def __init__(self, magnetic: bool) -> None:
-        try:
-            import vqf
-        except ImportError as error:
-            raise InvalidInputError(
-                "the methods vqf and vqf-online need the package vqf, got none installed: pip install vqf, "
-                "which may need a C++ compiler, or choose smoother or filter"
-            ) from error
-        self._vqf = vqf
-        self._magnetic = magnetic
-        self._uneven = 0
-
-    @property
-    def notes(self) -> list[str]:
-        """What VQF made of the log, for those who see the orientation."""
-        if not self._uneven:
-            return []
-        return [f"VQF wants an even clock: {self._uneven} samples between pauses interpolated to one"]
-
-    def run(self, stretch: Samples, own: Estimate, offline: bool) -> Estimate:
-        """Find the orientation of a stretch.
-
-        Parameters
-        ----------
-        stretch : Samples
-        own : Estimate
-            The same by this package's engine: its variances, plus the squared distance of VQF from it about
-            each of the world's axes, are VQF's variances.
-        offline : bool
-            Use later readings as well.
-        """
-        there = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
-        magnetic = self._magnetic and there.size > 0
-        place = np.cumsum(stretch.step_s) - stretch.step_s[0]
-        mean_s = float(place[-1]) / max(len(place) - 1, 1) or float(stretch.step_s[0])
-        # Losses make the mean step longer than the median, bursts shorter: at most two for one.
-        step_s = mean_s * min(max(float(np.median(stretch.step_s)) / mean_s, 0.5), 1.0)
-        place /= step_s
-        grid = np.arange(round(float(place[-1])) + 1.0)
-        if len(grid) != len(place) or np.abs(place - grid).max() >= _EVEN:
-            self._uneven += len(stretch)
-        # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.
-        angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=place[0])[:, None], axis=0)
-        rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
-        rate[0] = stretch.rate_rad_s[0]
-        force, field = _at(grid, place, stretch.force_m_s2), None
-        if magnetic:
-            field = _at(grid, place[there], stretch.field_au[there])
-        find = self._vqf.offlineVQF if offline else self._vqf.VQF(step_s).updateBatch
-        estimate = find(rate, force, field, *([step_s] if offline else []))
-        xyzw = estimate["quat9D" if magnetic else "quat6D"][:, [1, 2, 3, 0]]
-        # Neighbours of one sign, so that they can be interpolated: they are a small turn apart.
-        flips = np.einsum("ij,ij->i", xyzw[1:], xyzw[:-1]) < 0.0
-        xyzw[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-        xyzw = _at(place, grid, xyzw)
-        xyzw /= np.sqrt(np.einsum("ij,ij->i", xyzw, xyzw))[:, None]
-        north_rad = -0.5 * np.pi  # from VQF's world, x east
-        if not magnetic:  # about up as the other engine begins
-            first = Rotation.from_quat(own.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()
-            north_rad = 2.0 * float(np.arctan2(*first.as_quat()[2:]))
-        xyzw = turned(north_rad, xyzw)
-        at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
-        disturbed = np.zeros(len(stretch), dtype=bool)
-        if magnetic:
-            disturbed = estimate["magDistDetected"][at]
-        sd = np.minimum(np.hypot(own.sd_rad, _apart(xyzw, own.xyzw)), np.pi)
-        return replace(
-            own,
-            xyzw=xyzw,
-            sd_rad=sd,
-            bias_rad_s=estimate["bias"][at],
-            disturbed=disturbed,
-            resting=estimate["restDetected"][at],
-        )
+    try:
+        import vqf
+    except ImportError as error:
+        raise InvalidInputError(
+            "the methods vqf and vqf-online need the package vqf, got none installed: pip install vqf, "
+            "which may need a C++ compiler, or choose smoother or filter"
+        ) from error
+    there = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
+    magnetic = magnetic and there.size > 0
+    place = np.cumsum(stretch.step_s) - stretch.step_s[0]
+    mean_s = float(place[-1]) / max(len(place) - 1, 1) or float(stretch.step_s[0])
+    # Losses make the mean step longer than the median, bursts shorter: at most two for one.
+    step_s = mean_s * min(max(float(np.median(stretch.step_s)) / mean_s, 0.5), 1.0)
+    place /= step_s
+    grid = np.arange(round(float(place[-1])) + 1.0)
+    # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.
+    angle = np.cumsum(stretch.rate_rad_s * np.diff(place, prepend=place[0])[:, None], axis=0)
+    rate = np.diff(_at(grid, place, angle), axis=0, prepend=0.0)
+    rate[0] = stretch.rate_rad_s[0]
+    force, field = _at(grid, place, stretch.force_m_s2), None
+    if magnetic:
+        field = _at(grid, place[there], stretch.field_au[there])
+    find = vqf.offlineVQF if offline else vqf.VQF(step_s).updateBatch
+    estimate = find(rate, force, field, *([step_s] if offline else []))
+    xyzw = estimate["quat9D" if magnetic else "quat6D"][:, [1, 2, 3, 0]]
+    # Neighbours of one sign, so that they can be interpolated: they are a small turn apart.
+    flips = np.einsum("ij,ij->i", xyzw[1:], xyzw[:-1]) < 0.0
+    xyzw[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    xyzw = _at(place, grid, xyzw)
+    xyzw /= np.sqrt(np.einsum("ij,ij->i", xyzw, xyzw))[:, None]
+    north_rad = -0.5 * np.pi  # from VQF's world, x east
+    if not magnetic:  # about up as the other engine begins
+        first = Rotation.from_quat(own.xyzw[0]) * Rotation.from_quat(xyzw[0]).inv()
+        north_rad = 2.0 * float(np.arctan2(*first.as_quat()[2:]))
+    xyzw = turned(north_rad, xyzw)
+    at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
+    disturbed = np.zeros(len(stretch), dtype=bool)
+    if magnetic:
+        disturbed = estimate["magDistDetected"][at]
+    sd = np.minimum(np.hypot(own.sd_rad, _apart(xyzw, own.xyzw)), np.pi)
+    return replace(
+        own,
+        xyzw=xyzw,
+        sd_rad=sd,
+        bias_rad_s=estimate["bias"][at],
+        disturbed=disturbed,
+        resting=estimate["restDetected"][at],
+    )
 
 
 def _at(places: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:

@@ -222,14 +222,11 @@ def _scan(data: ByteArray, final: bool) -> tuple[IntArray, IntArray, int]:
     """
     start = np.flatnonzero(data == PREAMBLE)
     padded = np.append(data, np.zeros(5, dtype=np.uint8))
-    length = padded[start + 3].astype(np.int64)
-    extended = np.flatnonzero(length == _EXTENDED)
-    at = start[extended]
-    length[extended] = 256 * padded[at + 4].astype(np.int64) + padded[at + 5]
-    end = start + 5 + length
-    end[extended] += 2
-    plausible = length <= MOST_PAYLOAD
-    start, end = start[plausible], end[plausible]
+    size, high, low = (padded[start + k].astype(np.int64) for k in (3, 4, 5))
+    extended = size == _EXTENDED
+    size = np.where(extended, 256 * high + low + 2, size)
+    plausible = size <= MOST_PAYLOAD + 2 * extended
+    start, end = start[plausible], (start + 5 + size)[plausible]
     whole = end <= data.size  # without the whole head it is not, as what is missing is taken for zeros
     unfinished = start[~whole]
     start, end = start[whole], end[whole]
