@@ -23,6 +23,9 @@ FASTEST_RAD_S = 60.0
 """The widest range of the sensors' gyroscopes ends at 35 rad/s about an axis, and a hand's ordinary movement
 in deg/s exceeds 60."""
 
+_SHORTEST_S = 1e-4
+"""Mean step of no sensor: they end at 2 kHz."""
+
 _SHOWN_BY = 99.0
 """Percentile of the gyroscope's rates that shows another unit."""
 
@@ -193,12 +196,12 @@ def _bridging(readings: FloatArray, step_s: FloatArray) -> FloatArray:
 
 
 def _require_seconds(steps_s: FloatArray, source: str) -> None:
-    """Raise `InvalidInputError` if samples are too far apart to integrate a gyroscope."""
+    """Raise `InvalidInputError` if samples are too far apart to integrate a gyroscope, or nearer than any."""
     median = float(np.median(steps_s))
-    if median > 1.05 * BRIDGED_S:  # a clock of 10 Hz, and jitter
+    if median > 1.05 * BRIDGED_S or steps_s.mean() < _SHORTEST_S:  # a clock of 10 Hz, and jitter
         raise InvalidInputError(
-            f"{source}: expected samples at most {BRIDGED_S:g} s apart, got a median of {median:.4g} s: "
-            "times in milliseconds?"
+            f"{source}: expected samples {_SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
+            f"{median:.4g} s: times in milliseconds?"
         )
 
 

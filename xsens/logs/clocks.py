@@ -140,12 +140,13 @@ def _rising(stamps: Stamps) -> tuple[Any, IntArray]:
     A step far back shows a new start, unless those overtaken were followed by a jump forward to where it was.
     """
     if stamps.time_s is not None:
-        return stamps.time_s, np.zeros(stamps.time_s.size, dtype=np.int64)
-    values, span = (
-        (stamps.counter, stamps.counter_span) if stamps.ticks is None else (stamps.ticks, _TICK_SPAN)
-    )
-    assert values is not None
-    steps = (np.diff(values) + span // 2) % span - span // 2
+        values: Any = stamps.time_s
+        steps = np.diff(values)
+    else:
+        values, span = stamps.ticks, _TICK_SPAN
+        if values is None:
+            values, span = stamps.counter, stamps.counter_span
+        steps = (np.diff(values) + span // 2) % span - span // 2
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     anew, key = np.zeros(values.size, dtype=bool), np.append(0, np.cumsum(steps))
     back = np.flatnonzero(steps < -_LATE * usual)
@@ -153,12 +154,14 @@ def _rising(stamps: Stamps) -> tuple[Any, IntArray]:
     for i in back[:_OVERTAKINGS].tolist():
         there = key[i + 1 :] > key[i]
         anew[i + 1] = not there.any() or steps[i + int(np.argmax(there))] < _LONGER * usual
-    if stamps.ticks is None and stamps.starts is not None:
+    if stamps.ticks is None and stamps.time_s is None and stamps.starts is not None:
         anew |= stamps.starts
     elif stamps.computer_s is not None:
         anew |= np.isfinite(stamps.computer_s)
     anew[0] = False
-    steps[anew[1:]] = int(_LATE * usual)
+    if stamps.time_s is not None and not anew.any():
+        return values, np.cumsum(anew)
+    steps[anew[1:]] = _LATE * usual
     return np.append(0, np.cumsum(steps)), np.cumsum(anew)
 
 
@@ -198,8 +201,9 @@ def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Time
     missing = np.where(anew[at], 0, np.round(np.minimum(taken[at], _MOST_PERIODS)) - 1)
     gaps = tuple(Gap(int(i), int(lost), float(seconds[i])) for i, lost in zip(at, missing, strict=True))
     time_s = stamps.time_s
-    if time_s is None:
+    if time_s is None or anew.any():
         first_s = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
+        first_s = first_s if time_s is None else float(time_s[0])
         time_s = first_s + np.append(0.0, np.cumsum(seconds))
     counter = None
     if stamps.counter is not None and counts is not None:

@@ -12,15 +12,18 @@ from xsens.logs.samples import ImuLog
 _COMPARED_S = 0.1
 """Interval over which turns are compared: a hand turns by less than a radian in it."""
 
-_TURNING_RAD_S = 0.2
+_MOVING_RAD_S = 0.2
 """Smallest RMS rate that is compared: eleven degrees per second, beyond any bias."""
 
-_FOLLOWED = (0.3, 3.0)
-"""Share of the gyroscope's turn that the other must show: 1 if the unit is rad/s, 1/57 if it is deg/s, 57 if
-degrees were converted twice, about 0 if the two do not belong together."""
+_TURNING_RAD_S = 0.5
+"""RMS rate from which a gyroscope must be followed: BROAD's trials turn by less, or show 0.95 to 1.04."""
 
-_ALIKE = 0.9
-"""Correlation from which more turning than the gyroscope's is another unit, not the hand's acceleration."""
+_FOLLOWED = (0.6, 1.6)
+"""Share of the gyroscope's turn, axis by axis, that the other must show: 1 if all is right, 1/57 if the unit
+is deg/s, a half or two if the rate of samples is another, -1 or about 0 if axes are exchanged."""
+
+_ALIKE, _MORE = 0.9, 3.0
+"""Correlation from which so many times the gyroscope's turn is another unit, not the hand's acceleration."""
 
 _CALM = 0.1
 """Share of its median by which the acceleration's length may differ where it shows gravity."""
@@ -37,24 +40,24 @@ def contradictions(log: ImuLog) -> dict[str, str]:
     sentences = {}
     for name, direction in directions.items():
         rates = None if direction is None else _rates_across(log, direction)
-        if rates is not None and max(map(_rms, rates)) > _TURNING_RAD_S:
+        if rates is not None and max(map(_rms, rates)) > _MOVING_RAD_S:
             sentences[name] = _sentence(name, *rates)
     return sentences
 
 
 def _sentence(name: str, gyroscope: FloatArray, other: FloatArray) -> str:
     rate, shown = _rms(gyroscope), _rms(other)
-    share = shown / max(rate, 1e-9)
-    alike = float((gyroscope * other).mean()) / max(rate * shown / 3.0, 1e-12) > _ALIKE
-    if rate > _TURNING_RAD_S and share < _FOLLOWED[0]:
-        unit = "deg/s" if alike and share < 0.05 else "rad/s"
-    elif alike and share > _FOLLOWED[1]:
-        unit = "rad/s"
+    common = float((gyroscope * other).sum(axis=1).mean())
+    share = common / max(rate, 1e-9) ** 2
+    if rate > _TURNING_RAD_S and not _FOLLOWED[0] < share < _FOLLOWED[1]:
+        doubt = "in deg/s" if 0.0 < share < 0.05 else "as it is told, in rate, axes and signs"
+    elif common > _ALIKE * rate * shown and shown > _MORE * rate:
+        doubt = "in rad/s"
     else:
         return ""
     return (
         f"gyroscope and {name} contradict each other: the one turns by {rate:.2g} rad/s, the other shows "
-        f"{100.0 * share:.3g} % of it: is the gyroscope in {unit}?"
+        f"{100.0 * share:.3g} % of it: is the gyroscope {doubt}?"
     )
 
 

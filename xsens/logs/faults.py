@@ -157,7 +157,7 @@ def _repeated(
     changes = np.logical_or.reduce([axis[1:] != axis[:-1] for axis in rows.T])
     start = np.flatnonzero(np.append(True, changes))
     length = np.diff(np.append(start, len(rows)))
-    usual = int(np.median(length))
+    usual = int(np.median(length)) if len(length) > 1 else 1
     long = length > max(2, 2 * usual)
     if not long.any():
         return np.zeros(len(rows), dtype=bool)
@@ -165,10 +165,11 @@ def _repeated(
     before, after = step[start], step[start + length]
     moves = (after > change) | (np.isnan(after) & (start > 0))
     if name == VECTORS[1]:  # a resting one may read its bias, or zero
-        rest = (size[start] < _SLOW_RAD_S) & (np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S))
+        still = np.ones(len(start), dtype=bool)
         for axis in () if force is None else force.T:
-            rest &= ~(np.fmax.reduceat(axis, start) - np.fmin.reduceat(axis, start) > _STEADY_M_S2)
-        moves &= ~rest
+            still &= ~(np.fmax.reduceat(axis, start) - np.fmin.reduceat(axis, start) > _STEADY_M_S2)
+        begun = np.isnan(before) | np.isnan(after) | (before > _DROP_RAD_S)
+        moves = (moves & ~(still & begun & (size[start] < _SLOW_RAD_S))) | (np.isnan(after) & ~still)
     else:  # what is repeated to the log's end was left while the sensor turned
         turn = 0.0 if rate is None else np.add.reduceat(np.nan_to_num(_norm(rate)), start)
         moves &= ~np.isnan(after) | (turn > _TURNING_RAD_S * length)

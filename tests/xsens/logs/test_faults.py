@@ -7,7 +7,7 @@ import pytest
 from imu_logs import calibration, calibration_message, framed, mtdata_payloads, raw_values
 from scipy.spatial.transform import Rotation
 
-from speckle3d.core.errors import InvalidInputError
+from speckle3d.core.errors import InvalidInputError, Speckle3DError
 from xsens.fusion.orient import orient
 from xsens.logs.faults import measured
 from xsens.logs.read import parse_stream
@@ -142,11 +142,20 @@ def test_what_a_sensor_may_repeat_is_a_measurement():
         assert measured(one).notes == ()
 
 
-@pytest.mark.parametrize("factor", [np.rad2deg(1.0), np.deg2rad(1.0)])
-def test_a_gyroscope_in_another_unit_is_refused(factor):
+FACTORS = (np.rad2deg(1.0), np.deg2rad(1.0), 2.0, 0.5, -1.0, 0.0)
+MIXINGS = [*(factor * np.eye(3) for factor in FACTORS), np.eye(3)[[1, 0, 2]]]
+
+
+@pytest.mark.parametrize("mixing", MIXINGS)
+def test_a_gyroscope_in_another_unit_rate_or_axes_or_that_is_dead_is_refused(mixing):
     log, _ = swinging(20.0)
-    with pytest.raises(InvalidInputError, match="gyroscope"):
-        orient(replace(log, gyroscope_rad_s=factor * log.gyroscope_rad_s))
+    with pytest.raises(Speckle3DError, match="gyroscope"):
+        orient(
+            replace(
+                log,
+                gyroscope_rad_s=log.gyroscope_rad_s @ (mixing * np.eye(3) if np.isscalar(mixing) else mixing),
+            )
+        )
 
 
 def rows_of(log, sensor="", shift_s=0.0):
