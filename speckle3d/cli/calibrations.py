@@ -13,14 +13,8 @@ from speckle3d.core.errors import InvalidInputError
 if TYPE_CHECKING:
     from calibration.beam import BeamBias
     from speckle3d.calibrating.written import Written
-    from speckle3d.core.calibration import Calibration
     from speckle3d.core.sweep import Sweep
     from speckle3d.io.import_settings import ImportSettings
-
-NOTED_SIZE = 0.01
-"""Relative difference of pixel sizes that is reported: 0.4 mm over an image of 40 mm."""
-
-NOTED_OFFSET_S = 0.001
 
 NOTED_DEG, NOTED_MM = 5.0, 10.0
 """Difference of mountings that is reported: calibrations of one mounting differ by less."""
@@ -90,36 +84,17 @@ def report_written(
 
 def mount(sweep: Sweep, paths: Sequence[Path]) -> Sweep:
     """Put calibration files on a sweep's sensors, and report on stderr where they contradict the sweep."""
+    from speckle3d.core.calibration import mounting_difference
     from speckle3d.io.calibrations import apply_calibrations, read_calibration
 
     mounted, _ = apply_calibrations(sweep, paths)
     for path in paths:
-        _note_differences(sweep, path, read_calibration(path))
+        calibration = read_calibration(path)
+        turned_deg, moved_mm = mounting_difference(sweep, calibration)
+        if turned_deg > NOTED_DEG or moved_mm > NOTED_MM:
+            moved = f" and {moved_mm:.0f} mm" if calibration.sensor == "tracker" else ""
+            note(
+                f"{path}: puts the image {turned_deg:.0f} degrees{moved} from where the sweep has it on the "
+                f"{calibration.sensor} sensor, and is used: is it of this mounting?"
+            )
     return mounted
-
-
-def _note_differences(sweep: Sweep, path: Path, calibration: Calibration) -> None:
-    from speckle3d.core.calibration import mounting_difference, pixel_difference
-    from speckle3d.matching.intensity import IntensityExtractor
-
-    # A calibration counts the pixels of images; RF has more samples than they.
-    grid, pixel_mm = IntensityExtractor.for_sweep(sweep).grid, calibration.pixel_mm
-    # Two sweeps' own pixels, say, were not found but taken as they are.
-    found = any(parameter.name in ("s_x", "s_y") for parameter in calibration.parameters)
-    if pixel_mm is not None and found and pixel_difference(grid, calibration) > NOTED_SIZE:
-        note(
-            f"{path}: found pixels of {pixel_mm[0]:.4g} x {pixel_mm[1]:.4g} mm, "
-            f"those of the sweep's images are {grid.vector_pitch_mm:.4g} x {grid.sample_spacing_mm:.4g} mm"
-            " and stay so"
-        )
-    sensor = sweep.tracker if calibration.sensor == "tracker" else sweep.orientation
-    own_s, offset_s = (0.0 if sensor is None else sensor.time_offset_s), calibration.time_offset_s
-    if own_s and offset_s is not None and abs(offset_s - own_s) > NOTED_OFFSET_S:
-        note(f"{path}: time offset {offset_s:+.4f} s is used, not the sweep's {own_s:+.4f} s")
-    turned_deg, moved_mm = mounting_difference(sweep, calibration)
-    if turned_deg > NOTED_DEG or moved_mm > NOTED_MM:
-        moved = f" and {moved_mm:.0f} mm" if calibration.sensor == "tracker" else ""
-        note(
-            f"{path}: puts the image {turned_deg:.0f} degrees{moved} from where the sweep has it on the "
-            f"{calibration.sensor} sensor, and is used: is it of this mounting?"
-        )

@@ -2,9 +2,10 @@
 
 A command is a function with a numpydoc docstring. Options under *Parameters* are common and shown by
 ``--help`` in that order, those under *Other Parameters* by ``--help-all``. "With --origin or --curve:" and
-"Not with --paper." in a help are rules that are checked. A parameter annotated with `Fields` of a pydantic
-model or a dataclass becomes an option for each field, with a model's description of it as help; the function
-gets the values that were given as a dict, and of a dataclass the others as well.
+"Not with --paper." in a help are rules that are checked, as is "One of --level or --labels." in the text. A
+parameter annotated with `Fields` of a pydantic model or a dataclass becomes an option for each field, with a
+model's description of it as help; the function gets the values that were given as a dict, and of a dataclass
+the others as well.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"]}
 _SECTION = re.compile(r"^(Parameters|Other Parameters|Examples)\n-+\n", re.MULTILINE)
 _ENTRY = re.compile(r"^(\S.*)\n?((?:[ \t]+.*\n?|\n)*)", re.MULTILINE)
 _RULE = re.compile(r"\b(With|Not with) (--[\w-]+(?: or --[\w-]+)*)[:.]")
+_CHOICE = re.compile(r"\bOne of ((?:[A-Z]+|--[\w-]+) or --[\w-]+)")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
 _FUSED = "`fused` takes any sensor there is, `crossed` a second sweep"
 _REMOVED = {
@@ -122,13 +124,16 @@ def command_of(name: str, function: Command) -> TyperCommand:
     def run(**values: Any) -> None:
         # Zero is a value that was given, and equal to False.
         given = {
-            _flag(name): option
+            _called(option): option
             for name, option in options.items()
             if values[name] is not None and values[name] is not False and values[name] != option.default
         }
         for flag, option in given.items():
             _require_fit(flag, option, values[option.name], given)
             values[option.name] = _opened(option, values[option.name])
+        for choice in _CHOICE.finditer(words.text):
+            if sum(other in given for other in choice[1].split(" or ")) != 1:
+                raise InvalidInputError(f"expected one of {choice[1]}, got both or neither")
         for group, names in groups.items():
             picked = {name: values.pop(name) for name in names}
             values[group] = {name: value for name, value in picked.items() if value is not None}
@@ -149,6 +154,12 @@ _SHARED = Words.of(shared).options
 
 def _flag(name: str) -> str:
     return f"--{name.removesuffix('_file').replace('_', '-')}"
+
+
+def _called(option: inspect.Parameter) -> str:
+    """What an option, or an argument, is called in a help."""
+    (info,) = option.annotation.__metadata__
+    return _flag(option.name) if isinstance(info, typer.models.OptionInfo) else option.name.upper()
 
 
 def _require_fit(flag: str, option: inspect.Parameter, value: Any, flags: Mapping[str, Any]) -> None:

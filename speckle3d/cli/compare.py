@@ -19,7 +19,7 @@ from speckle3d.cli.common import (
     load_settings,
     note,
 )
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError
+from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.extras import require_extra
 from speckle3d.core.progress import progress_bar
 
@@ -42,7 +42,7 @@ def compare(
 ) -> None:
     """Compare drift-correction modes over sweeps with a reference: tables, curves, a report.
 
-    A sweep that fails is a row that says why; the exit code is 2 only if all do.
+    One of SWEEPS or --paper. A sweep that fails is a row that says why; the exit code is 2 only if all do.
 
     Parameters
     ----------
@@ -79,8 +79,6 @@ def compare(
     from speckle3d.study.schedulers import scheduler_for
 
     settings, paths = load_settings(config_file), sweeps or []
-    if paper == bool(paths):
-        raise InvalidInputError("expected sweeps to compare, or --paper, one of them")
     table = ""
     with scheduler_for(scheduler, workers) as where, progress_bar("comparing") as bar:
         if curves_file is not None and paper:

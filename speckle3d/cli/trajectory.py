@@ -96,19 +96,9 @@ def score(
     --------
     $ speckle3d trajectory score out/reconstruction.h5 sweep.h5 --mode pose
     """
-    from speckle3d.scoring.trajectories import compare_trajectories, kind_of, load_estimate, load_reference
+    from speckle3d.scoring.trajectories import compare_trajectories, load_estimate, load_reference
     from speckle3d.study.results import json_text
 
-    kinds = kind_of(estimate), kind_of(of)
-    for flag, value, kind, among in (
-        ("--mode", mode, "reconstruction", kinds),
-        ("--reference", reference, "sweep", kinds[1:]),
-        ("--length-unit", length_unit, "text", kinds),
-    ):
-        if value is not None and kind not in among:
-            raise InvalidInputError(
-                f"{flag} {value}: is of a {kind}, expected none with {' or '.join(among)}"
-            )
     loaded = load_estimate(estimate, mode, length_unit)
     found = compare_trajectories(loaded, load_reference(of, reference, mode, length_unit))
     if found["same_sweep"] is False:

@@ -11,7 +11,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
-from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 
@@ -213,12 +212,6 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     square = {"image_skew_rad": 0.0} if name == "tracker" else {}
     mounted = replace(held, sensor_from_image=calibration.mounting, time_offset_s=offset_s, **square)
     return replace(sweep, **{name: mounted})
-
-
-def pixel_difference(grid: ImageGrid, calibration: Calibration) -> float:
-    """Return the larger relative difference of a calibration's pixel sizes from a grid's; zero if unknown."""
-    size_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-    return 0.0 if calibration.pixel_mm is None else float(np.abs(calibration.pixel_mm / size_mm - 1.0).max())
 
 
 def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -12,9 +12,6 @@ from speckle3d.cli.calibrations import require_free
 from speckle3d.cli.common import Json, MaybePath, MaybeText, OptionalOut, PixelMm, emit, note
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError, naming
 from speckle3d.core.progress import progress_bar
-
-if TYPE_CHECKING:
-    from speckle3d.core.calibration import Calibration
 
 
 def clock(
@@ -43,7 +40,7 @@ def clock(
     calibration
         Calibration to start from (images), and to copy with the offset that was found.
     out
-        Where that copy goes.
+        With --calibration: where that copy goes.
     search_s
         Delays to either side of the file's own.
     poses, transform, as_json
@@ -65,12 +62,18 @@ def clock(
     from calibration.detection.lines import detect_lines
     from speckle3d.calibrating.recordings import open_recording, open_tracked, require_unsized
     from speckle3d.calibrating.settings import region_of
-    from speckle3d.io.calibrations import write_calibration
+    from speckle3d.io.calibrations import read_calibration, write_calibration
     from speckle3d.study.results import json_text
 
     if out is not None:
         require_free(out, images, poses, calibration)
-    known = _known(by, sensor, calibration, out)
+    if by == "images" and sensor != "tracker":
+        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
+    known = None if calibration is None else read_calibration(calibration)
+    if known is not None and known.sensor != sensor:
+        raise MismatchError(
+            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
+        )
     require_unsized(images, pixel_mm)
     if by == "images":
         offset_s = None if known is None else known.time_offset_s
@@ -111,23 +114,3 @@ def clock(
         return
     emit(f"sensor clock offset  {delay.seconds:+.4f} +- {1.96 * error_s:.4f} s (95 %)")
     emit(words)
-
-
-def _known(by: str, sensor: str, calibration: Path | None, out: Path | None) -> Calibration | None:
-    """Read the calibration, if one is given, after checking that the options fit each other and it."""
-    from speckle3d.io.calibrations import read_calibration
-
-    if by == "images" and sensor != "tracker":
-        raise InvalidInputError(f"--by images: expected --sensor tracker, which knows places, got {sensor}")
-    if calibration is None:
-        if out is not None:
-            raise InvalidInputError("-o: expected --calibration with it, the calibration to copy, got none")
-        return None
-    if by == "line" and out is None:
-        raise InvalidInputError("--calibration: expected -o with it, where the copy goes, got none")
-    known = read_calibration(calibration)
-    if known.sensor != sensor:
-        raise MismatchError(
-            f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
-        )
-    return known

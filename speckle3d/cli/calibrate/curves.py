@@ -19,7 +19,7 @@ from speckle3d.cli.common import (
     part_of,
 )
 from speckle3d.cli.outputs import require_own_place
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import naming
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def curves(
 ) -> None:
     """Measure decorrelation curves on sweeps with known positions, or calculate them from a data sheet.
 
-    Positions are a sweep's /truth, or else its /tracker.
+    One of SWEEPS or --probe. Positions are a sweep's /truth, or else its /tracker.
 
     Parameters
     ----------
@@ -75,8 +75,6 @@ def curves(
 
     require_own_place(out, "curves", *(sweeps or []), config_file, probe, like, start)
     settings = load_settings(config_file).with_choices(region=region)
-    if (probe is None) == (not sweeps):
-        raise InvalidInputError("expected sweeps to measure curves on, or --probe, got both or neither")
     if probe is not None:
         with naming(str(probe)):
             sheet = load_toml(ProbeSheet, probe)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,18 +18,14 @@ from speckle3d.cli.common import (
     Paths,
     PixelMm,
     from_options,
-    note,
     require_finite,
 )
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, naming
+from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform
 
-    from calibration.images.solver import ImageCalibration
-    from calibration.images.stacks import TrackedImages
-    from calibration.settings import ImageFit
 
 Triple = tuple[float, float, float]
 
@@ -47,7 +42,6 @@ def images(
     transform: MaybeText = None,
     pixel_mm: PixelMm = None,
     settings: Annotated[dict[str, Any], Fields("calibration.settings:ImageFit")],
-    clock: MaybePath = None,
     time_offset_s: MaybeNumber = None,
     as_json: Json = False,
 ) -> None:
@@ -67,8 +61,6 @@ def images(
         With --start-deg: start by ruler, the image's top left corner seen from the sensor, x y z.
     start_deg
         With --start-mm: start by eye, turns from sensor to image, roll yaw tilt (fixed x, y, z of TR 303).
-    clock
-        Sweep forward and back: solve, find the clock offset from it, solve again.
     scales, as_json
 
     Other Parameters
@@ -77,15 +69,15 @@ def images(
         File with readings, if not in A and B; once for each.
     transform, pixel_mm
     time_offset_s
-        The sensor's clock offset, in place of the files' own.
+        The sensor's clock offset, in place of the files' own; see `speckle3d calibrate clock --by images`.
 
     Examples
     --------
     $ speckle3d calibrate images one.h5 across.h5 -o tracker.h5 --start rough.h5
     """
-    from calibration.clock.images import delay_from_images
     from calibration.images.angulation import angulation
     from calibration.images.report import calibration_from_images, figure_of, notes_of
+    from calibration.images.solver import calibrate_images
     from calibration.settings import ImageFit
     from speckle3d.calibrating.recordings import open_tracked, require_unsized
     from speckle3d.calibrating.written import write_with_report
@@ -94,7 +86,7 @@ def images(
     require_finite("--time-offset-s", time_offset_s)
     if poses and len(poses) != 2:
         raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
-    require_free(out, first, second, start, clock, *(poses or ()))
+    require_free(out, first, second, start, *(poses or ()))
     fit = from_options(ImageFit, settings)
     for path in (first, second):
         require_unsized(path, pixel_mm)
@@ -103,7 +95,6 @@ def images(
     readings = poses or (None, None)
     one, mounting = open_tracked(first, readings[0], pixel_mm, offset_s, transform)
     other, _ = open_tracked(second, readings[1], pixel_mm, offset_s, transform)
-    back = None if clock is None else open_tracked(clock, None, pixel_mm, offset_s, transform)[0]
     if known is not None:
         mounting = known.sensor_from_image
     begin = _start(start_mm, start_deg, mounting, first)
@@ -111,22 +102,14 @@ def images(
     # Half of the limits: a mounting that is off by 20 degrees is good enough for no more.
     posed = [sweep.world_from_sensor(sweep.covered()) for sweep in sweeps]
     angulation(posed[0], posed[1], begin, one.grid.corners_mm).require(0.5)
-    found = _solve(sweeps, begin, fit)
-    words = []
-    if back is not None:
-        with progress_bar("trying delays") as progress, naming(str(clock)):
-            delay = delay_from_images(back, found.sensor_from_image, progress=progress)
-        offset = f"clock offset {delay.seconds:+.4f} +- {1.96 * delay.standard_error_s:.4f} s (95 %)"
-        note(f"sensor {offset}; solving again")
-        words.append(f"{offset}, from images")
-        sweeps = replace(one, time_offset_s=delay.seconds), replace(other, time_offset_s=delay.seconds)
-        found = _solve(sweeps, found.sensor_from_image, fit)
+    with progress_bar("comparing sweeps") as bar:
+        found = calibrate_images(one, other, begin, fit, bar)
     if not found.converged:
         raise InsufficientDataError(
             f"{first.name} and {second.name}: the solution did not converge: expected a better start, or "
             "longer sweeps with more structure; nothing is written"
         )
-    notes = notes_of(found) + words
+    notes = notes_of(found)
     made = calibration_from_images(found, sweeps)
     written = write_with_report(made, (first, second), out, lambda _: figure_of(found, sweeps), notes)
     report_written(written, notes, as_json=as_json)
@@ -155,12 +138,3 @@ def _start(
             "with --start-deg ROLL YAW TILT; got none"
         )
     return mounting
-
-
-def _solve(
-    sweeps: tuple[TrackedImages, TrackedImages], start: RigidTransform, settings: ImageFit
-) -> ImageCalibration:
-    from calibration.images.solver import calibrate_images
-
-    with progress_bar("comparing sweeps") as bar:
-        return calibrate_images(*sweeps, start, settings, bar)

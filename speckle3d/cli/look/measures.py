@@ -30,8 +30,8 @@ def measure(
 ) -> None:
     """Say how long it is between points, and how sure that is: distances, the line's length, angles.
 
-    Standard errors are those of the poses of the frames on either side of each point, jointly, and of the
-    picking.
+    One of --point or --points. Standard errors are those of the poses of the frames on either side of each
+    point, jointly, and of the picking.
 
     Parameters
     ----------
@@ -64,9 +64,6 @@ def measure(
     from speckle3d.study.reslices.cut_geometry import read_plane
 
     columns = WORLD if on is None else PICTURE
-    if (points is None) == (not point):
-        wanted = "X,Y,Z" if on is None else "X,Y"
-        raise InvalidInputError(f"expected --point {wanted} two or more times, or --points CSV")
     if pick_mm is not None and not 0.0 <= pick_mm < float("inf"):
         raise InvalidInputError(f"--pick-mm: expected zero or more, got {pick_mm}")
     places = read_places(points, columns) if points is not None else parse_places(point or [], columns)
@@ -128,7 +125,7 @@ def surface(
 ) -> None:
     """Find the surface where a volume crosses a grey level, or those of its labels, and measure them.
 
-    Where the sweep ends the surface stays open, and what is open has no volume.
+    One of --level or --labels. Where the sweep ends the surface stays open, and what is open has no volume.
 
     Parameters
     ----------
@@ -167,8 +164,6 @@ def surface(
     from speckle3d.io.shapes.surfaces import require_suffix, write_surface
     from speckle3d.io.voxels.volumes import read_states, read_volume
 
-    if labels == (level is not None):
-        raise InvalidInputError("expected --level or --labels, one of them")
     suffix = require_suffix(out)
     if not labels:
         require_own_place(out, "surface", volume_file, reconstruction, state)

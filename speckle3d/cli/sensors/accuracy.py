@@ -20,7 +20,7 @@ from speckle3d.cli.common import (
 )
 from speckle3d.cli.outputs import require_own_place
 from speckle3d.cli.sensors.imu import Method, World, orientation_of, read, tell
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import naming
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -44,6 +44,8 @@ def accuracy(
     as_json: Json = False,
 ) -> None:
     """Compare the angles between all pairs of orientations with a reference's (Housden 2008, Table 2).
+
+    One of --reference or --optical.
 
     Parameters
     ----------
@@ -81,8 +83,6 @@ def accuracy(
     from xsens.accuracy.figures import figure_turns
     from xsens.accuracy.mechanism import read_mechanism_csv, readings_at
 
-    if (reference is None) == (optical is None):
-        raise InvalidInputError("expected --reference CSV of a mechanism or --optical FILE, one of them")
     require_finite("--time-offset-s", time_offset_s)
     if figure is not None:
         require_own_place(figure, "picture", log_file, reference, optical, *(calibration or ()))

@@ -269,8 +269,6 @@ def _orientation_rows(
 ) -> list[tuple[str, float | str, str]]:
     import numpy as np
 
-    from xsens.accuracy.comparison import compare_orientations
-
     rows: list[tuple[str, float | str, str]] = [
         ("method", method, ""),
         ("samples", float(len(rotations)), ""),
@@ -285,12 +283,4 @@ def _orientation_rows(
         rows.append((f"{name}, standard deviation, median", float(np.median(values)), "deg"))
     if found.magnetic:
         rows.append(("magnetic field disturbed", 100.0 * float(np.mean(found.disturbed)), "% of samples"))
-    if log.oriented.any():
-        apart = compare_orientations(rotations, log.rotations())
-        for name, value in (
-            ("inclination", apart.inclination_rms_rad),
-            ("heading", apart.heading_rms_rad),
-            ("heading, constant offset removed", apart.heading_rms_without_offset_rad),
-        ):
-            rows.append((f"{name}, RMS difference from the sensor's own", float(np.rad2deg(value)), "deg"))
     return rows

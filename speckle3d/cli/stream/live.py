@@ -32,7 +32,6 @@ from speckle3d.core.printable import printable
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from types import FrameType
 
     from speckle3d.io.igtl.link import Connection
@@ -48,15 +47,6 @@ _LAST_LOOK_S = 1.0
 """For pages to show the end."""
 _SWITCH_S = 5e-4
 """For which one thread keeps the interpreter at most; Python's 5 ms a frame would wait for many times."""
-_NEEDS = {
-    "pose": ("transform",),
-    "tracker": ("transform",),
-    "orientation": ("orientation", "transform"),
-    "consistent-subset": ("orientation", "transform"),
-    "crossed": ("crossing",),
-    "fused": ("orientation", "transform", "crossing"),
-}
-"""Options of which a mode, or the calibration of a sensor, needs one."""
 _IMPORTED = (
     "sampling_rate_hz",
     "vector_pitch_mm",
@@ -158,8 +148,6 @@ def live(
     if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 2**16):
         raise InvalidInputError(f"expected HOST:PORT, as localhost:18944, got {server!r}")
     config, curves = load_settings(config_file).with_choices(region=region), read_curves(curves_file)
-    sources = {"transform": transform, "orientation": orientation, "crossing": crossing_file}
-    _require_possible(drift or (), calibration or (), **sources)
     recorded = out / "sweep.h5"
     if recorded.exists():
         raise InvalidInputError(f"{recorded}: there already; expected a folder without a recorded sweep")
@@ -212,18 +200,6 @@ def live(
             time.sleep(_LAST_LOOK_S)
     if session.failure is not None:
         raise session.failure
-
-
-def _require_possible(drift: Sequence[str], calibrations: Sequence[Path], **sources: object) -> None:
-    """Refuse now what the reconstruction at the end would refuse for want of an option."""
-    from speckle3d.io.calibrations import read_calibration
-
-    wanted = [(f"--drift {mode}", _NEEDS[mode]) for mode in drift]
-    wanted += [(str(path), _NEEDS[read_calibration(path).sensor]) for path in calibrations]
-    for what, names in wanted:
-        if not any(sources[name] for name in names):
-            flags = " or ".join(f"--{name}" for name in names)
-            raise InvalidInputError(f"{what}: expected {flags} beside it, got none")
 
 
 class _Sender:
