@@ -13,10 +13,9 @@ from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
-from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
-from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
+from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
 from speckle3d.io import calibrations, curves, reconstructions
 from speckle3d.io.calibrations import read_calibration
 from speckle3d.io.import_settings import settings_for
@@ -58,15 +57,9 @@ def describe(path: PathLike) -> list[Row]:
 
 def sweep_rows(sweep: Sweep) -> list[Row]:
     """Tell what a sweep holds."""
-    grid, signal, stored = sweep.grid, sweep.signal, stored_dtype(sweep.frames)
-    kind = "B-mode"
-    if isinstance(signal, RFSettings):
-        is_shifted = bool(signal.demodulation_frequency_hz)
-        complex_kind = "I/Q" if is_shifted else "I/Q, not demodulated (the analytic signal)"
-        kind = complex_kind if signal.are_complex else "RF"
+    grid, stored, tracker = sweep.grid, stored_dtype(sweep.frames), sweep.tracker
     narrow = "" if sweep.frames.dtype == stored else f", stored as pairs of {stored}"
-    skew_rad = 0.0 if sweep.tracker is None else sweep.tracker.image_skew_rad
-    return [
+    rows = [
         ("frames", str(len(sweep)), ""),
         *_rate_rows("", sweep.frame_time_s, "frames/s"),
         ("vectors x samples", f"{grid.vectors} x {grid.samples}", ""),
@@ -75,44 +68,42 @@ def sweep_rows(sweep: Sweep) -> list[Row]:
         ("sample spacing", f"{grid.sample_spacing_mm:.4g}", "mm"),
         ("width", f"{grid.width_mm:.2f}", "mm"),
         ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
-        *_fan_rows(grid),
-        ("signal", kind, ""),
-        *(number_row(name, value) for name, value in vars(signal).items() if value and name != "full_scale"),
-        *_sensor_rows("orientation sensor", sweep.orientation, sweep),
-        *_sensor_rows("tracker", sweep.tracker, sweep),
-        *([("image axes off square", f"{np.rad2deg(skew_rad):.3g}", "deg")] if skew_rad else []),
-        ("truth", "no" if sweep.truth is None else "yes", ""),
     ]
+    if grid.fan is not None:
+        first, last = np.rad2deg(grid.angle_rad([0, grid.vectors - 1]))
+        rows.append(("array radius", f"{grid.fan.radius_mm:.4g}", "mm"))
+        rows.append(("vectors from straight down", f"{first:.4g} to {last:.4g}", "deg"))
+    rows += _signal_rows(sweep.signal)
+    for name, sensor in (("orientation sensor", sweep.orientation), ("tracker", tracker)):
+        if sensor is None:
+            rows.append((name, "none", ""))
+            continue
+        covered = np.count_nonzero(sensor.covers(sweep.frame_time_s))
+        rows += [
+            (name, str(len(sensor.readings)), "samples"),
+            *_rate_rows(f"{name} ", sensor.readings.time_s, "samples/s"),
+            (f"{name} covers", str(covered), "frames"),
+            (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
+            (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
+        ]
+    if tracker is not None and tracker.image_skew_rad:
+        rows.append(("image axes off square", f"{np.rad2deg(tracker.image_skew_rad):.3g}", "deg"))
+    return [*rows, ("truth", "no" if sweep.truth is None else "yes", "")]
 
 
-def _fan_rows(grid: ImageGrid) -> list[Row]:
-    """Tell where the vectors of a curved or phased array lie."""
-    if grid.fan is None:
-        return []
-    first, last = np.rad2deg(grid.angle_rad([0, grid.vectors - 1]))
-    return [
-        ("array", "phased" if grid.fan.radius_mm == 0 else "curved", ""),
-        ("array radius", f"{grid.fan.radius_mm:.4g}", "mm"),
-        ("vectors from straight down", f"{first:.4g} to {last:.4g}", "deg"),
-    ]
+def _signal_rows(signal: RFSettings | BModeSettings) -> list[Row]:
+    kind = "B-mode"
+    if isinstance(signal, RFSettings):
+        is_shifted = bool(signal.demodulation_frequency_hz)
+        kind = "RF" if not signal.are_complex else "I/Q" if is_shifted else "I/Q, the analytic signal"
+    numbers = ((name, value) for name, value in vars(signal).items() if value and name != "full_scale")
+    return [("signal", kind, ""), *(number_row(*one) for one in numbers)]
 
 
 def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
     span = float(np.ptp(times)) if times.size else 0.0
-    rows = [(f"{name} duration".strip(), f"{span:.3f}", "s"), (f"{name} rate".strip(), "", unit)]
-    return [*rows[:1], (rows[1][0], f"{(times.size - 1) / span:.2f}", unit)] if span else rows[: times.size]
-
-
-def _sensor_rows(name: str, sensor: OrientationSensor | Tracker | None, sweep: Sweep) -> list[Row]:
-    if sensor is None:
-        return [(name, "none", "")]
-    return [
-        (name, str(len(sensor.readings)), "samples"),
-        *_rate_rows(name, sensor.readings.time_s, "samples/s"),
-        (f"{name} covers", str(np.count_nonzero(sensor.covers(sweep.frame_time_s))), "frames"),
-        (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
-        (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
-    ]
+    rate = f"{(times.size - 1) / span:.2f}" if span else ""
+    return [(f"{name}duration", f"{span:.3f}", "s"), (f"{name}rate", rate, unit)]
 
 
 def _describe_reconstruction(path: PathLike) -> list[Row]:
@@ -158,12 +149,14 @@ def _describe_calibration(path: PathLike) -> list[Row]:
 
 def _mounting_rows(held: Calibration) -> list[Row]:
     """Where the image is, angles in degrees, and how well that is known about and along the image's axes."""
-    angles = zip(("roll", "yaw", "tilt"), np.rad2deg(roll_yaw_tilt(held.rotation)), strict=True)
     spread = np.sqrt(np.diag(held.covariance))
-    rows: list[Row] = [(f"sensor_from_image {name}", f"{angle:.3f}", "deg") for name, angle in angles]
-    rows.append(("standard error, tilt, yaw, roll", _listed(np.rad2deg(spread[:3])), "deg"))
+    angles = np.rad2deg(roll_yaw_tilt(held.rotation))
+    rows: list[Row] = [
+        ("sensor_from_image roll, yaw, tilt", _listed(angles), "deg"),
+        ("standard error, tilt, yaw, roll", _listed(np.rad2deg(spread[:3])), "deg"),
+    ]
     if held.translation_mm is not None:
-        rows.insert(3, ("sensor_from_image x, y, z", _listed(held.translation_mm), "mm"))
+        rows.append(("sensor_from_image x, y, z", _listed(held.translation_mm), "mm"))
         rows.append(("standard error along the image's x, y, z", _listed(spread[3:]), "mm"))
     if held.pixel_mm is not None:
         rows.append(("pixel", " x ".join(f"{size:.5f}" for size in held.pixel_mm), "mm"))
@@ -182,10 +175,7 @@ def _describe_volume(path: PathLike) -> list[Row]:
         ("spacing", " x ".join(f"{step:g}" for step in volume.spacing_mm), "mm"),
         ("voxel type", volume.voxels.dtype.name, ""),
         ("first voxel at x, y, z (LPS)", _listed(volume.world_from_grid.translation), "mm"),
-        *(
-            (f"direction of {axis} (LPS)", _listed(along), "")
-            for axis, along in zip("ijk", turned, strict=True)
-        ),
+        *((f"direction of {axis} (LPS)", _listed(turned[k]), "") for k, axis in enumerate("ijk")),
         *((printable(name), text, "") for name, text in volume.fields.items()),
     ]
     if not isinstance(volume, LabelMap):
@@ -200,14 +190,12 @@ def _describe_volume(path: PathLike) -> list[Row]:
 
 def _describe_curves(path: PathLike) -> list[Row]:
     held = curves.read_curves(path)
-    key, signal = held.key, held.key.signal
-    kind = "B-mode" if not isinstance(signal, RFSettings) else "I/Q" if signal.are_complex else "RF"
+    key, parts = held.key, ("tilt", "speckle", "spectrum")
     half = [np.interp(-0.5, -row, held.distance_mm) for row in held.correlation]
     return [
         ("probe", key.probe or "not named", ""),
         ("origin", held.origin, ""),
-        ("signal", kind, ""),
-        *(number_row(name, value) for name, value in vars(signal).items() if value and name != "full_scale"),
+        *_signal_rows(key.signal),
         ("vector pitch", f"{key.vector_pitch_mm:.4g}", "mm"),
         ("patches", f"{key.patch_width_mm:g} x {key.patch_height_mm:g}", "mm"),
         ("correlation of", key.correlation_of, ""),
@@ -215,9 +203,7 @@ def _describe_curves(path: PathLike) -> list[Row]:
         ("distances", f"up to {held.distance_mm[-1]:.2f}", "mm"),
         ("correlation halves at", f"{min(half):.2f} to {max(half):.2f}", "mm"),
         ("frame pairs", str(held.pairs_used), ""),
-        ("tilt", "no" if held.tilt is None else "yes", ""),
-        ("speckle size", "no" if held.speckle is None else "yes", ""),
-        ("spectrum", "no" if held.spectrum is None else "yes", ""),
+        *((part, "no" if getattr(held, part) is None else "yes", "") for part in parts),
         ("lengths read with them, 95 %", f"+- {196 * held.scale_sigma:.1f}", "%"),
     ]
 
