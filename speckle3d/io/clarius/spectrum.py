@@ -1,20 +1,20 @@
 """The band of echoes, measured in a recording whose files do not give it.
 
-Neighbouring lines see much of the same echoes but not the same noise: the mean of their cross-spectrum, over
-segments along the lines that are each scaled to the same power, is that of the echoes alone, whatever the
+Neighbouring lines see much of the same echoes but not the same noise: the mean of their cross-spectra, by
+Welch's method, of lines scaled to the same power at all depths, is that of the echoes alone, whatever the
 noise's. The band is where it is above a quarter of its highest (-6 dB), about the transmit frequency. It is
 the band of the echoes at all depths together, lower than the probe's in tissue that attenuates. On simulated
-RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise; at -10 dB no band is found.
+RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import csd
 
 from speckle3d.core.sweep import Frames
 
-_PAIRS = 48
 _RESOLUTION_HZ = 0.5e6
 """A tenth of a narrow probe's band."""
 
@@ -44,31 +44,27 @@ def band_hz(
     count, vectors, samples = frames.shape
     if vectors < 2 or samples < length:
         return None
-    shared, power, spectra = np.zeros(length), np.zeros(length), 0
-    first = np.unique(np.linspace(0, vectors - 2, _PAIRS).astype(int))
-    for i in sorted({0, count // 2, count - 1}):
-        segments = sliding_window_view(frames[i], length, axis=1)[:, :: length // 2]
-        if shift_hz is None:  # what is constant in RF is of the electronics
-            segments = segments - segments.mean(axis=2, keepdims=True)
-        pair = np.fft.fft(segments * np.hanning(length + 1)[:-1])
-        one, other = pair[first], pair[first + 1]
-        scale = np.linalg.norm(one, axis=2) * np.linalg.norm(other, axis=2)
-        used = scale > 0
-        one, other = (lines[used] / np.sqrt(scale[used, None]) for lines in (one, other))
-        shared += (one * other.conj()).real.sum(axis=0)
-        power += 0.5 * (np.abs(one) ** 2 + np.abs(other) ** 2).sum(axis=0)
-        spectra += int(np.count_nonzero(used))
+    chosen = sorted({0, count // 2, count - 1})
+    spectra = len(chosen) * (vectors - 1) * (2 * samples // length - 1)
+    shared, power = np.zeros(length), np.zeros(length)
+    for i in chosen:
+        lines = frames[i] - (frames[i].mean(axis=1, keepdims=True) if shift_hz is None else 0.0)
+        level = np.sqrt(uniform_filter1d(np.mean(np.abs(lines) ** 2, axis=0), length))
+        lines = lines / np.where(level > 0, level, 1.0)
+        for other, mean in ((lines[1:], shared), (lines[:-1], power)):
+            _, cross = csd(lines[:-1], other, nperseg=length, return_onesided=False, detrend=False)
+            mean += cross.real.mean(axis=0)
     frequency = np.fft.fftfreq(length, 1 / sampling_rate_hz) + (shift_hz or 0.0)
     # Real samples have each frequency twice.
     order = np.argsort(frequency[: length // 2] if shift_hz is None else frequency)
     frequency, shared, power = frequency[order], shared[order], power[order]
     near = np.flatnonzero((frequency > 0.5 * transmit_hz) & (frequency < 2 * transmit_hz))
-    if not near.size or not spectra:
+    if not near.size:
         return None
     top = int(near[np.argmax(shared[near])])
     level = shared[top] / 4
     left, right = np.flatnonzero(shared[:top] < level), np.flatnonzero(shared[top:] < level) + top
-    if shared[top] < _CLEAR / np.sqrt(spectra) * power[top] or not (left.size and right.size):
+    if shared[top] <= _CLEAR / np.sqrt(spectra) * power[top] or not (left.size and right.size):
         return None
     rise, fall = slice(left[-1], left[-1] + 2), slice(right[0], right[0] - 2, -1)
     edges = (np.interp(level, shared[edge], frequency[edge]) for edge in (rise, fall))

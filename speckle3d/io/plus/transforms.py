@@ -271,23 +271,21 @@ def _poses_of_pixels(
     path: str, name: str, matrices: FloatArray, missing: list[str]
 ) -> tuple[FloatArray, list[str], FloatArray | None]:
     """Split transforms of pixels to mm into the image's poses and its pixels, the same in all frames."""
-    poses, faults, first = np.tile(np.eye(4), (len(matrices), 1, 1)), [""] * len(matrices), None
-    for i in [i for i, fault in enumerate(missing) if not fault]:
+    poses, faults, rows = np.tile(np.eye(4), (len(matrices), 1, 1)), [""] * len(matrices), list[int]()
+    sizes, given = np.linalg.norm(matrices[:, :3, :2], axis=1), [not fault for fault in missing]
+    middle = np.median(sizes[given], axis=0)
+    for i in np.flatnonzero(given).tolist():
         try:
             poses[i] = sensor_from_image(matrices[i], 0.0, f"{path}: {name}Transform[{i}]").as_matrix()
-        except InvalidInputError as error:
-            faults[i], first = "whose pixels make no sense", first or error
-    rows = np.array([not (fault or other) for fault, other in zip(faults, missing, strict=True)])
-    if not rows.any():
-        if first is not None:
-            raise first
+        except InvalidInputError:
+            if not rows and not any(given[i + 1 :]):
+                raise
+            faults[i] = "whose pixels make no sense"
+            continue
+        rows.append(i)
+        if (np.abs(sizes[i] / middle - 1.0) > ROUNDING_TOLERANCE).any():
+            faults[i] = f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
+    if not rows:
         return poses, faults, None
-    sizes = np.linalg.norm(matrices[:, :3, :2], axis=1)
-    middle = np.median(sizes[rows], axis=0)
-    odd = rows & (np.abs(sizes / middle - 1.0) > ROUNDING_TOLERANCE).any(axis=1)
-    other = f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
-    faults = [fault or (other if is_odd else "") for fault, is_odd in zip(faults, odd, strict=True)]
-    same = rows & ~odd
-    leaning = np.mean([image_skew_rad(matrix, path) for matrix in matrices[same]])
-    column_mm, row_mm = sizes[same].mean(axis=0).tolist()
-    return poses, faults, image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, float(leaning))
+    leaning = image_skew_rad(matrices[rows[0]], path)
+    return poses, faults, image_matrix(RigidTransform.identity(), *middle.tolist(), 0.0, leaning)
