@@ -287,5 +287,5 @@ def _poses_of_pixels(
             faults[i] = f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
     if not rows:
         return poses, faults, None
-    leaning = image_skew_rad(matrices[rows[0]], path)
-    return poses, faults, image_matrix(RigidTransform.identity(), *middle.tolist(), 0.0, leaning)
+    leaning, (column_mm, row_mm) = image_skew_rad(matrices[rows[0]], path), middle.tolist()
+    return poses, faults, image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning)
