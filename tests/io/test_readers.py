@@ -1,19 +1,14 @@
 """One door: what a recording lacks comes from options or from a file beside it, and is asked for at once."""
 
-from pathlib import Path
 
-import numpy as np
 import pytest
 from image_examples import grey, tracked, write_mha
+from PIL import Image
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.sweep import BModeSettings
-from speckle3d.io import readers
-from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings, MissingSettingsError, settings_for
 from speckle3d.io.load import load_sweep, recording_files, recording_sha256
-from speckle3d.io.readers import Reader, find_reader
-from speckle3d.io.recordings import Recording, Value
 
 BMODE = "column_pitch_mm = 0.1\nrow_spacing_mm = 0.2\ndynamic_range_db = 60\n"
 
@@ -43,43 +38,19 @@ def test_the_hash_of_a_recording_covers_what_stands_beside_it(images):
     assert len({alone, with_settings, recording_sha256(images)}) == 3
 
 
-@pytest.fixture
-def folders(monkeypatch):
-    """A reader of another package, for folders with a file `frames.npy`."""
-
-    def read(path: Path, settings: ImportSettings) -> Recording:
-        frames = np.load(path / "frames.npy")
-        values = {"row_spacing_mm": Value(0.1), "dynamic_range_db": Value(60.0)}
-        return Recording(path, settings, frames, values, name=path.name)
-
-    reader = Reader(
-        "folder of a lab",
-        lambda path, start: not start and (path / "frames.npy").is_file(),
-        read,
-        lambda path: [path / "frames.npy"],
-    )
-    monkeypatch.setattr(readers, "_others", lambda: (reader,))
-    readers.readers.cache_clear()
-    yield reader
-    readers.readers.cache_clear()
-
-
-def test_a_folder_is_read_by_the_reader_of_another_package(folders, tmp_path, monkeypatch):
+def test_settings_of_a_folder_stand_beside_it_or_in_it(tmp_path, monkeypatch):
     scan = tmp_path / "scan"
     scan.mkdir()
-    np.save(scan / "frames.npy", np.zeros((3, 4, 5), dtype=np.uint8))
-    assert find_reader(scan) is folders
+    for i, image in enumerate(grey()):
+        Image.fromarray(image).save(scan / f"{i}.png")
     with pytest.raises(MissingSettingsError, match=r"--column-pitch-mm.*--frame-rate-hz"):
         load_sweep(scan)
-    (tmp_path / "scan.toml").write_text("frame_rate_hz = 10\ncolumn_pitch_mm = 0.3\n")
-    rows = {name: value for name, value, _ in describe(scan)}
-    assert (rows["format"], rows["frames"]) == ("folder of a lab", "3")
-    sweep = load_sweep(scan)
-    assert sweep.frame_time_s.tolist() == [0.0, 0.1, 0.2]
-    assert recording_files(scan) == [scan / "frames.npy", tmp_path / "scan.toml"]
+    (tmp_path / "scan.toml").write_text(f"{BMODE}frame_rate_hz = 10\n")
+    assert load_sweep(scan).frame_time_s.tolist() == [0.0, 0.1, 0.2]
+    assert recording_files(scan)[-1] == tmp_path / "scan.toml"
     (tmp_path / "scan.toml").rename(scan / "import.toml")
     monkeypatch.chdir(scan)
-    assert load_sweep(".").grid.vector_pitch_mm == 0.3
+    assert load_sweep(".").grid.vector_pitch_mm == 0.1
 
 
 @pytest.mark.parametrize(
