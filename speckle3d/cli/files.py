@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -103,6 +104,7 @@ def convert(
     """
     from speckle3d.io.calibrations import fitted_pixels, resized
     from speckle3d.io.load import kind_of, open_recording
+    from speckle3d.io.plus.device_set import read_device_set
     from speckle3d.io.plus.write import SUFFIXES, write_sequence
     from speckle3d.io.reconstructions import FORMAT
     from speckle3d.io.sweep_writer import COMPRESSIONS, write_sweep
@@ -135,6 +137,11 @@ def convert(
     recording = open_recording(source, given.model_copy(update=fitted))
     sweep = mount(resized(recording.sweep, fitted), calibration or ())
     notes(recording.notes)
+    config = recording.settings.plus_config
+    clip = None if config is None else read_device_set(config).clip
+    skew_rad = 0.0 if sweep.tracker is None else sweep.tracker.image_skew_rad
+    if region := clip and clip.region_text(replace(sweep.grid, skew_rad=skew_rad)):
+        note(f"{out}: does not hold the clip of {config}: give `speckle3d volume` --region '{region}'")
     with progress_bar(f"writing {out.name}") as progress:
         if suffix not in SUFFIXES:
             write_sweep(out, sweep, progress, COMPRESSIONS[compression or "none"])

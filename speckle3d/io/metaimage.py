@@ -325,10 +325,7 @@ def _remarks(
         what = "images are taken for scan-converted" if is_picture else "its lines spread"
         notes.append(f"the device set calls the transducer {device.geometry}: {what}")
     if device.clip is not None and device.clip.is_part_of(header.size):
-        notes.append(
-            "the device set clips images for volumes: `speckle3d volume` does with --plus-config, and a file "
-            f"that `convert` makes has whole images: {device.clip}"
-        )
+        notes.append(f"the device set clips images for volumes, as `speckle3d volume` does: {device.clip}")
     if header.is_volume:
         notes.append("third axis is time, as the frame rate that is given says: by its Kinds it is in space")
     return notes

@@ -1,6 +1,5 @@
 """One door: what a recording lacks comes from options or from a file beside it, and is asked for at once."""
 
-
 import pytest
 from image_examples import grey, tracked, write_mha
 from PIL import Image
