@@ -28,6 +28,8 @@ SINGLE_LOOK_DB = 13.4
 """From the 10th to the 90th percentile of an exponential variable's decibels: 10 lg(ln 0.1 / ln 0.9)."""
 PATCH_MM = (3.6, 2.0)
 """Across and along the beam: some fifty cells of speckle, and less of structure than larger ones."""
+USUAL_PIXEL_MM = 0.1
+"""Of images of which nobody says how far apart their pixels are, and of fans."""
 FRAMES, LEAST_PATCHES = 10, 20
 BRIGHT, QUIET = 0.5, 0.3
 """Shares of the patches that count: the brighter half, of it the least varied, that hold least structure."""

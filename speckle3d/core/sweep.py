@@ -12,6 +12,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
+from speckle3d.core.compression import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.geometry import require_increasing
@@ -329,7 +330,7 @@ class Sweep:
         frame_rate_hz : float
             Or `frame_time_s`, shape (n,).
         dynamic_range_db : float
-            Of grey levels, from black to white.
+            Of grey levels, from black to white; estimated from their speckle if not given.
         signal : RFSettings
             Of echoes: how they were sampled.
         first_row_depth_mm : float
@@ -353,8 +354,12 @@ class Sweep:
         if frame_time_s is None and frame_rate_hz is not None:
             frame_time_s = np.arange(n) / frame_rate_hz
         kind: RFSettings | BModeSettings | None = signal
-        if dynamic_range_db is not None and signal is None and read.dtype == np.uint8:
-            kind = BModeSettings(dynamic_range_db)
+        if signal is None and read.dtype == np.uint8:
+            sides = np.broadcast_to(USUAL_PIXEL_MM if pitch_mm is None else pitch_mm, (2,)).tolist()
+            seen = (
+                estimate_dynamic_range(read, *sides) if dynamic_range_db is None else (dynamic_range_db, 0.0)
+            )
+            kind = seen and BModeSettings(seen[0], dynamic_range_sigma_db=seen[1])
         of_kind = "dynamic_range_db" if read.dtype == np.uint8 else "signal"
         if pitch_mm is None or frame_time_s is None or kind is None:
             known = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, of_kind: kind}

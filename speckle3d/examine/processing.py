@@ -3,7 +3,7 @@
 Averaging of frames (persistence) widens the beam by what the probe goes meanwhile, so that lengths come out
 short. Where speckle has changed from one frame to the next, their mean varies less in grey: frames taken at
 speed are flatter than those taken slowly, which nothing else makes of them. To first order the beam is
-widened by twice the logarithm of what is lost of the grey levels' spread.
+widened by twice the logarithm of what the grey levels' spread loses.
 
 Filters leave structure and take speckle away. Decibels of speckle have a long tail of dark ones, filtered
 they are even about their median; where bright ones have the long tail, it is structure that is seen.
@@ -12,22 +12,25 @@ they are even about their median; where bright ones have the long tail, it is st
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.stats import theilslopes
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.matching.frames import MatchedSweep
 
-SMOOTHED = 11
+SMOOTHED = 21
 """Frames over which tissue goes by: what changes more slowly is no effect of speed."""
 USABLE_SHARE = 0.8
 """Of the frames in which a patch must be usable to be compared from frame to frame."""
 LEAST_FRAMES = 12
 AVERAGED_SLOPE = -0.2
 """Logarithm of the grey levels' spread over correlation lost from frame to frame, below which frames are
-averages. Simulated sweeps of two physics have -0.05 to 0.01; means of two frames -0.4 to -0.8, of three -0.6
+averages. Simulated sweeps of two physics have -0.1 to 0.04; means of two frames -0.3 to -0.6, of three -0.6
 to -1, half of the last frame kept -1.1 to -1.8; bone at 0.5 mm a frame -0.16."""
-CONFIDENCE = 0.9
+CONFIDENCE = 0.8
+SHORT_BY_SPREAD = 3.0
+"""Length lost over what is lost of the spread: 2 to first order, simulated sweeps have 2 to 4."""
 SHORT_REFUSED = 0.05
 """Of the length, from which averaging refuses it."""
 STRUCTURE_BALANCE = 0.8
@@ -75,10 +78,9 @@ def shortening(matches: MatchedSweep) -> float:
     slope, _, _, high = theilslopes(_changes(level), _changes(lost), CONFIDENCE)
     if slope > AVERAGED_SLOPE or high > 0.0:
         return 0.0
-    return float(-2.0 * slope * np.median(lost))
+    return float(-SHORT_BY_SPREAD * slope * np.median(lost))
 
 
 def _changes(values: FloatArray) -> FloatArray:
     """Values over their mean about each frame."""
-    window, ones = np.ones(SMOOTHED), np.ones_like(values)
-    return np.asarray(values - np.convolve(values, window, "same") / np.convolve(ones, window, "same"))
+    return np.asarray(values - uniform_filter1d(values, SMOOTHED))

@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.compression import estimate_dynamic_range
+from speckle3d.core.compression import USUAL_PIXEL_MM, estimate_dynamic_range
 from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.printable import printable
@@ -36,9 +36,6 @@ Row = tuple[str, str, str]
 
 SPREAD = 1e-3
 """How far steps of an axis may be from their mean, as a share: rounding of single precision in metres."""
-
-USUAL_PIXEL_MM = 0.1
-"""Of images of which nobody says how far apart their pixels are, and of fans."""
 
 CONTRADICTION = 0.01
 """Difference, as a share, above which a number that is given contradicts what a file says."""

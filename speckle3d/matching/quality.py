@@ -165,7 +165,8 @@ def inspect_frame(
     if is_bmode:
         grey = np.empty_like(statistics)
         patch_statistics(np.asarray(frame, dtype=np.float32), patches.first, patches.size, step, grey)
-        spread[usable] = np.log(grey[usable, 0] * grey[usable, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):  # Black patches have none.
+            spread = np.log(grey[:, 0] * grey[:, 1])
     return FrameFeatures(
         mean, _clipped(frame, is_bmode, s), share(together & fine), share(~together), spread, usable
     )

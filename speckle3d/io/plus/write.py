@@ -230,6 +230,8 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
     spacing = (1.0, 1.0) if calibrated else sizes[::-1] if is_rf else sizes
     names = ("vector_pitch_mm",) if is_rf else ("column_pitch_mm", "row_spacing_mm")
     own: dict[str, Any] = {name: value for name, value in vars(signal).items() if value is not None}
+    if own.pop("dynamic_range_sigma_db", 0.0):
+        del own["dynamic_range_db"]  # which is estimated from the images as it was
     own |= {"first_sample_depth_mm": grid.first_sample_depth_mm, **dict(zip(names, sizes, strict=False))}
     texts = {name: " ".join(map(_text, np.ravel(value))) for name, value in own.items()}
     if sweep.probe:
