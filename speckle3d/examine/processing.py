@@ -31,8 +31,8 @@ to -1, half of the last frame kept -1.1 to -1.8; bone at 0.5 mm a frame -0.16.""
 CONFIDENCE = 0.8
 SHORT_BY_SPREAD = 3.0
 """Length lost over what is lost of the spread: 2 to first order, simulated sweeps have 2 to 4."""
-SHORT_REFUSED = 0.05
-"""Of the length, from which averaging refuses it."""
+SHORT_REFUSED = 0.03
+"""Of the length, from which averaging refuses it: the share is known to a factor of two."""
 STRUCTURE_BALANCE = 0.8
 """Ratio of the distances of the 10th and the 90th percentile of decibels from their median, below which
 structure is seen in place of speckle. Simulated speckle has 1.4 to 1.6, smoothed by 5 x 5 samples 0.85 to 1;
