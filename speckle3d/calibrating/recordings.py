@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.stacks import TrackedImages
@@ -49,10 +45,9 @@ def open_recording(
     InsufficientDataError
         If there is no such sensor.
     """
-    sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, sensor, transform)
+    sweep, pictures, grid, readings, offset_s = _opened(images, poses, pixel_mm, sensor, transform, 0.0)
     size = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
     first_px = np.array([grid.first_vector_mm, grid.first_sample_depth_mm]) / size
-    pictures = pictures if sweep.grid.fan is None else _BlackOutside(pictures)
     return Recording(pictures, size, first_px, sweep.frame_time_s, readings, offset_s)
 
 
@@ -84,91 +79,40 @@ def open_tracked(
     return TrackedImages(pictures, grid, sweep.frame_time_s, readings, offset_s, images.name), mounting
 
 
-@dataclass(frozen=True)
-class _BlackOutside:
-    """Scan-converted images, black outside the fan, where there is nothing to detect."""
-
-    source: Frames
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        return self.source.shape
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return self.source.dtype
-
-    def __getitem__(self, index: int) -> npt.NDArray[Any]:
-        return np.asarray(np.nan_to_num(self.source[index]))
-
-
 def _opened(
-    images: Path, poses: Path | None, pixel_mm: tuple[float, float] | None, sensor: str, transform: str | None
+    images: Path,
+    poses: Path | None,
+    pixel_mm: tuple[float, float] | None,
+    sensor: str,
+    transform: str | None,
+    outside: float = np.nan,
 ) -> tuple[Sweep, Frames, ImageGrid, TimedPoses | TimedRotations, float]:
     """A sweep, its grey images and their grid, and one sensor's readings with the offset of their clock."""
     if sensor not in ("tracker", "orientation"):
         raise InvalidInputError(f"--sensor: expected tracker or orientation, got {sensor!r}")
-    require_sequence(images if poses is None else poses, transform)
     sweep = _load(images, pixel_mm, transform if poses is None else None)
     given = _readings(sweep, images, sensor) if poses is None else _readings_of(poses, sensor, transform)
     is_grey = isinstance(sweep.signal, BModeSettings)
     if is_grey and sweep.grid.fan is None:
         return sweep, sweep.frames, sweep.grid, *given
     levels: Levels = "stored" if is_grey else "log"
-    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False, levels=levels)
+    pictures = GreyImages(sweep, DYNAMIC_RANGE_DB, clipped=False, levels=levels, outside=outside)
     return sweep, pictures, pictures.grid, *given
 
 
 def _load(path: Path, pixel_mm: tuple[float, float] | None, transform: str | None) -> Sweep:
     given = ImportSettings(dynamic_range_db=DYNAMIC_RANGE_DB, tracker_transform=transform)
     if pixel_mm is not None:
-        if not min(pixel_mm) > 0:
-            raise InvalidInputError(f"--pixel-mm: expected two values above zero, got {pixel_mm}")
         column, row = pixel_mm
         given = given.model_copy(update={"column_pitch_mm": column, "row_spacing_mm": row})
+    require_unsaid(path, given.model_copy(update={"dynamic_range_db": None}))
     try:
         return load_sweep(path, given)
     except MissingSettingsError as error:
-        raise InvalidInputError(f"{path}: {_advice(path, error.settings)}") from None
-
-
-_PIXEL = {"column_pitch_mm", "row_spacing_mm"}
-
-
-def _advice(path: Path, lacking: Sequence[str]) -> str:
-    """Advise which options or which file supply all that a recording does not say."""
-    size = "how large a pixel is: give --pixel-mm COLUMN ROW, roughly"
-    others = [name.replace("_", "-") for name in lacking if name not in _PIXEL]
-    if not others:
-        return f"the recording does not say {size}"
-    also = f"; nor {size}" if _PIXEL & {*lacking} else ""
-    options = " ".join(f"--{each} ..." for each in others)
-    return (
-        f"the recording does not say its {', '.join(others)}: give that in {path.name}.toml, or make "
-        f"it a sweep file by `speckle3d convert {path.name} OUT.h5 {options}`{also}"
-    )
-
-
-def require_sequence(path: Path, given: object, option: str = "--transform") -> None:
-    """Refuse an option of image sequences, if given, for another recording, as a sweep file.
-
-    Raises
-    ------
-    InvalidInputError
-    """
-    if given is not None and kind_of(path) != IMAGE:
-        raise InvalidInputError(f"{option}: expected an image sequence with it, got {path} ({kind_of(path)})")
-
-
-def require_unsized(path: Path, pixel_mm: tuple[float, float] | None) -> None:
-    """Refuse a pixel size for a sweep file, which has its own.
-
-    Raises
-    ------
-    InvalidInputError
-    """
-    if pixel_mm is not None and kind_of(path) in SIZED:
-        raise InvalidInputError(f"--pixel-mm: expected none with {path}, which has its own")
+        raise InvalidInputError(
+            f"{path}: the recording does not say its {', '.join(error.settings)}: give --pixel-mm COLUMN "
+            f"ROW, roughly, for the size of a pixel, and what else there is in {path.name}.toml"
+        ) from None
 
 
 def require_unsaid(path: Path, given: ImportSettings) -> None:
@@ -178,10 +122,10 @@ def require_unsaid(path: Path, given: ImportSettings) -> None:
     ------
     InvalidInputError
     """
-    names = sorted(given.model_fields_set)
+    names = sorted(name for name in given.model_fields_set if getattr(given, name) is not None)
     if names and kind_of(path) in SIZED:
-        options = ", ".join(f"--{name.replace('_', '-')}" for name in names)
-        raise InvalidInputError(f"{options}: expected none with {path} ({kind_of(path)}), which has its own")
+        words = ", ".join(names).replace("_", " ")
+        raise InvalidInputError(f"{path} ({kind_of(path)}) has its own {words}: expected no option for that")
 
 
 def _readings(sweep: Sweep, path: Path, sensor: str) -> tuple[TimedPoses | TimedRotations, float]:

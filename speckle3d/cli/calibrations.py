@@ -26,14 +26,11 @@ def given_settings(source: Path, imported: Mapping[str, Any], transform: str | N
     Raises
     ------
     InvalidInputError
-        If an option is for another kind of recording, or the recording says the same itself.
+        If the recording says the same itself.
     """
-    from speckle3d.calibrating.recordings import require_sequence, require_unsaid
+    from speckle3d.calibrating.recordings import require_unsaid
     from speckle3d.io.import_settings import ImportSettings
 
-    require_sequence(source, transform, "--transform")
-    for name in ("reference_transform", "plus_config"):
-        require_sequence(source, imported.get(name), f"--{name.replace('_', '-')}")
     named = {} if transform is None else {"tracker_transform": transform}
     given = from_options(ImportSettings, {**imported, **named})
     require_unsaid(source, given)

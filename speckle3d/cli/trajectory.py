@@ -42,14 +42,14 @@ def export(
     """
     from speckle3d.io.shapes.transforms import SUFFIXES, transform_paths, write_transform, write_transforms
     from speckle3d.io.tum import write_tum
-    from speckle3d.scoring.trajectories import load_reconstructed
+    from speckle3d.scoring.trajectories import load_estimate
 
     is_transform = out.suffix.lower() in SUFFIXES
     if is_transform != (frame is not None):
         raise InvalidInputError(
             f"{out}: expected --frame N or --frame all with {', '.join(SUFFIXES)}, and with no other name"
         )
-    made = load_reconstructed(reconstruction_file, mode)
+    made = load_estimate(reconstruction_file, mode)
     note(made.name)
     if frame is None:
         require_own_place(out, "trajectory", reconstruction_file)
@@ -121,7 +121,7 @@ def _table(found: dict[str, Any]) -> str:
     from speckle3d.core.tables import text_rows
     from speckle3d.scoring.displacements import MEANINGS
 
-    rows = [(name, str(found[name]), "") for name in ("estimate", "poses", "association", "alignment")]
+    rows = [(name, str(found[name]), "") for name in ("estimate", "poses")]
     for name, words in (("APE", "absolute pose error (APE)"), ("RPE", "relative pose error (RPE)")):
         error = found[name]
         rows.append((f"{words}, RMS", f"{error.rmse_mm:.4f} mm, {error.rmse_deg:.4f}", "deg"))

@@ -26,7 +26,7 @@ from scipy.spatial.transform import RigidTransform
 from scipy.stats import theilslopes
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.errors import InvalidInputError, MismatchError
 from speckle3d.core.geometry import relative_poses, require_finite, roll_yaw_tilt
 from speckle3d.core.leastsquares import robust_sigma
 
@@ -120,8 +120,6 @@ def accumulated(world_from_image: RigidTransform, centre_mm: npt.ArrayLike) -> A
     ----------
     .. [1] Housden et al., BioMedical Engineering OnLine 7:5, 2008, figure 6.
     """
-    if len(world_from_image) < 2:
-        raise InsufficientDataError(f"expected at least 2 poses, got {len(world_from_image)}")
     centre = np.asarray(centre_mm, dtype=float)
     steps = relative_poses(world_from_image)
     roll, yaw, tilt = roll_yaw_tilt(steps.rotation).T
@@ -211,10 +209,9 @@ def compare_modes(
     frames = len(next(iter(poses.values()))) if covered is None else np.size(covered)
     used = np.ones(frames, dtype=bool) if covered is None else np.asarray(covered, dtype=bool)
     true_poses = reference[used] if len(reference) == frames else reference
-    lengths = [(f"mode {mode}", len(each), frames) for mode, each in poses.items()]
-    for name, got, expected in [*lengths, ("reference", len(true_poses), used.sum())]:
-        if got != expected:
-            raise MismatchError(f"{name}: expected {expected} poses, got {got}")
+    lengths = {*map(len, poses.values()), frames + len(true_poses) - int(used.sum())}
+    if lengths != {frames}:
+        raise MismatchError(f"expected {frames} poses of each mode and of the reference, got {lengths}")
     true = accumulated(true_poses, centre_mm)
     estimates = {mode: accumulated(each[used], centre_mm) for mode, each in poses.items()}
     rows = []

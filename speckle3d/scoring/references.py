@@ -87,12 +87,6 @@ class SweepCurves:
         return int(next(iter(self.modes.values())).shape[1])
 
 
-def require_reference(wanted: str | None) -> None:
-    """Raise `InvalidInputError` unless `wanted` is None or one of `REFERENCES`."""
-    if wanted is not None and wanted not in REFERENCES:
-        raise InvalidInputError(f"expected a reference among {', '.join(REFERENCES)}; got {wanted!r}")
-
-
 def find_reference(sweep: Sweep, wanted: str | None = None) -> Reference | None:
     """Poses to compare a sweep's modes with: by default the truth if stored, else the tracker, else None.
 
@@ -108,7 +102,8 @@ def find_reference(sweep: Sweep, wanted: str | None = None) -> Reference | None:
     InsufficientDataError
         If the sweep does not have what is wanted.
     """
-    require_reference(wanted)
+    if wanted not in (None, *REFERENCES):
+        raise InvalidInputError(f"expected {' or '.join(REFERENCES)}, got {wanted!r}")
     if sweep.truth is not None and wanted != "tracker":
         return Reference.over_all("truth", sweep.truth)
     if wanted == "truth":

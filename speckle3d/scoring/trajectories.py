@@ -97,17 +97,6 @@ def load_estimate(path: Path, mode: str | None = None, length_unit: LengthUnit |
     if kind_of(path) == "text":
         text = read_tum(path, length_unit)
         return Trajectory(path.name, text.time_s, text.world_from_sensor)
-    return load_reconstructed(path, mode)
-
-
-def load_reconstructed(path: Path, mode: str | None = None) -> Trajectory:
-    """Read one mode of a reconstruction; by default that which claims the smallest error of length.
-
-    Raises
-    ------
-    InvalidInputError
-        If the reconstruction has no such mode.
-    """
     made = read_reconstruction(path, with_pairs=False)
     mode = default_mode(made)[0] if mode is None else mode
     name, of = f"{path.name}, mode {mode}", made.provenance.input_sha256
@@ -163,24 +152,21 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     Returns
     -------
     dict
-        ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, how they were matched
-        (``association``) and laid on each other (``alignment``), ``same_sweep`` (whether both are of the same
-        bytes, None where a file does not say), as `PoseError` [1]_ ``APE``, of poses with the first frames
-        laid on each other, and ``RPE``, from each frame to the next, what
+        ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, ``same_sweep`` (whether
+        both are of the same bytes, None where a file does not say), as `PoseError` [1]_ ``APE``, of poses with
+        the first frames laid on each other, and ``RPE``, from each frame to the next, what
         `speckle3d.scoring.displacements.score_row` gives, and the TUS-REC ``score``, None without landmarks.
 
     Raises
     ------
     MismatchError
-        If the two share fewer than two times, or their images differ in size.
+        If the two share fewer than two times.
 
     References
     ----------
     .. [1] M. Grupp, "evo: Python package for the evaluation of odometry and SLAM", 2017.
     """
     grid = estimate.grid or reference.grid
-    if estimate.grid and reference.grid and estimate.grid != reference.grid:
-        raise MismatchError(f"{estimate.name} and {reference.name}: expected images of one size, got two")
     stream = TimedPoses(reference.time_s, reference.poses)
     times = _snapped(estimate.time_s, reference.time_s)
     shared = stream.covers(times)
@@ -198,8 +184,6 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
         "reference": reference.name,
         "poses": len(estimated),
         "left_out": len(shared) - common,
-        "association": "the reference interpolated at the estimate's times",
-        "alignment": "first poses on each other, lengths as they are",
         "same_sweep": of[0] == of[1] if all(of) else None,
         "APE": PoseError.of((true[0].inv() * true).inv() * (estimated[0].inv() * estimated)),
         "RPE": PoseError.of(relative_poses(true).inv() * relative_poses(estimated)),

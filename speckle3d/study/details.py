@@ -60,6 +60,16 @@ def details_of(
     tracked: Tracked, corrections: Mapping[str, Correction], provenance: Provenance
 ) -> dict[str, Any]:
     """Everything worth keeping of a reconstruction beside its errors, by name."""
+    fits: dict[str, dict[str, Any]] = {}
+    about: dict[str, Any]
+    for mode, each in corrections.items():
+        if isinstance(each, DriftCorrection):
+            parameters = dict(zip(each.names, each.fit.x.tolist(), strict=True))
+            about = {"curves": each.settings.curves, "coverage": each.coverage, "parameters": parameters}
+        else:
+            rests_on = [source.source for source in each.evidence]
+            about = {"length_over_images": each.scale, "rests_on": rests_on, **each.details}
+        fits[mode] = about
     return {
         "provenance": provenance,
         "pairs": tracked.pairs,
@@ -67,20 +77,5 @@ def details_of(
         "rejected_patch_share": tracked.rejected_share,
         "direction": tracked.direction,
         "direction_from": tracked.direction_from,
-        "corrections": {mode: _correction_details(c) for mode, c in corrections.items()},
-    }
-
-
-def _correction_details(correction: Correction) -> dict[str, Any]:
-    if not isinstance(correction, DriftCorrection):
-        return {
-            "length_over_images": correction.scale,
-            "relative_sigma": correction.log_scale_sigma,
-            "rests_on": [each.source for each in correction.evidence],
-            **correction.details,
-        }
-    return {
-        "curves": correction.settings.curves,
-        "coverage": correction.coverage,
-        "parameters": dict(zip(correction.names, correction.fit.x.tolist(), strict=True)),
+        "corrections": fits,
     }

@@ -40,6 +40,8 @@ class GreyImages:
         Let the brightest echoes saturate, as on a screen.
     levels : {"log", "linear", "stored"}
         Log-compressed to 0-255, linear echo amplitude, or B-mode as it is stored.
+    outside : float
+        Level of what is outside a fan.
 
     Attributes
     ----------
@@ -65,11 +67,12 @@ class GreyImages:
         settings: IntensitySettings | None = None,
         clipped: bool = True,
         levels: Levels = "log",
+        outside: float = np.nan,
     ) -> None:
         if not (np.isfinite(dynamic_range_db) and dynamic_range_db > 0):
             raise InvalidInputError(f"dynamic_range_db: expected a value above zero, got {dynamic_range_db}")
         bmode = sweep.signal if isinstance(sweep.signal, BModeSettings) else None
-        self._sweep, self._levels = sweep, levels
+        self._sweep, self._levels, self._outside = sweep, levels, outside
         self._extractor = IntensityExtractor.for_sweep(sweep, settings)
         source = sweep.grid if levels == "stored" else self._extractor.grid
         self._convert = ScanConversion(source) if source.fan is not None else None
@@ -105,7 +108,7 @@ class GreyImages:
 
     def __getitem__(self, index: int) -> npt.NDArray[Any]:
         levels = self._levels_of(read_frame(self._sweep.frames, index))
-        return levels if self._convert is None else self._convert(levels)
+        return levels if self._convert is None else np.nan_to_num(self._convert(levels), nan=self._outside)
 
     def _levels_of(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
         if self._levels == "stored":
@@ -163,11 +166,6 @@ def grey_images(
     if reconstruction is not None and reconstruction.config_toml:
         settings = stored_config(reconstruction.config_toml).intensity
     return GreyImages(sweep, dynamic_range_db, settings, levels=levels)
-
-
-def usual_levels(sweep: Sweep) -> Levels:
-    """As stored for B-mode, which is compressed already, and log-compressed for echoes."""
-    return "stored" if isinstance(sweep.signal, BModeSettings) else "log"
 
 
 def open_reconstruction(path: Path, sweep_file: Path | None = None) -> tuple[Reconstruction, Sweep]:

@@ -314,10 +314,9 @@ def _corrected(
 
 
 def _title(summary: Summary) -> str:
-    """Name of the sweep, what is in doubt and which modes are left out, for figures."""
+    """Name of the sweep and what is in doubt, for figures."""
     doubts = ", ".join(dict.fromkeys(summary.doubted.values()))
-    left_out = [f"{mode} left out" for mode in summary.left_out]
-    return "; ".join([summary.sweep, *([f"in doubt: {doubts}"] if doubts else []), *left_out])
+    return f"{summary.sweep}; in doubt: {doubts}" if doubts else summary.sweep
 
 
 def _drift(

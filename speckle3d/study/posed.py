@@ -16,7 +16,7 @@ from speckle3d.core.errors import InsufficientDataError, InvalidInputError, Mism
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.reconstruction import Reconstruction
 from speckle3d.core.shown import shown
-from speckle3d.core.sweep import Sweep
+from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.imaging.images import ChosenImages, Images, PosedImages
 from speckle3d.imaging.voxels.settings import Levels
 from speckle3d.io.calibrations import apply_calibrations, fitted_pixels, resized
@@ -28,7 +28,7 @@ from speckle3d.matching.quality import describe
 from speckle3d.scoring.modes import default_mode
 from speckle3d.scoring.references import REFERENCES, find_reference
 from speckle3d.scoring.trajectories import poses_of
-from speckle3d.study.images import grey_images, open_reconstruction, usual_levels
+from speckle3d.study.images import grey_images, open_reconstruction
 
 USUAL_RANGE_DB = 60.0
 """Dynamic range where nothing says another."""
@@ -97,8 +97,13 @@ class PosedSweep:
             If levels need the dynamic range of B-mode, and the recording does not say it; or if echoes are
             asked for as stored.
         """
-        chosen = levels or usual_levels(self.sweep)
-        self._require_range(chosen)
+        chosen = levels or ("stored" if isinstance(self.sweep.signal, BModeSettings) else "log")
+        if not self.range_is_known and chosen != "stored":
+            raise InvalidInputError(
+                f"{self.sweep.name}: levels {chosen}: expected the dynamic range of its B-mode, got none: "
+                "give --dynamic-range-db (decibels from black to white, beside the image on the scanner's "
+                "screen), or take levels stored"
+            )
         every = grey_images(self.sweep, dynamic_range_db, self.reconstruction, chosen)
         grid = replace(every.grid, skew_rad=self.skew_rad)
         return PosedImages(ChosenImages(every, self.frames), grid, self.world_from_image), every.meaning
@@ -112,22 +117,14 @@ class PosedSweep:
     def notes(self) -> list[str]:
         """Tell why this mode was taken, which frames are left out, and which have poses that are guesses."""
         without = len(self.sweep) - len(self.frames)
-        trust = None if self.reconstruction is None else self.reconstruction.trust
-        flagged = [] if trust is None else describe(trust.flags)
+        trust = self.reconstruction and self.reconstruction.trust
+        flagged = describe(trust.flags) if trust else []
         left_out = f"{without} of {len(self.sweep)} frames have no valid pose and are left out"
         return [
             *filter(None, [self.chosen_for]),
             *([f"{self.sweep.name}: {left_out}"] if without else []),
             *(f"{line}: poses there are guesses" for line in flagged),
         ]
-
-    def _require_range(self, levels: Levels) -> None:
-        if not self.range_is_known and levels != "stored":
-            raise InvalidInputError(
-                f"{self.sweep.name}: levels {levels}: expected the dynamic range of its B-mode, got none: "
-                "give --dynamic-range-db (decibels from black to white, beside the image on the scanner's "
-                "screen), or take levels stored"
-            )
 
 
 MARK = "poses_mark"

@@ -147,17 +147,17 @@ class Study:
     @property
     def done(self) -> list[SweepOutcome]:
         """Sweeps with results."""
-        return [each for each in self.outcomes if each.summary is not None]
+        return [each for each in self.outcomes if each.summary]
 
     @property
     def broken(self) -> list[SweepOutcome]:
         """Sweeps without."""
-        return [each for each in self.outcomes if each.summary is None]
+        return [each for each in self.outcomes if not each.summary]
 
     @property
     def summaries(self) -> list[Summary]:
         """Of the sweeps with results."""
-        return [each.summary for each in self.outcomes if each.summary is not None]
+        return [each.summary for each in self.outcomes if each.summary]
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:

@@ -60,7 +60,7 @@ def clock(
     from calibration.clock.images import delay_from_images
     from calibration.clock.line import FEWEST_FRAMES, delay_from_lines, line_signal
     from calibration.detection.lines import detect_lines
-    from speckle3d.calibrating.recordings import open_recording, open_tracked, require_unsized
+    from speckle3d.calibrating.recordings import open_recording, open_tracked
     from speckle3d.calibrating.settings import region_of
     from speckle3d.io.calibrations import read_calibration, write_calibration
     from speckle3d.study.results import json_text
@@ -74,7 +74,6 @@ def clock(
         raise MismatchError(
             f"{calibration}: expected a calibration of the {sensor}, got one of {known.sensor}"
         )
-    require_unsized(images, pixel_mm)
     if by == "images":
         offset_s = None if known is None else known.time_offset_s
         tracked, mounting = open_tracked(images, poses, pixel_mm, offset_s, transform)

@@ -79,7 +79,7 @@ def images(
     from calibration.images.report import calibration_from_images, figure_of, notes_of
     from calibration.images.solver import calibrate_images
     from calibration.settings import ImageFit
-    from speckle3d.calibrating.recordings import open_tracked, require_unsized
+    from speckle3d.calibrating.recordings import open_tracked
     from speckle3d.calibrating.written import write_with_report
     from speckle3d.io.calibrations import read_calibration
 
@@ -88,8 +88,6 @@ def images(
         raise InvalidInputError(f"--poses: expected it twice, for A and for B, got {len(poses)}")
     require_free(out, first, second, start, *(poses or ()))
     fit = from_options(ImageFit, settings)
-    for path in (first, second):
-        require_unsized(path, pixel_mm)
     known = None if start is None else read_calibration(start)
     offset_s = known.time_offset_s if time_offset_s is None and known is not None else time_offset_s
     readings = poses or (None, None)

@@ -110,8 +110,8 @@ def in_world(
     opened: OpenedModes,
     grid: ImageGrid,
     plane: RigidTransform,
-    pixel_mm: float = DEFAULT_PIXEL_MM,
-    reach_mm: float = REACH_MM,
+    pixel_mm: float,
+    reach_mm: float,
 ) -> Place:
     """Cut in a plane of the reference's world: x and y of the picture are its own."""
     cut = covering_plane(plane, grid, opened.poses[opened.reference], reach_mm, pixel_mm)
@@ -136,22 +136,16 @@ def along_curve(
         Join the points by a spline.
     """
     there = opened.poses[opened.reference]
-    direction = _mean_directions(there)[1] if down is None else down
-    sheet = swept(curve_mm, direction, frame_outlines(grid, there).reshape(-1, 3), pixel_mm, smooth)
+    axis = np.asarray(_mean_directions(there)[1] if down is None else down)
+    # As far along its columns as there is something.
+    along = (frame_outlines(grid, there) - curve_mm[0]) @ axis / max(float(np.linalg.norm(axis)), 1e-9)
+    sheet = curved_sheet(curve_mm, axis, (along.min(), along.max()), pixel_mm, smooth)
     if down is None:
         # Depth counts from the probe where the curve begins, as the nearest frame has it.
         at = there.inv().apply(curve_mm[0])
         depth = float(at[np.argmin(np.abs(at[:, 2])), 1])
         sheet = replace(sheet, first_mm=(0.0, sheet.first_mm[1] + depth))
     return _carried(opened, sheet, f"along a curve through {len(curve_mm)} points")
-
-
-def swept(
-    curve_mm: FloatArray, down: Vector, around_mm: FloatArray, pixel_mm: float, smooth: bool
-) -> CurvedSheet:
-    """Sweep a curve as far along its columns as there is something."""
-    along = (around_mm - curve_mm[0]) @ np.asarray(down) / max(float(np.linalg.norm(down)), 1e-9)
-    return curved_sheet(curve_mm, down, (along.min(), along.max()), pixel_mm, smooth)
 
 
 def _carried(opened: OpenedModes, cut: AnyCut, words: str, frame: int = 0) -> Place:

@@ -74,14 +74,10 @@ def write_scene(
 
     Raises
     ------
-    InvalidInputError
-        If there is no mode, or one twice.
     FileError
         If the folder cannot be written.
     """
     asked, modes, target = request or VolumeRequest(), [each.mode for each in posed], Path(folder)
-    if not modes or len({*modes}) != len(modes):
-        raise InvalidInputError(f"{folder}: expected one mode or more, each once, got {', '.join(modes)}")
     wanted = {"deviation": with_deviation, "images": with_images, "poses": with_images}
     kinds = [what for what in _NAMES if wanted.get(what, True)]
     names = [_NAMES[what].format(mode) for mode in modes for what in kinds]
