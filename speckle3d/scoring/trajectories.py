@@ -152,9 +152,9 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     Returns
     -------
     dict
-        ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, ``same_sweep`` (whether
-        both are of the same bytes, None where a file does not say), as `PoseError` [1]_ ``APE``, of poses with
-        the first frames laid on each other, and ``RPE``, from each frame to the next, what
+        ``estimate`` and ``reference`` (their names), ``poses`` compared, ``left_out``, ``same_sweep``
+        (whether both are of the same bytes, None where a file does not say), as `PoseError` [1]_ ``APE``, of
+        poses with the first frames laid on each other, and ``RPE``, from each frame to the next, what
         `speckle3d.scoring.displacements.score_row` gives, and the TUS-REC ``score``, None without landmarks.
 
     Raises
