@@ -19,8 +19,6 @@ from speckle3d.motion.trajectory import solve_trajectory
 from speckle3d.motion.uncertainty import claimed_covariance
 from speckle3d.simulation.movement import HandMotion, frame_times, hand_sweep
 from speckle3d.simulation.sensors import (
-    OrientationModel,
-    TrackerModel,
     simulate_orientation,
     simulate_tracker,
 )
@@ -64,7 +62,7 @@ def scene(
     length_mm: float = 5.0,
     scale_sigma: float = 0.03,
     motion: HandMotion | None = None,
-    tracker: TrackerModel | None = None,
+    noise: float = 1.0,
 ) -> Scene:
     """A sweep of a hand at 25 frames/s, with a tracker and an orientation sensor."""
     rng = np.random.default_rng(seed)
@@ -88,8 +86,8 @@ def scene(
         scale_sigma,
         turn,
         times,
-        simulate_orientation(path, span, OrientationModel(), rng),
-        simulate_tracker(path, span, tracker or TrackerModel(), rng),
+        simulate_orientation(path, span, rng),
+        simulate_tracker(path, span, rng, noise),
     )
 
 

@@ -21,7 +21,7 @@ from calibration.images.stacks import TrackedImages
 from speckle3d.core.arrays import Float32Array
 from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
 from speckle3d.imaging.cuts.planes import image_plane
-from speckle3d.imaging.cuts.reslice import resample_image, reslice_frames
+from speckle3d.imaging.cuts.reslice import reslice_frames
 from speckle3d.imaging.images import ChosenImages
 
 PIXEL_MM = 0.15
@@ -112,7 +112,7 @@ def _draw_images(
     row: Sequence[Axes], result: ImageCalibration, shown: TrackedImages, other: TrackedImages, frame: int
 ) -> None:
     """An image, and what the other sweep shows in its place at the start and at the answer."""
-    own, grid = resample_image(shown.images, frame, shown.grid, PIXEL_MM), shown.grid
+    own, grid = np.asarray(shown.images[frame]).T, shown.grid
     grey = own[np.isfinite(own)]
     low, high = np.percentile(grey, [2.0, 99.5]) if grey.size else (0.0, 1.0)
     extent = (0.0, grid.width_mm, grid.depth_mm - grid.first_sample_depth_mm, 0.0)

@@ -21,7 +21,7 @@ from speckle3d.core.extras import extra_module
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.threads import in_parallel
-from speckle3d.imaging.images import Images, PosedImages
+from speckle3d.imaging.images import IndexedImages, PosedImages
 
 BASE_PIXEL_MM = 0.35
 """Pixel size to which images are reduced: half the finest blur that comparisons use."""
@@ -44,7 +44,7 @@ class TrackedImages:
 
     Parameters
     ----------
-    images : indexable or callable
+    images : indexable
         Grey images by frame number, shape (vector, sample): B-mode, log-compressed; NaN where there is none.
     grid : ImageGrid
     frame_time_s : ndarray, shape (n,)
@@ -56,7 +56,7 @@ class TrackedImages:
         For messages.
     """
 
-    images: Images
+    images: IndexedImages
     grid: ImageGrid
     frame_time_s: FloatArray
     readings: TimedPoses

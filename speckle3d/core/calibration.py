@@ -135,7 +135,7 @@ class Calibration:
         size = 3 if self.translation_mm is None else 6
         if self.covariance.shape != (size, size):
             raise InvalidInputError(f"covariance: expected shape {(size, size)}, got {self.covariance.shape}")
-        if self.pixel_mm is not None and not (np.isfinite(self.pixel_mm).all() and (self.pixel_mm > 0).all()):
+        if self.pixel_mm is not None and not ((self.pixel_mm > 0) & (self.pixel_mm < np.inf)).all():
             raise InvalidInputError(f"pixel_mm: expected values above zero, got {self.pixel_mm}")
 
     @property

@@ -74,16 +74,15 @@ class CurveKey:
         others = _settings(other)
         if any(getattr(key.signal, "dynamic_range_sigma_db", 0.0) for key in (self, other)):
             others["dynamic_range_db"] = _settings(self).get("dynamic_range_db")
-        if self.probe and other.probe and self.probe != other.probe:
-            raise MismatchError(f"{what}: probe is {self.probe!r} and {other.probe!r}")
-        if self.lines and other.lines and self.lines != other.lines:
-            raise MismatchError(f"{what}: lines are {self.lines!r} and {other.lines!r}")
         for name, mine in _settings(self).items():
             theirs = others.get(name, mine)
-            exact = isinstance(mine, str)
-            if not (mine == theirs if exact else np.allclose(mine, theirs, rtol=1e-3, atol=1e-9)):
+            if isinstance(mine, str):
+                same = theirs in (mine, "") or not mine
+            else:
+                same = np.allclose(mine, theirs, rtol=1e-3, atol=1e-9)
+            if not same:
                 advice = BAND_ADVICE if name == "bandwidth_hz" else ""
-                raise MismatchError(f"{what}: {name} is {mine} and {theirs}{advice}")
+                raise MismatchError(f"{what}: {name} is {mine!r} and {theirs!r}{advice}")
 
 
 class _ByDepth:
@@ -302,4 +301,5 @@ def _settings(key: CurveKey) -> dict[str, Any]:
     # How finely the echo was sampled, real or as I/Q, is no property of the beam, and matching resamples it.
     left_out = ["demodulation_frequency_hz", "dynamic_range_sigma_db", *["sampling_rate_hz"] * (kind == "RF")]
     signal = {name: value for name, value in vars(key.signal).items() if name not in left_out}
-    return {"signal": kind, "correlation_of": key.correlation_of} | signal | numbers
+    words = {"signal": kind, **{name: getattr(key, name) for name in ("correlation_of", "probe", "lines")}}
+    return words | signal | numbers

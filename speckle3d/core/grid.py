@@ -209,5 +209,5 @@ def require_positive(settings: object, names: tuple[str, ...]) -> None:
     """Raise `InvalidInputError` naming the first attribute that is not finite and above zero."""
     for name in names:
         value = getattr(settings, name)
-        if not (np.isfinite(value) and value > 0):
+        if not 0 < value < np.inf:
             raise InvalidInputError(f"{name}: expected a value above zero, got {value}")

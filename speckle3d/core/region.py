@@ -145,13 +145,10 @@ def _fan(grid: ImageGrid, apex: Pair, angles_deg: Pair, radii: Pair) -> BoolArra
         raise ValueError
     x, y, hair = _positions_mm(grid)
     x, y = x - apex[0], y - apex[1]
-    radius = np.hypot(x, y)
-    left, right = np.radians(angles_deg)
-    # Distances from the two sides, positive inside; each is right for all angles up to 90 degrees.
-    between = (x * np.cos(left) - y * np.sin(left) >= -hair) & (
-        y * np.sin(right) - x * np.cos(right) >= -hair
-    )
-    return np.asarray(between & (radius >= near - hair) & (radius <= far + hair) & (y >= -hair))
+    radius, angle = np.hypot(x, y), np.arctan2(x, y)
+    # Distances along the arc from the two sides, positive inside.
+    between = radius * np.minimum(angle - np.radians(left), np.radians(right) - angle) >= -hair
+    return np.asarray(between & (radius >= near - hair) & (radius <= far + hair))
 
 
 def _polygon(grid: ImageGrid, *corners: Pair) -> BoolArray:

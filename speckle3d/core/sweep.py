@@ -372,24 +372,20 @@ class Sweep:
         return cls(read, grid, kind, np.asarray(frame_time_s), **others)
 
     def to_xarray(self) -> Any:
-        """All frames as an `xarray.DataArray` over frame, lateral_mm and depth_mm; read into memory.
+        """All frames as an `xarray.DataArray` over frame, lateral_mm and depth_mm, read into memory.
 
         Vectors of a fan are at their angle_rad.
         """
         xarray = extra_module("xarray", "notebook", "a labelled array")
         grid, vector = self.grid, np.arange(self.grid.vectors)
-        lateral, unit, values = "lateral_mm", "mm", vector * grid.vector_pitch_mm
+        lateral, places = "lateral_mm", vector * grid.vector_pitch_mm
         if grid.fan is not None:
-            lateral, unit, values = "angle_rad", "rad", grid.angle_rad(vector)
+            lateral, places = "angle_rad", grid.angle_rad(vector)
         depth_mm = grid.first_sample_depth_mm + np.arange(grid.samples) * grid.sample_spacing_mm
-        frames = {"frame": np.arange(len(self)), "time_s": ("frame", self.frame_time_s, {"units": "s"})}
-        places = {
-            lateral: (lateral, values, {"units": unit}),
-            "depth_mm": ("depth_mm", depth_mm, {"units": "mm"}),
-        }
+        frames = {"frame": np.arange(len(self)), "time_s": ("frame", self.frame_time_s)}
         return xarray.DataArray(
             np.stack([np.asarray(self.frames[i]) for i in range(len(self))]),
-            coords=frames | places,
+            coords=frames | {lateral: places, "depth_mm": depth_mm},
             dims=("frame", lateral, "depth_mm"),
             name=self.name,
         )

@@ -54,7 +54,7 @@ class Volume:
         if self.voxels.dtype.name not in VOXEL_TYPES:
             raise InvalidInputError(f"voxels: expected {', '.join(VOXEL_TYPES)}, got {self.voxels.dtype}")
         spacing = tuple(float(step) for step in self.spacing_mm)
-        if len(spacing) != 3 or not all(np.isfinite(step) and step > 0 for step in spacing):
+        if len(spacing) != 3 or not all(0 < step < np.inf for step in spacing):
             raise InvalidInputError(f"spacing_mm: expected three values above zero, got {spacing}")
         object.__setattr__(self, "spacing_mm", spacing)
 

@@ -47,7 +47,7 @@ class NearestImages:
     def __init__(
         self, source: PosedImages, lines: FloatArray, points: int, hull_mm: FloatArray, reach_mm: float
     ) -> None:
-        if not (np.isfinite(reach_mm) and reach_mm > 0):
+        if not 0 < reach_mm < np.inf:
             raise InvalidInputError(f"max_distance_mm: expected a value above zero, got {reach_mm}")
         self.source, self._lines, self._reach_mm = source, lines, reach_mm
         image_from_world = source.world_from_image.inv().as_matrix()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
@@ -27,8 +27,8 @@ from speckle3d.simulation.movement import (
 from speckle3d.simulation.receiver import received
 from speckle3d.simulation.scan import SimulatedFrames
 from speckle3d.simulation.sensors import (
-    OrientationModel,
-    TrackerModel,
+    ORIENTATION_FROM_IMAGE,
+    TRACKER_FROM_IMAGE,
     simulate_orientation,
     simulate_tracker,
 )
@@ -54,22 +54,17 @@ class SimulatedSweep:
     ----------
     sweep : Sweep
     settings : SimulationSettings
-    tracker_from_image, orientation_from_image : RigidTransform, Rotation, optional
-        The true ``sensor_from_image`` of sensors that the sweep leaves uncalibrated.
     """
 
     sweep: Sweep
     settings: SimulationSettings
-    tracker_from_image: RigidTransform | None = None
-    orientation_from_image: Rotation | None = None
 
     def description(self) -> dict[str, Any]:
         """Plain values for a file: the settings and, where it is for a calibration to find, the mounting."""
         values = self.settings.model_dump(mode="json")
-        if self.tracker_from_image is not None:
-            values["tracker_sensor_from_image"] = self.tracker_from_image.as_matrix().tolist()
-        if self.orientation_from_image is not None:
-            wxyz = self.orientation_from_image.as_quat(scalar_first=True)
+        if self.sweep.tracker is not None and self.sweep.tracker.sensor_from_image is None:
+            values["tracker_sensor_from_image"] = TRACKER_FROM_IMAGE.as_matrix().tolist()
+            wxyz = ORIENTATION_FROM_IMAGE.as_quat(scalar_first=True)
             values["orientation_sensor_from_image_wxyz"] = wxyz.tolist()
         return values
 
@@ -98,7 +93,8 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
     medium_seed, heading_seed, *sweep_seeds = np.random.SeedSequence(settings.seed).spawn(4)
     world = world_from_medium(float(np.random.default_rng(heading_seed).uniform(-np.pi, np.pi)))
     if settings.preset in _BATH:
-        world = RigidTransform.from_translation(_BATH_MM) * world
+        # Its floor is level; by the turn of nothing files are those of older versions, to the last bit.
+        world = RigidTransform.from_translation(_BATH_MM) * world * RigidTransform.identity()
     medium = _medium(settings, _entropy(medium_seed))
     beam = tabulate_beam(Probe(), attenuation_db_cm_mhz=medium.attenuation_db_cm_mhz)
     count = 2 if settings.preset == "crossed" else 1
@@ -145,11 +141,11 @@ def _sweep(
         trajectory = _trajectory(settings, image, duration, world, number, np.random.default_rng(motion_seed))
         poses, span = trajectory.medium_from_image(times), (-0.3, duration + 0.3)
         noise = settings.sensor_noise if in_bath else 1.0
-        tracker = simulate_tracker(
-            trajectory, span, TrackerModel(), np.random.default_rng(tracker_seed), noise
-        )
-        rng = np.random.default_rng(orientation_seed)
-        orientation = simulate_orientation(trajectory, span, OrientationModel(), rng, noise)
+        tracker = simulate_tracker(trajectory, span, np.random.default_rng(tracker_seed), noise)
+        orientation = simulate_orientation(trajectory, span, np.random.default_rng(orientation_seed), noise)
+        if in_bath or settings.uncalibrated:
+            tracker = replace(tracker, sensor_from_image=None)
+            orientation = replace(orientation, sensor_from_image=None)
     rf = SimulatedFrames(beam, medium, poses, image, settings.snr_db, _entropy(seed))
     reflector = f"-{settings.reflector}" if settings.preset == "plane" else ""
     name = f"{settings.preset}{reflector}-{settings.seed}" + ("-crossing" if number else "")
@@ -157,14 +153,7 @@ def _sweep(
     if settings.signal != "rf":
         range_db = settings.dynamic_range_db if settings.signal == "bmode" else None
         sweep = received(sweep, range_db, settings.demodulation_frequency_hz, settings.decimation)
-    if orientation is None or tracker is None or not (in_bath or settings.uncalibrated):
-        return SimulatedSweep(sweep, settings)
-    bare = replace(
-        sweep,
-        orientation=replace(orientation, sensor_from_image=None),
-        tracker=replace(tracker, sensor_from_image=None),
-    )
-    return SimulatedSweep(bare, settings, tracker.sensor_from_image, orientation.sensor_from_image)
+    return SimulatedSweep(sweep, settings)
 
 
 def _image_grid(settings: SimulationSettings, probe: Probe) -> ImageGrid:

@@ -19,6 +19,7 @@ from speckle3d.calibrating.phantoms import solved
 from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.simulation.sensors import ORIENTATION_FROM_IMAGE, TRACKER_FROM_IMAGE
 from speckle3d.study.images import GreyImages
 
 FIRST_SEED = 3001
@@ -51,7 +52,7 @@ def trial(seed, frames, reflector):
     found = {}
     for level in (False, True):
         outcome = solved(recording, seen, OrientationSettings(level=level))
-        turn = simulated.orientation_from_image.inv() * outcome.calibration.rotation
+        turn = ORIENTATION_FROM_IMAGE.inv() * outcome.calibration.rotation
         found[f"orientation sensor, {'level' if level else 'any'} plane"] = (
             np.rad2deg(turn.as_rotvec()),
             np.rad2deg(np.sqrt(np.diag(outcome.calibration.covariance))),
@@ -61,7 +62,7 @@ def trial(seed, frames, reflector):
         outcome = solved(
             recording_of(sweep, sweep.tracker), seen, PlaneSettings(fixed_pixels=not fit, reflector="bar")
         )
-        step = simulated.tracker_from_image.inv() * outcome.calibration.sensor_from_image
+        step = TRACKER_FROM_IMAGE.inv() * outcome.calibration.sensor_from_image
         centre = sweep.grid.centre_mm
         found[f"tracker, pixels {'fitted' if fit else 'held'}"] = (
             np.rad2deg(step.rotation.as_rotvec()),

@@ -24,11 +24,11 @@ from calibration.settings import ImageFit
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.io.load import load_sweep
 from speckle3d.simulation.presets import SimulationSettings
-from speckle3d.simulation.sensors import TrackerModel
+from speckle3d.simulation.sensors import TRACKER_FROM_IMAGE
 from speckle3d.study.images import GreyImages
 
 SAME_MM = 0.5
-TRUTH = TrackerModel().sensor_from_image
+TRUTH = TRACKER_FROM_IMAGE
 
 
 def opened(path):

@@ -15,6 +15,7 @@ from calibration.report import IMAGE_POSE
 from speckle3d.calibrating.phantoms import found, solved
 from speckle3d.calibrating.settings import WireSettings
 from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.simulation.sensors import TRACKER_FROM_IMAGE
 
 FIRST_SEED = 4001
 """Seeds that no test and no development used."""
@@ -25,7 +26,7 @@ def trial(seed, vectors, frames):
     (simulated,) = simulate(SimulationSettings(preset="wires", seed=seed, vectors=vectors, frames=frames))
     recording = recording_of(simulated.sweep, simulated.sweep.tracker)
     solution = solved(recording, found(recording, WireSettings()), WireSettings()).solution
-    step = simulated.tracker_from_image.inv() * solution.chain.sensor_from_image
+    step = TRACKER_FROM_IMAGE.inv() * solution.chain.sensor_from_image
     shift, turn = step.as_components()
     # Roll, yaw and tilt are about the image's z, y and x.
     error = np.array([*turn.as_rotvec(), *shift])

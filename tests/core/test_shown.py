@@ -51,7 +51,7 @@ def test_frames_become_a_labelled_array(sweep):
     array = sweep.part(0, 3).to_xarray()
     assert array.dims == ("frame", "lateral_mm", "depth_mm")
     np.testing.assert_array_equal(array.sel(frame=2), sweep.frames[2])
-    assert array.depth_mm.attrs["units"] == "mm"
+    assert float(array.depth_mm[-1]) == pytest.approx(sweep.grid.depth_mm)
 
 
 def test_poses_are_drawn_with_names_and_units(tracked):

@@ -87,16 +87,6 @@ def test_elevational_energy_profile(beam, depth_mm):
     np.testing.assert_allclose(made / made[0], direct / direct[0], atol=0.03)
 
 
-def test_predicted_echo_power_is_that_of_speckle(beam):
-    rf = SimulatedFrames(beam, TiledMedium(3, 100.0, 0.0), STILL, image(32), SILENT).waveforms(0)
-    predicted = beam.echo_power(np.linspace(0, 100e6 / 3, 513))
-    for depth in (10.0, 20.0, 30.0):
-        row = round(depth / PROBE.signal.sample_spacing_mm)
-        measured = rf[:, row - 150 : row + 150].astype(float).var()
-        # About 20 x 20 cells of exponential intensity: 5 % standard error; three of them.
-        assert measured == pytest.approx(np.interp(depth, beam.depth_mm, predicted), rel=0.15)
-
-
 def intensity_correlation(medium, beam, depths_mm, blocks):
     """Mean correlation of intensity over pairs at 0, 1, .. steps, and its standard error over blocks."""
     poses = stepped_poses(STEPS, STEP_MM, blocks, 6.0)

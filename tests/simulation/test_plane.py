@@ -11,6 +11,7 @@ from speckle3d.simulation.bath import Level, water_bath
 from speckle3d.simulation.beam import tabulate_beam
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.scan import SimulatedFrames
+from speckle3d.simulation.sensors import ORIENTATION_FROM_IMAGE, TRACKER_FROM_IMAGE
 
 CENTRE_MM = (320.0, -150.0, -240.0)
 """Of a level floor, and where threads cross, in the world of the simulated tracker."""
@@ -123,15 +124,15 @@ def test_sensors_are_left_to_calibrate_and_the_true_mounting_is_told(preset):
     sweep, times = simulated.sweep, simulated.sweep.frame_time_s
     assert sweep.tracker.sensor_from_image is None
     assert sweep.orientation.sensor_from_image is None
-    poses = sweep.tracker.readings.at(times - sweep.tracker.time_offset_s) * simulated.tracker_from_image
+    poses = sweep.tracker.readings.at(times - sweep.tracker.time_offset_s) * TRACKER_FROM_IMAGE
     # Interpolation over 20 ms of tremor, with a lever of 280 mm on 0.016 deg: as in the sensors' own tests.
     assert np.abs((sweep.truth.inv() * poses).translation).max() < 0.2
     readings = sweep.orientation.readings.at(times - sweep.orientation.time_offset_s)
-    turned = (sweep.truth.rotation.inv() * readings * simulated.orientation_from_image).magnitude()
+    turned = (sweep.truth.rotation.inv() * readings * ORIENTATION_FROM_IMAGE).magnitude()
     assert np.rad2deg(turned).max() < 0.02
     # The same mounting as in sweeps, which tell it.
     mounting = scan("tissue", frames=4, vectors=4, samples=600).sweep.tracker.sensor_from_image
-    np.testing.assert_array_equal(mounting.as_matrix(), simulated.tracker_from_image.as_matrix())
+    np.testing.assert_array_equal(mounting.as_matrix(), TRACKER_FROM_IMAGE.as_matrix())
 
 
 def test_crossing_threads_echo_where_the_truth_says():

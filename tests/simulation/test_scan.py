@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from points import PointMedium
 from scipy.signal import hilbert
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.simulation.beam import tabulate_beam
@@ -56,14 +56,3 @@ def test_electronic_noise_is_as_far_below_speckle_as_asked_at_the_focus_and_grow
     # 6400 samples, a third of them independent: 1.5 % standard error, and the gain's slope.
     assert level[20] == pytest.approx(350.0 * 10**-1.5, rel=0.06)
     assert level[38] > 2.0 * level[20]
-
-
-def test_moving_medium_and_probe_together_changes_nothing(beam):
-    rng = np.random.default_rng(5)
-    position = rng.uniform([-2, 5, -2], [4, 35, 2], (3000, 3))
-    strength = rng.standard_normal(3000).astype(np.float32)
-    shift = RigidTransform.from_components([12.0, -7.0, 31.0], Rotation.from_rotvec([0.3, -1.1, 0.7]))
-    here = SimulatedFrames(beam, PointMedium(position, strength), STILL, image(8, beam))
-    there = SimulatedFrames(beam, PointMedium(shift.apply(position), strength), shift * STILL, image(8, beam))
-    # Rounding of positions may tip a count over its edge.
-    assert np.abs(here[0].astype(int) - there[0]).max() <= 1

@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.simulation.movement import HandMotion, hand_sweep, world_from_medium
 from speckle3d.simulation.sensors import (
-    OrientationModel,
-    TrackerModel,
+    LEVER_MM,
+    TRACKER_FROM_IMAGE,
     simulate_orientation,
     simulate_tracker,
 )
@@ -17,17 +18,6 @@ from speckle3d.simulation.sensors import (
 HERE = RigidTransform.identity()
 SPAN_S = (-0.3, 20.3)
 FRAMES_S = np.arange(500) / 25.0
-EXACT = OrientationModel(
-    clock_jitter_s=0.0,
-    inclination_rad=0.0,
-    heading_rad=0.0,
-    white_rad=0.0,
-    gyroscope_rad_s=0.0,
-    gyroscope_bias_rad_s=0.0,
-    accelerometer_m_s2=0.0,
-    accelerometer_bias_m_s2=0.0,
-    magnetometer_au=0.0,
-)
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +27,9 @@ def trajectory():
 
 
 def test_tracker_errors_are_the_stated_jitter(trajectory):
-    model = TrackerModel()
-    tracker = simulate_tracker(trajectory, SPAN_S, model, np.random.default_rng(1))
+    tracker = simulate_tracker(trajectory, SPAN_S, np.random.default_rng(1))
     times = tracker.readings.time_s + tracker.time_offset_s
-    true = trajectory.world_from_image(times) * model.sensor_from_image.inv()
+    true = trajectory.world_from_image(times) * TRACKER_FROM_IMAGE.inv()
     error = true.inv() * tracker.readings.world_from_sensor
     # About 1000 samples: standard deviations to 2.2 %; four standard errors.
     shift = tracker.readings.world_from_sensor.translation - true.translation
@@ -49,8 +38,7 @@ def test_tracker_errors_are_the_stated_jitter(trajectory):
 
 
 def test_tracker_latency_is_recorded_and_undone(trajectory):
-    exact = TrackerModel(position_mm=0.0, orientation_rad=0.0)
-    tracker = simulate_tracker(trajectory, SPAN_S, exact, np.random.default_rng(1))
+    tracker = simulate_tracker(trajectory, SPAN_S, np.random.default_rng(1), 0.0)
     assert tracker.time_offset_s == pytest.approx(-0.04)
     error = trajectory.world_from_image(FRAMES_S).inv() * tracker.world_from_image(FRAMES_S)
     # Linear interpolation over 20 ms of tremor: (2 pi 12)^2 0.012 mm (20 ms)^2 / 8, peaks five times that,
@@ -61,7 +49,7 @@ def test_tracker_latency_is_recorded_and_undone(trajectory):
 
 
 def test_exact_raw_readings_integrate_to_the_orientation_and_the_path(trajectory):
-    sensor = simulate_orientation(trajectory, SPAN_S, EXACT, np.random.default_rng(1))
+    sensor = simulate_orientation(trajectory, SPAN_S, np.random.default_rng(1), 0.0)
     readings = sensor.readings
     rates = sensor.gyroscope_rad_s
     steps = (readings.world_from_sensor[:-1].inv() * readings.world_from_sensor[1:]).as_rotvec()
@@ -74,10 +62,10 @@ def test_exact_raw_readings_integrate_to_the_orientation_and_the_path(trajectory
     force = sensor.readings.world_from_sensor.apply(sensor.accelerometer_m_s2)
     assert force.mean(axis=0) == pytest.approx([0.0, 0.0, 9.81], abs=0.01)
     # Integrated twice, the specific force less gravity is the sensor's own path.
-    dt = np.diff(sensor.readings.time_s).mean()
-    path = 1e3 * np.cumsum(np.cumsum(force - [0, 0, 9.81], axis=0), axis=0) * dt**2
     times = sensor.readings.time_s + sensor.time_offset_s
-    true = trajectory.world_from_image(times).apply(np.array(EXACT.lever_mm))
+    speed = cumulative_trapezoid(1e3 * (force - [0, 0, 9.81]), times, axis=0, initial=0)
+    path = cumulative_trapezoid(speed, times, axis=0, initial=0)
+    true = trajectory.world_from_image(times).apply(LEVER_MM)
     line = np.stack([np.ones_like(times), times], axis=1)
     rest = (true - path) - line @ np.linalg.lstsq(line, true - path, rcond=None)[0]
     # Half a percent of the 20 mm travelled: sums of 100 Hz samples are no integrals.

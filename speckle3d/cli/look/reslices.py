@@ -93,7 +93,7 @@ def reslice(
     --------
     $ speckle3d reslice out/reconstruction.h5 -o cut.png --mode image --mode pose
     """
-    from speckle3d.imaging.cuts.oblique import spanned_plane, three_point_plane
+    from speckle3d.imaging.cuts.oblique import spanned_plane
     from speckle3d.io.points import parse_places
     from speckle3d.io.voxels.volume_writer import SUFFIXES, write_volume
     from speckle3d.study.figures import RANGE_DB
@@ -107,7 +107,10 @@ def reslice(
     require_own_place(out, "volume" if as_volume else "picture", *read)
     plane = None
     if points is not None:
-        plane = three_point_plane(parse_places(points.split(), option="--points"))
+        corners = parse_places(points.split(), option="--points")
+        if len(corners) != 3:
+            raise InvalidInputError(f"--points: expected three, got {len(corners)}")
+        plane = spanned_plane(corners[0], *(corners[1:] - corners[0]))
     elif origin is not None and right is not None and down is not None:
         plane = spanned_plane(origin, right, down)
     imports = given_settings(input_file, imported, transform)

@@ -17,27 +17,7 @@ _LEAST_SINE = 1e-4
 """Of the angle between two directions that span a plane: six thousandths of a degree."""
 
 
-def three_point_plane(points_mm: npt.ArrayLike) -> RigidTransform:
-    """Place a plane through three points: x from the first to the second, y on the third's side.
-
-    Raises
-    ------
-    InvalidInputError
-        If they are not three, or lie on one line.
-    """
-    points = np.asarray(points_mm, dtype=float)
-    if points.shape != (3, 3):
-        raise InvalidInputError(f"points: expected three of x, y, z in mm, got shape {points.shape}")
-    first, second, third = points
-    return spanned_plane(first, second - first, third - first, "three points that are not on one line")
-
-
-def spanned_plane(
-    origin_mm: npt.ArrayLike,
-    right: npt.ArrayLike,
-    down: npt.ArrayLike,
-    expected: str = "two directions that span a plane",
-) -> RigidTransform:
+def spanned_plane(origin_mm: npt.ArrayLike, right: npt.ArrayLike, down: npt.ArrayLike) -> RigidTransform:
     """Place a plane by its origin, the direction of its rows and one on the side of its columns.
 
     Raises
@@ -52,7 +32,7 @@ def spanned_plane(
     sine = np.linalg.norm(normal)
     if not (sine >= _LEAST_SINE and np.isfinite(origin_mm).all()):
         got = " and ".join(vector_words(np.asarray(each)) for each in (origin_mm, right, down))
-        raise InvalidInputError(f"plane: expected a finite origin and {expected}, got {got}")
+        raise InvalidInputError(f"plane: expected an origin and two directions that span it, got {got}")
     axes = Rotation.from_matrix(np.column_stack([x, np.cross(normal / sine, x), normal / sine]))
     return RigidTransform.from_components(np.asarray(origin_mm, dtype=float), axes)
 

@@ -13,12 +13,9 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, Float32Array
 from speckle3d.core.grid import ImageGrid
-from speckle3d.imaging.cuts.planes import Cut, image_plane
-from speckle3d.imaging.images import ChosenImages, Images, PosedImages
+from speckle3d.imaging.cuts.planes import Cut
+from speckle3d.imaging.images import Images, PosedImages
 from speckle3d.imaging.nearest import NearestImages, look_up
-
-_EDGE = 1e-6
-"""Fraction of a voxel by which a point may miss the border: rounding of poses."""
 
 
 def reslice_frames(
@@ -81,15 +78,3 @@ def reslice_at(
     ]
     look_up(sought, region)
     return [np.ascontiguousarray(each.blended()[0].T) for each in sought]
-
-
-def resample_image(images: Images, frame: int, grid: ImageGrid, pixel_mm: float) -> Float32Array:
-    """One image on square pixels, as a reslice through its own plane shows it.
-
-    Returns
-    -------
-    ndarray of float32, shape (rows, columns)
-    """
-    plane = image_plane(RigidTransform.identity(), grid, pixel_mm)
-    alone = ChosenImages(images, np.array([frame]))
-    return reslice_frames(alone, grid, RigidTransform.identity(1), plane, 1.0)
