@@ -144,11 +144,9 @@ class EchoSpectra:
 
     def __post_init__(self) -> None:
         for name in ("depth_mm", "frequency_hz"):
-            if not getattr(self, name).size:
-                raise InvalidInputError(f"spectrum, {name}: expected values, got none")
             require_increasing(getattr(self, name), f"spectrum, {name}")
         shape = self.depth_mm.size, self.frequency_hz.size
-        if self.power.shape != shape or not (np.isfinite(self.power) & (self.power >= 0)).all():
+        if 0 in shape or self.power.shape != shape or not (self.power >= 0).all():
             raise InvalidInputError(f"spectrum, power: expected values of zero or above, shape {shape}")
 
     def at(self, depth_mm: FloatArray, frequency_hz: FloatArray) -> FloatArray:
@@ -179,12 +177,6 @@ class NominalProbe:
     low_hz: float
     high_hz: float
     attenuation_db_cm_mhz: float
-
-    def __post_init__(self) -> None:
-        above_zero = self.aperture_mm > 0 and self.focus_mm > 0 and 0 < self.low_hz < self.high_hz
-        numbers = np.array([*vars(self).values()])
-        if not (above_zero and np.isfinite(numbers).all() and (numbers >= 0).all()):
-            raise InvalidInputError(f"probe: expected aperture, focus and 0 < low < high, got {vars(self)}")
 
 
 @shown

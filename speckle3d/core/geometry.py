@@ -102,10 +102,9 @@ def nearest_rotation(matrices: npt.ArrayLike) -> FloatArray:
     >>> nearest_rotation(1.001 * np.eye(3)).round(6).tolist()
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    left, _, right = np.linalg.svd(np.asarray(matrices, dtype=float), full_matrices=False)
-    if right.shape[-1] == 2:
-        axes = left @ right
-        return np.concatenate([axes, np.cross(axes[..., 0], axes[..., 1])[..., None]], axis=-1)
+    rough = np.asarray(matrices, dtype=float)
+    rough = np.concatenate([rough, np.zeros((*rough.shape[:-1], 3 - rough.shape[-1]))], axis=-1)
+    left, _, right = np.linalg.svd(rough)
     left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
     return np.asarray(left @ right)
 

@@ -80,10 +80,10 @@ class TimedSamples(Generic[Samples]):
             If a time is outside the samples or in a gap longer than `max_gap_s`.
         """
         t = np.asarray(times_s, dtype=float)
-        missing = np.flatnonzero(~np.atleast_1d(self.covers(t)))
+        missing = np.flatnonzero(~self.covers(t))
         if missing.size:
             raise InsufficientDataError(
-                f"sensor samples do not cover time {np.atleast_1d(t)[missing[0]]:.4f} s "
+                f"sensor samples do not cover time {t.flat[missing[0]]:.4f} s "
                 f"({missing.size} of {t.size} asked times): samples span "
                 f"{self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s, "
                 f"gaps over {self.max_gap_s:g} s are not bridged"

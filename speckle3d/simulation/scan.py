@@ -76,7 +76,7 @@ class SimulatedFrames:
 
     def __getitem__(self, index: int) -> npt.NDArray[np.int16]:
         """One frame, shape (vector, sample), 14-bit counts."""
-        counts = self.waveforms(range(len(self))[index]) * self._gain
+        counts: Float32Array = self.waveforms(range(len(self))[index]) * self._levels[0]
         return np.clip(np.rint(counts), -_FULL_SCALE, _FULL_SCALE).astype(np.int16)
 
     def waveforms(self, index: int) -> Float32Array:
@@ -98,22 +98,18 @@ class SimulatedFrames:
         medium_from_image = self.medium_from_image[index]
         image_from_medium = medium_from_image.inv()
         field = self._field, grid, out.view(np.float32)
+        fan, angle = image.fan, image.angle_rad(np.arange(image.vectors))
         for position, strength in self.medium.seen(medium_from_image, self._box):
-            if self._fan is None:
+            if fan is None:
                 matrix = image_from_medium.as_matrix()
                 scatter_echoes(position, strength, matrix, image.vector_pitch_mm, *field)
                 continue
             place = image_from_medium.apply(position)
             inside = ((place > self._box[0]) & (place < self._box[1])).all(axis=1)
+            lines = Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
             far_mm = self.beam.lateral_extent_mm
-            scatter_fan_echoes(place[inside], strength[inside], self._fan, far_mm, *field)
+            scatter_fan_echoes(place[inside], strength[inside], lines, far_mm, *field)
         return out
-
-    @cached_property
-    def _fan(self) -> Fan | None:
-        """Vectors that are not parallel."""
-        fan, angle = self.image.fan, self.image.angle_rad(np.arange(self.image.vectors))
-        return None if fan is None else Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
 
     @cached_property
     def _field(self) -> FieldTable:
@@ -156,20 +152,15 @@ class SimulatedFrames:
         return band, np.ascontiguousarray(spectra[:, band].T).astype(np.complex64)
 
     @cached_property
-    def _rms(self) -> tuple[FloatArray, float]:
-        """RF rms of unit speckle at each sample, and at the focus."""
-        frequency = np.linspace(0.0, self.beam.probe.sampling_rate_hz / 2.0, 513)
-        rms = np.sqrt(self.beam.echo_power(frequency))
-        image = self.image
+    def _levels(self) -> tuple[Float32Array, float]:
+        """Gain at each sample, and RF rms of unit speckle at the focus."""
+        probe, image = self.beam.probe, self.image
+        rms = np.sqrt(self.beam.echo_power(np.linspace(0.0, probe.sampling_rate_hz / 2.0, 513)))
         depth = image.first_sample_depth_mm + np.arange(image.samples) * image.sample_spacing_mm
-        focus = np.interp(self.beam.probe.transmit_focus_mm, self.beam.depth_mm, rms)
-        return np.interp(depth, self.beam.depth_mm, rms), float(focus)
-
-    @cached_property
-    def _gain(self) -> FloatArray:
-        rms, focus = self._rms
+        focus = float(np.interp(probe.transmit_focus_mm, self.beam.depth_mm, rms))
         quietest = focus * 10.0 ** (-_MOST_GAIN_DB / 20.0)
-        return np.asarray(SPECKLE_RMS_COUNTS / np.maximum(rms, quietest)).astype(np.float32)
+        gain = SPECKLE_RMS_COUNTS / np.maximum(np.interp(depth, self.beam.depth_mm, rms), quietest)
+        return gain.astype(np.float32), focus
 
     def _noise(self, index: int) -> Complex64Array:
         """Spectrum of one frame's electronic noise, shape (vector, bin)."""
@@ -177,8 +168,7 @@ class SimulatedFrames:
         low, high = _NOISE_BAND_HZ
         frequency = self._frequency_hz
         band = np.flatnonzero((frequency >= low) & (frequency <= high))
-        _, focus = self._rms
-        rms = focus * 10.0 ** (-self.snr_db / 20.0)
+        rms = self._levels[1] * 10.0 ** (-self.snr_db / 20.0)
         # irfft of bins of variance 2 s^2 over n samples has variance 4 s^2 bins / n^2.
         scale = rms * self._length / np.sqrt(4.0 * band.size)
         noise = np.zeros((self.image.vectors, frequency.size), np.complex64)

@@ -9,6 +9,7 @@ from speckle3d.cli.calibrations import files_of, given_settings
 from speckle3d.cli.common import MaybeNumber, MaybePath, MaybeText, Out, Paths, notes
 from speckle3d.cli.look.volumes import Imported, region_of
 from speckle3d.cli.outputs import require_own_place
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.progress import progress_bar
 
 if TYPE_CHECKING:

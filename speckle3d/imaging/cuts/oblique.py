@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.outlines import crossings, frame_outlines
-from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_around
+from speckle3d.imaging.cuts.planes import DEFAULT_PIXEL_MM, ReslicePlane, plane_part
 
 _LEAST_SINE = 1e-4
 """Of the angle between two directions that span a plane: six thousandths of a degree."""
@@ -84,7 +84,7 @@ def covering_plane(
             f"plane: expected one that meets a frame within {reach_mm:g} mm, all between {vector_words(low)} "
             f"and {vector_words(high)} mm, got one {away.min():.1f} mm from there"
         )
-    return plane_around(placed, points, pixel_mm)
+    return plane_part(placed, points.min(axis=0), points.max(axis=0), pixel_mm)
 
 
 def vector_words(vector: Iterable[float]) -> str:

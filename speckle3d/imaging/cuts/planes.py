@@ -208,18 +208,13 @@ def planes_from_first_frame(
     high = np.min([ends.max(axis=0), largest_mm, low + largest_mm], axis=0)
     # Depth counts from the probe, lateral from the first vector.
     begin = line_mm[0] @ (line_mm[1] != line_mm[0])
-    return {mode: _part(axes, low, high, pixel_mm, begin) for mode, (axes, _) in placed.items()}
+    return {mode: plane_part(axes, low, high, pixel_mm, begin) for mode, (axes, _) in placed.items()}
 
 
-def plane_around(placed: RigidTransform, points_mm: FloatArray, pixel_mm: float) -> ReslicePlane:
-    """Smallest rectangle of a placed plane that holds points of it, shape (n, 2), mm."""
-    return _part(placed, points_mm.min(axis=0), points_mm.max(axis=0), pixel_mm, 0.0)
-
-
-def _part(
-    placed: RigidTransform, low: FloatArray, high: FloatArray, pixel_mm: float, begin_mm: float
+def plane_part(
+    placed: RigidTransform, low: FloatArray, high: FloatArray, pixel_mm: float, begin_mm: float = 0.0
 ) -> ReslicePlane:
-    """Rectangle of a placed plane, whose axes count from its origin, y with `begin_mm` there."""
+    """Rectangle of a placed plane; its axes count from the origin, y with `begin_mm` there."""
     start = RigidTransform.from_translation([*low, 0.0])
     width, height = np.maximum(high - low, pixel_mm).tolist()
     return ReslicePlane(placed * start, width, height, pixel_mm, (float(low[0]), float(low[1] + begin_mm)))

@@ -53,4 +53,4 @@ def deviations(errors: PosedErrors, grid: ImageGrid, points_mm: FloatArray) -> F
     """Standard deviation of points' positions along the sweep, shape (k,), mm."""
     near = belonging_of(points_mm, grid, errors.world_from_image)
     along = errors.world_from_image.rotation[near.frames[:, 0]].apply([0.0, 0.0, 1.0])
-    return np.sqrt(np.maximum(errors.variance(points_mm, along, near), 0.0))
+    return np.sqrt(errors.variance(points_mm, along, near))
