@@ -55,8 +55,8 @@ UNADAPTED_SIGMA = 0.15
 tissue reads 5 to 25 % short with them."""
 _BIN_EDGES_MM = np.concatenate([np.arange(0.0, 1.0, 0.03), np.arange(1.0, 4.01, 0.15)])
 """Fine where the curves fall, coarse where only structure is left."""
-ROUNDS, SETTLED = 30, 1e-3
-"""Most rounds of a fit, and the step of its numbers that ends them."""
+ROUNDS, SETTLED, DIFFERENCE = 30, 1e-3, 1e-6
+"""Most rounds of a fit, the step of its numbers that ends them, and that of derivatives."""
 MOST_SHARE, MOST_POWER = {"echo": 0.5, "intensity": 0.95}, 0.9
 """Bounds of c, by what is correlated, and of a. An echo that is structure for the most part is r^a alone, a
 curve of another width, and tells no scale; of intensity, structure's share is larger, because its phase does
@@ -130,15 +130,6 @@ class _Binned:
     step_mm: float
     determined: BoolArray
 
-    def speckle(self, scale: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Amplitude of speckle at scaled distances, and its derivative by ln scale."""
-        last = self.amplitude.shape[1] - 1
-        position = np.minimum(self.distance * scale / self.step_mm, last)
-        cell = np.minimum(position, last - 1).astype(int)
-        low, high = (np.take_along_axis(self.amplitude, cell + k, axis=1) for k in (0, 1))
-        slope = np.where(position < last, (high - low) * position, 0.0)
-        return np.maximum(low + (position - cell) * (high - low), 1e-6), slope
-
     def fit(
         self,
         most_share: float,
@@ -160,9 +151,13 @@ class _Binned:
         low, high = (-1.0, 1.0) if log_scale is None else (log_scale, log_scale)
         lowest, highest = np.array([low, 0.05, 0.0, 0.0]), np.array([high, 1.2, most_share, most_power])
         x = np.tile(np.clip([0.0, 0.95, 0.05, 0.1], lowest, highest), (len(self.mean), 1))
-        left, jacobian = self._misfit(x, sigma)
+        left = self._misfit(x, sigma)
         damping = np.full((len(x), 1), 1e-2)
         for _ in range(ROUNDS):
+            steps = DIFFERENCE * np.eye(4)
+            jacobian = (
+                np.stack([self._misfit(x + step, sigma) - left for step in steps], axis=-1) / DIFFERENCE
+            )
             gradient = np.einsum("kmn,km->kn", jacobian, left)
             free = ~(((x <= lowest) & (gradient > 0)) | ((x >= highest) & (gradient < 0)))
             normal = np.einsum("kmn,kmo->kno", jacobian, jacobian) * (free[:, :, None] & free[:, None, :])
@@ -170,32 +165,25 @@ class _Binned:
             diagonal += damping * diagonal + np.where(free, 1e-12, 1.0)
             step = np.linalg.solve(normal, np.where(free, gradient, 0.0)[:, :, None])[:, :, 0]
             trial = np.clip(x - step, lowest, highest)
-            trial_left, trial_jacobian = self._misfit(trial, sigma)
+            trial_left = self._misfit(trial, sigma)
             better = (trial_left**2).sum(axis=1) <= (left**2).sum(axis=1)
             moved = np.abs(trial - x).max()
-            x[better], left[better], jacobian[better] = (
-                trial[better],
-                trial_left[better],
-                trial_jacobian[better],
-            )
+            x[better], left[better] = trial[better], trial_left[better]
             damping *= np.where(better, 0.2, 4.0)[:, None]
             if moved < SETTLED:
                 break
         return x
 
-    def _misfit(self, x: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
-        """Weighted misfits, shape (q, bins + 1), and their derivatives by ln s, gain, c and a."""
-        r, slope = self.speckle(np.exp(x[:, :1]))
-        gain, share, power = x[:, 1:2], x[:, 2:3], x[:, 3:4]
-        long = r**power
-        echo = (1 - share) * r + share * long
-        by_echo = 2 * gain * echo
-        by_scale = by_echo * (1 - share + share * power * long / r) * slope
-        by = by_scale, echo**2, by_echo * (long - r), by_echo * share * long * np.log(r)
-        jacobian = np.stack(by, axis=-1) * self.weight[..., None]
-        prior = np.broadcast_to([0.0, 0.0, 1 / sigma, 0.0], (len(x), 1, 4))
-        left = self.weight * (gain * echo**2 - self.mean)
-        return np.append(left, share / sigma, axis=1), np.concatenate([jacobian, prior], axis=1)
+    def _misfit(self, x: FloatArray, sigma: float) -> FloatArray:
+        """Weighted misfits, and c over its deviation, shape (q, bins + 1)."""
+        log_scale, gain, share, power = x.T[:, :, None]
+        last = self.amplitude.shape[1] - 1
+        position = np.minimum(self.distance * np.exp(log_scale) / self.step_mm, last)
+        cell = np.minimum(position, last - 1).astype(int)
+        low, high = (np.take_along_axis(self.amplitude, cell + k, axis=1) for k in (0, 1))
+        speckle = np.maximum(low + (position - cell) * (high - low), 1e-6)
+        echo = (1 - share) * speckle + share * speckle**power
+        return np.append(self.weight * (gain * echo**2 - self.mean), share / sigma, axis=1)
 
 
 def _binned(
@@ -242,12 +230,6 @@ def _binned(
     return binned, (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
 
 
-def _median(values: FloatArray) -> float:
-    """Median of the finite values; NaN of none."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else float("nan")
-
-
 def _standard_error(values: FloatArray, prior: int) -> float:
     """Standard error of the median of finite values, by their own scatter and `prior` more of `ROW_SIGMA`."""
     finite = values[np.isfinite(values)]
@@ -281,7 +263,9 @@ def estimate_coherence(
 
     def row_medians(values: FloatArray) -> FloatArray:
         by_piece = np.where(determined, values, np.nan).reshape(centres.size, -1)
-        return np.array([_median(row) for row in np.moveaxis(problem.patches.rows_of(by_piece), 1, 0)])
+        by_row = np.moveaxis(problem.patches.rows_of(by_piece), 1, 0)
+        finite = (row[np.isfinite(row)] for row in by_row)
+        return np.array([np.median(row) if row.size else np.nan for row in finite])
 
     frozen = binned.fit(most_share)
     typical = float(np.nanmean(row_medians(frozen[:, 2])))
@@ -291,11 +275,11 @@ def estimate_coherence(
     # Where noise is most of the correlation, its course tells nothing of the scale.
     clear = determined & (frozen[:, 1] >= LEAST_GAIN)
     clear = clear if clear.any() else determined
-    medians = [_median(fit[clear, 0]) for fit in fits]
+    medians = [float(np.median(fit[clear, 0])) for fit in fits]
     log_scale = float(np.mean(medians))
     gain, share = binned.fit(most_share, 0.0, log_scale, max(typical, NO_STRUCTURE))[:, 1:3].T
     # Patches that tell nothing are taken for the sweep's typical ones.
-    gain, share = (np.where(determined, v, _median(v[determined])) for v in (gain, share))
+    gain, share = (np.where(determined, v, np.median(v[determined])) for v in (gain, share))
     own = np.mean(fits, axis=0)[:, 0] - log_scale
     rows = RowScales(problem.patches.row_depth_mm, row_medians(own), row_medians(gain))
     # Deviations from a line over depth: tilt makes one.

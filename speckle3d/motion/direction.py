@@ -48,21 +48,16 @@ def sensed_orientation(sweep: Sweep, settings: SensorSettings) -> Rotation | Non
     sensor = sweep.orientation_source
     if not settings.consistent_subset or sensor is None or sensor.sensor_from_image is None:
         return None
-    if not sensor.covers(sweep.frame_time_s).all():
+    time_s, sigma_s = sweep.frame_time_s, settings.smooth_s
+    if not sensor.covers(time_s).all():
         return None
-    return smooth_rotations(
-        image_orientation(sensor, sweep.frame_time_s), sweep.frame_time_s, settings.smooth_s
-    )
-
-
-def smooth_rotations(rotations: Rotation, time_s: FloatArray, sigma_s: float) -> Rotation:
-    """Smooth rotations that stay within a half turn of their mean, by a Gaussian over time."""
-    if sigma_s == 0 or len(rotations) < 3:
-        return rotations
-    mean = rotations.mean()
-    vectors = (mean.inv() * rotations).as_rotvec()
-    sigma = sigma_s / float(np.median(np.diff(time_s)))
-    return mean * Rotation.from_rotvec(gaussian_filter1d(vectors, sigma, axis=0, mode="nearest"))
+    sensed = image_orientation(sensor, time_s)
+    if sigma_s == 0 or len(time_s) < 3:
+        return sensed
+    # As turns from their mean, of which they stay within a half turn.
+    mean, frames = sensed.mean(), sigma_s / float(np.median(np.diff(time_s)))
+    turns = gaussian_filter1d((mean.inv() * sensed).as_rotvec(), frames, axis=0, mode="nearest")
+    return mean * Rotation.from_rotvec(turns)
 
 
 def settle_direction(

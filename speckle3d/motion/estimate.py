@@ -136,7 +136,7 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
             coherence = estimate_coherence(problem, table, sound, path)
             pairs = _signed_planes(problem, table, sound, path * coherence.scale, coherence)
             slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
-            _, solved = _solved(problem, table, slopes.applied(pairs))
+            _, solved = solve_planes(problem, table, slopes.applied(pairs))
             path = elevation_of(solved.poses, problem.centre_mm)
         coherence = estimate_coherence(problem, table, sound, path)
         if left and sheet and coherence.rows:
@@ -144,11 +144,11 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
     slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
     pairs = pairs.scaled(coherence.scale)
-    edges, solved = _solved(problem, table, slopes.applied(pairs), with_covariance=True)
+    edges, solved = solve_planes(problem, table, slopes.applied(pairs), with_covariance=True)
     return Motion(problem, table, pairs, coherence, slopes, edges, solved.poses, solved.covariance)
 
 
-def _solved(
+def solve_planes(
     problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes, with_covariance: bool = False
 ) -> tuple[RelativePoses, Trajectory]:
     """Trajectory of some pairs, and the edges that it is solved from."""

@@ -115,7 +115,7 @@ def fit_curves(
         if response is None:
             break
         pivot, spread = response.pivot_mm[row], response.spread_mm[row]
-        distance = effective_distance(offset, tilt, pivot, spread)
+        distance = np.hypot(offset - pivot * tilt, spread * tilt)
         fair = np.abs(distance - np.abs(offset)) <= LITTLE_TILT_MM + LITTLE_TILT * np.abs(offset)
     grid = grid[: max(2, int(np.searchsorted(grid, ends.min(), side="right")))]
     pairs = sum(one.pairs for one in every)
@@ -168,13 +168,6 @@ def _fitted_fall(grid: FloatArray, centre: FloatArray, rho: FloatArray, terms: i
     return np.asarray(np.maximum.accumulate(fall + 1e-9 * np.arange(fall.size)))
 
 
-def effective_distance(
-    offset_mm: FloatArray, tilt_rad: FloatArray, pivot_mm: FloatArray | float, spread_mm: FloatArray | float
-) -> FloatArray:
-    """Distance without tilt at which speckle would have decorrelated as much."""
-    return np.asarray(np.hypot(offset_mm - pivot_mm * tilt_rad, spread_mm * tilt_rad))
-
-
 def _fit_tilt(
     key: CurveKey,
     curves: DecorrelationCurves,
@@ -204,7 +197,7 @@ def _fit_tilt(
     design = np.vander((depth - depth.mean()) / max(np.ptp(depth), 1.0), min(3, depth.size))
 
     def misfit(values: FloatArray) -> FloatArray:
-        at = effective_distance(offset, tilt, (design @ values)[row], spread[row]) / step
+        at = np.hypot(offset - (design @ values)[row] * tilt, spread[row] * tilt) / step
         cell = np.minimum(at.astype(int), curves.distance_mm.size - 2)
         low, high = curves.correlation[row, cell], curves.correlation[row, cell + 1]
         expected = low + np.minimum(at - cell, 1.0) * (high - low)

@@ -134,7 +134,7 @@ class MotionProblem:
 
     def typical_distance(self, amplitude: FloatArray | float) -> FloatArray:
         """Distance at which the median patch's fully developed speckle keeps an amplitude, mm."""
-        return np.asarray(np.interp(-np.asarray(amplitude), -self._typical, self.curves.distance_mm))
+        return np.asarray(np.interp(-amplitude, -self._typical, self.curves.distance_mm))
 
     def typical_correlation(self, distance_mm: FloatArray) -> FloatArray:
         """Correlation of the median patch's fully developed speckle; 0 where it was not measured."""
@@ -283,7 +283,7 @@ def pair_planes(
 
 def _lost(problem: MotionProblem, moved_mm: FloatArray) -> FloatArray:
     """What in-plane motion takes from the patches' lateral positions and levers, shape (e, 2)."""
-    return np.ascontiguousarray(moved_mm * [1.0, float(problem.curves.tilt is not None)])
+    return moved_mm * [1.0, float(problem.curves.tilt is not None)]
 
 
 def raised(problem: MotionProblem, moved_mm: FloatArray, slopes: FloatArray) -> FloatArray:

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray
-from speckle3d.motion.estimate import Motion
+from speckle3d.motion.estimate import Motion, solve_planes
 from speckle3d.motion.planes import pair_planes, patch_distances, raised
-from speckle3d.motion.trajectory import edges_of, solve_trajectory
 
 
 def consistent_poses(motion: Motion, sensed: Rotation) -> tuple[RigidTransform, BoolArray]:
@@ -40,8 +39,7 @@ def consistent_poses(motion: Motion, sensed: Rotation) -> tuple[RigidTransform, 
     planes.covariance[:] *= scale**2
     for name in ("coefficients", "covariance", "used"):
         getattr(planes, name)[~determined] = getattr(pairs, name)[~determined]
-    edges, huber = edges_of(table, planes), problem.trajectory.huber
-    return solve_trajectory(edges, problem.frames, problem.centre_mm, huber).poses, planes.used
+    return solve_planes(problem, table, planes)[1].poses, planes.used
 
 
 def consistent_subset(
@@ -80,13 +78,9 @@ def consistent_subset(
             continue
         d, sigma, farther = (v[pair, known].astype("f4") for v in (distance_mm, sigma_mm, raised_mm))
         offset = np.concatenate([d - farther, -d - farther] if either_side[pair] else [d - farther])
-        misfit = np.abs(offset[:, None] + farther)
-        misfit -= d
-        misfit *= 1 / sigma
-        np.abs(misfit, out=misfit)
+        misfit = np.abs((np.abs(offset[:, None] + farther) - d) / sigma)
         agree = misfit <= support_sigma
         # Among placements of equal support, the one whose supporters lie closest.
-        misfit *= agree
-        score = agree.sum(axis=1) - misfit.sum(axis=1) / (d.size * support_sigma + 1.0)
+        score = agree.sum(axis=1) - (agree * misfit).sum(axis=1) / (d.size * support_sigma + 1.0)
         support[pair, known] = agree[score.argmax()]
     return support

@@ -68,23 +68,23 @@ def solve_trajectory(
     poses, root = RigidTransform.identity(frames), np.linalg.cholesky(np.linalg.inv(pairs.covariance))
     for number in range(ROUNDS):
         # From nowhere, all pairs are far off alike.
-        jacobian, left = _linearised(pairs, root, poses, huber if number else np.finfo(float).max)
+        normal, gradient = _normal(pairs, root, poses, huber if number else np.finfo(float).max)
         step = np.zeros((frames, 6))
-        step[1:] = _factored(jacobian).solve(-jacobian.T @ left).reshape(-1, 6)
+        step[1:] = -normal.solve(gradient).reshape(-1, 6)
         poses = poses * RigidTransform.from_exp_coords(step[:, _TWIST])
         if np.abs(step).max() < SETTLED:
             break
     covariance = np.zeros((frames, 6, 6))
     if with_covariance:
-        covariance = _marginals(_factored(_linearised(pairs, root, poses, huber)[0]), frames)
+        covariance = _marginals(_normal(pairs, root, poses, huber)[0], frames)
     centre = RigidTransform.from_translation(centre_mm)
     return Trajectory(centre * poses * centre.inv(), covariance)
 
 
-def _linearised(
+def _normal(
     pairs: RelativePoses, root: FloatArray, poses: RigidTransform, huber: float
 ) -> tuple[Any, FloatArray]:
-    """Sparse Jacobian of the weighted misfits by twists of all frames but the first, and the misfits.
+    """Factors of the normal equations for twists of all frames but the first, and the cost's gradient.
 
     Parameters
     ----------
@@ -104,12 +104,10 @@ def _linearised(
     columns = np.column_stack([pairs.first, pairs.second]).ravel()
     shape = 6 * len(pairs), 6 * len(poses)
     every = bsr_array((blocks, columns, np.arange(0, columns.size + 1, 2)), shape=shape)
-    return every.tocsc()[:, 6:], (whiten @ error).ravel()
-
-
-def _factored(jacobian: Any) -> Any:
-    """Factors of the normal equations."""
-    return splu((jacobian.T @ jacobian).tocsc(), "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
+    jacobian = every.tocsc()[:, 6:]
+    normal = (jacobian.T @ jacobian).tocsc()
+    factors = splu(normal, "MMD_AT_PLUS_A", 0.0, options={"SymmetricMode": True})
+    return factors, jacobian.T @ (whiten @ error).ravel()
 
 
 def _marginals(normal: Any, frames: int) -> FloatArray:

@@ -39,9 +39,8 @@ def claimed_covariance(
     turn = np.zeros((len(poses), 6, 6))
     turn[:, :3, :3] = turn[:, 3:, 3:] = poses.rotation.as_matrix()
     grown = SHARED * (1.0 + STRUCTURE * structure)
-    covariance = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
-    covariance += shared_covariance(poses, centre_mm, shared)
-    return np.asarray((covariance + covariance.transpose(0, 2, 1)) / 2)
+    own = turn @ (independent * np.outer(grown, grown)) @ turn.transpose(0, 2, 1)
+    return np.asarray(own + shared_covariance(poses, centre_mm, shared))
 
 
 def shared_covariance(poses: RigidTransform, centre_mm: FloatArray, shared: SharedErrors) -> FloatArray:

@@ -35,7 +35,7 @@ from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import Sweep
 from speckle3d.corrections import correct
 from speckle3d.io.load import load_sweep
-from speckle3d.motion import estimate, subset
+from speckle3d.motion import estimate
 from speckle3d.motion.coherence import Coherence
 from speckle3d.motion.direction import settle_direction
 from speckle3d.motion.planes import fully_developed
@@ -164,8 +164,8 @@ def measure(case: Case, method: str, seed: int, curves: DecorrelationCurves, fol
     config = Config.model_validate(METHODS[method])
     pairs: list[FramePairs] = []
     with ExitStack() as patches:
-        for module in (estimate, subset) if method in CHAINED else ():
-            patches.enter_context(patch.object(module, "solve_trajectory", chained))
+        if method in CHAINED:
+            patches.enter_context(patch.object(estimate, "solve_trajectory", chained))
         if method == "plain":
             patches.enter_context(patch.object(estimate, "estimate_coherence", of_phantom))
         tracked = track(sweep, curves, config, sink=pairs.append)
