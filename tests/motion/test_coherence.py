@@ -148,3 +148,12 @@ def test_a_long_sweep_is_fitted_in_pieces():
     np.testing.assert_array_equal(models.share, coherence.share)
     np.testing.assert_array_equal(models.gain, coherence.gain)
     assert coherence.scale == pytest.approx(1.0, abs=0.02)
+
+
+def test_two_frames_keep_the_phantoms_curves_and_claim_what_tissue_may_do():
+    path = made_path(2)
+    table = sweep_table(path, some([0.0, 0.3]), np.zeros(len(PATCHES)), "echo", steps=(1,))
+    coherence = estimated(path, table)
+    assert coherence.scale == 1.0
+    assert coherence.rows is None
+    assert 0.1 < coherence.scale_sigma < 0.2

@@ -58,17 +58,3 @@ def test_an_echos_deviation_is_the_cramer_rao_bound(u):
     _, sigma = read(problem(), r**2)
     # Above it by 1 / (4 N rho) at the last and by what interpolation leaves at the first.
     assert (np.abs(sigma / bound - 1.02) < 0.05).all()
-
-
-@pytest.mark.parametrize("u", [1 / 3, 2 / 3, 1.0])
-def test_an_intensitys_deviation_is_that_of_sampled_coefficients(u):
-    """Pearson's coefficient of 45 pairs of normal numbers, drawn 20 000 times, read as distance."""
-    rng, rho = np.random.default_rng(8), np.exp(-(u**2) / 2)
-    a, b = rng.normal(size=(2, 20000, int(CELLS)))
-    b = rho * a + np.sqrt(1 - rho**2) * b
-    r = np.array([np.corrcoef(x, y)[0, 1] for x, y in zip(a, b, strict=True)])
-    r = r[: r.size // len(PATCHES) * len(PATCHES)].reshape(-1, len(PATCHES))
-    distance, _ = read(problem(of="intensity"), r)
-    _, sigma = read(problem(of="intensity"), rho)
-    # The prediction is of first order; the curve bends over a deviation.
-    assert abs(np.nanstd(distance) / sigma.mean() - 1) < 0.1

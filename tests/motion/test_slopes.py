@@ -71,24 +71,6 @@ def test_a_turn_of_five_degrees_over_twenty_millimetres_is_believed():
     assert abs(rates(weights.applied(planes))[0] - DELIBERATE) < 2 * weights.deviation_per_mm[0]
 
 
-def test_tilt_is_believed_less_than_yaw_and_not_at_all_where_curves_know_nothing_of_it():
-    """Off the focus patches are moved by tilt as if they lay there: seven millimetres of lever, not ten."""
-    weights = weigh_slopes(fitted(), PHANTOM, SETTINGS)
-    assert weights.share[1] < weights.share[0]
-    weights = weigh_slopes(fitted(tilt=None), PHANTOM, SETTINGS)
-    assert weights.share[1] < 1e-3
-    # What is left is what sweeps are expected to have.
-    assert abs(weights.deviation_per_mm[1] / EXPECTED - 1) < 0.01
-
-
-@pytest.mark.parametrize(("variance", "least", "most"), [(3e-3, 0.0, 0.1), (3e-6, 0.9, 1.0)])
-def test_a_turn_is_deliberate_only_beyond_its_own_noise(variance, least, most):
-    """Eleven degrees in a millimetre, seen by few patches to nine, and by many to a third."""
-    covariance = np.diag([0.02, variance, variance])
-    planes = made([0.1, -0.1] * 6, np.tile([0.02, -0.02], 6), 0.0, covariance)
-    assert least <= weigh_slopes(planes, TISSUE, SETTINGS).share[0] <= most
-
-
 def test_offsets_stay_on_their_side_when_slopes_are_left_out():
     covariance = np.diag([0.02, 3e-3, 3e-3])
     covariance[0, 1] = covariance[1, 0] = -5e-3

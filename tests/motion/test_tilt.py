@@ -88,14 +88,6 @@ def test_the_pivot_of_a_made_law_is_recovered(learnt):
     np.testing.assert_allclose(learnt.tilt.pivot_mm, pivots(DEPTHS_MM), atol=1.0)
 
 
-def test_the_curves_are_those_of_frames_that_do_not_turn(learnt):
-    d = learnt.distance_mm
-    for row, width in zip(learnt.correlation, widths(DEPTHS_MM), strict=True):
-        useful = (d > 0.1) & (d < 1.5 * width)
-        read = np.interp(-np.exp(-(d[useful] ** 2) / (2 * width**2)), -row, d)
-        np.testing.assert_allclose(read, d[useful], rtol=0.03)
-
-
 def test_phantoms_that_do_not_turn_tell_nothing_of_it():
     assert learn([stepped(seed=seed) for seed in range(2)]).tilt is None
 

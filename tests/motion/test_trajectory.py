@@ -9,7 +9,6 @@ from scipy.linalg import logm
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from speckle3d.core.geometry import relative_poses
 from speckle3d.core.relative import RelativePoses
 from speckle3d.matching.table import CorrelationTable
 from speckle3d.motion import trajectory
@@ -136,23 +135,6 @@ def test_poses_are_the_least_squares_ones(seed, monkeypatch):
     assert cost < dense.cost * 1.001
 
 
-@pytest.mark.parametrize("axis", range(6), ids=["x", "y", "z", "tilt", "yaw", "roll"])
-def test_a_pair_uncertain_in_one_direction_gives_way_in_that_direction_alone(axis):
-    """Two steps and the jump over both disagree in one direction; the step unsure of it takes it all up."""
-    sure = np.diag([1e-6] * 3 + [1e-8] * 3)
-    unsure = sure.copy()
-    unsure[axis, axis] *= 1e6
-    gap = np.zeros(6)
-    gap[axis] = 0.02
-    still = np.zeros(6)
-    pairs = graph_of(
-        [(0, 1, pose_of(*still), unsure), (1, 2, pose_of(*still), sure), (0, 2, pose_of(*gap), sure)]
-    )
-    first, second = relative_poses(solved(pairs, 3, np.zeros(3), PLAIN))
-    np.testing.assert_allclose(first.as_matrix(), pose_of(*gap).as_matrix(), atol=1e-5)
-    np.testing.assert_allclose(second.as_matrix(), np.eye(4), atol=1e-5)
-
-
 def neighbours(frames=40, reach=3):
     """Pairs of near frames of a hand that travels 0.1 mm a frame, with errors as claimed; and its poses."""
     rng, t = np.random.default_rng(1), np.arange(frames)
@@ -189,34 +171,6 @@ def test_one_false_pair_among_many_is_overruled():
 
 
 # ---- covariance --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_marginal_covariance_is_that_of_many_draws():
-    """Errors in each frame's own axes, over draws of all pairs' errors."""
-    draws, frames = 400, 6
-    pairs, _ = random_graph(4, frames)
-    truth = solved(pairs, frames, np.zeros(3), PLAIN)
-    # The same graph without misfit, pairs right but for what is drawn.
-    exact = truth[pairs.first].inv() * truth[pairs.second]
-    claimed = solve_trajectory(replace(pairs, poses=exact), frames, np.zeros(3), PLAIN, True).covariance
-    rng = np.random.default_rng(12)
-    root = np.linalg.cholesky(pairs.covariance)
-    errors = np.empty((draws, frames, 6))
-    for k in range(draws):
-        twist = np.einsum("eij,ej->ei", root, rng.normal(size=(len(pairs), 6)))
-        off = RigidTransform.from_exp_coords(twist[:, [3, 4, 5, 0, 1, 2]])
-        found = solved(replace(pairs, poses=exact * off), frames, np.zeros(3), PLAIN)
-        errors[k] = (truth.inv() * found).as_exp_coords()[:, [3, 4, 5, 0, 1, 2]]
-    assert (claimed[0] == 0).all()
-    for covariance, error in zip(claimed[1:], errors.transpose(1, 0, 2)[1:], strict=True):
-        seen = np.cov(error.T)
-        deviation = np.sqrt(np.diag(covariance))
-        # A deviation from 400 draws is itself right to 3.5 %, a correlation to 0.05.
-        np.testing.assert_allclose(np.sqrt(np.diag(seen)), deviation, rtol=0.15)
-        np.testing.assert_allclose(
-            seen / np.outer(deviation, deviation), covariance / np.outer(deviation, deviation), atol=0.25
-        )
 
 
 def test_a_chain_of_equal_steps_is_a_random_walk():
