@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
+from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.grid import ImageGrid
@@ -51,8 +50,8 @@ class FramePairs:
     second: IntArray
     first_from_second: FloatArray
     covariance: FloatArray
-    distance_mm: npt.NDArray[np.float32]
-    sigma_mm: npt.NDArray[np.float32]
+    distance_mm: Float32Array
+    sigma_mm: Float32Array
     used: BoolArray
     patch_centre_mm: FloatArray
 
