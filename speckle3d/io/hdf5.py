@@ -262,9 +262,9 @@ def read_checked(
 
 def require_shape(node: h5py.Dataset, shape: tuple[int | str, ...], where: str) -> None:
     """Raise `InvalidInputError` unless a data set is of a shape; a word stands for a length that is free."""
-    got = node.shape or ()
-    lengths = tuple(n if isinstance(wanted, str) else wanted for n, wanted in zip(got, shape, strict=False))
-    if len(got) != len(shape) or got != lengths:
+    pairs = zip(node.shape or (), shape, strict=False)
+    is_other = any(length != wanted for length, wanted in pairs if isinstance(wanted, int))
+    if is_other or node.ndim != len(shape):
         raise InvalidInputError(f"{where}: expected shape {shape}, got {node.shape}")
 
 

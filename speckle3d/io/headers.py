@@ -154,12 +154,6 @@ class SequenceHeader:
         """Whether the file is NRRD, else MetaImage."""
         return "sizes" in self.fields
 
-    @property
-    def transforms(self) -> list[str]:
-        """Names of the tracked transforms, as ``ProbeToTracker``."""
-        names = {name for frame in self.frames for name in frame if name.endswith("Transform")}
-        return sorted(name.removesuffix("Transform") for name in names)
-
     def images(self) -> npt.NDArray[Any]:
         """Map or unpack all images, shape (frame, y, x).
 

@@ -27,6 +27,7 @@ from speckle3d.io.plus.transforms import (
     Poses,
     fixed_transform,
     image_skew_rad,
+    names_of,
     pixel_axes,
     sensor_from_image,
     tracked_orientation,
@@ -77,9 +78,8 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
 
 def lacking_poses(path: PathLike) -> str:
     """Say which transforms an image sequence holds, if not those of the usual names."""
-    header = read_header(path)
-    advice = ": name the sensor's with --transform" if header.transforms else ""
-    return f"{', '.join(header.transforms) or 'none'}{advice}"
+    names = names_of(read_header(path).frames)
+    return f"{', '.join(names)}: name the sensor's with --transform" if names else "none"
 
 
 def open_sequence(path: Path, settings: ImportSettings) -> Recording:
@@ -106,7 +106,7 @@ def open_sequence(path: Path, settings: ImportSettings) -> Recording:
         ("spacing", _shown(header.spacing_mm or ()) or "unknown", "mm" if header.spacing_mm else ""),
         ("image type", kind, ""),
         ("image orientation", orientation, ""),
-        ("transforms", ", ".join(header.transforms) or "none", ""),
+        ("transforms", ", ".join(names_of(header.frames)) or "none", ""),
     ]
     if settings.plus_config is not None:
         rows.append(("device set", settings.plus_config, ""))
@@ -186,7 +186,7 @@ def _recording(
 def _require_images(header: SequenceHeader, layout: Layout, settings: ImportSettings) -> None:
     """Refuse what is no sequence of images of lines."""
     if 0 in header.size or max(header.size[:2]) == 1:
-        what = ": the recording of a tracker, for --poses" if header.transforms else ""
+        what = ": the recording of a tracker, for --poses" if names_of(header.frames) else ""
         raise InvalidInputError(
             f"{header.path}: expected pixels of images, got images of size {_shown(header.size[:2])}{what}"
         )
@@ -316,7 +316,7 @@ def _remarks(
 ) -> list[str]:
     """Tell what contradicts, and which poses were not used."""
     count, notes = header.frame_count, list[str]()
-    if poses is None and header.transforms and settings.tracker_transform is None:
+    if poses is None and names_of(header.frames) and settings.tracker_transform is None:
         notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
     if len(header.frames) not in (0, count):
         notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")
