@@ -30,7 +30,7 @@ Node: TypeAlias = h5py.Group | h5py.Dataset
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file without a user block."""
 
-_DAMAGE: tuple[type[Exception], ...] = (
+_DAMAGE: tuple[type[BaseException], ...] = (
     OSError,
     RuntimeError,
     LookupError,
@@ -116,8 +116,6 @@ def open_hdf5(path: PathLike) -> h5py.File:
     """
     require_file(path)
     with reading(path):
-        if not h5py.is_hdf5(path):
-            raise FileError(f"{path}: expected an HDF5 file, got something else")
         try:
             return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
         except OSError as error:
@@ -148,7 +146,7 @@ def require_file(path: PathLike) -> None:
 
 
 @contextmanager
-def reading(where: PathLike, *others: type[Exception]) -> Iterator[None]:
+def reading(where: PathLike, *others: type[BaseException]) -> Iterator[None]:
     """Turn what a damaged or unreadable file raises in the block into a `FileError` of one line.
 
     Other exceptions are errors of a program and pass. `others` are those of a library that has its own;

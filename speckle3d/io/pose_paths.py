@@ -164,10 +164,12 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     Where that leaves out more than a fifth, poses are single placements and not a path: all stay.
     """
     poses, time_s = readings.world_from_sensor, readings.time_s
+    matrices = poses.as_matrix()
+    origin = matrices[:, None, :3, 3]
+    points = np.concatenate([origin, origin + _LEVER_MM * matrices[:, :3, :3].transpose(0, 2, 1)], axis=1)
 
     def moved_mm(i: IntArray, k: IntArray) -> FloatArray:
-        step = poses[i].inv() * poses[k]
-        return np.linalg.norm(step.translation, axis=-1) + _LEVER_MM * step.rotation.magnitude()
+        return np.asarray(np.linalg.norm(points[i] - points[k], axis=-1).max(axis=-1))
 
     def is_jump(i: IntArray, k: IntArray) -> BoolArray:
         return np.asarray(moved_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * (time_s[k] - time_s[i]))
@@ -177,7 +179,7 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
     if not jumps.size:
         return readings, []
     # A tool that is lost is often written as the identity: such pieces count for nothing.
-    is_lost = (poses.as_matrix() == np.eye(4)).all(axis=(1, 2))
+    is_lost = (matrices == np.eye(4)).all(axis=(1, 2))
     pieces = [piece for piece in np.split(numbers, jumps) if not is_lost[piece].all()]
     largest = int(np.argmax([piece.size for piece in pieces])) if pieces else 0
     rows = pieces[largest] if pieces else numbers[:0]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.extras import extra_module
 from speckle3d.core.files import PathLike
 from speckle3d.core.surface import Surface
-from speckle3d.io.hdf5 import atomic_path, one_line
+from speckle3d.io.hdf5 import atomic_path, reading
 
 SUFFIXES = (".stl", ".ply", ".vtk")
 SPACE = "SPACE=LPS"
@@ -89,13 +88,11 @@ def read_surface(path: PathLike) -> Surface:
     """
     suffix = require_suffix(path)
     meshio = extra_module("meshio", "surface", "a surface's file")
-    try:
+    # A damaged file shows in whatever meshio happens to stumble over.
+    with reading(f"{path}: as {suffix[1:].upper()}", Exception, SystemExit):
         if suffix == ".ply" and b"end_header" not in Path(path).read_bytes():
             raise ValueError("its header has no end")  # which meshio would search for ever
         mesh = meshio.read(path)
-    # A damaged file shows in whatever meshio happens to stumble over.
-    except (Exception, SystemExit) as error:
-        raise FileError(f"{path}: cannot be read as {suffix[1:].upper()}: {one_line(error)}") from error
     triangles = [block.data for block in mesh.cells if block.type == "triangle"]
     if not triangles or any(block.dtype.kind not in "iu" for block in triangles):
         raise InvalidInputError(f"{path}: expected triangles by numbers of their vertices, got none")
@@ -119,10 +116,8 @@ def _replace_line(part: Path, begins: bytes, line: str) -> None:
     part.write_bytes(held[:start] + line.encode() + held[held.index(b"\n", start) :])
 
 
-def write_polylines(
-    path: PathLike, lines_mm: FloatArray, values: Mapping[str, npt.NDArray[np.floating]] | None = None
-) -> None:
-    """Write lines of equally many points; the file appears whole or not at all.
+def write_polylines(path: PathLike, lines_mm: FloatArray, frames: npt.NDArray[np.integer]) -> None:
+    """Write lines of equally many points, with the frame of each; the file appears whole or not at all.
 
     Parameters
     ----------
@@ -130,30 +125,24 @@ def write_polylines(
         With the suffix .vtk.
     lines_mm : ndarray, shape (n, points, 3)
         In a world whose axes lead left, posterior and superior; stored in single precision.
-    values : mapping of str to ndarray, shape (n,), optional
-        What each line is coloured by; names without blanks.
+    frames : ndarray of int, shape (n,)
+        Numbers that lines may be coloured by.
 
     Raises
     ------
-    InvalidInputError
-        If there is no line, or points are not finite.
     FileError
         If the file cannot be written.
     """
-    if not lines_mm.size or not np.isfinite(lines_mm).all():
-        raise InvalidInputError(f"{path}: expected lines of finite points, got shape {lines_mm.shape}")
     count, points = lines_mm.shape[:2]
     cells = np.insert(np.arange(count * points).reshape(count, points), 0, points, axis=1)
-    pieces: list[bytes] = [
+    pieces = (
         f"# vtk DataFile Version 4.2\nspeckle3d lines. {SPACE}\nBINARY\nDATASET POLYDATA\n".encode(),
         f"POINTS {count * points} float\n".encode(),
         lines_mm.astype(">f4").tobytes(),
         f"\nLINES {count} {cells.size}\n".encode(),
         cells.astype(">i4").tobytes(),
-        f"\nCELL_DATA {count}\n".encode() if values else b"",
-    ]
-    for name, numbers in (values or {}).items():
-        pieces.append(f"SCALARS {name} float 1\nLOOKUP_TABLE default\n".encode())
-        pieces.append(numbers.astype(">f4").tobytes())
+        f"\nCELL_DATA {count}\nSCALARS frame float 1\nLOOKUP_TABLE default\n".encode(),
+        frames.astype(">f4").tobytes(),
+    )
     with atomic_path(path) as part:
         part.write_bytes(b"".join(pieces) + b"\n")

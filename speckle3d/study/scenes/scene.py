@@ -129,7 +129,7 @@ def _write_mode(files: Mapping[str, Path], posed: PosedSweep, request: VolumeReq
     report = write_voxels(posed, request, files["volume"], files["state"], files.get("deviation"))
     sweep, poses = slicer_sequence(posed, request.settings.dynamic_range_db)
     outlines = frame_outlines(sweep.grid, posed.world_from_image)
-    write_polylines(files["outlines"], outlines, {"frame": posed.frames.astype(np.float64)})
+    write_polylines(files["outlines"], outlines, posed.frames)
     write_transform(files["first"], posed.world_from_image[0])
     if "images" in files:
         write_sequence(files["images"], sweep, None, True, poses)
