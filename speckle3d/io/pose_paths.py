@@ -163,54 +163,52 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
 
     Where that leaves out more than a fifth, poses are single placements and not a path: all stay.
     """
-    poses, time_s = readings.world_from_sensor, readings.time_s
-    matrices = poses.as_matrix()
+    matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
     origin = matrices[:, None, :3, 3]
     points = np.concatenate([origin, origin + _LEVER_MM * matrices[:, :3, :3].transpose(0, 2, 1)], axis=1)
 
-    def moved_mm(i: IntArray, k: IntArray) -> FloatArray:
-        return np.asarray(np.linalg.norm(points[i] - points[k], axis=-1).max(axis=-1))
-
     def is_jump(i: IntArray, k: IntArray) -> BoolArray:
-        return np.asarray(moved_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * (time_s[k] - time_s[i]))
+        moved = np.linalg.norm(points[i] - points[k], axis=-1).max(axis=-1)
+        return np.asarray(moved > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k]))
 
     numbers = np.arange(len(readings))
-    jumps = numbers[1:][is_jump(numbers[:-1], numbers[1:])]
+    jumps = numbers[1:][is_jump(numbers[1:], numbers[:-1])]
     if not jumps.size:
         return readings, []
     # A tool that is lost is often written as the identity: such pieces count for nothing.
-    is_lost = (matrices == np.eye(4)).all(axis=(1, 2))
-    pieces = [piece for piece in np.split(numbers, jumps) if not is_lost[piece].all()]
-    largest = int(np.argmax([piece.size for piece in pieces])) if pieces else 0
+    pieces = [piece for piece in np.split(numbers, jumps) if (matrices[piece] != np.eye(4)).any()]
+    largest = max(range(len(pieces)), key=lambda k: pieces[k].size, default=-1)
     rows = pieces[largest] if pieces else numbers[:0]
     for piece in pieces[largest + 1 :]:
-        rows = rows if is_jump(rows[-1:], piece[:1]) else np.append(rows, piece)
+        rows = rows if is_jump(piece[:1], rows[-1:]) else np.append(rows, piece)
     for piece in pieces[:largest][::-1]:
         rows = rows if is_jump(piece[-1:], rows[:1]) else np.append(piece, rows)
-    before, after = jumps[:1] - 1, jumps[:1]
-    took_ms, when_s = 1e3 * (time_s[after] - time_s[before]).item(), time_s[after].item()
-    jump = f"{moved_mm(before, after).item():.3g} mm in {took_ms:.3g} ms at {when_s:.3f} s"
+    worst = int(jumps[0])
+    moved_mm = np.linalg.norm(points[worst] - points[worst - 1], axis=-1).max()
+    jump = f"{moved_mm:.3g} mm in {1e3 * (time_s[worst] - time_s[worst - 1]):.3g} ms at {time_s[worst]:.3f} s"
     if rows.size < (1.0 - _MOST_JUMPING) * len(readings):
         return readings, [f"poses: {jumps.size} jumps that no hand makes, as {jump}: all are kept"]
-    dropped = {f"after jumps, as {jump}": len(readings) - rows.size}
-    kept = replace(readings, time_s=time_s[rows], world_from_sensor=poses[rows])
-    return kept, left_out("poses", len(readings), dropped, time_s[rows])
+    notes = left_out(
+        "poses", len(readings), {f"after jumps, as {jump}": len(readings) - rows.size}, time_s[rows]
+    )
+    return replace(readings, time_s=time_s[rows], world_from_sensor=readings.world_from_sensor[rows]), notes
 
 
 def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> list[str]:
     """Tell the longest run of one pose while images change."""
     matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
     changes = np.flatnonzero((matrices[1:] != matrices[:-1]).any(axis=(1, 2))) + 1
-    bounds = np.array([0, *changes, len(readings)])
-    lengths = np.diff(bounds)
-    longest = int(np.argmax(lengths))
-    if not changes.size or lengths[longest] <= max(_MOST_ALIKE, _MOST_TIMES * float(np.median(lengths))):
+    runs = np.split(np.arange(len(readings)), changes)
+    lengths = np.array([run.size for run in runs])
+    odd = lengths > max(_MOST_ALIKE, _MOST_TIMES * float(np.median(lengths)))
+    if changes.size == 0 or not odd.any():
         return []
-    first_s, last_s = time_s[bounds[longest]], time_s[bounds[longest + 1] - 1]
-    inside = np.flatnonzero((frame_time_s >= first_s) & (frame_time_s <= last_s)).tolist()
-    if len(inside) < 2 or np.array_equal(sweep.frames[inside[0]], sweep.frames[inside[-1]]):
+    first_s, last_s = time_s[runs[int(np.argmax(lengths))][[0, -1]]]
+    inside = np.flatnonzero((frame_time_s >= first_s) & (frame_time_s <= last_s))
+    if inside.size < 2 or np.array_equal(sweep.frames[int(inside[0])], sweep.frames[int(inside[-1])]):
         return []
     return [
-        f"poses: run(s) of one pose while images change, the longest of {lengths[longest]} poses, "
-        f"{last_s - first_s:.3g} s from {first_s:.3f} s: the tracker's output stood still"
+        f"poses: {np.count_nonzero(odd)} run(s) of one pose while images change, the longest of "
+        f"{lengths.max()} poses, {last_s - first_s:.3g} s from {first_s:.3f} s: the tracker's output stood "
+        "still"
     ]
