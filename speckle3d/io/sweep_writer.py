@@ -86,6 +86,7 @@ class _FrameSet:
         kind, self._where = np.dtype(dtype or SAMPLE_TYPES[name][0]), f"{path}: /{name}"
         require_sample_type(name, kind, self._where)
         self._shape, self._are_complex, self.count = (grid.vectors, grid.samples), name == "iq", 0
+        self._file, self._kind, self._is_packed = file.id, kind, compression is not None
         shape = (*self._shape, *((2,) if self._are_complex and kind == np.int16 else ()))
         self.node = file.create_dataset(
             name, (0, *shape), kind, maxshape=(None, *shape), chunks=(1, *shape), compression=compression,
@@ -104,22 +105,21 @@ class _FrameSet:
         InvalidInputError
             If its shape or type is another, or it holds NaN.
         """
-        node, where = self.node, f"{self._where}[{self.count}]"
-        wanted = np.dtype(np.complex64) if self._are_complex else node.dtype
+        where, wanted = f"{self._where}[{self.count}]", np.complex64 if self._are_complex else self._kind
         if frame.shape != self._shape or not np.can_cast(frame.dtype, wanted, "same_kind"):
             got = f"{frame.dtype}, {frame.shape}"
             raise InvalidInputError(f"{where}: expected a frame of {wanted}, shape {self._shape}, got {got}")
         if frame.dtype.kind in "fc":
             require_finite(frame, where)
         stored = np.ascontiguousarray(frame, wanted)
-        if node.ndim == 4:  # pairs of int16, as which they were read
-            stored = stored.view(np.float32).reshape(node.shape[1:]).astype(node.dtype)
-        reserve(node.file.id, stored.nbytes)
-        node.resize(self.count + 1, axis=0)
-        if node.compression is None:
-            node.id.write_direct_chunk((self.count, *(0,) * stored.ndim), stored)
+        if stored.dtype != self._kind:  # pairs of int16, as which they were read
+            stored = stored.view(np.float32).reshape(*self._shape, 2).astype(self._kind)
+        reserve(self._file, stored.nbytes)
+        self.node.id.set_extent((self.count + 1, *stored.shape))
+        if self._is_packed:
+            self.node[self.count] = stored
         else:
-            node[self.count] = stored
+            self.node.id.write_direct_chunk((self.count, *(0,) * stored.ndim), stored)
         self.count += 1
 
 
