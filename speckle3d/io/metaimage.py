@@ -39,7 +39,7 @@ from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Value, differs, rate_of
 
 _DEVICE = "the device set"
-_OWN, _NO_VALUES = "as this package wrote it", ("probe", "full_scale")
+_OWN, _NO_VALUES = "as this package wrote it", ("probe", "full_scale", "dynamic_range_sigma_db")
 _CARRIER = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
 
 
@@ -177,6 +177,7 @@ def _recording(
         chain=" * ".join(chain),
         probe=settings.probe or own.get("probe") or device.probe,
         full_scale=own.get("full_scale", 255.0),
+        range_sigma_db=own.get("dynamic_range_sigma_db", 0.0),
         assumptions=("parallel lines",) if layout.is_rf and not own else (),
         rows=(("tracker of", " * ".join(chain) or "none", ""),),
         remarks=(*remarks, *lost, *_remarks(header, settings, device, layout, poses)),

@@ -43,11 +43,10 @@ def test_the_suffix_of_out_says_what_is_written(done, sequence, tmp_path):
 CONFIG = "PlusDeviceSet_"
 SPINE = f"{CONFIG}SpinePhantomFreehandReconstructionOnly.xml"
 LINEAR = f"{CONFIG}RfProcessingAlgoLinearTest.xml"
-DB = {"dynamic_range_db": "60"}
 ECHOES = {"centre_frequency_hz": "6e6", "bandwidth_hz": "4e6 8e6"}
 
 SWEEPS = {
-    "plus/SpinePhantomFreehand.igs.mha": (SPINE, DB, (21, 820, 616), 21),
+    "plus/SpinePhantomFreehand.igs.mha": (SPINE, {}, (21, 820, 616), 21),
     "plus/UltrasonixLinearRfData.igs.mha": (
         LINEAR,
         ECHOES | {"sampling_rate_hz": "40e6", "demodulation_frequency_hz": "0"},
@@ -67,8 +66,8 @@ def test_real_recordings_convert_at_the_first_try_and_back(realdata, run, done, 
     source, h5, back = realdata / name, tmp_path / "a.h5", tmp_path / "back.mha"
     given = [] if config is None else ["--plus-config", source.parent / config]
     code, _, err = run("convert", source, h5, *given)
-    assert code == 2
-    assert len(err.splitlines()) == 1
+    assert code == (2 if asked else 0)
+    assert len(err.splitlines()) == 1 or not asked
     # All that is missing, and nothing else, at once.
     assert {*re.findall(r"--([\w-]+) \(", err)} == {each.replace("_", "-") for each in asked}
     options = [

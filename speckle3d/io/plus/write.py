@@ -59,7 +59,7 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
         Naming the field that does not make sense.
     """
     own: dict[str, Any] = {}
-    for name in (*ImportSettings.model_fields, "full_scale"):
+    for name in (*ImportSettings.model_fields, "full_scale", "dynamic_range_sigma_db"):
         if (text := fields.get(_PREFIX + name)) is not None and name != "probe":
             values = numbers(text, 2 if name == "bandwidth_hz" else 1, f"{path}: {_PREFIX}{name}")
             own[name] = values if len(values) == 2 else values[0]
