@@ -31,7 +31,6 @@ from speckle3d.io.hdf5 import (
     read_checked,
     read_texts,
     read_transforms,
-    read_vector_attribute,
     require_group,
     sha256_of,
 )
@@ -117,8 +116,6 @@ def read_calibration(path: PathLike) -> Calibration:
             translation_mm=None if pose is None else np.asarray(pose.translation),
             pixel_mm=read_checked(file, "pixel_mm", (2,)) if has_member(file, "pixel_mm") else None,
             parameters=_read_parameters(require_group(file, "parameters")),
-            # Infinite where the motion leaves something undetermined.
-            condition_number=float(read_vector_attribute(file, "condition_number", 1, finite=False)[0]),
             frames=_read_frames(require_group(file, "frames")),
         )
         if not (np.diag(calibration.covariance) >= 0).all() or np.isnan(calibration.covariance).any():

@@ -285,20 +285,19 @@ def read_texts(group: h5py.Group, name: str, shape: tuple[int, ...]) -> Any:
 
 
 def read_attribute(node: Node, name: str, default: float | None = None) -> float:
-    """Read a finite number; `default` stands in for a missing one unless it is None."""
+    """Read a number; `default` stands in for a missing one unless it is None."""
     if default is not None and name not in node.attrs:
         return default
     return float(read_vector_attribute(node, name, 1)[0])
 
 
-def read_vector_attribute(node: Node, name: str, size: int, finite: bool = True) -> FloatArray:
-    """Read an attribute of `size` numbers, finite ones by default, as a flat array."""
+def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
+    """Read an attribute of `size` numbers, which may be infinite, as a flat array."""
     raw = node.attrs.get(name)
     value = np.asarray(raw)
-    is_right = value.dtype.kind in "fiu" and value.size == size
-    if not is_right or np.isnan(value).any() or (finite and np.isinf(value).any()):
+    if value.dtype.kind not in "fiu" or value.size != size or np.isnan(value).any():
         where = f"{locate(node)} attribute {name}"
-        raise InvalidInputError(f"{where}: expected {size} finite number(s), got {_shown(raw)}")
+        raise InvalidInputError(f"{where}: expected {size} number(s), got {_shown(raw)}")
     return value.astype(np.float64).ravel()
 
 

@@ -1,11 +1,7 @@
 """Image sequences of PLUS and others: pixels turned, poses chained, numbers used with their units."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from image_examples import grey, text_of, tracked, write_mha
 from scipy.spatial.transform import RigidTransform, Rotation
 from sweep_examples import frames_of
@@ -137,38 +133,6 @@ def test_transforms_are_chosen_by_name(tmp_path):
     assert load_sweep(path, given_over(BMODE, tracker_transform="none")).tracker is None
     with pytest.raises(InvalidInputError, match=r"StylusToTracker.*ProbeToTracker"):
         read_poses(path, ImportSettings(tracker_transform="StylusToTracker"))
-
-
-@given(
-    scale=st.tuples(st.floats(0.01, 1), st.floats(0.01, 1)),
-    seed=st.integers(0, 99),
-    skew=st.floats(-0.05, 0.05),
-    first_mm=st.sampled_from([0.0, 3.0]),
-)
-@settings(deadline=None, max_examples=8)
-def test_an_image_calibration_in_pixels_gives_spacing_and_a_rigid_pose(
-    tmp_path_factory, scale, seed, skew, first_mm
-):
-    rng = np.random.default_rng(seed)
-    rotation, place = Rotation.random(rng=rng), rng.normal(0, 50, 3)
-    matrix = np.eye(4)
-    x, y = rotation.as_matrix().T[:2]
-    # The skew is shared by both axes, so the nearest square pair is the one without it.
-    x, y = np.cos(skew) * x + np.sin(skew) * y, np.sin(skew) * x + np.cos(skew) * y
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 3] = scale[0] * x, scale[1] * y, place
-    matrix[:3, 2] = np.cross(x, y)
-    path = write_mha(tmp_path_factory.mktemp("calibration") / "a.mha", grey(), frames=path_of(3)[1])
-    sweep = load_sweep(
-        path, given_over(LEVELS, image_to_probe=tuple(map(tuple, matrix)), first_sample_depth_mm=first_mm)
-    )
-    assert (sweep.grid.vector_pitch_mm, sweep.grid.sample_spacing_mm) == pytest.approx(scale)
-    above = rotation.apply([0.0, first_mm, 0.0])
-    expected = RigidTransform.from_components(place - above, rotation).as_matrix()
-    np.testing.assert_allclose(sweep.tracker.sensor_from_image.as_matrix(), expected, atol=1e-9)
-    # With the skew, the image's pixels lie where the calibration puts them.
-    leaning = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
-    got = sweep.tracker.sensor_from_image.as_matrix() @ leaning.image_from_sample
-    np.testing.assert_allclose(got, matrix[:, [0, 1, 3]], atol=1e-9)
 
 
 CASES = [

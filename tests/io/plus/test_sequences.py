@@ -79,6 +79,9 @@ def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
     given = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
     sweep = load_sweep(path, given)
     assert np.rad2deg(sweep.tracker.image_skew_rad) == pytest.approx(-2.745, abs=1e-3)
+    grid = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
+    placed = sweep.tracker.sensor_from_image.as_matrix() @ grid.image_from_sample
+    np.testing.assert_allclose(placed, matrix[:, [0, 1, 3]], atol=1e-9)
     write_sweep(tmp_path / "a.h5", sweep)
     held = load_sweep(tmp_path / "a.h5")
     write_sequence(tmp_path / "b.mha", held)
