@@ -177,9 +177,7 @@ def opened(path: PathLike, format_name: str, versions: Sequence[int] = (1,)) -> 
 
 def file_format(file: h5py.File) -> str:
     """Kind of a file of the family, by its attribute ``format``; empty of other programs' files."""
-    raw = file.attrs.get("format")
-    text = raw.decode("utf-8", "replace") if isinstance(raw, bytes) else raw
-    return text if isinstance(text, str) else ""
+    return read_text(file, "format", "")
 
 
 def locate(node: Node, name: str = "") -> str:
@@ -301,14 +299,14 @@ def read_vector_attribute(node: Node, name: str, size: int) -> FloatArray:
     return value.astype(np.float64).ravel()
 
 
-def read_text(node: Node, name: str) -> str:
-    """Read a text attribute."""
+def read_text(node: Node, name: str, default: str | None = None) -> str:
+    """Read a text attribute; `default` stands in for what is none unless it is None."""
     raw = node.attrs.get(name)
-    if isinstance(raw, bytes):
-        raw = raw.decode("utf-8", errors="replace")
-    if not isinstance(raw, str):
+    text = raw.decode("utf-8", errors="replace") if isinstance(raw, bytes) else raw
+    text = text if isinstance(text, str) else default
+    if text is None:
         raise InvalidInputError(f"{locate(node)} attribute {name}: expected a text, got {_shown(raw)}")
-    return str(raw)
+    return str(text)
 
 
 def sha256_of(path: PathLike) -> str:

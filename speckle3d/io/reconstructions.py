@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import h5py
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.geometry import require_finite, require_increasing, transforms_from_matrices
@@ -105,12 +104,13 @@ def read_reconstruction(path: PathLike, with_pairs: bool = True) -> Reconstructi
         Naming the file, the data set and the first bad index.
     """
     with opened(path, FORMAT) as file:
-        times = read_checked(file, "frame_time_s", ("frame",))
+        times, group = read_checked(file, "frame_time_s", ("frame",)), require_group(file, "poses")
+        modes = [mode for mode in MODES if has_member(group, mode)]
         with naming(str(path)):
             return Reconstruction(
                 frame_time_s=require_increasing(times, locate(file, "frame_time_s")),
                 grid=read_record(file, ImageGrid),
-                poses=_read_poses(file, times.size),
+                poses={mode: read_transforms(group, mode, times.size) for mode in modes},
                 provenance=_read_provenance(file),
                 config_toml=read_texts(file, "config_toml", ()),
                 pairs=_read_pairs(file, times.size) if with_pairs else None,
@@ -131,11 +131,6 @@ def _read_provenance(file: h5py.File) -> Provenance:
         group = require_group(file, "import")
         imported = ImportRecord(read_text(group, "name"), read_texts(group, "settings_json", ()))
     return read_record(file, Provenance, calibrations=tuple(used), imported=imported)
-
-
-def _read_poses(file: h5py.File, frames: int) -> dict[str, RigidTransform]:
-    group = require_group(file, "poses")
-    return {mode: read_transforms(group, mode, frames) for mode in MODES if has_member(group, mode)}
 
 
 def _read_trust(file: h5py.File, frames: int) -> Trust | None:

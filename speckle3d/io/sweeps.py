@@ -87,7 +87,7 @@ def _open(path: Path, _: ImportSettings) -> Recording:
             tracker=_read_tracker(file),
             truth=None if truth is None else read_transforms(truth, "world_from_image", count),
             name=printable(path.stem),
-            probe=read_text(file, "probe") if "probe" in file.attrs else "",
+            probe=read_text(file, "probe", ""),
         )
     if not clock.is_growing:
         return Recording(path, ready=sweep)
