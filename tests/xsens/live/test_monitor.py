@@ -41,18 +41,6 @@ class TestMonitor:
         monitor.arrived(sent([65541]))
         assert monitor.state().lost == 5
 
-    def test_a_sensor_that_starts_anew_has_lost_nothing(self, monitor):
-        monitor.arrived(sent(range(1000, 1020)))
-        monitor.interrupted("gone")
-        monitor.interrupted("still gone")
-        away = monitor.state()
-        assert (away.connected, away.interruptions, away.note, away.rate_hz) == (False, 1, "still gone", 0.0)
-        assert away.world_from_sensor is None
-        monitor.started(HEADER)
-        monitor.arrived(sent(range(5)))
-        state = monitor.state()
-        assert (state.connected, state.lost, state.samples) == (True, 0, 25)
-
     def test_iron_disturbs_the_field_and_clears(self, monitor):
         monitor.arrived(sent(range(400)))
         assert monitor.state().disturbed is False

@@ -18,7 +18,7 @@ pytest.importorskip("serial", reason="needs pyserial")
 if not hasattr(os, "openpty"):
     pytest.skip("needs pseudo-terminals", allow_module_level=True)
 
-from simulated_device import KINDS, of_kind, values, wait_until
+from simulated_device import KINDS, of_kind, wait_until
 
 FAST = DeviceSettings(baud=115200)
 
@@ -55,12 +55,6 @@ class TestRecording:
         np.testing.assert_array_equal(log.counter - log.counter[0], np.arange(len(sensor.run)))
         assert log.gaps == ()
         assert log.rate_hz == pytest.approx(sensor.rate_hz, rel=1e-9)
-        acc, gyr, mag, _ = values(0, sensor.rate_hz)
-        # Half a count of each, of 1268 per m/s², 1250 per rad/s and 7366 per unit of field.
-        np.testing.assert_allclose(log.accelerometer_m_s2, np.tile(acc, (len(log), 1)), atol=4e-4)
-        np.testing.assert_allclose(log.gyroscope_rad_s, np.tile(gyr, (len(log), 1)), atol=4e-4)
-        strength = np.linalg.norm(log.magnetometer_au, axis=1)
-        np.testing.assert_allclose(strength, np.linalg.norm(mag), atol=2e-4)
         if sensor.kind != "mt9":
             turned = log.rotations().world_from_sensor
             angle = (turned[0].inv() * turned[-1]).as_rotvec(degrees=True)

@@ -81,9 +81,6 @@ def test_messages_of_an_mti_g_are_the_golden_ones(realdata, which):
         assert {name: values.tolist() for name, values in message.items()} == expected
 
 
-# Single packets of an MTi-300, with the vendor's decoding
-
-
 # Text
 
 
@@ -117,6 +114,3 @@ def test_exports_of_xsens_dot_with_and_without_losses(realdata):
     for gap in lossy.gaps:
         assert gap.duration_s == pytest.approx((gap.lost + 1) / 60.0, rel=1e-3)
     assert any("without gravity" in note for note in whole.notes)
-
-
-# Which world it is, beside optical orientations

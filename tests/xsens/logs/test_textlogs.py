@@ -109,9 +109,3 @@ def test_a_plain_file_by_hand():
     assert log.time_s.tolist() == [0.5, 0.6, 0.7]
     np.testing.assert_array_equal(log.gyroscope_rad_s[:, 2], [1.0, np.nan, 2.0])
     assert log.accelerometer_m_s2 is None
-
-
-# Tables
-
-
-# Columns that are not understood, and readings that are none
