@@ -110,18 +110,13 @@ def averaged_bins(
     bins["bias_variance"] = (sd[lasts, 3:] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
     bins["tilt_rad2"] = np.add.reduceat((sd[:, :2] ** 2).mean(axis=1), firsts) / counts
     seen = np.asarray(np.isfinite(rows["field"]).all(axis=1))
-    bins["seen"] = np.logical_or.reduceat(seen, firsts)
-    field = np.where(seen[:, None], rows["field"], 0.0)
-    level = Rotation.from_quat(levels)
-    weight = np.where(np.repeat(bins["seen"], counts), seen, 1.0)
-    for name, values in (
-        ("field", level.apply(field)),
-        ("field_rate", level.apply(np.cross(rows["rate"] - bias_rad_s, field))),
-        ("level", level.as_matrix()),
-    ):
-        flat = weight[:, None] * values.reshape(len(values), -1)
-        mean = np.add.reduceat(flat, firsts) / np.add.reduceat(weight, firsts)[:, None]
-        bins[name] = mean.reshape(bins[name].shape)
+    readings = np.add.reduceat(seen.astype(float), firsts)[:, None]
+    bins["seen"] = readings[:, 0] > 0.0
+    field, level = np.where(seen[:, None], rows["field"], 0.0), Rotation.from_quat(levels)
+    bins["level"] = np.add.reduceat(level.as_matrix(), firsts) / counts[:, None, None]
+    turning = np.cross(rows["rate"] - bias_rad_s, field)
+    for name, vectors in (("field", field), ("field_rate", turning)):
+        bins[name] = np.add.reduceat(level.apply(vectors), firsts) / np.maximum(readings, 1.0)
     return bins
 
 
