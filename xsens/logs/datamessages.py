@@ -76,9 +76,9 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
             raise InvalidInputError("expected a calibration block before raw counts, got none")
         notes.append(NOT_COMPENSATED)
         for sensor, name in enumerate(VECTORS):
-            counts = as_floats(rows[_RAW_VECTORS[sensor]])
+            counts = rows[_RAW_VECTORS[sensor]]
             ends = saturated(counts)  # which the units' mixture of axes would hide
-            values[name] = calibration.to_units(sensor, counts)
+            values[name] = calibration.to_units(sensor, as_floats(counts))
             if ends.any():
                 values[name][ends] = np.nan
                 notes.append(f"{name.split('_')[0]}: {ends.sum()} at the end of the range: taken as missing")

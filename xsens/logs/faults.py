@@ -180,7 +180,8 @@ def _repeated(
 def saturated(rows: FloatArray) -> BoolArray:
     """Rows in which an axis stays at its highest or lowest value, from one steep slope to another."""
     bad = np.zeros(len(rows), dtype=bool)
-    for axis in rows.T:
+    for column in rows.T:
+        axis = np.asarray(column, dtype=float)
         for end in {float(np.fmax.reduce(axis)), float(np.fmin.reduce(axis))} - {0.0}:
             at = np.flatnonzero(axis == end)
             if at.size < 3:
