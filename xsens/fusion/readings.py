@@ -126,9 +126,18 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         raise InsufficientDataError(
             f"{source}: expected two samples of gyroscope and accelerometer or more, got {told[used].sum()}"
         )
-    _require_seconds(np.diff(log.time_s), source)
+    steps_s = np.diff(log.time_s)
+    median_s, fast = np.median(steps_s), np.percentile(np.linalg.norm(rate[turns], axis=1), _SHOWN_BY)
+    if median_s > 1.05 * BRIDGED_S or steps_s.mean() < _SHORTEST_S:  # a clock of 10 Hz, and jitter
+        raise InvalidInputError(
+            f"{source}: expected samples {_SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
+            f"{median_s:.4g} s: times in milliseconds?"
+        )
     require_metres(force[told], source)
-    _require_radians(rate[turns], source)
+    if fast > FASTEST_RAD_S:
+        raise InvalidInputError(
+            f"{source}: expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
+        )
     notes += _agreement(log, source)
     if left_out := len(log) - used.size:
         notes.append(f"{left_out} samples without gyroscope or accelerometer left out")
@@ -195,16 +204,6 @@ def _bridging(readings: FloatArray, step_s: FloatArray) -> FloatArray:
     return means
 
 
-def _require_seconds(steps_s: FloatArray, source: str) -> None:
-    """Raise `InvalidInputError` if samples are too far apart to integrate a gyroscope, or nearer than any."""
-    median = float(np.median(steps_s))
-    if median > 1.05 * BRIDGED_S or steps_s.mean() < _SHORTEST_S:  # a clock of 10 Hz, and jitter
-        raise InvalidInputError(
-            f"{source}: expected samples {_SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
-            f"{median:.4g} s: times in milliseconds?"
-        )
-
-
 def require_metres(force_m_s2: FloatArray, source: str) -> None:
     """Raise `InvalidInputError` if an accelerometer, shape (m, 3), is not in m/s^2."""
     median = float(np.median(np.linalg.norm(force_m_s2, axis=1)))
@@ -212,15 +211,6 @@ def require_metres(force_m_s2: FloatArray, source: str) -> None:
     if not low < median < high:
         raise InvalidInputError(
             f"{source}: expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}"
-        )
-
-
-def _require_radians(rate_rad_s: FloatArray, source: str) -> None:
-    """Raise `InvalidInputError` if a hundredth of a gyroscope's readings, shape (m, 3), exceeds any range."""
-    fast = float(np.percentile(np.linalg.norm(rate_rad_s, axis=1), _SHOWN_BY))
-    if fast > FASTEST_RAD_S:
-        raise InvalidInputError(
-            f"{source}: expected a gyroscope in rad/s, got one in a hundred over {fast:.3g}: in deg/s?"
         )
 
 

@@ -103,19 +103,15 @@ class ImuLog:
             raise InvalidInputError(f"{self.source or 'log'}: expected at least one sample, got none")
         if self.oriented.size == 0:
             object.__setattr__(self, "oriented", np.full(len(self), self.world_from_sensor is not None))
-        self._require_shape("oriented", (len(self),))
-        for name in VECTORS:
-            self._require_shape(name, (len(self), 3))
-        self._require_shape("counter", (len(self),))
+        shapes = dict.fromkeys(VECTORS, (len(self), 3)) | dict.fromkeys(("oriented", "counter"), (len(self),))
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values is not None and np.shape(values) != shape:
+                raise MismatchError(f"{name}: expected shape {shape}, got {np.shape(values)}")
         if self.world_from_sensor is not None and len(self.world_from_sensor) != len(self):
             raise MismatchError(
                 f"world_from_sensor: expected {len(self)} samples, got {len(self.world_from_sensor)}"
             )
-
-    def _require_shape(self, name: str, shape: tuple[int, ...]) -> None:
-        values = getattr(self, name)
-        if values is not None and np.shape(values) != shape:
-            raise MismatchError(f"{name}: expected shape {shape}, got {np.shape(values)}")
 
     def __len__(self) -> int:
         return int(self.time_s.size)
