@@ -116,7 +116,7 @@ def timeline(stamps: Stamps) -> Timeline:
         raise InvalidInputError(
             f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
         )
-    key, segment = _rising(stamps)
+    key, starts = _rising(stamps)
     notes, rows = list[str](), None
     if (np.diff(key) < 0).any():
         rows = np.argsort(key, kind="stable")
@@ -130,12 +130,19 @@ def timeline(stamps: Stamps) -> Timeline:
         notes.append(f"{left_out} samples at the time of another were left out")
         key = key[kept]
     if rows is None:
-        return _spaced(stamps, key, np.diff(segment) > 0, notes)
-    return replace(_spaced(stamps[rows], key, np.diff(segment[rows]) > 0, notes), rows=rows)
+        return _spaced(stamps, key, starts[1:], notes)
+    return replace(_spaced(stamps[rows], key, np.diff(np.cumsum(starts)[rows]) > 0, notes), rows=rows)
 
 
-def _rising(stamps: Stamps) -> tuple[Any, IntArray]:
-    """Times, or else ticks, or else counts, made to rise by their span and at new starts; starts before each.
+def _summed(steps: Any) -> Any:
+    """Sums of steps, from zero on; in one array, as logs may be large."""
+    sums = np.zeros(len(steps) + 1, steps.dtype)
+    np.cumsum(steps, out=sums[1:])
+    return sums
+
+
+def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
+    """Times, or else ticks, or else counts, made to rise by their span and at new starts; new starts.
 
     A step far back shows a new start, unless those overtaken were followed by a jump forward to where it was.
     """
@@ -148,7 +155,7 @@ def _rising(stamps: Stamps) -> tuple[Any, IntArray]:
             values, span = stamps.counter, stamps.counter_span
         steps = (np.diff(values) + span // 2) % span - span // 2
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-    anew, key = np.zeros(values.size, dtype=bool), np.append(0, np.cumsum(steps))
+    anew, key = np.zeros(values.size, dtype=bool), _summed(steps)
     back = np.flatnonzero(steps < -_LATE * usual)
     anew[back + 1] = True
     for i in back[:_OVERTAKINGS].tolist():
@@ -160,9 +167,9 @@ def _rising(stamps: Stamps) -> tuple[Any, IntArray]:
         anew |= np.isfinite(stamps.computer_s)
     anew[0] = False
     if stamps.time_s is not None and not anew.any():
-        return values, np.cumsum(anew)
+        return values, anew
     steps[anew[1:]] = _LATE * usual
-    return np.append(0, np.cumsum(steps)), np.cumsum(anew)
+    return _summed(steps), anew
 
 
 def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timeline:
@@ -204,10 +211,10 @@ def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Time
     if time_s is None or anew.any():
         first_s = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
         first_s = first_s if time_s is None else float(time_s[0])
-        time_s = first_s + np.append(0.0, np.cumsum(seconds))
+        time_s = first_s + _summed(seconds)
     counter = None
     if stamps.counter is not None and counts is not None:
-        counter = stamps.counter[0] + np.append(0, np.cumsum(counts))
+        counter = stamps.counter[0] + _summed(counts)
     return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
 
 
@@ -246,7 +253,7 @@ def _pauses(stamps: Stamps, anew: BoolArray, seconds: FloatArray) -> FloatArray:
     pauses = np.full(anew.size, np.nan)
     if stamps.computer_s is None:
         return pauses
-    running = np.append(0.0, np.cumsum(np.where(anew, 0.0, seconds)))
+    running = _summed(np.where(anew, 0.0, seconds))
     behind = stamps.computer_s - running  # constant while the sensor runs, and larger by each pause
     for before, after in pairwise(np.flatnonzero(np.isfinite(behind))):
         if anew[before:after].sum() == 1:

@@ -69,14 +69,14 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
         which = which[fits]
     rates = [source.rate_hz for source in (configuration, calibration) if source is not None]
     rate_hz = next((rate for rate in rates if rate > 0.0), float("nan"))
-    rows = layout.decode(frames[which].payloads())
-    values = {name: as_floats(rows[name]) for name in rows.dtype.names if name in _WANTED}
+    data = frames[which]
+    values = {f.name: as_floats(layout.decode(data, f.name)) for f in layout.fields if f.name in _WANTED}
     if layout.mode & (OutputMode.RAW | OutputMode.MT9):
         if calibration is None:
             raise InvalidInputError("expected a calibration block before raw counts, got none")
         notes.append(NOT_COMPENSATED)
         for sensor, name in enumerate(VECTORS):
-            counts = rows[_RAW_VECTORS[sensor]]
+            counts = layout.decode(data, _RAW_VECTORS[sensor])
             ends = saturated(counts)  # which the units' mixture of axes would hide
             values[name] = calibration.to_units(sensor, as_floats(counts))
             if ends.any():

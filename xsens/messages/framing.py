@@ -142,10 +142,6 @@ class Frames:
         """Bytes in the payloads, shape (n,)."""
         return self.end - 1 - self.payload_start
 
-    def payloads(self) -> ByteArray:
-        """Payloads as rows, shape (n, size); all must be as long as the first."""
-        return rows_at(self.data, self.payload_start, int(self.payload_size[0]) if len(self) else 0)
-
     def message(self, index: int) -> Message:
         """The message at `index`."""
         payload = self.data[self.payload_start[index] : self.end[index] - 1].tobytes()

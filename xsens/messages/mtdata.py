@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from speckle3d.core.arrays import ByteArray, FloatArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from xsens.messages.framing import Frames, rows_at
 
 Values = dict[str, FloatArray]
 """Field name to values, shape (n, count); whole numbers are exact."""
@@ -165,6 +166,7 @@ class DataLayout:
         """Bytes of the payload."""
         return self.dtype.itemsize
 
-    def decode(self, payloads: ByteArray) -> Any:
-        """Fields of payloads, rows of bytes of shape (n, size), by name; for `as_floats`."""
-        return np.ascontiguousarray(payloads).view(self.dtype)[:, 0]
+    def decode(self, frames: Frames, name: str) -> npt.NDArray[Any]:
+        """Numbers of a field in messages of this layout, shape (n, count); for `as_floats`."""
+        kind, offset = self.dtype.fields[name][:2]  # type: ignore[index]
+        return rows_at(frames.data, frames.payload_start + offset, kind.itemsize).view(kind.base)

@@ -1,23 +1,14 @@
 import numpy as np
 
-from xsens.messages.framing import decode, find_frames
+from xsens.messages.framing import find_frames
 from xsens.messages.mtdata import DataLayout, OutputMode
 from xsens.messages.mtdata2 import read_items
 
 
-def rows(data):
-    return np.frombuffer(bytes.fromhex(data), dtype=np.uint8)[None]
-
-
-# Number formats
-
-
-# Legacy data
-
-
 def test_a_record_of_a_real_mt9():
-    (message,) = decode(bytes.fromhex("faff32168553716c8580ac7e7f4e7f377f26631489d776b0205040"))
-    values = DataLayout(OutputMode.MT9).decode(rows(message.payload.hex()))
+    frames = find_frames(bytes.fromhex("faff32168553716c8580ac7e7f4e7f377f26631489d776b0205040"))
+    layout = DataLayout(OutputMode.MT9)
+    values = {field.name: layout.decode(frames, field.name) for field in layout.fields}
     assert values["counter"] == 34131
     assert values["raw_accelerometer"].tolist() == [[29036, 34176, 44158]]
     assert values["raw_gyroscope"].tolist() == [[32590, 32567, 32550]]
