@@ -291,16 +291,12 @@ class Sweep:
         times = require_increasing(self.frame_time_s, f"{self.name}: frame_time_s")
         object.__setattr__(self, "frame_time_s", times)
         _require_kind(self)
-        n, vectors, samples = self.frames.shape
-        if (vectors, samples) != (self.grid.vectors, self.grid.samples):
+        shape = times.size, self.grid.vectors, self.grid.samples
+        if self.frames.shape != shape or (self.truth is not None and len(self.truth) != shape[0]):
             raise InvalidInputError(
-                f"{self.name}: expected frames of shape ({self.grid.vectors}, {self.grid.samples}), "
-                f"got ({vectors}, {samples})"
+                f"{self.name}: expected frames of shape {shape} by times and grid, and as many true poses "
+                f"if any, got {self.frames.shape}"
             )
-        if times.size != n:
-            raise InvalidInputError(f"{self.name}: expected {n} frame times, got {times.size}")
-        if self.truth is not None and len(self.truth) != n:
-            raise InvalidInputError(f"{self.name}: expected {n} true poses, got {len(self.truth)}")
 
     def __len__(self) -> int:
         return int(self.frames.shape[0])
