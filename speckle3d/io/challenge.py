@@ -112,13 +112,9 @@ def open_scan(scan: Path, _: ImportSettings) -> Recording:
         "frame_rate_hz": Value(FRAME_RATE_HZ, "as published"),
         "dynamic_range_db": Value(DYNAMIC_RANGE_DB, "as published"),
     }
-    try:
-        marks = str(len(read_landmarks(scan) or ()))
-    except InvalidInputError as error:
-        marks = f"cannot be told: {error}"
     return Recording(
         scan, frames=frames, values=published, tracker=tracker, chain="tforms", name=scan.stem,
-        rows=(("landmarks", marks, ""),), remarks=tuple(remarks),
+        rows=(("landmarks", "none" if _landmark_file(scan) is None else "yes", ""),), remarks=tuple(remarks),
     )  # fmt: skip
 
 

@@ -35,10 +35,6 @@ _OWN = (
 """Modules of this package that have a reader, in the order in which they are asked."""
 
 
-def _nothing_beside(_: Path) -> Sequence[Path]:
-    return ()
-
-
 @dataclass(frozen=True)
 class Reader:
     """How sweeps of one format are told and read.
@@ -64,7 +60,7 @@ class Reader:
     format: str
     claims: Callable[[Path, bytes], bool] | None
     read: Callable[[Path, ImportSettings], Sweep | Recording]
-    companions: Callable[[Path], Sequence[Path]] = _nothing_beside
+    companions: Callable[[Path], Sequence[Path]] = lambda _: ()
     takes_settings: bool = True
     claims_hdf5: Callable[[h5py.File], bool] | None = None
 
