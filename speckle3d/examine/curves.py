@@ -115,17 +115,16 @@ def doubt_size(
     known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
     found = []
     for name in ("lateral_mm", "axial_mm"):
-        here, there = getattr(seen, name), getattr(known, name)
-        fair = np.isfinite(here)
+        # Noise differs from sample to sample, so that speckle under it looks finer.
+        fair = np.isfinite(getattr(seen, name)) & (left >= NOISY_GAIN)
         if fair.sum() < LEAST_ROWS:
             continue
-        ratio = np.log(here[fair] / there[fair])
-        # Noise differs from sample to sample, so that speckle under it looks finer.
-        off = float(np.median(np.where(left[fair] < NOISY_GAIN, np.maximum(ratio, 0.0), np.abs(ratio))))
+        own, phantom = (getattr(size, name)[fair] for size in (seen, known))
+        off = float(np.median(np.abs(np.log(own / phantom))))
         if off > RESIZED[name]:
             evidence = (
-                f"expected {name.removesuffix('_mm')} speckle of {np.median(there[fair]):.3f} mm, as in the "
-                f"curves' phantom, got {np.median(here[fair]):.3f} mm ({100 * off:.0f} % off at "
+                f"expected {name.removesuffix('_mm')} speckle of {np.median(phantom):.3f} mm, as in the "
+                f"curves' phantom, got {np.median(own):.3f} mm ({100 * off:.0f} % off at "
                 "the median depth)"
             )
             refuted = bool(off > REFUTED_SIZE[name] and fair.sum() >= ENOUGH_ROWS)

@@ -113,10 +113,9 @@ def unit_of_length(image: RigidTransform, tracker: Tracker, poses: RigidTransfor
     )
     ratio = float((images * measured).sum() / max((images**2).sum(), LEAST_SIGMA_MM**2))
     for factor, name in UNITS.items():
-        if 1.0 / UNIT_FACTOR < ratio * factor < UNIT_FACTOR:
-            return name
-        if 1.0 / UNIT_FACTOR < ratio / factor < UNIT_FACTOR:
-            return f"1/{factor:g} of a millimetre"
+        for multiple, unit in (1.0 / factor, name), (factor, f"1/{factor:g} of a millimetre"):
+            if 1.0 / UNIT_FACTOR < ratio / multiple < UNIT_FACTOR:
+                return unit
     return ""
 
 
