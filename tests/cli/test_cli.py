@@ -6,17 +6,6 @@ import sys
 
 import pytest
 
-from speckle3d.io.voxels.volumes import read_volume
-
-
-def test_info_tells_what_a_sweep_holds(run, bench):
-    code, out, _ = run("info", bench / "sweep.h5", "--json")
-    rows = {row["description"]: row["value"] for row in json.loads(out)}
-    assert code == 0
-    assert rows["frames"] == "24"
-    assert rows["vectors x samples"] == "26 x 1800"
-    assert rows["orientation sensor calibrated"] == rows["tracker calibrated"] == rows["truth"] == "yes"
-
 
 def test_the_errors_against_truth_are_in_every_table(reconstructed):
     summary = json.loads((reconstructed / "summary.json").read_text())["sweeps"][0]
@@ -52,16 +41,6 @@ def test_of_a_tracker_that_the_images_contradict_both_lengths_are_told(run, chan
     code, _, err = run("volume", made, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5")
     assert (code, "expected --mode" in err) == (2, True)
     assert run("volume", made, "-o", tmp_path / "v.nrrd", "--voxel-mm", "0.5", "--mode", "image")[0] == 0
-
-
-def test_volume(run, reconstructed, tmp_path):
-    out = tmp_path / "v.nii.gz"
-    code, _, err = run("volume", reconstructed / "reconstruction.h5", "-o", out, "--voxel-mm", 0.5)
-    assert code == 0, err
-    voxels = read_volume(out).voxels
-    # 7.5 x 3 x 21 mm of frames, which are filled: a good part of the box is not zero.
-    assert sorted(voxels.shape)[0] >= 6
-    assert (voxels > 0).mean() > 0.3
 
 
 @pytest.mark.parametrize("arguments", [(), ("reconstruct", "--help")])

@@ -164,6 +164,7 @@ def cut_as_volume(picture: CutPicture) -> Volume:
     low, high = picture.levels
     level = 1 + np.rint(254 * np.clip((drawn.image - low) / (high - low), 0, 1))
     fields = {"cut": picture.place, "of": picture.name, "mode": mode}
-    fields["levels"] = f"1 to 255: {low:g} to {high:g} {picture.unit}; 0 where nothing was seen"
+    unit = picture.unit.partition(",")[0]
+    fields["levels"] = f"1 to 255: {low:g} to {high:g} {unit}; 0 where nothing was seen"
     voxels = np.nan_to_num(level, nan=0.0).astype(np.uint8)
     return Volume(voxels[None].T, (drawn.cut.pixel_mm,) * 3, drawn.cut.world_from_plane, fields)

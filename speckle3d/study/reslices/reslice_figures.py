@@ -125,7 +125,7 @@ def draw_cuts(picture: CutPicture, across_in: float = _ACROSS_IN, part_mm: Exten
         panel.set(xlim=(left, right), ylim=(bottom, top))
         panel.tick_params(labelsize="small")
     places[0].set_ylabel(f"{picture.axes[1]} / mm")
-    places[-1 if down > 1 else 0].set_xlabel(f"{picture.axes[0]} / mm")
+    figure.supxlabel(f"{picture.axes[0]} / mm", fontsize="medium")
     figure.colorbar(image, ax=list(places), label=picture.unit, shrink=0.8)
     name_figure(figure, ": ".join(filter(None, [picture.name, picture.place])))
     return figure
