@@ -101,18 +101,16 @@ class Wired:
         return cls(config.phantom, size, config.clip_px)
 
 
-def opened(images: Path, settings: ScanSettings, poses: Path | None) -> Recording:
+def opened(images: Path, settings: ScanSettings) -> Recording:
     """Open a recording of a phantom; for errors see `open_recording`."""
     sensor = settings.sensor if isinstance(settings, OrientationSettings) else "tracker"
     pixel_mm = settings.pixel_mm
     if pixel_mm is None and isinstance(settings, WireSettings):
         pixel_mm = Wired.of(settings.phantom).pixel_mm
-    return open_recording(images, poses, pixel_mm, sensor, settings.transform)
+    return open_recording(images, settings.poses, pixel_mm, sensor, settings.transform)
 
 
-def found(
-    recording: Recording, settings: ScanSettings, points: Path | None = None, progress: Progress | None = None
-) -> Seen:
+def found(recording: Recording, settings: ScanSettings, progress: Progress | None = None) -> Seen:
     """Find the phantom in every image, or read the points picked by hand; without the frames left out.
 
     Raises
@@ -122,7 +120,7 @@ def found(
     """
     require_frames(settings.frames_left_out, recording.images.shape[0])
     if isinstance(settings, WireSettings):
-        seen = _seen_wires(recording, settings, points, progress)
+        seen = _seen_wires(recording, settings, progress)
     else:
         assert isinstance(settings, PlaneSettings | OrientationSettings)
         seen = detect_lines(recording.images, recording.pixel_mm, settings, settings.corners, progress)
@@ -211,10 +209,11 @@ def validated(outcome: Outcome, settings: ScanSettings, progress: Progress | Non
     path = settings.validation
     if path is None:
         return []
-    settings = settings.model_copy(update={"leave_out": ""})
-    other = opened(path, settings, None)
+    points = getattr(settings, "validation_points", None)
+    settings = settings.model_copy(update={"leave_out": "", "poses": None, "points": points})
+    other = opened(path, settings)
     with naming(str(path)):
-        seen = found(other, settings, getattr(settings, "validation_points", None), progress)
+        seen = found(other, settings, progress)
         seconds = outcome.calibration.time_offset_s
         offset_s = other.time_offset_s if seconds is None else seconds
         if isinstance(outcome.solution.phantom, CrossWire):
@@ -253,13 +252,11 @@ def write_outcome(
     )
 
 
-def _seen_wires(
-    recording: Recording, settings: WireSettings, points: Path | None, progress: Progress | None
-) -> Seen:
+def _seen_wires(recording: Recording, settings: WireSettings, progress: Progress | None) -> Seen:
     wired = Wired.of(settings.phantom)
-    if points is not None:
-        read = read_points(points, wired.names)
-        with naming(str(points)):
+    if settings.points is not None:
+        read = read_points(settings.points, wired.names)
+        with naming(str(settings.points)):
             return picked(recording, read, settings)
     if not wired.found:
         raise InvalidInputError(

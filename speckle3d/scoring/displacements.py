@@ -200,7 +200,5 @@ def _mean_over_pixels(differences: FloatArray, grid: ImageGrid) -> float:
 
 
 def _require_comparable(poses: RigidTransform, reference: RigidTransform) -> None:
-    if len(poses) != len(reference):
-        raise MismatchError(f"reference: expected {len(poses)} poses, got {len(reference)}")
-    if len(poses) < 2:
-        raise InsufficientDataError(f"expected at least 2 poses, got {len(poses)}")
+    if len(poses) != len(reference) or len(poses) < 2:
+        raise MismatchError(f"expected 2 poses or more of both, got {len(poses)} and {len(reference)}")

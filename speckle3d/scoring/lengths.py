@@ -27,7 +27,7 @@ from scipy.stats import theilslopes
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.geometry import relative_poses, require_finite, roll_yaw_tilt
+from speckle3d.core.geometry import relative_poses, roll_yaw_tilt
 from speckle3d.core.leastsquares import robust_sigma
 
 TRACKER = "tracker"
@@ -141,7 +141,6 @@ def monotone_parts(length_mm: npt.ArrayLike) -> list[Part]:
         Named "f", "r", then "f2", "r2" and so on; "f" is the first, whatever its sign.
     """
     length = np.asarray(length_mm, dtype=float)
-    require_finite(length, "length_mm")
     width = min(JITTER_FRAMES, length.size)
     smooth = uniform_filter1d(median_filter(length, width, mode="nearest"), width, mode="nearest")
     turns = [find_peaks(sign * smooth, prominence=HYSTERESIS_MM)[0] for sign in (1, -1)]

@@ -178,7 +178,7 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     marks = reference.landmarks if whole else None
     of = estimate.sweep_sha256, reference.sweep_sha256
     errors = score_row(estimated, true, grid, marks)
-    score = challenge_score(errors, true, grid, marks) if grid is not None and marks is not None else None
+    score = challenge_score(errors, true, grid, marks) if grid and marks else None
     return {
         "estimate": estimate.name,
         "reference": reference.name,

@@ -53,7 +53,7 @@ def phantom_pages(images: Path, settings: ScanSettings) -> Sequence[Page]:
     FileError, InvalidInputError, InsufficientDataError
         If the recording cannot be opened, or what is given does not fit it.
     """
-    recording = opened(images, settings, settings.poses)
+    recording = opened(images, settings)
     if not recording.images.shape[0]:
         raise InvalidInputError(f"{images}: expected frames to look at, got none")
     require_frames(settings.frames_left_out, recording.images.shape[0])

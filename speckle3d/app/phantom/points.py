@@ -199,7 +199,7 @@ class PointsViewer(PhantomViewer):
     def _search(self, settings: ScanSettings, progress: Progress) -> Seen | str:
         """Points, or why there are none."""
         try:
-            seen = found(self.recording, settings, None, progress)
+            seen = found(self.recording, settings.model_copy(update={"points": None}), progress)
             if self._wired.names:
                 return seen
             return choose_crossings(self.recording, seen, [self.recording.time_offset_s])

@@ -129,7 +129,7 @@ class PhantomViewer:
 
     def find(self, settings: ScanSettings, progress: Progress) -> Seen:
         """Find the phantom in all frames."""
-        return found(self.recording, settings, None, progress)
+        return found(self.recording, settings, progress)
 
     def before_saving(self, settings: ScanSettings, out: Path) -> ScanSettings:
         """Bring the settings of a run into what a command can be given."""

@@ -101,9 +101,9 @@ def _calibrate(images: Path, settings: ScanSettings, out: Path, as_json: bool) -
     files = [getattr(settings, name, None) for name in ("points", "validation_points", "phantom")]
     others = [None if file is None else Path(file) for file in files]
     require_free(out, images, settings.poses, settings.validation, *others)
-    recording = opened(images, settings, settings.poses)
+    recording = opened(images, settings)
     with progress_bar(f"looking into {images.name}") as progress, naming(str(images)):
-        seen = found(recording, settings, getattr(settings, "points", None), progress)
+        seen = found(recording, settings, progress)
     with naming(str(images)):
         outcome = solved(recording, seen, settings)
     notes = remarks(outcome)
