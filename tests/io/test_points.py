@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.io.points import PickedPoints, read_points, write_points
 
 WIRES = ("G1", "7:L1", "2")
@@ -27,6 +28,8 @@ def test_a_wire_goes_by_its_name_before_its_number_or_there_are_none(tmp_path):
     np.testing.assert_array_equal(read_points(path, WIRES).wire, [2, 0, 1])
     plain = read_points(file_of(tmp_path, "frame,column_px,row_px\n0,1,2\n0,1,2\n"))
     assert (plain.wire, len(plain)) == (None, 2)
+    with pytest.raises(InvalidInputError, match="line 2"):
+        read_points(file_of(tmp_path, "frame,column_px,row_px\n-1,1,2\n"))
 
 
 @pytest.mark.parametrize("names", [WIRES, ()])

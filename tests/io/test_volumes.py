@@ -131,3 +131,14 @@ def test_nifti_is_in_its_own_unit(tmp_path, kind, unit, factor):
     np.testing.assert_allclose(
         read_volume(tmp_path / "v.nii").spacing_mm, np.multiply((0.2, 0.3, 0.4), factor), rtol=1e-6
     )
+
+
+def test_nrrd_is_in_its_own_unit_and_space(tmp_path):
+    (tmp_path / "v.nrrd").write_bytes(
+        b"NRRD0005\ntype: uint8\ndimension: 3\nsizes: 2 3 4\nspace: right-anterior-superior\n"
+        b"space directions: (0.02,0,0) (0,0.03,0) (0,0,0.04)\nspace origin: (1,2,3)\n"
+        b'space units: "cm" "cm" "cm"\nencoding: raw\n\n' + bytes(24)
+    )
+    expected = np.diag([-0.2, -0.3, 0.4, 1.0])
+    expected[:3, 3] = -10, -20, 30
+    np.testing.assert_allclose(read_volume(tmp_path / "v.nrrd").world_from_index, expected)

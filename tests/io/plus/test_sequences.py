@@ -9,7 +9,7 @@ from image_examples import grey, write_mha
 
 from speckle3d.io.headers import read_header
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.sweep_writer import write_sweep
 
@@ -79,6 +79,7 @@ def test_a_skewed_calibration_survives_a_sweep_file_and_a_sequence(tmp_path):
     given = ImportSettings(dynamic_range_db=60.0, image_to_probe=tuple(map(tuple, matrix)))
     sweep = load_sweep(path, given)
     assert np.rad2deg(sweep.tracker.image_skew_rad) == pytest.approx(-2.745, abs=1e-3)
+    assert any("ImageToProbe * ProbeToTracker" in note for note in open_recording(path, given).notes)
     grid = replace(sweep.grid, skew_rad=sweep.tracker.image_skew_rad)
     placed = sweep.tracker.sensor_from_image.as_matrix() @ grid.image_from_sample
     np.testing.assert_allclose(placed, matrix[:, [0, 1, 3]], atol=1e-9)
