@@ -114,7 +114,7 @@ def open_hdf5(path: PathLike) -> h5py.File:
     FileError
         If it is missing, truncated or not HDF5.
     """
-    require_file(path)
+    open_regular(path).close()
     with reading(path):
         try:
             return h5py.File(path, "r", rdcc_nbytes=_CHUNK_CACHE_BYTES)
@@ -136,13 +136,6 @@ def _opened_beside_writer(path: PathLike) -> h5py.File:
         tell(ctypes.c_int64(access.id), ctypes.c_uint(_READ_ATTEMPTS))
     flags = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
     return h5py.File(h5py.h5f.open(os.fsencode(path), flags, fapl=access))
-
-
-def require_file(path: PathLike) -> None:
-    """Raise `FileError` unless there is an ordinary file at `path`."""
-    if not Path(path).is_file():
-        got = "a folder or device" if Path(path).exists() else "none"
-        raise FileError(f"{path}: expected a file, got {got}")
 
 
 @contextmanager

@@ -27,7 +27,6 @@ from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import atomic_path
 from speckle3d.io.headers import GZIP, ZLIB, header_bytes, meta_start, meta_type, nrrd_type, packer
-from speckle3d.io.text import unescaped
 from speckle3d.io.voxels.segments import segment_fields
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
@@ -252,15 +251,6 @@ def require_suffix(path: Path, is_labels: bool = False) -> str:
             f"{path}: {LABELS_ALONE} is of labels with their segments: take another name ending in .nrrd"
         )
     return suffix
-
-
-def own_fields(fields: Mapping[str, str]) -> dict[str, str]:
-    """Fields of a volume among those in a header."""
-    return {
-        name.removeprefix(PREFIX): unescaped(value)
-        for name, value in fields.items()
-        if name.startswith(PREFIX) and name != PREFIX
-    }
 
 
 def _escaped(text: str) -> str:

@@ -21,8 +21,9 @@ from speckle3d.core.volume import VOXEL_TYPES, Volume
 from speckle3d.io.hdf5 import reading
 from speckle3d.io.headers import is_image, mm_per, read_header
 from speckle3d.io.readers import first_bytes
+from speckle3d.io.text import unescaped
 from speckle3d.io.voxels.segments import is_segmentation, read_segments
-from speckle3d.io.voxels.volume_writer import LABELS, OWN, RAS_FROM_LPS, own_fields
+from speckle3d.io.voxels.volume_writer import LABELS, OWN, PREFIX, RAS_FROM_LPS
 
 _SIZES = {size.to_bytes(4, order) for size in (348, 540) for order in ("little", "big")}
 """First bytes of NIfTI-1 and NIfTI-2: the length of the header."""
@@ -88,7 +89,9 @@ def read_volume(path: PathLike) -> Volume:
         own = {name: text for name, text in fields.items() if not is_segmentation({name: text})}
     elif is_image(start):
         header = read_header(path)
-        fields, own, is_labels = header.fields, own_fields(header.fields), is_segmentation(header.fields)
+        fields, is_labels = header.fields, is_segmentation(header.fields)
+        texts = {name.removeprefix(PREFIX): text for name, text in fields.items() if name.startswith(PREFIX)}
+        own = {name: unescaped(text) for name, text in texts.items()}
         axes = np.eye(3) if header.axes_mm is None else header.axes_mm
         if header.channels > 1 or len(header.size) != 3 or axes.shape != (3, 3):
             got = f"axes {header.stored}, {header.channels} number(s) a pixel"
