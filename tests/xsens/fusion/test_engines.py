@@ -87,6 +87,14 @@ def test_the_heading_of_a_sensor_at_rest_stays(method):
     assert np.rad2deg(np.ptp(turned)) < 0.14
 
 
+@pytest.mark.parametrize(("method", "most_deg"), [("filter", 15.0), ("smoother", 0.5)])
+def test_a_bias_beyond_what_is_foreseen_is_found_again(method, most_deg):
+    truth, log = swung()
+    biased = replace(log, gyroscope_rad_s=log.gyroscope_rad_s + np.deg2rad([10.0, 0.0, 0.0]))
+    # Measured 9.9 and 0.3; 39 and 1.3 where three degrees per second at most are foreseen.
+    assert error_deg(truth, orient(biased, method=method), 0.0).max() < most_deg
+
+
 def test_readings_in_other_units_are_refused():
     _, log = swung(5.0)
     with pytest.raises(InvalidInputError, match=r"10 s.*milliseconds"):

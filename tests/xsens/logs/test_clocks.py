@@ -44,6 +44,14 @@ def test_samples_that_come_too_late_are_sorted_and_no_new_start(at):
     assert line.gaps == ()
 
 
+def test_times_that_jump_back_show_a_new_start():
+    once = 0.01 * np.arange(300)
+    line = timeline(Stamps(time_s=np.concatenate([once, once])))
+    assert line.time_s.size == 600
+    assert [gap.after_index for gap in line.gaps] == [299]
+    assert (np.diff(line.time_s) > 0).all()
+
+
 def trembling(samples=2000, lost=()):
     """Times at 100 Hz that are off by up to 4 ms, some samples lost."""
     taken = np.setdiff1d(np.arange(samples), lost)
