@@ -52,8 +52,7 @@ def _kinds_of(path: Path) -> set[str]:
     if start.startswith(SIGNATURE):
         with open_hdf5(path) as held:
             own = str(held.attrs.get("format", "")).removeprefix("speckle3d.")
-            groups = {"simulation": "simulation", "TransformGroup": "transform"}
-            return {own, *(kind for group, kind in groups.items() if group in held)}
+            return {own, *({"simulation"} & {*held})}
     triangles = int.from_bytes(start[80:84], "little")
     row = next((line for line in start.splitlines() if not line.startswith(b"#")), b"")
     signs = {

@@ -29,7 +29,7 @@ def export(
     ----------
     reconstruction_file
     out
-        Text file to write; ITK transform if it ends in .tfm or .h5.
+        Text file to write; ITK transform if it ends in .tfm.
     mode
     length_unit
         Unit of lengths in TUM text.
@@ -40,14 +40,14 @@ def export(
     --------
     $ speckle3d trajectory export out/reconstruction.h5 -o poses.tum --mode pose
     """
-    from speckle3d.io.shapes.transforms import SUFFIXES, transform_paths, write_transform, write_transforms
+    from speckle3d.io.shapes.transforms import SUFFIX, transform_paths, write_transform, write_transforms
     from speckle3d.io.tum import write_tum
     from speckle3d.scoring.trajectories import load_estimate
 
-    is_transform = out.suffix.lower() in SUFFIXES
+    is_transform = out.suffix.lower() == SUFFIX
     if is_transform != (frame is not None):
         raise InvalidInputError(
-            f"{out}: expected --frame N or --frame all with {', '.join(SUFFIXES)}, and with no other name"
+            f"{out}: expected --frame N or --frame all with {SUFFIX}, and with no other name"
         )
     made = load_estimate(reconstruction_file, mode)
     note(made.name)

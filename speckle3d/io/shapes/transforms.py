@@ -1,4 +1,4 @@
-"""Poses as ITK transform files, which 3D Slicer reads: text (.tfm) or HDF5 (.h5).
+"""Poses as ITK transform files of text (.tfm), which 3D Slicer reads.
 
 ITK's files hold what takes points of the parent to those of the child, as for resampling [1]_; Slicer shows
 its inverse as the node's "transform to parent". So what is written is `world_from_image`'s inverse, in axes
@@ -13,18 +13,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
 from speckle3d.io.fileset import FileSet
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.records import reserve, trim
 
-SUFFIXES = (".tfm", ".h5")
+SUFFIX = ".tfm"
 
 _TYPE = "AffineTransform_double_3_3"
 """Rigid, but of the type that all of ITK's readers know."""
@@ -36,7 +33,7 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     Parameters
     ----------
     path : path
-        With a suffix of `SUFFIXES`.
+        Ends in .tfm.
     world_from_image : RigidTransform
         A single pose; its world's axes lead left, posterior and superior; mm.
 
@@ -55,26 +52,22 @@ def write_transform(path: PathLike, world_from_image: RigidTransform) -> None:
     ...     print(Path(f"{folder}/t.tfm").read_text().splitlines()[3])
     Parameters: 1.0 0.0 0.0 0.0 1.0 0.0 0.0 0.0 1.0 -1.0 -2.0 -3.0
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InvalidInputError(f"{path}: expected a name ending in {' or '.join(SUFFIXES)}, got {suffix!r}")
+    if Path(path).suffix.lower() != SUFFIX:
+        raise InvalidInputError(f"{path}: expected a name ending in {SUFFIX}")
     if not world_from_image.single:
         raise InvalidInputError(f"{path}: expected one pose, got a row of {len(world_from_image)}")
     matrix = world_from_image.inv().as_matrix()
     # Matrix, row by row, and translation; no number is a negative zero.
     parameters = np.concatenate((matrix[:3, :3].ravel(), matrix[:3, 3])) + 0.0
+    lines = (
+        "#Insight Transform File V1.0",
+        "#Transform 0",
+        f"Transform: {_TYPE}",
+        f"Parameters: {' '.join(map(repr, parameters.tolist()))}",
+        "FixedParameters: 0 0 0",
+    )
     with atomic_path(path) as part:
-        if suffix == ".h5":
-            _write_hdf5(part, parameters)
-        else:
-            lines = (
-                "#Insight Transform File V1.0",
-                "#Transform 0",
-                f"Transform: {_TYPE}",
-                f"Parameters: {' '.join(map(repr, parameters.tolist()))}",
-                "FixedParameters: 0 0 0",
-            )
-            part.write_text("\n".join(lines) + "\n", encoding="ascii")
+        part.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def write_transforms(path: PathLike, world_from_image: RigidTransform) -> None:
@@ -101,18 +94,3 @@ def transform_paths(path: PathLike, count: int) -> list[Path]:
     """Files of a row of poses: the path with the frame's number behind its stem, as poses-0000.tfm."""
     given = Path(path)
     return [given.with_name(f"{given.stem}-{i:04d}{given.suffix}") for i in range(count)]
-
-
-def _write_hdf5(part: Path, parameters: FloatArray) -> None:
-    with h5py.File(part, "w", locking=False) as file:
-        reserve(file.id)
-        names = {
-            "ITKVersion": "5.4",
-            "HDFVersion": h5py.version.hdf5_version,
-            "TransformGroup/0/TransformType": _TYPE,
-        }
-        for name, value in names.items():
-            file.create_dataset(name, data=[value], dtype=h5py.string_dtype("ascii"))
-        file["TransformGroup/0/TransformParameters"] = parameters
-        file["TransformGroup/0/TransformFixedParameters"] = np.zeros(3)
-    trim(part)
