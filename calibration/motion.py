@@ -84,13 +84,10 @@ class Adequacy:
         Of the image's worst corner, mm; about its worst axis, rad, where only directions are known.
     missing : tuple of str
         Motions that would help; none if the answer is certain enough.
-    weakest : str
-        What the motion determines least, in words.
     """
 
     standard_error: float
     missing: tuple[str, ...]
-    weakest: str
     refused: bool
     verdict: str
 
@@ -130,7 +127,7 @@ def judge(solution: Solution) -> Adequacy:
     errors = np.maximum(white, _errors(solution, solution.full_covariance))
     refused_at, weak_at = np.array([REFUSED_MM, REFUSED_RAD]), np.array([WEAK_MM, WEAK_RAD])
     excess, weak = float((errors / refused_at).max()), bool((errors / weak_at).max() > 1)
-    error, weakest = float(errors[1 if angular else 0]), weakest_of(solution.jacobian, solution.free)
+    error = float(errors[1 if angular else 0])
     share = (MISFIT_RAD if angular else MISFIT_MM) / max(solution.rms, np.finfo(float).tiny)
     # Where even a phantom that fits would not determine the answer, the misfit comes from the motion: the
     # solver runs away in the direction left open.
@@ -140,7 +137,7 @@ def judge(solution: Solution) -> Adequacy:
             "the images and the sensor readings belong together, and are the phantom, its wires and their "
             "numbers the ones named?"
         )
-        return Adequacy(error, (), weakest, True, misfit)
+        return Adequacy(error, (), True, misfit)
     tied = solution.evidence < TIE
     extent_of = extents(solution)
     lacking = [motion for motion, extent in extent_of.items() if extent < _ABSENT]
@@ -164,13 +161,15 @@ def judge(solution: Solution) -> Adequacy:
         verdict = (
             "the motion " + ("does not determine" if refused else "weakly determines") + " the calibration"
         )
-    verdict += f" ({state})" + (f": {'; and '.join(missing)}; weakest is {weakest}" if missing else "")
+    advice = f": {'; and '.join(missing)}; weakest is {weakest_of(solution)}" if missing else ""
+    verdict += f" ({state}){advice}"
     verdict += f"; {solution.assumed}" if solution.assumed else ""
-    return Adequacy(error, missing, weakest, refused, verdict)
+    return Adequacy(error, missing, refused, verdict)
 
 
-def weakest_of(jacobian: FloatArray, free: tuple[str, ...]) -> str:
+def weakest_of(solution: Solution) -> str:
     """What a motion determines least, in words: the last eigenvector of the scaled normal matrix."""
+    jacobian, free = solution.jacobian, solution.free
     scaled = jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), np.finfo(float).tiny)
     part = np.abs(np.linalg.eigh(scaled.T @ scaled)[1][:, 0])
     named = [name for name, share in zip(free, part, strict=True) if share > _TAKES_PART * part.max()]

@@ -107,7 +107,6 @@ class LineSettings(_Settings):
 class ImageFit(_Settings):
     """How two crossing sweeps are calibrated with."""
 
-    scales: bool = Field(False, description="Estimate the two pixel sizes too.")
     capture_mm: float = Field(
         20.0,
         ge=0,

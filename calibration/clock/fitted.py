@@ -7,6 +7,7 @@ calibration's Jacobian, and the offset is solved for together with the calibrati
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -16,17 +17,15 @@ from calibration.clock.offset import ClockOffset, covered, delays_around, peak_o
 from calibration.clock.smoothing import SmoothReadings
 from calibration.motion import InadequateError
 from calibration.noise import fit_noise
-from calibration.points import SCALES, SOME_FRAMES, ImagePoints, as_directions
+from calibration.points import SOME_FRAMES, ImagePoints, as_directions
 from calibration.solution import Solution, sigma_of
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.streams import TimedPoses, TimedRotations
 
-STEP_S = 0.02
-"""Steps of the offsets tried first: half a frame at 25 frames/s, in which no hand reverses."""
+STEP_S = 0.04
+"""Steps of the offsets tried first: a frame at 25 frames/s, in which no hand reverses."""
 
-_ANEW = 15
-"""Of so many offsets tried, one gets a calibration from nothing; others begin from the nearest of these."""
 _MOST_STEPS = 10
 _CLOSE = 0.1
 """Steps end when one is below this share of the standard error."""
@@ -69,7 +68,13 @@ def estimate_offset(
         )
     points_at = _Reader(points[there], readings).at
     tried = delays_around(around_s, search_s, STEP_S)
-    misfit = _sigmas(calibrate, points_at, tried) ** 2
+    some = [points_at(float(offset)).of_some_frames(SOME_FRAMES) for offset in tried]
+    misfit = np.array([_misfit(calibrate, one) for one in some]) ** 2
+    if not np.isfinite(misfit).any():
+        raise InsufficientDataError(
+            f"expected a clock offset that gives a calibration, got none of {len(tried)}"
+        )
+    misfit = np.nan_to_num(misfit, nan=np.nanmax(misfit))
     seconds = float(tried[peak_of(tried, misfit, "the motion repeats itself; move irregularly")])
     for _ in range(_MOST_STEPS):
         # Anew, for the frames that contradict the others depend on the offset.
@@ -138,39 +143,11 @@ def _as_seen(solution: Solution, points: ImagePoints) -> ImagePoints:
     return as_directions(points, solution.chain.pixel_mm)
 
 
-def _sigmas(
-    calibrate: Calibrate, points_at: Callable[[float], ImagePoints], tried_s: FloatArray
-) -> FloatArray:
-    """Robust standard deviation of the residuals of some frames at every offset."""
-    some = [points_at(float(offset)).of_some_frames(SOME_FRAMES) for offset in tried_s]
-    found = _anew(calibrate, some)
-    sigmas = []
-    for number, points in enumerate(some):
-        solution = found[min(found, key=lambda begin: abs(begin - number))]
-        equations = solution.phantom.equations(_as_seen(solution, points))
-        free = [name for name in solution.free if solution.prior is None or name not in SCALES]
-        chain = equations.least_absolute(solution.chain, free)
-        sigmas.append(sigma_of(equations.residuals(chain)))
-    return np.array(sigmas)
-
-
-def _anew(calibrate: Calibrate, some: list[ImagePoints]) -> dict[int, Solution]:
-    """Calibrations from nothing at some of the offsets; at all, until there is one, if those fail."""
-    first = list(range(len(some) // 2 % _ANEW, len(some), _ANEW))
-    found: dict[int, Solution] = {}
-    refusal: InsufficientDataError | None = None
-    for number in first + [k for k in range(len(some)) if k not in first]:
-        if found and number not in first:
-            break
-        try:
-            found[number] = _adequate_or_not(calibrate, some[number])
-        except InsufficientDataError as error:
-            refusal = error
-    if not found:
-        raise InsufficientDataError(
-            f"expected a clock offset that gives a calibration, got none among {len(some)} tried: {refusal}"
-        )
-    return found
+def _misfit(calibrate: Calibrate, points: ImagePoints) -> float:
+    """Robust standard deviation of all residuals of a calibration with some frames; NaN without one."""
+    with suppress(InsufficientDataError):
+        return sigma_of(_adequate_or_not(calibrate, points).residuals)
+    return np.nan
 
 
 def _adequate_or_not(calibrate: Calibrate, points: ImagePoints) -> Solution:

@@ -56,19 +56,37 @@ class EchoLine:
 
     Attributes
     ----------
-    points_px : ndarray, shape (2, 2)
-        Column and row, fractional, of two points on the line: at the mean of the agreeing columns minus and
-        plus their root mean square spread, where the errors of a fitted line are uncorrelated and equal.
-    consensus, possible : int
-        Columns that agree, and sampled columns in which the line is inside the region.
     inlier_px : ndarray, shape (k, 2)
         Column and row of the edges that agree.
+    possible : int
+        Sampled columns in which the line is inside the region.
+    start, slope : float
+        Row in column 0, and rows to a column.
+    strength : float
+        Mean of the edges that agree.
     """
 
-    points_px: FloatArray
-    consensus: int
-    possible: int
     inlier_px: FloatArray
+    possible: int
+    start: float
+    slope: float
+    strength: float
+
+    @property
+    def consensus(self) -> int:
+        """Number of columns that agree."""
+        return len(self.inlier_px)
+
+    @property
+    def points_px(self) -> FloatArray:
+        """Column and row of two points on the line, shape (2, 2).
+
+        At the mean of the agreeing columns minus and plus their root mean square spread: there the errors of
+        a fitted line are uncorrelated and equal.
+        """
+        column = self.inlier_px[:, 0]
+        ends = column.mean() + column.std() * np.array([-1.0, 1.0])
+        return np.stack([ends, self.start + self.slope * ends], axis=1)
 
 
 @dataclass(frozen=True)
@@ -117,7 +135,68 @@ class LineFinder:
         NoLineError
             If too few columns agree on a line.
         """
-        return _detect(image, self.pixel_mm, self.settings, self.columns)
+        s, columns = self.settings, self.columns
+        samples, inside = np.asarray(image[columns.column], np.float32), columns.inside
+        levels = samples[inside]
+        if not np.isfinite(levels).all():
+            raise NoLineError("no line: the image holds values that are not finite")
+        if levels.size == 0 or np.ptp(levels) == 0:
+            raise NoLineError("no line: the image is of one level all over")
+        row_mm = float(self.pixel_mm[1])
+        tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.filled(samples)
+        levels = gaussian_filter1d(samples, _FINE * sigma, truncate=_REACH, mode="nearest")
+        slope = gaussian_filter1d(samples, sigma, order=1, truncate=_REACH, mode="nearest")
+        slope[~inside] = 0.0
+        peak = np.zeros(inside.shape, bool)
+        peak[:, 1:-1] = inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]
+        peak[:, 1:-1] &= (slope[:, 1:-1] > slope[:, :-2]) & (slope[:, 1:-1] >= slope[:, 2:])
+        if s.threshold is None:
+            column, at = np.nonzero(peak & (slope > _LEAST * _typical(slope)))
+            below = at[:, None] + np.arange(int(np.ceil(_AHEAD * sigma)) + 1)
+            bright = levels[column[:, None], np.minimum(below, levels.shape[1] - 1)].max(axis=1)
+            score = np.zeros_like(levels)
+            # Every third row: enough for a median, in a third of the time.
+            score[column, at] = np.maximum(bright - np.median(levels[:, ::3][inside[:, ::3]]), 0.0)
+            usual = _typical(score)
+            thresholds = [part * usual for part in _PARTS]
+        else:
+            score, thresholds = np.where(peak, slope, np.float32(0.0)), [s.threshold * row_mm]
+        tried: list[EchoLine] = []
+        before = np.zeros(0, np.int64)
+        for threshold in thresholds:
+            above = score > threshold
+            edge = np.where(above.any(axis=1), above.argmax(axis=1), score.argmax(axis=1))
+            if np.array_equal(edge, before):
+                continue  # neighbouring thresholds mostly find the same
+            before = edge
+            strength = score[np.arange(len(edge)), edge]
+            row = _placed(levels, slope, inside, edge, sigma, s.place)
+            row[strength <= 0] = np.nan
+            agree, possible, start, rise = consensus_line(
+                columns.column.astype(float), row, inside, tolerance
+            )
+            mean = float(strength[agree].mean()) if agree.any() else 0.0
+            edges = np.stack([columns.column, row], axis=1)
+            tried.append(EchoLine(edges[agree], possible, start, rise, mean))
+        accepted = [line for line in tried if line.consensus >= self._needed(line)]
+        if not accepted:
+            best = max(tried, key=lambda line: line.consensus)
+            raise NoLineError(
+                f"no line: {best.consensus} of {best.possible} possible columns agree, "
+                f"{self._needed(best)} needed"
+            )
+        # The uppermost of those nearly as strong as the strongest, as most columns see it.
+        middle, least = columns.column.mean(), _WEAKER * max(line.strength for line in accepted)
+        strong = [line for line in accepted if line.strength >= least]
+        depths = [line.start + line.slope * middle for line in strong]
+        upper = [line for line, depth in zip(strong, depths, strict=True) if depth <= min(depths) + tolerance]
+        return max(upper, key=lambda line: line.consensus)
+
+    def _needed(self, line: EchoLine) -> int:
+        """How many columns must agree on a line."""
+        s = self.settings
+        shares = s.consensus * line.possible, _LEAST_SHARE * len(self.columns.column)
+        return max(3, *(int(np.ceil(share - 1e-9)) for share in shares))
 
 
 def detect_lines(
@@ -160,84 +239,6 @@ def detect_lines(
             progress(index + 1, count)
     points = np.reshape(list(found.values()), (-1, 2, 2))
     return Seen(np.array(list(found), dtype=np.int64), points, dropped=dropped)
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A line that some columns' edges agree with.
-
-    Attributes
-    ----------
-    row : ndarray, shape (n,)
-        Of each column's echo; NaN without one.
-    agree : ndarray of bool, shape (n,)
-    """
-
-    row: FloatArray
-    agree: BoolArray
-    possible: int
-    start: float
-    slope: float
-    strength: float
-
-    @property
-    def agreed(self) -> int:
-        return int(self.agree.sum())
-
-
-def _detect(image: npt.NDArray[Any], pixel_mm: FloatArray, s: LineSettings, columns: Columns) -> EchoLine:
-    samples, inside = np.asarray(image[columns.column], np.float32), columns.inside
-    levels = samples[inside]
-    if not np.isfinite(levels).all():
-        raise NoLineError("no line: the image holds values that are not finite")
-    if levels.size == 0 or np.ptp(levels) == 0:
-        raise NoLineError("no line: the image is of one level all over")
-    row_mm = float(pixel_mm[1])
-    tolerance, sigma, samples = s.tolerance_mm / row_mm, s.smoothing_mm / row_mm, columns.filled(samples)
-    levels = gaussian_filter1d(samples, _FINE * sigma, truncate=_REACH, mode="nearest")
-    slope = gaussian_filter1d(samples, sigma, order=1, truncate=_REACH, mode="nearest")
-    slope[~inside] = 0.0
-    peak = np.zeros(inside.shape, bool)
-    peak[:, 1:-1] = inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]
-    peak[:, 1:-1] &= (slope[:, 1:-1] > slope[:, :-2]) & (slope[:, 1:-1] >= slope[:, 2:])
-    if s.threshold is None:
-        column, at = np.nonzero(peak & (slope > _LEAST * _typical(slope)))
-        below = at[:, None] + np.arange(int(np.ceil(_AHEAD * sigma)) + 1)
-        bright = levels[column[:, None], np.minimum(below, levels.shape[1] - 1)].max(axis=1)
-        score = np.zeros_like(levels)
-        # Every third row: enough for a median, in a third of the time.
-        score[column, at] = np.maximum(bright - np.median(levels[:, ::3][inside[:, ::3]]), 0.0)
-        usual = _typical(score)
-        thresholds = [part * usual for part in _PARTS]
-    else:
-        score, thresholds = np.where(peak, slope, np.float32(0.0)), [s.threshold * row_mm]
-    tried: list[_Candidate] = []
-    before = np.zeros(0, np.int64)
-    for threshold in thresholds:
-        above = score > threshold
-        edge = np.where(above.any(axis=1), above.argmax(axis=1), score.argmax(axis=1))
-        if np.array_equal(edge, before):
-            continue  # neighbouring thresholds mostly find the same
-        before = edge
-        strength = score[np.arange(len(edge)), edge]
-        row = _placed(levels, slope, inside, edge, sigma, s.place)
-        row[strength <= 0] = np.nan
-        agree, possible, start, rise = consensus_line(columns.column.astype(float), row, inside, tolerance)
-        mean = float(strength[agree].mean()) if agree.any() else 0.0
-        tried.append(_Candidate(row, agree, possible, start, rise, mean))
-    accepted = [line for line in tried if line.agreed >= _needed(line, columns, s)]
-    if not accepted:
-        best = max(tried, key=lambda line: line.agreed)
-        raise NoLineError(
-            f"no line: {best.agreed} of {best.possible} possible columns agree, "
-            f"{_needed(best, columns, s)} needed"
-        )
-    # The uppermost of those nearly as strong as the strongest, as most columns see it.
-    middle, least = columns.column.mean(), _WEAKER * max(line.strength for line in accepted)
-    strong = [line for line in accepted if line.strength >= least]
-    depths = [line.start + line.slope * middle for line in strong]
-    upper = [line for line, depth in zip(strong, depths, strict=True) if depth <= min(depths) + tolerance]
-    return _measured(max(upper, key=lambda line: line.agreed), columns)
 
 
 def consensus_line(
@@ -298,11 +299,6 @@ def _typical(score: Float32Array) -> float:
     return float(np.median(score.max(axis=1)))
 
 
-def _needed(line: _Candidate, columns: Columns, s: LineSettings) -> int:
-    shares = s.consensus * line.possible, _LEAST_SHARE * len(columns.column)
-    return max(3, *(int(np.ceil(share - 1e-9)) for share in shares))
-
-
 def _placed(
     levels: Float32Array, slope: Float32Array, inside: BoolArray, edge: IntArray, sigma: float, place: Place
 ) -> FloatArray:
@@ -345,12 +341,3 @@ def _between(values: Float32Array, column: IntArray, row: IntArray) -> FloatArra
     before, here, after = (values[column, row + step].astype(float) for step in (-1, 0, 1))
     bend = before - 2.0 * here + after
     return np.where(bend < 0.0, 0.5 * (before - after) / np.where(bend < 0.0, bend, -1.0), 0.0)
-
-
-def _measured(line: _Candidate, columns: Columns) -> EchoLine:
-    # Errors of a fit's level at the mean column and of its slope are uncorrelated. At one standard deviation
-    # of the columns to either side both contribute equally, so that the two points' errors are uncorrelated.
-    x = columns.column[line.agree].astype(float)
-    ends = x.mean() + x.std() * np.array([-1.0, 1.0])
-    points_px = np.stack([ends, line.start + line.slope * ends], axis=1)
-    return EchoLine(points_px, line.agreed, line.possible, np.stack([x, line.row[line.agree]], axis=1))

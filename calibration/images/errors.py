@@ -16,9 +16,9 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import RigidTransform
 
 from calibration.images.angulation import PARAMETERS, Angulation, point_motion
-from calibration.images.fit import LEVERS_MM, Refined, about_pivot, refine
+from calibration.images.fit import Refined, about_pivot, refine
 from calibration.images.search import apart_mm
-from calibration.images.similarity import Comparison, CrossingSweeps, Estimate, Level, Similarity
+from calibration.images.similarity import Comparison, CrossingSweeps, Level, Similarity, stepped
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import skew
@@ -28,12 +28,8 @@ WIDE_MM = 1.6
 taken: over twice the blur, beyond which speckle is no longer like itself. In 15 simulated pairs claims were
 0.7 of the errors at 0.3 mm, 0.9 at 1 mm, 1.2 at 1.6 mm."""
 
-NARROW_MM = 0.3
-"""As `WIDE_MM`, where pixel sizes are estimated: they so nearly replace displacements that over wide steps
-the similarity's bends of a higher order drown the difference."""
-
-_FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0, 0.2, 0.2])
-"""Largest steps, rad, mm and relative sizes: of an error that hardly shows no step would be wide enough."""
+_FARTHEST = np.array([0.25, 0.25, 0.25, 5.0, 5.0, 5.0])
+"""Largest steps, rad and mm: of an error that hardly shows no step would be wide enough."""
 
 APART_MM = 0.3
 """Displacement of the image's edge for the curvature with which last steps are taken: less than speckle."""
@@ -47,9 +43,6 @@ patches, since neighbours show the same speckle and reflections."""
 
 STRETCH = 3
 """Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
-
-WANDERS = 1.0
-"""Time over which a tracker's error is like itself, in lengths of a sweep: seconds."""
 
 DEEP_MM = 0.1
 """Standard deviation of a displacement along the beam that all of the tissue shares, so that no differences
@@ -83,17 +76,14 @@ the lead over it, in standard errors of their difference, that an answer must ha
 
 
 def curvature_of(refined: Refined, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Curvature of each patch's weighted correlation, (p, f, f), and of all, (f, f), over steps either way.
+    """Curvature of each patch's weighted correlation, (p, 6, 6), and of all, (6, 6), over steps either way.
 
     By differences of the exact slopes; Gauss-Newton's matrix, in which the slopes of speckle count in full,
     is several times too stiff.
     """
-    base = about_pivot(refined.pivot_mm)[:, list(refined.free)]
-    columns = []
-    for parameter in refined.free:
-        step = np.zeros(len(LEVERS_MM))
-        step[parameter] = steps[parameter]
-        places = (refined.estimate.stepped(sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
+    base, columns = about_pivot(refined.pivot_mm), []
+    for parameter, step in enumerate(np.diag(steps)):
+        places = (stepped(refined.sensor_from_image, sign * step, refined.pivot_mm) for sign in (-1.0, 1.0))
         seen = [refined.comparison.at(place, True) for place in places]
         columns.append(_fallen(refined, seen) @ base / (2.0 * steps[parameter]))
     bends = np.stack(columns, axis=2)
@@ -103,7 +93,7 @@ def curvature_of(refined: Refined, steps: FloatArray) -> tuple[FloatArray, Float
 def claimed(
     refined: Refined, angulation: Angulation, crossing: CrossingSweeps, tracker: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Covariance of an answer's turns, displacements and relative pixel sizes at the image's origin, (8, 8).
+    """Covariance of an answer's turns and displacements at the image's origin, (6, 6).
 
     Errors of tissue (speckle, reflections) and of poses are told by how the answer changes when one block of
     tissue, or one stretch of images, after another is left out. An error of the tracker that lasts for
@@ -118,8 +108,8 @@ def claimed(
 
     Returns
     -------
-    covariance : ndarray, shape (8, 8)
-    curvature : ndarray, shape (f, f)
+    covariance : ndarray, shape (6, 6)
+    curvature : ndarray, shape (6, 6)
         Of the similarity over more than speckle's width.
 
     References
@@ -127,24 +117,20 @@ def claimed(
     .. [1] A. C. Cameron and D. L. Miller, "A practitioner's guide to cluster-robust inference", Journal of
        Human Resources, 2015 (the jackknife over clusters).
     """
-    unit, base = crossing.unit, about_pivot(refined.pivot_mm)[:, list(refined.free)]
-    wide = unit * (WIDE_MM if len(refined.free) == len(PARAMETERS) else NARROW_MM)
-    shows = np.append(angulation.alone, 0.5 * LEVERS_MM[6:])
-    shows[:3] /= np.deg2rad(1.0)
-    farthest = _FARTHEST * np.repeat([1.0, unit, 1.0], [3, 3, 2])
+    unit, base = crossing.unit, about_pivot(refined.pivot_mm)
+    wide, shows = unit * WIDE_MM, angulation.alone / np.repeat([np.deg2rad(1.0), 1.0], 3)
+    farthest = _FARTHEST * np.repeat([1.0, unit], 3)
     bends, curvature = curvature_of(refined, np.minimum(wide / np.maximum(shows, 1e-6), farthest))
     slopes = (refined.weight[:, None] * refined.similarity.gradient) @ base
     blocks = _numbered(np.floor(refined.places_mm / (BLOCK_MM * unit)))
     sweep, image = refined.comparison.images.T
     stretches = _numbered(np.column_stack([sweep, _numbered(np.column_stack([sweep, image])) // STRETCH]))
     left_out = [_left_out(slopes, bends, one, curvature) for one in (blocks, stretches)]
-    moved = np.linalg.inv(curvature)
-    wander = (
-        moved @ _wandering(refined, _pulls(refined, wide, base), np.repeat(np.square(tracker), 3)) @ moved.T
-    )
+    shift = np.linalg.solve(curvature, _displaced(refined, _pulls(refined, wide, base)))
+    wander = (shift * np.repeat(np.square(tracker), 3)) @ shift.T
     covariance = base @ (sum(left_out) + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
-    covariance[:6, :6] += _scatter(refined, crossing)
+    covariance += _scatter(refined, crossing)
     return np.asarray(covariance), curvature
 
 
@@ -156,10 +142,9 @@ def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: Flo
     InsufficientDataError
         With what would help: other motion, or other tissue.
     """
-    pose = covariance[:6, :6]
     moved = point_motion(centre_mm[None])[0]
-    turns = np.rad2deg(np.sqrt(np.diag(pose)[:3]))
-    shifts = np.sqrt(np.diag(moved @ pose @ moved.T))
+    turns = np.rad2deg(np.sqrt(np.diag(covariance)[:3]))
+    shifts = np.sqrt(np.diag(moved @ covariance @ moved.T))
     if turns.max() <= MOST_DEG and shifts.max() <= MOST_MM:
         return
     worst = int(np.argmax(np.concatenate([turns / MOST_DEG, shifts / MOST_MM])))
@@ -174,8 +159,8 @@ def require_known(covariance: FloatArray, angulation: Angulation, centre_mm: Flo
 
 def require_one_answer(
     comparison: Comparison,
-    answer: Estimate,
-    rivals: list[Estimate],
+    answer: RigidTransform,
+    rivals: list[RigidTransform],
     centre_mm: FloatArray,
 ) -> None:
     """Refuse an answer if another that the search found, far from it, is as good for all that is known.
@@ -195,7 +180,7 @@ def require_one_answer(
             continue
         both = here.valid & there.valid
         lead = here.score - there.score
-        blocks = _numbered(np.floor(comparison.places_mm(answer.sensor_from_image)[both] / BLOCK_MM))
+        blocks = _numbered(np.floor(comparison.places_mm(answer)[both] / BLOCK_MM))
         gain = np.bincount(blocks, here.alike[both] - there.alike[both]) / max(int(both.sum()), 1)
         noise = float(np.sqrt(np.square(gain - gain.mean()).sum())) if both.any() else 0.0
         if lead < CLEAR_LEAD * noise:
@@ -212,12 +197,12 @@ def _scatter(refined: Refined, crossing: CrossingSweeps) -> FloatArray:
     Not about their own mean: fits that all end in the same other place are in doubt, too. Nor about the
     answer, for at `RESTARTED` images are blurred, which moves all ends alike.
     """
-    comparison = crossing.level(RESTARTED, refined.estimate.sensor_from_image)
+    comparison = crossing.level(RESTARTED, refined.sensor_from_image)
     beside = np.repeat([np.deg2rad(_BESIDE_DEG), _BESIDE_MM * crossing.unit], 3)
 
     def end(side: FloatArray) -> RigidTransform:
-        start = refined.estimate.stepped(np.append(side * beside, [0.0, 0.0]), refined.pivot_mm)
-        return refine(comparison, start, max_steps=_RESTART_STEPS).estimate.sensor_from_image
+        start = stepped(refined.sensor_from_image, side * beside, refined.pivot_mm)
+        return refine(comparison, start, max_steps=_RESTART_STEPS).sensor_from_image
 
     back = end(np.zeros(6)).inv()
     away = [back * end(side) for side in np.concatenate([_SIDES, -_SIDES])]
@@ -226,7 +211,7 @@ def _scatter(refined: Refined, crossing: CrossingSweeps) -> FloatArray:
 
 
 def _pulls(refined: Refined, step_mm: float, base: FloatArray) -> FloatArray:
-    """How each patch's slopes change as the second sweep is displaced along the world's axes, (p, f, 3)."""
+    """How each patch's slopes change as the second sweep is displaced along the world's axes, (p, 6, 3)."""
     first, second = refined.comparison.stacks
     columns = []
     for axis in np.eye(3):
@@ -234,7 +219,7 @@ def _pulls(refined: Refined, step_mm: float, base: FloatArray) -> FloatArray:
         for sign in (-1.0, 1.0):
             world = RigidTransform.from_translation(sign * step_mm * axis) * second.world_from_sensor
             moved = replace(refined.comparison, stacks=(first, replace(second, world_from_sensor=world)))
-            seen.append(moved.at(refined.estimate, True))
+            seen.append(moved.at(refined.sensor_from_image, True))
         columns.append(_fallen(refined, seen) @ base / (2.0 * step_mm))
     return np.stack(columns, axis=2)
 
@@ -246,29 +231,11 @@ def _fallen(refined: Refined, seen: list[Similarity]) -> FloatArray:
     return np.where(there[:, None], fallen, 0.0)
 
 
-def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> FloatArray:
-    """Covariance of the slope from an error of each sweep's poses that wanders over the sweep's length.
-
-    An image's error counts where the image is compared, and as much again where it is cut.
-
-    Parameters
-    ----------
-    variance : ndarray, shape (6,)
-        Of displacements (mm^2) and turns (rad^2) of one sweep against the other about the tissue.
-    """
+def _displaced(refined: Refined, pulls: FloatArray) -> FloatArray:
+    """How the slope changes with displacements, mm, and turns about the tissue, rad, of a sweep, (6, 6)."""
     share = np.linalg.norm(pulls, axis=(1, 2))
-    arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), 1e-300)
-    each = 2.0 * np.concatenate([pulls, pulls @ -skew(arms)], axis=2)
-    found = np.zeros((pulls.shape[1],) * 2)
-    for sweep, stack in enumerate(refined.comparison.stacks):
-        ours, image = refined.comparison.images.T
-        sums = np.zeros((len(stack), *each.shape[1:]))
-        np.add.at(sums, image[ours == sweep], each[ours == sweep])
-        lag = np.arange(len(stack)) / (WANDERS * len(stack))
-        alike = np.exp(-np.abs(lag[:, None] - lag))
-        # Half of the variance is this sweep's.
-        found += np.einsum("iak,ij,jbk,k->ab", sums, alike, sums, 0.5 * variance, optimize=True)
-    return found
+    arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), np.finfo(float).tiny)
+    return np.asarray(np.concatenate([pulls, pulls @ -skew(arms)], axis=2).sum(axis=0))
 
 
 def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvature: FloatArray) -> FloatArray:

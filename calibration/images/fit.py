@@ -14,8 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
-from calibration.images.similarity import Comparison, Estimate, Similarity
+from calibration.images.similarity import Comparison, Similarity, stepped
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.geometry import skew
 
@@ -24,7 +25,7 @@ ROBUST = 0.5
 
 MAX_STEPS = 25
 
-LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0, 30.0, 30.0])
+LEVERS_MM = np.array([30.0, 30.0, 30.0, 1.0, 1.0, 1.0])
 """How far the image's edge moves per unit of each parameter, mm."""
 
 CLOSE_MM = 2e-3
@@ -48,35 +49,31 @@ class Refined:
         Where the patches come from.
     pivot_mm : ndarray, shape (3,)
         The point of the image that turns leave in place.
-    free : tuple of int
-        Which of the eight parameters were estimated.
     """
 
-    estimate: Estimate
+    sensor_from_image: RigidTransform
     similarity: Similarity
     weight: FloatArray
     comparison: Comparison
     pivot_mm: FloatArray
-    free: tuple[int, ...]
     converged: bool = False
 
     @property
     def places_mm(self) -> FloatArray:
         """Where in the world the patches lie, shape (p, 3)."""
-        return self.comparison.places_mm(self.estimate.sensor_from_image)
+        return self.comparison.places_mm(self.sensor_from_image)
 
     @property
     def system(self) -> tuple[FloatArray, FloatArray]:
-        """Gauss-Newton's matrix and the slope of the similarity, of the free parameters at the pivot."""
-        base = about_pivot(self.pivot_mm)[:, list(self.free)]
+        """Gauss-Newton's matrix and the slope of the similarity, of the parameters at the pivot."""
+        base = about_pivot(self.pivot_mm)
         normal = np.einsum("p,pij->ij", self.weight, self.similarity.normal)
         return base.T @ normal @ base, base.T @ (self.weight @ self.similarity.gradient)
 
 
 def refine(
     comparison: Comparison,
-    start: Estimate,
-    free: tuple[int, ...] = (0, 1, 2, 3, 4, 5),
+    start: RigidTransform,
     max_steps: int = MAX_STEPS,
     curvature: FloatArray | None = None,
 ) -> Refined:
@@ -84,14 +81,14 @@ def refine(
 
     Parameters
     ----------
-    curvature : ndarray, shape (f, f), optional
+    curvature : ndarray, shape (6, 6), optional
         In place of Gauss-Newton's matrix, for Newton's last steps.
     """
-    pivot, chosen = comparison.stacks[0].centre_mm, list(free)
+    pivot = comparison.stacks[0].centre_mm
 
-    def look(estimate: Estimate) -> Refined:
-        seen = comparison.at(estimate, True)
-        return Refined(estimate, seen, weights(seen), comparison, pivot, free)
+    def look(pose: RigidTransform) -> Refined:
+        seen = comparison.at(pose, True)
+        return Refined(pose, seen, weights(seen), comparison, pivot)
 
     now, damping = look(start), 1e-2
     for _ in range(max_steps - 1):
@@ -100,12 +97,11 @@ def refine(
         matrix, slope = now.system
         matrix = matrix if curvature is None else curvature
         lift = damping * np.diag(matrix) + 1e-9 * np.trace(matrix)
-        step = np.zeros(len(LEVERS_MM))
-        step[chosen] = np.linalg.solve(matrix + np.diag(lift), slope)
+        step = np.asarray(np.linalg.solve(matrix + np.diag(lift), slope), dtype=np.float64)
         size = float(np.abs(step * LEVERS_MM).max())
         if curvature is not None:
             step *= min(1.0, LONGEST_MM / max(size, LONGEST_MM))
-        trial = look(now.estimate.stepped(step, pivot))
+        trial = look(stepped(now.sensor_from_image, step, pivot))
         if better(now.similarity, trial.similarity, now.weight):
             now, damping = trial, max(0.2 * damping, 1e-5)
         else:
@@ -128,9 +124,9 @@ def weights(similarity: Similarity) -> FloatArray:
 
 
 def about_pivot(pivot_mm: FloatArray) -> FloatArray:
-    """Derivative of the parameters at the image's origin with respect to those at a pivot, shape (8, 8)."""
-    base = np.eye(8)
-    base[3:6, :3] = skew(pivot_mm)
+    """Derivative of the parameters at the image's origin with respect to those at a pivot, shape (6, 6)."""
+    base = np.eye(6)
+    base[3:, :3] = skew(pivot_mm)
     return base
 
 

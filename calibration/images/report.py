@@ -29,9 +29,6 @@ _UNSEEN = "#33415c"
 """Where the other sweep has no frame: blue-grey, as in cuts."""
 _REACH_MM = 1.5
 
-WEAK_SCALE = 0.01
-"""Relative standard error of an estimated pixel size above which the scanner's own value is better."""
-
 _WORSE = 0.02
 """Most that the correlation may fall below that at the start: twice what it varies between answers from
 different starts."""
@@ -128,25 +125,16 @@ def _draw_images(
 
 
 def _parameters(result: ImageCalibration) -> tuple[Parameter, ...]:
-    """The image's origin in the sensor's frame, and the pixel sizes if they were estimated."""
+    """The image's origin in the sensor's frame."""
     turn = result.sensor_from_image.rotation.as_matrix()
     errors = np.sqrt(np.diag(turn @ result.covariance[3:, 3:] @ turn.T))
-    rows = [
+    return tuple(
         Parameter(name, float(value), float(error), "mm")
         for name, value, error in zip("xyz", result.sensor_from_image.translation, errors, strict=True)
-    ]
-    if (result.scale_errors > 0).any():
-        pixels = zip(("s_x", "s_y"), result.pixel_mm, result.pixel_mm * result.scale_errors, strict=True)
-        rows += [Parameter(name, float(size), float(error), "mm/pixel") for name, size, error in pixels]
-    return tuple(rows)
+    )
 
 
 def _verdict(result: ImageCalibration) -> str:
-    if result.scale_errors.max() > WEAK_SCALE:
-        lateral, axial = 100.0 * result.scale_errors
-        return (
-            f"weak: the pixel sizes are known to {lateral:.0f} and {axial:.0f} %: do without estimating them"
-        )
     if not result.converged:
         return "did not converge: a better start or sweeps with more structure are needed"
     if result.after - np.nan_to_num(result.before) < -_WORSE:

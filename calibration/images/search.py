@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import qmc
 
 from calibration.images.fit import Refined, refine
-from calibration.images.similarity import CrossingSweeps, Estimate, Level
+from calibration.images.similarity import CrossingSweeps, Level
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.progress import Progress
@@ -38,11 +38,11 @@ _SAME_MM = 1.5
 
 def search(
     crossing: CrossingSweeps,
-    start: Estimate,
+    start: RigidTransform,
     capture_mm: float,
     capture_rad: float,
     progress: Progress | None = None,
-) -> list[Estimate]:
+) -> list[RigidTransform]:
     """Search a box of six parameters about the start, from coarse to fine; the best places, best first.
 
     Raises
@@ -52,32 +52,32 @@ def search(
     """
     centre_mm = crossing.centre_mm
 
-    def best_of(count: int, most: int) -> list[Estimate]:
+    def best_of(count: int, most: int) -> list[RigidTransform]:
         """The best of many places in the box: those from which an increment leads to the start."""
         places = 2.0 * qmc.Sobol(6, rng=1).random(count) - 1.0
         places[0] = 0.0
         turn = Rotation.from_euler("xyz", capture_rad * places[:, :3])
         away = RigidTransform.from_components(capture_mm * places[:, 3:], turn)
-        tried = [Estimate(place, start.scales) for place in start.sensor_from_image * away.inv()]
-        comparison, scores = crossing.level(GLANCE, start.sensor_from_image), np.empty(count)
+        tried = list(start * away.inv())
+        comparison, scores = crossing.level(GLANCE, start), np.empty(count)
         for n, score in enumerate(ahead(lambda place: comparison.at(place).score, tried)):
             scores[n] = score
             if progress is not None:
                 progress(n + 1, count)
         return [tried[int(n)] for n in np.argsort(-scores)[:most] if scores[n] > -1]
 
-    def refined(level: Level, starts: list[Estimate]) -> list[Refined]:
+    def refined(level: Level, starts: list[RigidTransform]) -> list[Refined]:
         """Refine each start, best first."""
         if not starts:
             return []
-        comparison = crossing.level(level, starts[0].sensor_from_image)
+        comparison = crossing.level(level, starts[0])
         ends = ahead(lambda place: refine(comparison, place, max_steps=_STEPS), starts)
         return sorted(ends, key=lambda one: -one.similarity.score)
 
     def inside(ends: list[Refined]) -> list[Refined]:
         """Keep those within 1.2 times the distance of the box's corners from the start."""
         far = np.sqrt(3.0) * 1.2
-        steps = [one.estimate.sensor_from_image.inv() * start.sensor_from_image for one in ends]
+        steps = [one.sensor_from_image.inv() * start for one in ends]
         return [
             one
             for one, step in zip(ends, steps, strict=True)
@@ -100,17 +100,17 @@ def search(
     return _distinct(refined(DECIDED, compared[:_DECIDED]), centre_mm)
 
 
-def _distinct(ends: list[Refined], centre_mm: FloatArray) -> list[Estimate]:
-    """Estimates without those within `_SAME_MM` of a better one."""
-    kept: list[Estimate] = []
+def _distinct(ends: list[Refined], centre_mm: FloatArray) -> list[RigidTransform]:
+    """Places without those within `_SAME_MM` of a better one."""
+    kept: list[RigidTransform] = []
     for one in ends:
-        if all(apart_mm(one.estimate, other, centre_mm) > _SAME_MM for other in kept):
-            kept.append(one.estimate)
+        if all(apart_mm(one.sensor_from_image, other, centre_mm) > _SAME_MM for other in kept):
+            kept.append(one.sensor_from_image)
     return kept
 
 
-def apart_mm(one: Estimate, other: Estimate, centre_mm: FloatArray) -> float:
-    """Distance between estimates, mm: of the image's centre and of points that turn 20 mm away from it."""
-    step = other.sensor_from_image.inv() * one.sensor_from_image
+def apart_mm(one: RigidTransform, other: RigidTransform, centre_mm: FloatArray) -> float:
+    """Distance between calibrations, mm: of the image's centre and of points that turn 20 mm away from it."""
+    step = other.inv() * one
     moved = float(np.linalg.norm(step.apply(centre_mm) - centre_mm))
     return float(np.hypot(moved, 20.0 * step.rotation.magnitude()))

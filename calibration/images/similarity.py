@@ -31,34 +31,20 @@ FEWEST_PATCHES = 0.1
 """Part of the patches that must have support for the score to mean anything."""
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A calibration during the fit.
-
-    Attributes
-    ----------
-    scales : ndarray, shape (2,)
-        Factors on the pixel sizes, lateral and axial.
-    """
-
-    sensor_from_image: RigidTransform
-    scales: FloatArray
-
-    def stepped(self, step: FloatArray, pivot_mm: FloatArray) -> Estimate:
-        """Turn about a point of the image and displace it, in the image's own frame; then rescale."""
-        # As one product of matrices: transforms check themselves, which takes as long as a small comparison.
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
-        matrix[:3, 3] = pivot_mm + step[3:6] - matrix[:3, :3] @ pivot_mm
-        moved = RigidTransform.from_matrix(self.sensor_from_image.as_matrix() @ matrix)
-        return Estimate(moved, self.scales * (1.0 + step[6:8]))
+def stepped(sensor_from_image: RigidTransform, step: FloatArray, pivot_mm: FloatArray) -> RigidTransform:
+    """Turn about a point of the image and displace it, in the image's own frame."""
+    # As one product of matrices: transforms check themselves, which takes as long as a small comparison.
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
+    matrix[:3, 3] = pivot_mm + step[3:] - matrix[:3, :3] @ pivot_mm
+    return RigidTransform.from_matrix(sensor_from_image.as_matrix() @ matrix)
 
 
 class Similarity(PatchScores):
     """Correlations of the first sweep's patches with the second sweep, then of the second's with the first.
 
-    `energy` is in grey levels; `normal` and `gradient` are by the image's turns (rad) and displacements (mm),
-    and the relative pixel sizes; they are empty if they were not asked for.
+    `energy` is in grey levels; `normal` and `gradient` are by the image's turns (rad) and displacements (mm);
+    they are empty if they were not asked for.
     """
 
     @property
@@ -95,9 +81,9 @@ class Comparison:
     max_gap_mm: float
     least_share: float = LEAST_SHARE
 
-    def at(self, estimate: Estimate, derivatives: bool = False) -> Similarity:
+    def at(self, sensor_from_image: RigidTransform, derivatives: bool = False) -> Similarity:
         """Compare at a calibration."""
-        parts = list(ahead(lambda way: self._one_way(way, estimate, derivatives), (0, 1)))
+        parts = list(ahead(lambda way: self._one_way(way, sensor_from_image, derivatives), (0, 1)))
         return Similarity(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     @property
@@ -119,10 +105,10 @@ class Comparison:
             rows.append(np.einsum("pij,pj->pi", poses, local)[:, :3])
         return np.concatenate(rows)
 
-    def _one_way(self, way: int, estimate: Estimate, derivatives: bool) -> PatchScores:
+    def _one_way(self, way: int, sensor_from_image: RigidTransform, derivatives: bool) -> PatchScores:
         sample, patches, source = self.stacks[way], self.patches[way], self.stacks[1 - way]
-        matrix = estimate.sensor_from_image.as_matrix()
-        count, pixels = len(patches.where), np.tile(estimate.scales, 2)
+        matrix = sensor_from_image.as_matrix()
+        count = len(patches.where)
         size = count if derivatives else 0
         found = PatchScores(
             np.empty(count),
@@ -134,8 +120,8 @@ class Comparison:
         world_from_sample = np.ascontiguousarray((sample.sensor_matrices @ matrix)[:, :3])
         source_from_world = _inverted(source.sensor_matrices @ matrix)
         compare_patches(
-            PlacedImages(sample.images, world_from_sample, sample.pixels * pixels),
-            PlacedImages(source.images, source_from_world, source.pixels * pixels),
+            PlacedImages(sample.images, world_from_sample, sample.pixels),
+            PlacedImages(source.images, source_from_world, source.pixels),
             patches,
             self.max_gap_mm,
             self.least_share,

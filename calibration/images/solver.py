@@ -27,7 +27,7 @@ from calibration.images.errors import (
 )
 from calibration.images.fit import LEVERS_MM, refine
 from calibration.images.search import DECIDED, search
-from calibration.images.similarity import CrossingSweeps, Estimate, Level, prepare
+from calibration.images.similarity import CrossingSweeps, Level, prepare
 from calibration.images.stacks import TrackedImages
 from calibration.settings import ImageFit
 from speckle3d.core.arrays import FloatArray
@@ -54,9 +54,6 @@ class ImageCalibration:
     ----------
     settings : ImageFit
     sensor_from_image : RigidTransform
-    scales, scale_errors : ndarray, shape (2,)
-        Factors on the pixel sizes across and along the beams, and their standard errors; one and zero
-        where they were not estimated.
     covariance : ndarray, shape (6, 6)
         Of the image's pose in its own frame, at its origin: turns about its x, y, z (tilt, yaw, roll) in rad,
         then displacements along them in mm. From how the answer changes when one part of the scanned tissue,
@@ -80,8 +77,6 @@ class ImageCalibration:
     settings: ImageFit
     start: RigidTransform
     sensor_from_image: RigidTransform
-    scales: FloatArray
-    scale_errors: FloatArray
     pixel_mm: FloatArray
     covariance: FloatArray
     condition_number: float
@@ -135,18 +130,17 @@ def calibrate_from_sweeps(
     if not start.single:
         raise InvalidInputError("start: expected a single transform, got a row of them")
     chosen = settings or ImageFit()
-    first = answer = Estimate(start, np.ones(2))
-    free, rivals = tuple(range(8 if chosen.scales else 6)), list[Estimate]()
+    answer, rivals = start, list[RigidTransform]()
     if chosen.capture_mm > 0.0 or chosen.capture_deg > 0.0:
         reach = float(np.deg2rad(chosen.capture_deg))
-        answer, *rivals = search(crossing, first, chosen.capture_mm, reach, progress)
+        answer, *rivals = search(crossing, start, chosen.capture_mm, reach, progress)
     for number, level in enumerate(FINE):
-        refined = refine(crossing.level(level, answer.sensor_from_image), answer, free)
-        answer = refined.estimate
+        refined = refine(crossing.level(level, answer), answer)
+        answer = refined.sensor_from_image
         if progress:
             progress(number + 1, len(FINE))
     poses = [stack.world_from_sensor for stack in crossing.stacks]
-    decided = crossing.level(DECIDED, answer.sensor_from_image)
+    decided = crossing.level(DECIDED, answer)
     alike = decided.at(answer).score
     if alike < LEAST_SIMILARITY:
         got = "no overlap" if alike < 0 else f"{alike:.2f} at best"
@@ -154,27 +148,24 @@ def calibrate_from_sweeps(
             "expected sweeps that show the same structure, with a correlation of at least "
             f"{LEAST_SIMILARITY:g} over what both cover, got {got}"
         )
-    angles = angulation(poses[0], poses[1], answer.sensor_from_image, crossing.stacks[0].corners_mm)
+    angles = angulation(poses[0], poses[1], answer, crossing.stacks[0].corners_mm)
     angles.require()
     _, narrow = curvature_of(refined, APART_MM / LEVERS_MM)
-    refined = refine(refined.comparison, answer, free, curvature=narrow)
-    answer = refined.estimate
+    refined = refine(refined.comparison, answer, curvature=narrow)
+    answer = refined.sensor_from_image
     tracker = chosen.tracker_mm, float(np.deg2rad(chosen.tracker_deg))
     covariance, curvature = claimed(refined, angles, crossing, tracker)
-    if not chosen.scales:  # which takes the place of a displacement along the beams; the verdict says so
-        require_known(covariance, angles, crossing.centre_mm)
+    require_known(covariance, angles, crossing.centre_mm)
     require_one_answer(decided, answer, rivals, crossing.centre_mm)
     return ImageCalibration(
         settings=chosen,
         start=start,
-        sensor_from_image=answer.sensor_from_image,
-        scales=answer.scales,
-        scale_errors=np.sqrt(np.diag(covariance)[6:8]),
-        pixel_mm=crossing.pixel_mm * answer.scales,
-        covariance=covariance[:6, :6],
+        sensor_from_image=answer,
+        pixel_mm=crossing.pixel_mm,
+        covariance=covariance,
         condition_number=condition_number(np.asarray(np.linalg.cholesky(curvature).T, np.float64)),
         alike=alike,
-        before=decided.at(first).mean,
+        before=decided.at(start).mean,
         after=decided.at(answer).mean,
         converged=refined.converged,
         angulation=angles,

@@ -15,8 +15,8 @@ from numba import njit
 
 from speckle3d.core.arrays import Float32Array, FloatArray, IntArray
 
-PARAMETERS = 8
-"""Turns about and displacements along the image's x, y, z, then relative changes of its two pixel sizes."""
+PARAMETERS = 6
+"""Turns about and displacements along the image's x, y, z."""
 
 LEAST_GAP = 0.1
 """Distance between two images, as part of the largest, from which their difference is taken for a slope."""
@@ -69,7 +69,7 @@ class PatchScores(NamedTuple):
         Standard deviations of the patch and of what was cut.
     share : float64, shape (p,)
         Share of points supported.
-    normal, gradient : float64, shape (p, 8, 8) and (p, 8), or empty
+    normal, gradient : float64, shape (p, 6, 6) and (p, 6), or empty
         Gauss-Newton matrix of the patches' normalised difference, whose squared length is twice
         (1 - correlation), and the change of the correlation with the parameters. Not computed when empty.
     """
@@ -315,8 +315,6 @@ def _fill_rows(
         row[3] += bx - ax
         row[4] += by - ay
         row[5] += bz - az
-        row[6] += x * bx - px * ax
-        row[7] += y * by - py * ay
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_SUMS_IN_ANY_ORDER)

@@ -61,7 +61,7 @@ def images(
         With --start-deg: start by ruler, the image's top left corner seen from the sensor, x y z.
     start_deg
         With --start-mm: start by eye, turns from sensor to image, roll yaw tilt (fixed x, y, z of TR 303).
-    scales, as_json
+    as_json
 
     Other Parameters
     ----------------
