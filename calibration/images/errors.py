@@ -44,6 +44,9 @@ patches, since neighbours show the same speckle and reflections."""
 STRETCH = 3
 """Consecutive compared images whose errors are correlated: a tracker's error lasts from one to the next."""
 
+WANDERS = 1.0
+"""Time over which a tracker's error is like itself, in lengths of a sweep: seconds."""
+
 DEEP_MM = 0.1
 """Standard deviation of a displacement along the beam that all of the tissue shares, so that no differences
 between its parts show it, in units of the images' size: a thick beam displays echoes from beside the image
@@ -126,8 +129,9 @@ def claimed(
     sweep, image = refined.comparison.images.T
     stretches = _numbered(np.column_stack([sweep, _numbered(np.column_stack([sweep, image])) // STRETCH]))
     left_out = [_left_out(slopes, bends, one, curvature) for one in (blocks, stretches)]
-    shift = np.linalg.solve(curvature, _displaced(refined, _pulls(refined, wide, base)))
-    wander = (shift * np.repeat(np.square(tracker), 3)) @ shift.T
+    moved = np.linalg.inv(curvature)
+    variance = np.repeat(np.square(tracker), 3)
+    wander = moved @ _wandering(refined, _pulls(refined, wide, base), variance) @ moved.T
     covariance = base @ (sum(left_out) + wander) @ base.T
     covariance[4, 4] += (DEEP_MM * unit) ** 2
     covariance += _scatter(refined, crossing)
@@ -231,11 +235,29 @@ def _fallen(refined: Refined, seen: list[Similarity]) -> FloatArray:
     return np.where(there[:, None], fallen, 0.0)
 
 
-def _displaced(refined: Refined, pulls: FloatArray) -> FloatArray:
-    """How the slope changes with displacements, mm, and turns about the tissue, rad, of a sweep, (6, 6)."""
+def _wandering(refined: Refined, pulls: FloatArray, variance: FloatArray) -> FloatArray:
+    """Covariance of the slope from an error of each sweep's poses that wanders over the sweep's length.
+
+    An image's error counts where the image is compared, and as much again where it is cut.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (6,)
+        Of displacements (mm^2) and turns (rad^2) of one sweep against the other about the tissue.
+    """
     share = np.linalg.norm(pulls, axis=(1, 2))
-    arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), np.finfo(float).tiny)
-    return np.asarray(np.concatenate([pulls, pulls @ -skew(arms)], axis=2).sum(axis=0))
+    arms = refined.places_mm - share @ refined.places_mm / max(float(share.sum()), 1e-300)
+    each = 2.0 * np.concatenate([pulls, pulls @ -skew(arms)], axis=2)
+    found = np.zeros((pulls.shape[1],) * 2)
+    for sweep, stack in enumerate(refined.comparison.stacks):
+        ours, image = refined.comparison.images.T
+        sums = np.zeros((len(stack), *each.shape[1:]))
+        np.add.at(sums, image[ours == sweep], each[ours == sweep])
+        lag = np.arange(len(stack)) / (WANDERS * len(stack))
+        alike = np.exp(-np.abs(lag[:, None] - lag))
+        # Half of the variance is this sweep's.
+        found += np.einsum("iak,ij,jbk,k->ab", sums, alike, sums, 0.5 * variance, optimize=True)
+    return found
 
 
 def _left_out(slopes: FloatArray, bends: FloatArray, cluster: IntArray, curvature: FloatArray) -> FloatArray:
