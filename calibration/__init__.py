@@ -1,6 +1,7 @@
-"""Where the image is relative to the sensor, from images of phantoms (`job`) or of anything (`images`).
+"""Where the image is relative to the sensor, from images of phantoms or of anything (`images`).
 
-`chain` is the model that all phantoms share, `plane` its solver, `starts` where the solver starts, and
-`identifiability` whether a scan's motion was sufficient. `plane`, `orientation`, `wires` and `nwires`
-calibrate with one phantom each; `clock` finds a sensor's clock offset and `detection` phantoms in images.
+`plane` is the model that all phantoms share, its least squares, and the plane itself; `solution` says which
+frames count and how certain an answer is, `motion` whether a scan's motion was sufficient. `orientation`,
+`wires` and `nwires` are the other phantoms; `clock` finds a sensor's clock offset, `detection` phantoms in
+images.
 """

@@ -19,7 +19,7 @@ from scipy.spatial.transform import RigidTransform
 from calibration.detection.labelling import label_by_calibration, label_dots
 from calibration.points import ImagePoints, Seen
 from calibration.wires import Wires, solve_wires
-from speckle3d.core.arrays import FloatArray, IntArray
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.wires import WirePhantom
 
@@ -61,17 +61,22 @@ def middle_wires(points: ImagePoints, phantom: WirePhantom) -> tuple[ImagePoints
     InvalidInputError
         If the points have no wires.
     """
-    wire = _wires(points, phantom)
-    middles, places = [], []
+    if points.wire is None:
+        raise InvalidInputError("points: expected the wire of each, got none")
+    # Number of the point that shows each wire in each frame; none is -1.
+    shown = np.full((points.frame.max(initial=0) + 1, len(phantom)), -1)
+    shown[points.frame, points.wire] = np.arange(len(points))
+    middles, places = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))]
     for shape, crossings in zip(phantom.n_shapes, phantom.crossings_mm(), strict=True):
-        first, middle, last = _together(points.frame, wire, shape)
+        together = shown[:, list(shape)]
+        first, middle, last = together[(together >= 0).all(axis=1)].T
         to_middle, between = (points.pixels[k] - points.pixels[first] for k in (middle, last))
         share = np.linalg.norm(to_middle, axis=1) / np.linalg.norm(between, axis=1)
         middles.append(middle)
         places.append(crossings[0] + share[:, None] * (crossings[1] - crossings[0]))
-    index = np.concatenate([np.zeros(0, dtype=np.int64), *middles])
+    index = np.concatenate(middles)
     order = np.argsort(points.frame[index], kind="stable")
-    return points[index[order]], np.concatenate([np.zeros((0, 3)), *places])[order]
+    return points[index[order]], np.concatenate(places)[order]
 
 
 def nwire_errors_mm(
@@ -131,19 +136,3 @@ def label_by_wires(
     solution = solve_wires(alone.points(world_from_sensor[alone.frame]), phantom)
     assert isinstance(solution.phantom, Wires)
     return label_by_calibration(dots, solution.phantom.geometry, solution.chain, world_from_sensor)
-
-
-def _wires(points: ImagePoints, phantom: WirePhantom) -> IntArray:
-    if points.wire is None:
-        raise InvalidInputError("points: expected the wire of each, got none")
-    if len(points) and not (int(points.wire.min()) >= 0 and int(points.wire.max()) < len(phantom)):
-        raise InvalidInputError(f"points: expected wires from 0 to {len(phantom) - 1}, got others")
-    return points.wire
-
-
-def _together(frame: IntArray, wire: IntArray, shape: tuple[int, ...]) -> list[IntArray]:
-    """Of the frames that show all wires of a shape, the numbers of the points, one array for each wire."""
-    numbers = [np.flatnonzero(wire == k) for k in shape]
-    first = [dict(zip(frame[n].tolist(), n.tolist(), strict=True)) for n in numbers]
-    common = sorted(set.intersection(*(set(found) for found in first)))
-    return [np.array([found[f] for f in common], dtype=np.int64) for found in first]

@@ -208,7 +208,7 @@ def figure_report(solution: Solution, calibration: Calibration, shots: Sequence[
     drawn = motion.scatter(tilt[used], roll[used], c=yaw[used], s=6)
     figure.colorbar(drawn, ax=motion, label="yaw / deg")
     motion.set(xlabel="tilt / deg", ylabel="roll / deg")
-    motion.set_title("\n".join(["how the probe was turned", *filter(None, [solution.assumed])]), fontsize=9)
+    motion.set_title(f"how the probe was turned\n{fill(solution.assumed, 60)}".strip(), fontsize=9)
     for axes in panels[1]:
         axes.grid(alpha=0.3)
     figure.suptitle(fill(calibration.verdict, 150), fontsize=9)

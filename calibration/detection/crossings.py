@@ -16,7 +16,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +27,6 @@ from calibration.detection.region import checked_pixel, region_mask, seen_in_fra
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.extras import extra_module
-from speckle3d.core.geometry import require_finite
 from speckle3d.core.sweep import Frames
 
 _ORIENTATIONS = 16
@@ -103,13 +101,11 @@ def standing_still(frames: Frames) -> Float32Array | None:
 
 
 def _crossings(
-    image: npt.NDArray[Any],
+    grey: Float32Array,
     pixel_mm: FloatArray,
     inside: BoolArray | None,
     standing: Float32Array | None,
 ) -> tuple[FloatArray, FloatArray]:
-    grey = np.asarray(image, dtype=np.float32)
-    require_finite(grey, "image")
     if standing is not None:
         grey = grey - standing
     if inside is not None:
@@ -125,7 +121,7 @@ def _crossings(
         scores.append(response[tuple(peaks.T)])
     pixels, score = np.concatenate(places), np.concatenate(scores)
     if inside is not None:
-        column, row = np.minimum(np.rint(pixels).astype(int), np.array(image.shape) - 1).T
+        column, row = np.minimum(np.rint(pixels).astype(int), np.array(grey.shape) - 1).T
         pixels, score = pixels[inside[column, row]], score[inside[column, row]]
     kept: list[int] = []
     for one in np.argsort(-score, kind="stable"):

@@ -8,7 +8,6 @@ above half of its peak.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +17,6 @@ from calibration.detection.region import checked_pixel, region_mask, seen_in_fra
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.extras import extra_module
-from speckle3d.core.geometry import require_finite
 from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.sweep import Frames
 
@@ -71,10 +69,8 @@ def dots_in_frames(
 
 
 def _dots(
-    image: npt.NDArray[Any], pixel_mm: FloatArray, inside: BoolArray | None
+    grey: Float32Array, pixel_mm: FloatArray, inside: BoolArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    grey = np.asarray(image, dtype=np.float32)
-    require_finite(grey, "image")
     contrast = ndimage.gaussian_filter(grey, _DOT_MM / pixel_mm)
     contrast -= ndimage.gaussian_filter(grey, _SURROUND_MM / pixel_mm, truncate=3.0)
     limit = _limit(contrast if inside is None else contrast[inside])

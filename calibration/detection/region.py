@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +13,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from calibration.points import Seen
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.geometry import require_finite
 from speckle3d.core.region import polygon_mask
 from speckle3d.core.sweep import Frames
 
@@ -153,7 +153,7 @@ def checked_pixel(pixel_mm: npt.ArrayLike) -> FloatArray:
 
 def seen_in_frames(
     frames: Frames,
-    find: Callable[[npt.NDArray[Any]], tuple[FloatArray, FloatArray]],
+    find: Callable[[Float32Array], tuple[FloatArray, FloatArray]],
     nothing: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> Seen:
@@ -172,7 +172,9 @@ def seen_in_frames(
     count, pixels, scores = frames.shape[0], [np.zeros((0, 2))], [np.zeros(0)]
     for index in range(count):
         with naming(f"frame {index}"):
-            places, score = find(np.asarray(frames[index]))
+            grey = np.asarray(frames[index], dtype=np.float32)
+            require_finite(grey, "image")
+            places, score = find(grey)
         pixels.append(places)
         scores.append(score)
         if progress:
