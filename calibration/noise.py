@@ -34,9 +34,9 @@ from speckle3d.kernels.wander import innovations
 if TYPE_CHECKING:
     from calibration.plane import Chain, Equations, PixelPrior
 
-WANDER = (0.3, 0.7, 1.6, 3.6, 8.0)
+WANDER = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Sizes tried: root mean square effect of the wandering error over the white noise of a residual."""
-JITTER = (0.0, 1.0, 3.0)
+JITTER = (0.0, 0.5, 1.5)
 """Sizes tried of the error that is new in every frame and moves all its residuals together."""
 STEADY = 0.5
 """Probability, before anything is measured, that nothing wanders."""
@@ -44,7 +44,7 @@ PROPORTIONS_MM = (1.0, 4.0)
 """Errors of position over errors of rotation tried, mm per degree: trackers are specified at 0.25 mm with 0.5
 degrees to 0.8 mm with 0.15 (TR 303, section 4.2)."""
 
-_TIMES = 3
+_TIMES = 4
 _SHORTEST, _LONGEST = 4.0, 2.0
 """Time constants tried: from four frames, of which fewer look like white noise, to twice the recording, which
 looks like a straight line."""

@@ -66,7 +66,7 @@ def estimate_offset(
             f"expected readings from {search_s:g} s before to {search_s:g} s after some frames, to tell the "
             "clock, got none"
         )
-    points_at = _Reader(points[there], readings).at
+    points_at = _reader(points[there], readings)
     tried = delays_around(around_s, search_s, STEP_S)
     some = [points_at(float(offset)).of_some_frames(SOME_FRAMES) for offset in tried]
     misfit = np.array([_misfit(calibrate, one) for one in some]) ** 2
@@ -96,21 +96,16 @@ def with_uncertain_offset(
     """Return a solution whose covariance includes that of the clock offset it was made with."""
     there = covered(readings, solution.points.times, seconds, _DERIVATIVE_S)
     shown = replace(solution, points=solution.points[there], used=solution.used[there])
-    _, joint = _joint_fit(shown, _Reader(shown.points, readings).at, seconds)
+    _, joint = _joint_fit(shown, _reader(shown.points, readings), seconds)
     along, variance = joint[:-1, -1], joint[-1, -1]
     return replace(solution, covariance=solution.covariance + np.outer(along, along) / variance)
 
 
-class _Reader:
+def _reader(points: ImagePoints, readings: TimedPoses | TimedRotations) -> Callable[[float], ImagePoints]:
     """Points with the sensor read at another offset, each time of a frame once."""
-
-    def __init__(self, points: ImagePoints, readings: TimedPoses | TimedRotations) -> None:
-        self._points, self._readings = points, SmoothReadings(readings)
-        self._times, self._of_point = np.unique(points.times, return_inverse=True)
-
-    def at(self, seconds: float) -> ImagePoints:
-        poses = self._readings.at(self._times - seconds)
-        return replace(self._points, world_from_sensor=poses[self._of_point])
+    smooth = SmoothReadings(readings)
+    times, of_point = np.unique(points.times, return_inverse=True)
+    return lambda seconds: replace(points, world_from_sensor=smooth.at(times - seconds)[of_point])
 
 
 def _joint_fit(

@@ -118,7 +118,7 @@ class Comparison:
             np.empty((size, PARAMETERS)),
         )
         world_from_sample = np.ascontiguousarray((sample.sensor_matrices @ matrix)[:, :3])
-        source_from_world = _inverted(source.sensor_matrices @ matrix)
+        source_from_world = np.ascontiguousarray(np.linalg.inv(source.sensor_matrices @ matrix)[:, :3])
         compare_patches(
             PlacedImages(sample.images, world_from_sample, sample.pixels),
             PlacedImages(source.images, source_from_world, source.pixels),
@@ -287,11 +287,3 @@ def frame_spacing(stack: Stack, sensor_from_image: RigidTransform) -> float:
     """Mean distance between neighbouring images along their normals, mm."""
     way = stack.travelled(sensor_from_image)
     return float(way[-1] / max(len(way) - 1, 1))
-
-
-def _inverted(matrices: FloatArray) -> FloatArray:
-    """Inverse of rigid matrices, shape (n, 4, 4) to (n, 3, 4)."""
-    out = np.empty((len(matrices), 3, 4))
-    out[:, :, :3] = np.swapaxes(matrices[:, :3, :3], 1, 2)
-    out[:, :, 3] = -np.einsum("nij,nj->ni", out[:, :, :3], matrices[:, :3, 3])
-    return out
