@@ -29,9 +29,9 @@ _SMALLEST_SIGMA = 1e-7
 """Residuals of exact data are rounding; nothing in them is an outlier."""
 _FREE_ROUNDS, _MOST_ROUNDS = 5, 30
 """After so many rounds frames may be left out but not taken back, so that the rounds end."""
-_RUNAWAY, _RESIZED = 1.25, 0.1
-"""A fit with wandering errors that makes residuals a quarter larger or changes pixel sizes by a tenth has run
-away along what the motion leaves open."""
+_RUNAWAY, _RESIZED = 2.0, 0.1
+"""A fit with wandering errors that doubles the residuals or changes pixel sizes by a tenth has run away along
+what the motion leaves open."""
 _CUT = 3.0
 """Residuals count up to so many standard deviations where answers are compared."""
 _APART_RAD, _APART = np.deg2rad(5.0), 0.1
