@@ -90,10 +90,8 @@ def read_curves(path: PathLike) -> DecorrelationCurves:
     'echo'
     """
     with opened(path, FORMAT, (1, 2)) as file, naming(str(path)):
-        kind = read_text(file, "signal")
-        if kind not in ("rf", "bmode"):
-            raise InvalidInputError(f"attribute signal: expected 'rf' or 'bmode', got {kind!r}")
-        key = read_record(file, CurveKey, signal=read_signal(file, kind))
+        signal = read_signal(file, read_text(file, "signal"))
+        key = read_record(file, CurveKey, signal=signal)
         curves = read_record(file, DecorrelationCurves, key=key)
         require_finite(curves.depth_mm, "/depth_mm")
         if not curves.depth_mm.size or (np.diff(curves.depth_mm) <= 0).any():

@@ -134,14 +134,12 @@ def read_states(path: PathLike, volume: Volume) -> ByteArray:
         If it holds no states, or not those of a volume of this shape and place.
     """
     states = read_volume(path)
-    if states.voxels.dtype != np.uint8 or states.shape != volume.shape:
-        wanted = " x ".join(str(n) for n in volume.shape)
-        raise InvalidInputError(
-            f"{path}: expected states on the volume's grid, uint8 of {wanted} voxels, got "
-            f"{states.voxels.dtype} of {' x '.join(str(n) for n in states.shape)}"
-        )
-    if not np.allclose(states.world_from_index, volume.world_from_index, atol=_SAME_PLACE_MM):
-        raise InvalidInputError(f"{path}: expected states on the volume's grid, got some of another place")
+    is_there = states.shape == volume.shape and np.allclose(
+        states.world_from_index, volume.world_from_index, atol=_SAME_PLACE_MM
+    )
+    if states.voxels.dtype != np.uint8 or not is_there:
+        got = f"{states.voxels.dtype}, shape {states.shape}{'' if is_there else ', elsewhere'}"
+        raise InvalidInputError(f"{path}: expected states (uint8) on the volume's {volume.shape}, got {got}")
     return states.voxels
 
 
