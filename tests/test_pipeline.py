@@ -140,7 +140,7 @@ def test_a_spoilt_frame_is_placed_between_its_neighbours_and_not_trusted(sweep, 
 
 def test_curves_of_intensity_do_not_serve_echoes(sweep, curves):
     config = Config.model_validate({"matching": {"correlate": "intensity"}})
-    with pytest.raises(MismatchError, match="echo and intensity"):
+    with pytest.raises(MismatchError, match="correlation_of"):
         track(sweep, curves, config)
 
 
