@@ -55,7 +55,7 @@ class Texture:
         if echo.analytic is not None:
             self._powers[frame] = np.where(kept, _patch_powers(echo.analytic, self._patches), np.nan)
         elif usable is not None and usable.any():
-            tiles = self._patches.tiles(echo.intensity)[usable].reshape(int(usable.sum()), -1)
+            tiles = self._patches.tiles(echo.intensity, 4)[usable].reshape(int(usable.sum()), -1)
             self._levels[frame] = np.log(np.percentile(tiles, (10, 50, 90), axis=1))
 
     def speckle_size(self, usable: BoolArray | None = None) -> SpeckleSize:
