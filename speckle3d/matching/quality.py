@@ -164,7 +164,7 @@ def inspect_frame(
     usable, spread = echo & together & inside, np.full(len(patches), np.nan)
     if is_bmode:
         grey = np.empty_like(statistics)
-        patch_statistics(np.asarray(frame, dtype=np.float32), patches.first, patches.size, 2 * step, grey)
+        patch_statistics(np.asarray(frame, dtype=np.float32), patches.first, patches.size, 4 * step, grey)
         with np.errstate(divide="ignore", invalid="ignore"):  # Black patches have none.
             spread = np.log(grey[:, 0] * grey[:, 1])
     return FrameFeatures(
