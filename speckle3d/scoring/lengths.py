@@ -265,7 +265,7 @@ def jitter_mm(length_mm: FloatArray) -> float:
     """
     if length_mm.size < 8:
         return np.nan
-    return robust_sigma(np.diff(length_mm, 3)) / float(np.sqrt(1 + 9 + 9 + 1))
+    return robust_sigma(np.diff(length_mm, 3)) / 20**0.5
 
 
 def _width(size: int, end_frames: int) -> int:

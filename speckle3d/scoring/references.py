@@ -14,7 +14,6 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
-from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 from speckle3d.scoring.lengths import (
     END_FRAMES,
@@ -31,7 +30,6 @@ _UNITS = np.array([[1.0], *[[180.0 / np.pi]] * 3])
 """mm per mm and degrees per radian, of length and three turns."""
 
 
-@shown
 @dataclass(frozen=True)
 class Reference:
     """Poses that modes are compared with.
@@ -61,7 +59,6 @@ class Reference:
         return END_FRAMES if self.name == TRACKER else 1
 
 
-@shown
 @dataclass(frozen=True)
 class SweepCurves:
     """Accumulated length (mm), tilt, yaw and roll (degrees) over the frames.
@@ -173,8 +170,6 @@ def error_rows(
     """
     others = {mode: each for mode, each in poses.items() if reference is None or mode != reference.name}
     frames = len(next(iter(poses.values())))
-    if frames < 2:
-        return []
     if reference is None or not others:
         return [
             ModeError("all", mode, frames, estimate_mm=abs(travelled_mm(mode, each, centre_mm)))

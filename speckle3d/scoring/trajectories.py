@@ -171,8 +171,9 @@ def compare_trajectories(estimate: Trajectory, reference: Trajectory) -> dict[st
     times = _snapped(estimate.time_s, reference.time_s)
     shared = stream.covers(times)
     if (common := int(shared.sum())) < 2:
-        both = f"{estimate.name} and {reference.name}"
-        raise MismatchError(f"{both}: expected at least 2 times that both have, got {common}")
+        raise MismatchError(
+            f"{estimate.name} and {reference.name}: expected 2 times or more that both have, got {common}"
+        )
     estimated, true = estimate.poses[shared], stream.at(times[shared])
     whole = bool(shared.all()) and len(true) == len(reference.poses)
     marks = reference.landmarks if whole else None
