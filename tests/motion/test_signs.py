@@ -182,6 +182,6 @@ def wobbled(seed, told):
 
 
 def test_frames_that_do_not_resemble_each_other_are_apart():
-    seeds = (21, 28, 31)
+    seeds = (2, 3, 4)
     assert sum(wobbled(seed, told=True) for seed in seeds) == 0
     assert sum(wobbled(seed, told=False) for seed in seeds) > 10
