@@ -1,7 +1,5 @@
 """Scans of phantoms as geometry makes them: where a probe was, and what it would see. No solver's code."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,11 +35,11 @@ class PlaneScan:
     normal_in_image: np.ndarray
 
 
-def about(axis: int, angles_rad: np.ndarray) -> Rotation:
+def about(axis, angles_rad):
     return Rotation.from_rotvec(np.outer(angles_rad, np.eye(3)[axis]))
 
 
-def hand_turns(rng, count, tilt_deg=25.0, roll_deg=11.0, yaw_deg=90.0) -> Rotation:
+def hand_turns(rng, count, tilt_deg=25.0, roll_deg=11.0, yaw_deg=90.0):
     """Orientations of the image about one that looks straight down, uniform in each angle."""
     tilt, roll, yaw = (
         np.deg2rad(rng.uniform(-r, r, count) if r else np.zeros(count)) for r in (tilt_deg, roll_deg, yaw_deg)
@@ -50,18 +48,18 @@ def hand_turns(rng, count, tilt_deg=25.0, roll_deg=11.0, yaw_deg=90.0) -> Rotati
 
 
 def scan_plane(
-    rng: np.random.Generator,
-    count: int = 697,
+    rng,
+    count=697,
     *,
-    tilt_deg: float = 25.0,
-    roll_deg: float = 11.0,
-    yaw_deg: float = 90.0,
-    depth_mm: tuple[float, float] = (12.0, 34.0),
-    beam_mm: float = 0.0,
-    line_noise_mm: float = 0.0,
-    sensor_from_image: RigidTransform = TRIAL_1,
-    floor: RigidTransform | None = None,
-) -> PlaneScan:
+    tilt_deg=25.0,
+    roll_deg=11.0,
+    yaw_deg=90.0,
+    depth_mm=(12.0, 34.0),
+    beam_mm=0.0,
+    line_noise_mm=0.0,
+    sensor_from_image=TRIAL_1,
+    floor=None,
+):
     """The recipe that reproduces TR 303's Tables 3 and 6: uniform angles and depths."""
     turn = hand_turns(rng, count, tilt_deg, roll_deg, yaw_deg)
     up = turn.inv().apply([0.0, 0.0, 1.0])
@@ -80,16 +78,16 @@ def scan_plane(
 
 
 def line_directions(
-    rng: np.random.Generator,
-    count: int = 100,
+    rng,
+    count=100,
     *,
-    noise_deg: float = 0.1,
-    sensor_noise_deg: float = 0.1,
-    heading_deg: float = 0.0,
-    from_below: bool = False,
-    mounting: Rotation | None = None,
-    **turns: float,
-) -> tuple[np.ndarray, Rotation, Rotation]:
+    noise_deg=0.1,
+    sensor_noise_deg=0.1,
+    heading_deg=0.0,
+    from_below=False,
+    mounting=None,
+    **turns,
+):
     """Directions of a plane's lines (square pixels), the sensor's readings, and the mounting."""
     mounted = Rotation.random(rng=rng) if mounting is None else mounting
     turn = hand_turns(rng, count, **({"yaw_deg": 30.0} | turns))
@@ -105,14 +103,14 @@ def line_directions(
 
 
 def scan_wires(
-    rng: np.random.Generator,
-    places_mm: np.ndarray,
+    rng,
+    places_mm,
     *,
-    sensor_from_image: RigidTransform = TRIAL_1,
-    world_from_phantom: RigidTransform | None = None,
-    noise_mm: float = 0.0,
-    **turns: float,
-) -> tuple[np.ndarray, RigidTransform]:
+    sensor_from_image=TRIAL_1,
+    world_from_phantom=None,
+    noise_mm=0.0,
+    **turns,
+):
     """Pixels at which images show points of a phantom, one to a frame, and the sensor's readings.
 
     Parameters
@@ -130,6 +128,6 @@ def scan_wires(
     return pixels, world_from_image * sensor_from_image.inv()
 
 
-def centre_of(sensor_from_image: RigidTransform, pixel_mm: np.ndarray) -> np.ndarray:
+def centre_of(sensor_from_image, pixel_mm):
     """The image's centre in the sensor's frame, mm; the image is as high as it is wide."""
     return sensor_from_image.apply(np.append(COLUMNS / 2 * pixel_mm, 0.0))

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
-def realdata() -> Path:
+def realdata():
     """Folder of third-party recordings, beside the project."""
     folder = ROOT.parent / "shared" / "realdata"
     if not folder.is_dir():
@@ -29,19 +29,19 @@ def realdata() -> Path:
 
 
 @pytest.fixture(scope="session")
-def project() -> Path:
+def project():
     """The project's folder."""
     return ROOT
 
 
 @pytest.fixture(scope="session")
-def shipped() -> Path:
+def shipped():
     """Folder of the sweep and the curves that come with the project."""
     return ROOT / "data"
 
 
 @pytest.fixture(scope="session")
-def back(tmp_path_factory) -> Path:
+def back(tmp_path_factory):
     """File of simulated tissue passed forward and back at 10 mm/s, 25 frames/s; nothing may change it."""
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings, simulate
@@ -58,7 +58,7 @@ def back(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def small_sweeps(tmp_path_factory, shipped) -> Path:
+def small_sweeps(tmp_path_factory, shipped):
     """Folder of s5.h5 and s6.h5, simulated tissue of 24 frames, and the curves for them."""
     from speckle3d.io.sweep_writer import write_sweep
     from speckle3d.simulation.presets import SimulationSettings, simulate
@@ -101,7 +101,7 @@ def many_threads(monkeypatch):
 def python():
     """Run a few lines in a fresh interpreter and return what it prints."""
 
-    def run(code: str) -> str:
+    def run(code):
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
         return done.stdout

@@ -1,7 +1,5 @@
 """Hand-like sweeps, their drifting image-based reconstruction, and a jittery tracker: poses only."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 

@@ -4,8 +4,6 @@ The errors are not those that the fusion assumes: the scale changes smoothly alo
 errors of their frames.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +40,7 @@ class Scene:
     orientation: OrientationSensor
     tracker: Tracker
 
-    def given(self) -> tuple[object, ...]:
+    def given(self):
         """First arguments of `fuse`."""
         return (
             self.edges,
@@ -57,13 +55,13 @@ class Scene:
 
 
 def scene(
-    seed: int,
-    frames: int = 60,
-    length_mm: float = 5.0,
-    scale_sigma: float = 0.03,
-    motion: HandMotion | None = None,
-    noise: float = 1.0,
-) -> Scene:
+    seed,
+    frames=60,
+    length_mm=5.0,
+    scale_sigma=0.03,
+    motion=None,
+    noise=1.0,
+):
     """A sweep of a hand at 25 frames/s, with a tracker and an orientation sensor."""
     rng = np.random.default_rng(seed)
     seconds = frames / 25.0
@@ -91,7 +89,7 @@ def scene(
     )
 
 
-def _edges(truth: RigidTransform, scale_sigma: float, rng: np.random.Generator) -> RelativePoses:
+def _edges(truth, scale_sigma, rng):
     centre = RigidTransform.from_translation(CENTRE_MM)
     about = centre.inv() * (truth[0].inv() * truth) * centre
     z = about.translation[:, 2]
@@ -123,7 +121,7 @@ def _edges(truth: RigidTransform, scale_sigma: float, rng: np.random.Generator) 
     )
 
 
-def errors(poses: RigidTransform, truth: RigidTransform) -> FloatArray:
+def errors(poses, truth):
     """(x, y, z, tilt, yaw, roll) of the last frame against the first, mm and rad."""
     found, true = poses[0].inv() * poses[-1], truth[0].inv() * truth[-1]
     turn = (found.rotation * true.rotation.inv()).as_rotvec()

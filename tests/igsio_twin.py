@@ -11,8 +11,6 @@ What it does otherwise than the definition of a mean:
 - Nearest: from the 256th pixel on, the mean moves 1/256 of the way to each, cut to whole levels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

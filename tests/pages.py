@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -15,18 +14,18 @@ _TIMEOUT_S = 1800
 _LEFT_OUT = ("pip ", "python -m pytest")
 
 
-def blocks(page: Path) -> list[tuple[str, str]]:
+def blocks(page):
     """Language and text of all fenced blocks of a page in order."""
     return _FENCE.findall(page.read_text())
 
 
-def shown_commands(page: Path) -> list[str]:
+def shown_commands(page):
     """Command lines behind a `$` in blocks that are shown, continued lines joined."""
     shown = "".join(text for language, text in blocks(page) if language == "console")
     return [line[2:] for line in shown.replace("\\\n", " ").splitlines() if line.startswith("$ ")]
 
 
-def run_page(page: Path, folder: Path) -> str:
+def run_page(page, folder):
     """Run a page's sh and python blocks in order, in a folder with `data` alone; return what they print.
 
     Installing is left out, as the tests run installed; so is the command that runs the tests.
@@ -34,7 +33,7 @@ def run_page(page: Path, folder: Path) -> str:
     return "".join(printed for language, _, printed in ran(page, folder) if language in ("sh", "python"))
 
 
-def ran(page: Path, folder: Path) -> Iterator[tuple[str, str, str]]:
+def ran(page, folder):
     """Language and text of each block of a page, and what it printed when it was run as `run_page` does."""
     (folder / "data").symlink_to(ROOT / "data")
     command = folder.parent / f"{folder.name}-bin"
@@ -69,7 +68,7 @@ def ran(page: Path, folder: Path) -> Iterator[tuple[str, str, str]]:
         yield language, text, done.stdout
 
 
-def _after(before: list[str], text: str) -> str:
+def _after(before, text):
     if not before:
         return text
     quiet = "\n".join(before)
@@ -78,7 +77,7 @@ def _after(before: list[str], text: str) -> str:
     )
 
 
-def _without_installing(text: str) -> str:
+def _without_installing(text):
     kept = []
     for line in text.splitlines():
         parts = [part for part in line.split(" && ") if not part.lstrip().startswith(_LEFT_OUT)]
@@ -86,7 +85,7 @@ def _without_installing(text: str) -> str:
     return "\n".join(kept)
 
 
-def run_tutorial(name: str, tmp_path: Path) -> tuple[Path, str]:
+def run_tutorial(name, tmp_path):
     """Run a tutorial in an empty folder; return the folder and what it printed."""
     folder = tmp_path / "empty"
     folder.mkdir()

@@ -102,10 +102,3 @@ def test_the_readmes_test_command_is_what_ci_runs(project):
     ci = (project / ".ci" / "run").read_text(encoding="utf-8")
     (command,) = re.findall(r"^pip install .*python -m pytest.*$", readme, re.MULTILINE)
     assert command in ci.replace(" --quiet", "")
-
-
-def test_every_shipped_file_is_small_and_its_making_told(project):
-    files = [path for path in (project / "data").iterdir() if path.is_file()]
-    told = (project / "data" / "README.md").read_text(encoding="utf-8")
-    assert sum(path.stat().st_size for path in files) < 40e6
-    assert all(f"`{path.name}`" in told for path in files if path.name != "README.md")

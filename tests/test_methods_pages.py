@@ -1,7 +1,5 @@
 """The pages of methods name what is there: settings with their defaults, modules, limits and sources."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -16,7 +14,7 @@ SETTINGS = Config().model_dump()
 named_page = pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 
 
-def settings_in(text: str) -> list[tuple[str, str, str]]:
+def settings_in(text):
     """Group and name of each setting in a page, and the number in parentheses behind it, if any."""
     found = re.findall(
         r"([a-z]+)\.([a-z_]+)\b(?:`|\})(?:\s(?:\(|\| )([-\d.]+)(?=[\s),;]))?", text.replace("\\_", "_")
@@ -27,7 +25,7 @@ def settings_in(text: str) -> list[tuple[str, str, str]]:
 
 
 @named_page
-def test_settings_of_a_page_exist_with_the_defaults_it_gives(page: Path) -> None:
+def test_settings_of_a_page_exist_with_the_defaults_it_gives(page):
     for group, name, value in settings_in(page.read_text()):
         assert name in SETTINGS[group], f"{page.name}: {group}.{name}"
         default = SETTINGS[group][name]
@@ -37,7 +35,7 @@ def test_settings_of_a_page_exist_with_the_defaults_it_gives(page: Path) -> None
 
 
 @named_page
-def test_modules_that_a_page_names_exist(page: Path) -> None:
+def test_modules_that_a_page_names_exist(page):
     text = page.read_text()
     for path in re.findall(r"`((?:speckle3d|calibration|xsens)/[\w/]+(?:\.py)?)`", text):
         assert (ROOT / path).exists(), f"{page.name}: {path}"

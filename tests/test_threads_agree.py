@@ -8,10 +8,10 @@ import pytest
 
 from speckle3d.core import threads
 from speckle3d.corrections import correct
-from speckle3d.pipeline import Tracked, track
+from speckle3d.pipeline import track
 
 
-def poses_of(tracked: Tracked, sweep) -> dict[str, np.ndarray]:
+def poses_of(tracked, sweep):
     corrected = correct(tracked, sweep, ["orientation", "pose"])
     return {
         "image": tracked.image.as_matrix(),

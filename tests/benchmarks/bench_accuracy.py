@@ -25,15 +25,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from cache import DEFAULT, simulated
-from scipy.spatial.transform import RigidTransform
+from options import parsed
 
 from speckle3d.config import Config
-from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.reconstruction import FramePairs
 from speckle3d.core.relative import RelativePoses
-from speckle3d.core.sweep import Sweep
 from speckle3d.corrections import correct
+from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.motion import estimate
 from speckle3d.motion.coherence import Coherence
@@ -46,6 +45,7 @@ from speckle3d.scoring.lengths import accumulated, compare_modes
 from speckle3d.simulation.presets import SimulationSettings
 
 FIRST_SEED = 1001
+SHIPPED = Path(__file__).resolve().parents[2] / "data" / "curves.h5"
 VECTORS = 48
 STEPPED = {"preset": "stepped", "vectors": VECTORS, "steps": 27, "step_mm": 0.06, "blocks": 6}
 TURNING = {"preset": "rotation", "vectors": VECTORS}
@@ -134,7 +134,7 @@ class Result:
     standard_patches: np.ndarray
 
 
-def align_sign(poses: RigidTransform, truth: RigidTransform, centre_mm: np.ndarray) -> RigidTransform:
+def align_sign(poses, truth, centre_mm):
     """Mirror a sensorless reconstruction that moves the other way than the truth.
 
     Images alone cannot tell a sweep from its mirror image in the first frame's plane, (z, tilt, yaw) ->
@@ -146,19 +146,19 @@ def align_sign(poses: RigidTransform, truth: RigidTransform, centre_mm: np.ndarr
     return poses[0] * mirrored(poses[0].inv() * poses)
 
 
-def of_phantom(problem, *_others) -> Coherence:
+def of_phantom(problem, *_others):
     """Fully developed speckle, whatever the sweep shows."""
     return Coherence(np.zeros(1), *fully_developed(len(problem.patches)))
 
 
-def chained(pairs: RelativePoses, *others, **named):
+def chained(pairs, *others, **named):
     """Trajectory from each frame's surest pair alone."""
     _, best = np.unique(pairs.second[order := np.argsort(pairs.covariance[:, 2, 2])], return_index=True)
     columns = (pairs.first, pairs.second, pairs.poses, pairs.covariance)
     return solve_trajectory(RelativePoses(*(column[order[best]] for column in columns)), *others, **named)
 
 
-def measure(case: Case, method: str, seed: int, curves: DecorrelationCurves, folder: Path) -> Result:
+def measure(case, method, seed, curves, folder):
     """Reconstruct and score one sweep of a case."""
     sweep = load_sweep(simulated(_settings({"preset": case.preset, "seed": seed, **case.options}), folder))
     config = Config.model_validate(METHODS[method])
@@ -188,11 +188,11 @@ def measure(case: Case, method: str, seed: int, curves: DecorrelationCurves, fol
     )
 
 
-def _settings(options: Mapping[str, object]) -> SimulationSettings:
+def _settings(options):
     return SimulationSettings.model_validate({"vectors": VECTORS, **options})
 
 
-def _direction_without_tracker(sweep: Sweep, image: RigidTransform, config: Config) -> str:
+def _direction_without_tracker(sweep, image, config):
     """Whether a sweep without a tracker would have got its sign right; `image` has the true one."""
     alone = replace(sweep, tracker=None, truth=None)
     sign, source = settle_direction(alone, image, config.sensors)
@@ -203,7 +203,7 @@ def _direction_without_tracker(sweep: Sweep, image: RigidTransform, config: Conf
     return "right" if sign > 0 else "wrong"
 
 
-def _standard_poses(sweep: Sweep, image: RigidTransform, covariance: np.ndarray) -> np.ndarray:
+def _standard_poses(sweep, image, covariance):
     """Errors of every eighth pose over their deviations, shape (m, 6)."""
     centre, true = sweep.grid.centre_mm, sweep.truth[0].inv() * sweep.truth
     turned = (image.rotation * true.rotation.inv()).as_rotvec()
@@ -211,7 +211,7 @@ def _standard_poses(sweep: Sweep, image: RigidTransform, covariance: np.ndarray)
     return (error[8::8] / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[8::8])).astype(np.float32)
 
 
-def _standard_patches(sweep: Sweep, pairs: FramePairs) -> np.ndarray:
+def _standard_patches(sweep, pairs):
     """Errors of the distances of patches over their deviations."""
     found = []
     for i, j, pose, d, sigma in zip(
@@ -224,13 +224,13 @@ def _standard_patches(sweep: Sweep, pairs: FramePairs) -> np.ndarray:
     return values[np.isfinite(values)].astype(np.float32)
 
 
-def curves_of(folder: Path, method: str = "ours") -> DecorrelationCurves:
+def curves_of(folder, method="ours"):
     """Curves of the default probe, as data/README.md makes them."""
     sweeps = [load_sweep(simulated(_settings(options), folder)) for options in CURVE_SWEEPS]
     return calibrate_curves(sweeps, Config.model_validate(METHODS[method]))
 
 
-def report(case: Case, results: list[Result]) -> None:
+def report(case, results):
     """Print the table of one case, a row for each mode and method."""
     print(f"\n{case.name}: {len(results) // len(case.methods)} sweeps of {VECTORS} vectors")
     print(f"  {'':29}{'length error %':>29} {'tilt error deg':>29} {'yaw deg':>9}")
@@ -257,7 +257,7 @@ def report(case: Case, results: list[Result]) -> None:
     _report_coverage([r for r in results if r.method == "ours"])
 
 
-def _report_coverage(results: list[Result]) -> None:
+def _report_coverage(results):
     """Share of errors within the claimed 68 % and 95 % intervals."""
     patches = np.concatenate([r.standard_patches for r in results])
     poses = np.concatenate([r.standard_poses for r in results])
@@ -266,12 +266,12 @@ def _report_coverage(results: list[Result]) -> None:
     print(f"  within 68 / 95 % intervals: {', '.join(cells)}; all of the pose {_coverage(poses.ravel())}")
 
 
-def _coverage(standard: np.ndarray) -> str:
+def _coverage(standard):
     inside = [100 * np.mean(np.abs(standard) < limit) for limit in (1.0, 1.96)]
     return f"{inside[0]:.0f} / {inside[1]:.0f}"
 
 
-def _column(values: list[tuple[float, int]], goal: float | None) -> str:
+def _column(values, goal):
     """A cell of median, worst, its seed, and the target (on the median)."""
     median = float(np.median([v for v, _ in values]))
     worst, seed = max(values)
@@ -279,22 +279,27 @@ def _column(values: list[tuple[float, int]], goal: float | None) -> str:
     return f"{median:.2f} {worst:7.2f} ({seed}) {target:>7}"
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=8, help="how many")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="the first of them")
     parser.add_argument("--workers", type=int, default=2, help="sweeps at a time, a process each")
     parser.add_argument("--case", default="", help="only cases whose name holds this")
     parser.add_argument("--cache", type=Path, default=DEFAULT)
-    options = parser.parse_args()
+    options = parsed(parser, seeds=1, case="tissue, 8 mm")
     began = time.perf_counter()
     # What only reads a sweep differently shares the curves of ours.
-    curves = {method: curves_of(options.cache, method) for method in ("ours", "plain")}
+    cases = [case for case in CASES if options.case in case.name]
+    if options.quick:
+        curves = {"ours": read_curves(SHIPPED)}
+        cases = [replace(case, methods=("ours",)) for case in cases]
+    else:
+        curves = {method: curves_of(options.cache, method) for method in ("ours", "plain")}
     seeds = range(options.first, options.first + options.seeds)
     print(f"seeds {seeds[0]} to {seeds[-1]}; curves from other sweeps, of seeds 11 to 16")
     # Spawned, not forked: numba's threads do not survive a fork.
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        for case in [c for c in CASES if options.case in c.name]:
+        for case in cases:
             waiting = [
                 pool.submit(measure, case, method, seed, curves.get(method, curves["ours"]), options.cache)
                 for method in case.methods

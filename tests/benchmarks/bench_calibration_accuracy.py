@@ -12,6 +12,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from options import parsed
 
 from calibration.detection.lines import detect_lines
 from calibration.recording import Recording
@@ -92,7 +93,7 @@ def main():
     parser.add_argument("--trials", type=int, default=25)
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--reflector", choices=["bar", "wall"], action="append")
-    options = parser.parse_args()
+    options = parsed(parser, trials=2, frames=40, reflector=["bar"])
     for reflector in options.reflector or ["bar", "wall"]:
         print(
             f"{reflector}, {options.trials} scans of {options.frames} frames (published sd 0.08, 1.10, 1.50):"

@@ -10,7 +10,6 @@ of the stages there, is halved and doubled in turn; printed are those that move 
 import argparse
 import importlib
 import pkgutil
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -28,7 +27,7 @@ NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
 """Modules of curves, which change no estimate."""
 
 
-def module_constants() -> Iterator[tuple[object, str, object]]:
+def module_constants():
     """Module, name and value of every numeric constant."""
     for info in pkgutil.iter_modules(speckle3d.motion.__path__):
         if info.name in NOT_OF_THE_PATH:
@@ -40,7 +39,7 @@ def module_constants() -> Iterator[tuple[object, str, object]]:
                 yield module, name, value
 
 
-def settings() -> Iterator[tuple[str, str, float]]:
+def settings():
     """Stage, name and value of every numeric setting."""
     for stage in STAGES:
         for name, value in getattr(Config(), stage):
@@ -49,7 +48,7 @@ def settings() -> Iterator[tuple[str, str, float]]:
 
 
 @contextmanager
-def changed(module: object, name: str, value: object, factor: float) -> Iterator[None]:
+def changed(module, name, value, factor):
     """Multiply a constant where it stands and wherever it was imported."""
     new = type(value)(v * factor for v in value) if isinstance(value, tuple) else type(value)(value * factor)
     holders = [
@@ -66,7 +65,7 @@ def changed(module: object, name: str, value: object, factor: float) -> Iterator
             setattr(holder, name, value)
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sweeps", nargs="+", type=Path)
     parser.add_argument("--curves", type=Path, required=True)
@@ -74,7 +73,7 @@ def main() -> None:
     chosen = parser.parse_args()
     sweeps, curves = [load_sweep(path) for path in chosen.sweeps], read_curves(chosen.curves)
 
-    def lengths(config: Config) -> np.ndarray:
+    def lengths(config):
         """Travel along the normal of every sweep; NaN where it is refused."""
         every = []
         for sweep in sweeps:

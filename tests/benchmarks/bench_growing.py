@@ -6,8 +6,6 @@ are; SIGKILL at a time drawn evenly from zero to `LONGEST_S`. Then the sweep mus
 frames that were told of, and each of its frames and readings must be the one that was written.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

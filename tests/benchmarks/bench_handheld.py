@@ -6,8 +6,6 @@ The scanner's packages are made of simulated scans of a bath's floor: I/Q, packe
 command `speckle3d calibrate orientation` sees nothing but the package.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import sys
@@ -19,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 from commands import run_command
 from handheld import PITCH_MM, write_handheld
+from options import parsed
 from scipy.spatial.transform import Rotation
 
 from speckle3d.io.calibrations import read_calibration
@@ -27,7 +26,7 @@ from speckle3d.simulation.presets import SimulationSettings, simulate
 GIVEN = f"vector_pitch_mm = {PITCH_MM}\nbandwidth_hz = [5e6, 10e6]\n"
 
 
-def mounting(folder: Path, seed: int, reflector: str, frames: int) -> tuple[np.ndarray, np.ndarray]:
+def mounting(folder, seed, reflector, frames):
     """Errors about the image's x, y, z and what is claimed of them, degrees."""
     settings = SimulationSettings(
         preset="plane",
@@ -50,14 +49,14 @@ def mounting(folder: Path, seed: int, reflector: str, frames: int) -> tuple[np.n
     return error, np.rad2deg(np.sqrt(np.diag(found.covariance)))[:3]
 
 
-def main() -> None:
+def main():
     """Print a row for each seed and what they come to."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--reflector", default="wall", choices=("wall", "bar"))
     parser.add_argument("--frames", type=int, default=110)
-    given = parser.parse_args()
+    given = parsed(parser, seeds=1, frames=60)
     ratios, sizes = [], []
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "import.toml").write_text(GIVEN, encoding="utf-8")

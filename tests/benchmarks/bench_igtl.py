@@ -7,8 +7,6 @@ frames received and recorded, the time from due to recorded, and this process's 
 recorders: bench_growing.py.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

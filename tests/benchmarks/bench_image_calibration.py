@@ -15,6 +15,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from cache import simulated_pair
+from options import parsed
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.similarity import prepare
@@ -94,7 +95,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--starts", type=int, default=183)
     parser.add_argument("--seeds", type=int, nargs="+", default=[601])
-    given = parser.parse_args()
+    given = parsed(parser, starts=2)
     for seed in given.seeds:
         crossing = prepared(seed)
         study(crossing, 1)  # compiled, and images blurred, before any clock runs

@@ -13,16 +13,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from cache import DEFAULT
 from length import crossing, sweeps
 from length.scenes import FIRST_SEED
+from options import parsed
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("part", nargs="*", choices=("sweeps", "crossing"), help="by default both")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--seeds", type=int, default=6, help="RF sweeps of each case")
     parser.add_argument("--share", type=float, default=1.0, help="of the cheaper cases")
     parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args()
+    options = parsed(parser, part=["crossing"], share=0.01)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     parts = {
         "sweeps": lambda: sweeps.measure(seeds, DEFAULT, options.workers),
@@ -31,6 +32,8 @@ def main() -> None:
     for part in options.part or parts:
         for name, text in parts[part]():
             print(f"{name}\n    {text}", flush=True)
+            if options.quick:
+                return
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from options import parsed
 
 import speckle3d as s3
 from speckle3d.io.igtl.link import Connection, Server
@@ -61,7 +62,7 @@ def main():
     parser.add_argument("curves", type=Path)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--no-volume", action="store_true")
-    options = parser.parse_args()
+    options = parsed(parser, seconds=5.0)
     curves, sweep = s3.load_curves(options.curves), s3.load_sweep(options.sweep)
     signal = sweep.signal
     imported = ImportSettings(

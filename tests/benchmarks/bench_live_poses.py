@@ -13,6 +13,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+from options import parsed
 from scipy.spatial.transform import RigidTransform
 
 import speckle3d as s3
@@ -58,7 +59,7 @@ def main():
     parser.add_argument("curves", type=Path)
     parser.add_argument("sweeps", type=Path, nargs="+")
     parser.add_argument("--step", type=int, default=4)
-    given = parser.parse_args()
+    given = parsed(parser, step=32)
     curves = s3.load_curves(given.curves)
     print("| sweep | first given, against the frames up to it: median | most | against the whole | ", end="")
     print("that part against the whole | at the end |")

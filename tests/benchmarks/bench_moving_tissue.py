@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from options import parsed
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.pipeline import track
@@ -74,7 +75,7 @@ def main():
     parser.add_argument("--length-mm", type=float, default=6.0)
     parser.add_argument("--vectors", type=int, default=36)
     parser.add_argument("--signal", choices=("rf", "bmode"), default="rf")
-    given = parser.parse_args()
+    given = parsed(parser, seeds=1, length_mm=2.0)
     rows = {}
     for seed in range(FIRST_SEED, FIRST_SEED + given.seeds):
         settings = SimulationSettings(

@@ -24,7 +24,7 @@ from speckle3d.imaging.voxels.volume import compound, look_up_voxels
 STEP_MM = 0.25
 
 
-def at_known_poses() -> None:
+def at_known_poses():
     """Print sizes of spheres and a helix from volumes made at known poses."""
     balls = [
         Ball((5.0, 6.0, 6.0), 3.0),
@@ -55,14 +55,14 @@ def at_known_poses() -> None:
             print(f"{way:16}{body.radius_mm:6.1f} mm{of_voxels:+21.2f}{of_mesh:+9.2f}{size}")
 
 
-def _volume(way: str, images, grid: ImageGrid, poses, voxel_grid) -> Volume:
+def _volume(way, images, grid, poses, voxel_grid):
     if way != "backward":
         return compound(images, grid, poses, voxel_grid=voxel_grid, splat=way.split(",")[0])
     voxels, _ = look_up_voxels(PosedImages(images, grid, poses), voxel_grid, 0.5)
     return Volume(voxels.T, voxel_grid.spacing_mm, voxel_grid.world_from_grid)
 
 
-def _voxel_volume(volume: Volume, ball: Ball) -> float:
+def _voxel_volume(volume, ball):
     """Volume of a sphere by its voxels' grey levels, each counted by its share of the inside."""
     index = np.moveaxis(np.indices(volume.shape), 0, -1)
     near = ball.depth(volume.world_from_grid.apply(index.reshape(-1, 3) * volume.spacing_mm)) > -3 * STEP_MM

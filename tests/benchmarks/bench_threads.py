@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from bench_calibration_accuracy import recording_of
+from options import parsed
 
 from calibration.report import IMAGE_POSE
 from speckle3d.calibrating.phantoms import found, solved
@@ -38,7 +39,7 @@ def main():
     parser.add_argument("--scans", type=int, default=20)
     parser.add_argument("--vectors", type=int, default=64)
     parser.add_argument("--frames", type=int, default=90)
-    given = parser.parse_args()
+    given = parsed(parser, scans=1)
     seeds = range(FIRST_SEED, FIRST_SEED + given.scans)
     found = np.array([trial(seed, given.vectors, given.frames) for seed in seeds])
     errors, scores = found[:, 0], found[:, 0] / found[:, 1]

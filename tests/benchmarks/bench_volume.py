@@ -43,7 +43,7 @@ IGSIO = {("nearest", 1): 172, ("nearest", 2): 207, ("linear", 1): 15, ("linear",
 """Million pixels per second, with the mean, by threads: IGSIO of 2024, measured elsewhere."""
 
 
-def sweep(frames: int, length_mm: float) -> RigidTransform:
+def sweep(frames, length_mm):
     """Poses along the voxels' k axis, wavering."""
     rng = np.random.default_rng(0)
     turned = Rotation.from_rotvec(0.03 * np.sin(np.linspace(0, 9, frames))[:, None] * rng.normal(size=3))
@@ -52,7 +52,7 @@ def sweep(frames: int, length_mm: float) -> RigidTransform:
     return RigidTransform.from_components(moved, turned)
 
 
-def ours(images: np.ndarray, poses: RigidTransform, runs: int) -> list[Row]:
+def ours(images, poses, runs):
     rows = []
     for splat in ("nearest", "linear"):
 
@@ -76,7 +76,7 @@ def ours(images: np.ndarray, poses: RigidTransform, runs: int) -> list[Row]:
     return rows
 
 
-def beside_simpleitk(images: np.ndarray, poses: RigidTransform, runs: int) -> Row:
+def beside_simpleitk(images, poses, runs):
     best = timed(
         lambda: compound(images, GRID, poses, voxel_grid=VOXELS, fill_radius=0, voxel_type="uint8"), runs
     )
@@ -84,7 +84,7 @@ def beside_simpleitk(images: np.ndarray, poses: RigidTransform, runs: int) -> Ro
     return Row("nearest + mean", value, "Mpixel/s", "SimpleITK resample of a stack", peer, cores=best.cores)
 
 
-def by_simpleitk(images: np.ndarray, poses: RigidTransform) -> float:
+def by_simpleitk(images, poses):
     began = time.perf_counter()
     stack = sitk.GetImageFromArray(images)
     step = float(np.diff(poses.translation[:, 2]).mean())
@@ -95,7 +95,7 @@ def by_simpleitk(images: np.ndarray, poses: RigidTransform) -> float:
     return time.perf_counter() - began
 
 
-def filling(images: np.ndarray, poses: RigidTransform, runs: int) -> Row:
+def filling(images, poses, runs):
     """Holes of a third of the frames, a millimetre apart and more."""
     volume = compound(images[::5], GRID, poses[::5], voxel_grid=VOXELS, fill_radius=0)
     voxels, state = volume.voxels.T, volume.state.T
@@ -104,7 +104,7 @@ def filling(images: np.ndarray, poses: RigidTransform, runs: int) -> Row:
     return Row(f"{holes / 1e6:.1f} million holes filled within 3 voxels", holes / seconds / 1e6, "Mvoxel/s")
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=5)
     options = parser.parse_args()

@@ -9,16 +9,16 @@ from scipy.spatial.transform import Rotation
 
 import speckle3d
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
+from speckle3d.core.sweep import OrientationSensor, Tracker
 from speckle3d.io.load import load_sweep
 from speckle3d.io.sweep_writer import write_sweep
-from speckle3d.simulation.presets import SimulationSettings, simulate
+from speckle3d.simulation.presets import simulate
 
 DEFAULT = Path(__file__).resolve().parents[2] / ".cache" / "sweeps"
 _SIMULATOR = ("simulation/*.py", "kernels/scatter.py", "kernels/diffraction.py", "core/geometry.py")
 
 
-def simulated(settings: SimulationSettings, folder: Path = DEFAULT) -> Path:
+def simulated(settings, folder=DEFAULT):
     """The sweep of `settings` as a file, simulated once; streamed, so that its size does not matter."""
     path = folder / f"{settings.preset}-{settings.seed}-{key_of(settings.model_dump_json())}.h5"
     if not path.is_file():
@@ -27,7 +27,7 @@ def simulated(settings: SimulationSettings, folder: Path = DEFAULT) -> Path:
     return path
 
 
-def simulated_pair(settings: SimulationSettings, folder: Path = DEFAULT) -> tuple[Path, Path]:
+def simulated_pair(settings, folder=DEFAULT):
     """The two sweeps of a ``crossed`` preset as files."""
     stem = f"{settings.preset}-{settings.seed}-{key_of(settings.model_dump_json())}"
     paths = folder / f"{stem}.h5", folder / f"{stem}-crossing.h5"
@@ -38,7 +38,7 @@ def simulated_pair(settings: SimulationSettings, folder: Path = DEFAULT) -> tupl
     return paths
 
 
-def to_and_fro(source: Path, frames: int, folder: Path = DEFAULT) -> Path:
+def to_and_fro(source, frames, folder=DEFAULT):
     """A long sweep made of a short one run forward and back, so that neighbours always share speckle."""
     path = folder / f"{source.stem}-{frames}.h5"
     if path.is_file():
@@ -65,18 +65,18 @@ class _InOrder:
 
     any_thread = False
 
-    def __init__(self, frames, index: np.ndarray) -> None:
+    def __init__(self, frames, index):
         self._frames, self._index = frames, index
         self.shape, self.dtype = (index.size, *frames.shape[1:]), frames.dtype
 
-    def __len__(self) -> int:
+    def __len__(self):
         return self.shape[0]
 
     def __getitem__(self, number):
         return self._frames[int(self._index[number])]
 
 
-def _sensors(sweep: Sweep, index: np.ndarray) -> tuple[Tracker, OrientationSensor]:
+def _sensors(sweep, index):
     """Exact sensors, fixed to the image, that read once per frame."""
     time_s = 0.04 * np.arange(index.size)
     poses = sweep.truth[index]
@@ -87,7 +87,7 @@ def _sensors(sweep: Sweep, index: np.ndarray) -> tuple[Tracker, OrientationSenso
     )
 
 
-def key_of(settings: str) -> str:
+def key_of(settings):
     """Digest of some settings and of the simulator."""
     package = Path(speckle3d.__file__).parent
     digest = hashlib.sha256(settings.encode())

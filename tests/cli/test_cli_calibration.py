@@ -11,40 +11,9 @@ from speckle3d.io.reconstructions import read_reconstruction
 from speckle3d.study.images import GreyImages
 
 
-def pixels_of(sweep):
-    """Those of the images made from RF, as a calibration sees them."""
-    grid = GreyImages(sweep, 60.0).grid
-    return np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
-
-
-def of_sweep(sweep, sensor, **changes):
-    """A calibration that says what the sweep itself says."""
-    held = getattr(sweep, sensor)
-    if sensor == "orientation":
-        own = {"rotation": held.sensor_from_image}
-    else:
-        own = {
-            "rotation": held.sensor_from_image.rotation,
-            "translation_mm": held.sensor_from_image.translation,
-            "pixel_mm": pixels_of(sweep),
-        }
-    return made(sensor, **({"time_offset_s": held.time_offset_s} | own | changes))
-
-
 @pytest.fixture(scope="session")
 def sweep(bench):
     return load_sweep(bench / "sweep.h5")
-
-
-@pytest.fixture
-def saved(tmp_path):
-    """Write a calibration; returns its path."""
-
-    def write(calibration, name="cal.h5"):
-        write_calibration(tmp_path / name, calibration)
-        return tmp_path / name
-
-    return write
 
 
 @pytest.fixture
@@ -60,11 +29,13 @@ def uncalibrated(changed):
     return changed(forget)
 
 
-def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_path):
+def test_a_turned_calibration_turns_the_reference(run, bench, sweep, tmp_path):
     """The image turned by 30 degrees about its own normal: the world's poses turn with it."""
     about_z = Rotation.from_euler("z", 30, degrees=True)
-    own = sweep.tracker.sensor_from_image.rotation
-    path = saved(of_sweep(sweep, "tracker", rotation=own * about_z, time_offset_s=None))
+    own, path, grid = sweep.tracker.sensor_from_image, tmp_path / "cal.h5", GreyImages(sweep, 60.0).grid
+    turned = {"rotation": own.rotation * about_z, "translation_mm": own.translation, "time_offset_s": None}
+    pixel_mm = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
+    write_calibration(path, made("tracker", pixel_mm=pixel_mm, **turned))
     options = ("--drift", "pose", "--calibration", path)
     code, _, err = run("reconstruct", bench / "sweep.h5", "-o", tmp_path / "o", *options)
     assert code == 0, err
@@ -75,8 +46,9 @@ def test_a_turned_calibration_turns_the_reference(run, bench, sweep, saved, tmp_
     assert np.rad2deg(((plain * about_z).inv() * first).magnitude()) < 2.0
 
 
-def test_convert_puts_a_calibration_into_a_sweep(run, uncalibrated, saved, tmp_path):
-    path = saved(made())
+def test_convert_puts_a_calibration_into_a_sweep(run, uncalibrated, tmp_path):
+    path = tmp_path / "cal.h5"
+    write_calibration(path, made())
     code, _, err = run("convert", uncalibrated, tmp_path / "out.h5", "--calibration", path)
     assert code == 0, err
     before, got = load_sweep(uncalibrated), load_sweep(tmp_path / "out.h5")

@@ -1,11 +1,10 @@
 """Clock offsets from the command line: nothing is overwritten, what cannot be told is one line."""
 
 import h5py
-import numpy as np
 import pytest
+from calibration_files import made
 from scipy.spatial.transform import RigidTransform
 
-from speckle3d.core.calibration import Calibration, FramesUsed
 from speckle3d.io.calibrations import read_calibration, write_calibration
 
 IMAGES = ("--by", "images", "--search-s", "0.2")
@@ -17,25 +16,9 @@ def held(back, tmp_path):
     with h5py.File(back) as file:
         mounting = RigidTransform.from_matrix(file["tracker"].attrs["sensor_from_image"])
     path = tmp_path / "held.h5"
-    write_calibration(path, calibration(mounting.rotation, mounting.translation))
+    placed = {"rotation": mounting.rotation, "translation_mm": mounting.translation}
+    write_calibration(path, made(time_offset_s=None, pixel_mm=None, **placed))
     return path
-
-
-def calibration(rotation, translation_mm):
-    size = 3 if translation_mm is None else 6
-    return Calibration(
-        method="images",
-        sensor="orientation" if translation_mm is None else "tracker",
-        rotation=rotation,
-        translation_mm=translation_mm,
-        pixel_mm=None,
-        covariance=np.eye(size),
-        parameters=(),
-        rms=0.1,
-        rms_unit="mm",
-        condition_number=1.0,
-        frames=FramesUsed(1, (0,)),
-    )
 
 
 def test_a_clock_is_found_from_images_and_its_calibration_goes_over_no_input(

@@ -30,6 +30,13 @@ def turning(seconds=20.0):
 
 
 @pytest.fixture
+def sweep_file(tmp_path):
+    path = tmp_path / "sweep.h5"
+    write_sweep(path, sweep_examples.rf_sweep())
+    return path
+
+
+@pytest.fixture
 def log_file(tmp_path):
     path = tmp_path / "log" / "log.csv"
     path.parent.mkdir()
@@ -37,16 +44,12 @@ def log_file(tmp_path):
     return path
 
 
-def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, tmp_path):
-    method = "filter"
-    sweep_file = tmp_path / "sweep.h5"
-    write_sweep(sweep_file, sweep_examples.rf_sweep())
+def test_an_orientation_goes_into_a_sweep_on_its_own_clock(run, log_file, sweep_file):
     into = ("--into", sweep_file, "--replace", "--time-offset-s", "0.05")
-    code, out, err = run("imu", "orient", log_file, *into, "--method", method, "--json")
+    code, out, err = run("imu", "orient", log_file, *into, "--method", "filter", "--json")
     assert code == 0, err
-    assert json.loads(out)["method"] == method
+    assert json.loads(out)["method"] == "filter"
     stream = load_sweep(sweep_file).orientation
-    assert stream is not None
     assert stream.time_offset_s == 0.05
     truth, log = turning()
     found = stream.readings.at(log.time_s[100:-100])
@@ -71,13 +74,6 @@ def test_accuracy_beside_an_optical_tracker(run, tmp_path):
     for angle in ("roll", "yaw", "tilt"):
         # Two readings of 0.4 degrees each: 0.57; 77 of them leave 10 % open.
         assert 0.45 < told[f"log: {angle} error, RMS"] < 0.7
-
-
-@pytest.fixture
-def sweep_file(tmp_path):
-    path = tmp_path / "sweep.h5"
-    write_sweep(path, sweep_examples.rf_sweep())
-    return path
 
 
 def test_a_stream_that_covers_no_frame_is_refused(run, refused, log_file, sweep_file):

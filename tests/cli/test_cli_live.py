@@ -12,7 +12,6 @@ import pytest
 from commands import command
 
 import speckle3d as s3
-from speckle3d.io.load import import_notes
 from speckle3d.io.reconstructions import read_reconstruction
 
 RF = (
@@ -92,19 +91,3 @@ def test_a_played_sweep_is_recorded_placed_and_reconstructed_as_off_line(player,
     made = read_reconstruction(out / "reconstruction.h5").poses["image"]
     expected = s3.track(kept, s3.load_curves(curves)).image
     np.testing.assert_allclose(made.as_matrix(), expected.as_matrix(), atol=1e-9)
-
-
-@pytest.mark.slow
-def test_told_to_end_it_closes_the_recording_first(player, shipped, tmp_path):
-    out = tmp_path / "out"
-    running = started(
-        "live", f"127.0.0.1:{player}", "-o", out, "--curves", shipped / "curves.h5", "--no-volume", *RF
-    )
-    waited_for(out / "sweep.h5", 10)
-    running.send_signal(signal.SIGTERM)
-    _, told = running.communicate(timeout=60)
-    assert running.returncode == 128 + signal.SIGTERM
-    assert told.splitlines()[-1] == "speckle3d: stopped"
-    assert "Traceback" not in told
-    assert import_notes(out / "sweep.h5") == []
-    assert len(s3.load_sweep(out / "sweep.h5")) >= 10

@@ -7,12 +7,8 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.streams import TimedPoses
-from speckle3d.correction import fused
-from speckle3d.correction.fused import FusionProblem, fuse
-from speckle3d.correction.image_path import ImagePath
+from speckle3d.correction.fused import fuse
 from speckle3d.correction.scale import ScaleEvidence
-from speckle3d.correction.sensor_readings import SensorReadings
-from speckle3d.correction.settings import FusedSettings
 from speckle3d.simulation.movement import HandMotion
 
 
@@ -50,28 +46,6 @@ def test_a_tracker_much_too_far_from_the_images_is_not_averaged_with_them():
     made = scene(3, frames=40, length_mm=4.0)
     with pytest.raises(MismatchError, match=r"times as far: compare modes"):
         fuse(*made.given(), tracker=moved(made.tracker, factor=1e-3))
-
-
-def test_derivatives_match_differences(monkeypatch):
-    monkeypatch.setattr(fused, "HUBER", 1e9)
-    made = scene(4, frames=16, length_mm=2.0)
-    centre = RigidTransform.from_translation(CENTRE_MM)
-    start = centre.inv() * made.image * centre
-    path = ImagePath.of(made.edges, start, 0.1, 0.03, 0.02, made.turn_sigma_per_mm, made.time_s)
-    known = start.as_matrix(), CENTRE_MM, made.time_s, FusedSettings()
-    sensors = tuple(SensorReadings.of(each, *known) for each in (made.tracker, made.orientation))
-    told = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.eye(3) / 0.01**2)
-    problem = FusionProblem(path, sensors, (told,))
-    rng = np.random.default_rng(0)
-    at = 1e-3 * rng.standard_normal(problem.columns[-1].stop)
-    step = 1e-6 * rng.standard_normal(at.size)
-    ahead, behind = (problem._equations(at + sign * step) for sign in (1.0, -1.0))
-    for (columns, _, slope, _), (_, after, *_), (_, before, *_) in zip(
-        problem._equations(at), ahead, behind, strict=True
-    ):
-        wanted = (after - before) / 2.0
-        # Right to first order in the turns of world and errors, and but for the motion's bend between frames.
-        np.testing.assert_allclose(slope @ step[columns], wanted, atol=0.03 * np.abs(wanted).max())
 
 
 LENGTHS = {"short": (60, 5.0), "long": (240, 20.0)}

@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from pages import ROOT, ran
 
 
-def shortened(printed: str, shown: str) -> str:
+def shortened(printed, shown):
     """What was printed, cut where the page cuts it."""
     lines, before = printed.splitlines(), shown.splitlines()
     if "..." in before:
@@ -23,7 +23,7 @@ def shortened(printed: str, shown: str) -> str:
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 
-def write_outputs(page: Path) -> None:
+def write_outputs(page):
     """Run a page, and put what it prints in place of what it shows."""
     text, printed = page.read_text(encoding="utf-8"), ""
     with tempfile.TemporaryDirectory() as folder:

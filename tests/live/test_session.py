@@ -146,29 +146,6 @@ def test_when_placing_fails_recording_goes_on(recorded, tmp_path, monkeypatch):
     assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 14
 
 
-def test_what_waits_at_the_end_is_recorded(recorded, tmp_path):
-    frames, curves = recorded
-
-    class Behind(Messages):
-        """Ended while messages wait."""
-
-        def receive(self, timeout_s):
-            if len(self.batches) == 1:
-                self.session.end()
-                if timeout_s:
-                    return []
-            return self.batches.pop(0) if self.batches else []
-
-    messages = Behind(
-        [[image(frames[0], 0.0)], [image(frame, 1.0 + k) for k, frame in enumerate(frames)]], None
-    )
-    settings = SessionSettings(tmp_path / "sweep.h5", imported=RF, volume=False)
-    messages.session = Session(messages, [], curves, settings)
-    messages.session.run()
-    assert messages.session.progress.recorded == 15
-    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 15
-
-
 def test_a_pose_takes_pixels_to_slicers_axes(recorded):
     frames, _ = recorded
     layout = ImageLayout.of(image(frames[0], 0.0), RF, "sweep")

@@ -10,7 +10,6 @@ from speckle3d.core.errors import MismatchError
 from speckle3d.core.geometry import mirrored
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import RFSettings, Sweep
-from speckle3d.live import tracking
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.pipeline import track
@@ -61,16 +60,6 @@ def test_at_the_end_poses_are_those_of_the_recording(followed):
     tracker.revise()
     # What the tissue attenuates (here nothing; read as 0.01 dB/cm/MHz) is told by the whole sweep alone.
     assert apart_mm(sweep, tracker.poses, track(sweep, curves).image).max() < 0.006
-
-
-@pytest.mark.slow
-def test_learning_from_the_latest_frames_alone_keeps_the_place(shipped, monkeypatch):
-    """As in a sweep too long to be looked at as a whole each time."""
-    sweep, curves = shipped_part(shipped, 64)
-    monkeypatch.setattr(tracking, "LATEST", 24)
-    monkeypatch.setattr(tracking, "EVERY", 4)
-    tracker, _ = live(sweep, curves)
-    assert apart_mm(sweep, tracker.poses, track(sweep, curves).image).max() < 0.1
 
 
 def test_a_frame_of_noise_is_flagged_and_the_sweep_goes_on(shipped):

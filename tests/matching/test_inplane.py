@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import speckle
 
-from speckle3d.core.errors import MismatchError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.matching.intensity import IntensitySettings, two_way_wavenumber
@@ -17,14 +16,11 @@ from speckle3d.matching.matcher import (
     FrameMatcher,
     InPlaneSettings,
     MatchingSettings,
-    compose,
-    inverse,
 )
 from speckle3d.matching.patches import PatchSettings
 
 GRID = speckle.GRID
 SPECTRA = [speckle.gaussian, speckle.triangle]
-SIGMA_ELEVATION_MM = 0.45
 WAVENUMBER_PER_MM = two_way_wavenumber(speckle.RF)
 BMODE = BModeSettings(60.0)
 
@@ -148,27 +144,7 @@ def test_patches_that_left_the_image_or_are_masked_are_nan_and_the_others_are_no
     assert (correlation[~gone] > 0.95).all()
 
 
-def test_composed_and_inverted_motions_are_those_of_rigid_matrices():
-    def matrix(m):
-        c, s = np.cos(m[2]), np.sin(m[2])
-        return np.array([[c, -s, m[0]], [s, c, m[1]], [0, 0, 1]])
-
-    first, then = np.array([3.0, -7.0, 0.4]), np.array([-2.0, 11.0, -1.1])
-    np.testing.assert_allclose(matrix(compose(first, then)), matrix(first) @ matrix(then), atol=1e-12)
-    np.testing.assert_allclose(matrix(inverse(first)), np.linalg.inv(matrix(first)), atol=1e-12)
-
-
 # ---- correlation at the motion ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("of_echo", [False, True])
-@pytest.mark.parametrize(("true_mm", "read_mm"), [(0.0, 0.027), (0.3, 0.288)])
-def test_half_a_pitch_does_not_read_as_elevation(true_mm, read_mm, of_echo):
-    """What a parabola through the logarithm reads; through the coefficient 0.113 mm (Housden et al. 2006)."""
-    rho = np.exp(-(true_mm**2) / (2 * SIGMA_ELEVATION_MM**2))
-    found = [match(pair(seed, (GRID.vector_pitch_mm / 2, 0, 0), rho), None, of_echo)[2] for seed in range(6)]
-    distance = SIGMA_ELEVATION_MM * np.sqrt(-2 * np.log(np.clip(found, 1e-6, 1)))
-    assert abs(np.nanmean(distance) - read_mm) < 0.02
 
 
 @pytest.mark.parametrize("spectrum", SPECTRA)
@@ -275,14 +251,3 @@ def test_rf_frames_are_matched_whichever_is_correlated(rolled, correlate):
     assert np.nanmean(table.correlation) == pytest.approx(RHO, abs=0.035)
     assert table.median[0] == pytest.approx(np.nanmedian(table.correlation))
     assert (one.echo.size > 0) == (correlate == "echo")
-
-
-def test_the_key_tells_what_curves_depend_on():
-    keys = [matcher_of(RF_GRID, speckle.RF, correlate=kind).key for kind in ("echo", "intensity")]
-    for mine, theirs in (keys, keys[::-1]):
-        with pytest.raises(MismatchError, match="correlation_of"):
-            mine.require_same(theirs)
-        mine.require_same(replace(theirs, correlation_of=mine.correlation_of))
-    key = matcher_of(patches=PatchSettings(width_mm=2.4, height_mm=2.5), equalise_mm=1.5).key
-    assert (key.patch_width_mm, key.patch_height_mm, key.equalise_mm) == (2.4, 2.5, 1.5)
-    assert (key.signal, key.correlation_of) == (BMODE, "intensity")

@@ -67,31 +67,6 @@ def test_resampled_intensity_is_the_plain_one_at_its_samples(signal, samples):
     np.testing.assert_allclose(got, expected, rtol=2e-3, atol=1e-3 * expected.mean())
 
 
-@settings(deadline=None, max_examples=40)
-@given(at=st.floats(200.0, 1600.0))
-def test_an_echo_stays_where_it_is(at):
-    made = extractor()
-    got = made.intensity(pulse(RF, 1800, at).astype(np.float32))[0].astype(float)
-    depth = np.arange(made.grid.samples) * made.grid.sample_spacing_mm
-    centroid = (got * depth).sum() / got.sum()
-    # Float32 alone costs a thousandth; a causal filter would delay by several samples.
-    assert abs(centroid / RF.sample_spacing_mm - at) < 0.1
-
-
-@pytest.mark.parametrize("frequency_hz", [1e6, 3.5e6, 12e6, 25e6])
-def test_a_tone_outside_the_band_is_rejected(frequency_hz):
-    t = np.arange(1800) / RF.sampling_rate_hz
-    levels = {
-        f: extractor()
-        .intensity(np.tile(np.cos(2 * np.pi * f * t), (6, 1)).astype(np.float32))[:, 150:-150]
-        .mean()
-        for f in (frequency_hz, 7e6)
-    }
-    # In the band the intensity is one. Outside only the cut ends leak in.
-    assert abs(levels[7e6] - 1) < 1e-3
-    assert levels[frequency_hz] < 1e-5
-
-
 def demodulated(rf, signal, middle_hz, every):
     """I/Q by mixing and a brick-wall filter, in double precision."""
     n = rf.shape[1]
@@ -128,23 +103,17 @@ def test_i_and_q_give_what_their_rf_gives(middle_hz, every):
     assert min(coherence.argmax(), coherence.size - coherence.argmax()) <= 16
 
 
-def test_frames_of_another_shape_and_phase_of_grey_levels_are_refused():
+def test_frames_of_another_shape_or_kind_and_phase_of_grey_levels_are_refused():
     bmode = IntensityExtractor(BModeSettings(60.0), ImageGrid(6, 18, 0.1, 0.1))
+    baseband = replace(RF, sampling_rate_hz=8e6, demodulation_frequency_hz=7.5e6)
     for refused in (
         lambda: extractor().intensity(np.zeros((6, 1799), np.float32)),
-        lambda: bmode.intensity(np.zeros((5, 18), np.uint8)),
+        lambda: extractor(baseband).intensity(noise(1800)),
+        lambda: extractor().intensity(noise(1800).astype(np.complex64)),
         lambda: bmode.analytic(np.zeros((6, 18), np.uint8)),
     ):
         with pytest.raises(InvalidInputError):
             refused()
-
-
-def test_real_samples_where_complex_ones_are_said_are_refused_and_the_other_way_round():
-    baseband = replace(RF, sampling_rate_hz=8e6, demodulation_frequency_hz=7.5e6)
-    with pytest.raises(InvalidInputError, match="complex"):
-        extractor(baseband).intensity(noise(1800))
-    with pytest.raises(InvalidInputError, match="real"):
-        extractor().intensity(noise(1800).astype(np.complex64))
 
 
 @settings(deadline=None, max_examples=50)
@@ -183,24 +152,11 @@ def equaliser():
     return IntensityExtractor(BModeSettings(60.0), speckle.GRID)
 
 
-def correlation(a, b):
-    return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
-
-
 def test_equalising_leaves_the_correlation_of_speckle_and_takes_away_that_of_brightness(
     two_views, ramp, equaliser
 ):
-    a, b = two_views
-    plain, ramped = correlation(a, b), correlation(a * ramp, b * ramp)
-    assert (
-        abs(correlation(a * ramp * equaliser.gain(a * ramp), b * ramp * equaliser.gain(b * ramp)) - plain)
-        < 0.04
-    )
-    assert ramped > plain + 0.1
-
-
-def test_no_echo_stays_no_echo(equaliser):
-    image = np.zeros((speckle.GRID.vectors, speckle.GRID.samples), np.float32)
-    assert np.array_equal(equaliser.gain(image) * image, image)
-    image[:, :200] = 1.0
-    assert np.isfinite(equaliser.gain(image) * image).all()
+    ramped = [view * ramp for view in two_views]
+    equalised = [view * equaliser.gain(view) for view in ramped]
+    plain, steep, level = (np.corrcoef(a.ravel(), b.ravel())[0, 1] for a, b in (two_views, ramped, equalised))
+    assert abs(level - plain) < 0.04
+    assert steep > plain + 0.1

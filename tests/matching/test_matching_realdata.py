@@ -15,7 +15,6 @@ pytestmark = pytest.mark.realdata
 
 # Centre and band are read off the spectra; the machines' own settings are not in the files.
 MOUSE = ImportSettings(centre_frequency_hz=20e6, bandwidth_hz=(12e6, 28e6), frame_rate_hz=10.0)
-MOUSE_ALSO = ImportSettings(centre_frequency_hz=18e6, bandwidth_hz=(14e6, 22e6), frame_rate_hz=10.0)
 ULTRASONIX = ImportSettings(
     sampling_rate_hz=40e6,
     vector_pitch_mm=0.3,
@@ -25,7 +24,6 @@ ULTRASONIX = ImportSettings(
 )
 RECORDINGS = {
     "mouse": ("rf/MouseLiverRF.mha", MOUSE),
-    "mouse, half the band": ("rf/MouseLiverRF.mha", MOUSE_ALSO),
     "ultrasonix": ("plus/UltrasonixLinearRfData.igs.mha", ULTRASONIX),
 }
 
@@ -47,7 +45,7 @@ def match(matcher, fixed, moving, start=None):
     return table.inplane[0], table.correlation[0]
 
 
-@pytest.mark.parametrize(("vectors", "steps"), [(0, 0), (-3, -16), (5, 32)])
+@pytest.mark.parametrize(("vectors", "steps"), [(-3, -16), (5, 32)])
 def test_a_frame_and_its_shifted_copy_are_the_same_speckle(recording, vectors, steps):
     sweep, matcher = recording
     step = matcher.grid.sample_spacing_mm / sweep.grid.sample_spacing_mm

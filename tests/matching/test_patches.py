@@ -40,13 +40,6 @@ def test_whole_patches_tile_the_image_without_overlap(vectors, samples, pitch, s
     assert abs(left - right) <= 1
 
 
-def test_an_image_too_small_is_refused_with_both_sizes_named():
-    with pytest.raises(InvalidInputError):
-        lay_patches(ImageGrid(11, 700, 0.3, 0.05))
-    with pytest.raises(InvalidInputError):
-        lay_patches(ImageGrid(64, 121, 0.3, 0.05))
-
-
 ROWS = ImageGrid(40, 700, 0.3, 0.05)
 """Eleven rows of patches, from 3.5 mm down."""
 

@@ -74,8 +74,8 @@ def echoes(low_hz, high_hz, complex_too=False, noise=0.0, rate_hz=RATE, band=(4e
 @pytest.mark.parametrize("complex_too", [False, True])
 @pytest.mark.parametrize(
     ("low", "high"),
-    [(4e6, 8e6), (3e6, 9e6), (5e6, 6e6), (2e6, 6e6), (0.2e6, 5e6)],
-    ids=["as claimed", "wider", "narrower", "attenuated", "mostly attenuated"],
+    [(4e6, 8e6), (3e6, 9e6), (0.2e6, 5e6)],
+    ids=["as claimed", "wider", "mostly attenuated"],
 )
 def test_echoes_in_the_band_are_believed(low, high, complex_too):
     assert doubt_band(echoes(low, high, complex_too)) is None

@@ -20,15 +20,10 @@ def spoilt(sweep):
     return replace(sweep.part(0, 10), frames=frames)
 
 
-def looked_at(sweep, reconstruction=None, doubts=None):
-    findings = FrameFindings(sweep, Config(), reconstruction, doubts)
+def test_without_a_reconstruction_frames_are_judged_here_and_say_why(spoilt):
+    findings = FrameFindings(spoilt, Config(), None, None)
     while findings.flags is None:
         findings.judge_next()
-    return findings
-
-
-def test_without_a_reconstruction_frames_are_judged_here_and_say_why(spoilt):
-    findings = looked_at(spoilt)
     flagged = {k: FrameFlag(int(flag)) for k, flag in enumerate(findings.flags) if flag}
     assert flagged == {
         3: FrameFlag.FROZEN, 5: FrameFlag.LIFTED, 6: FrameFlag.LIFTED, 8: FrameFlag.SATURATED,
@@ -39,5 +34,3 @@ def test_without_a_reconstruction_frames_are_judged_here_and_say_why(spoilt):
     assert "0 % of its patches hold speckle, expected at least 15 %" in lifted
     clipped = 100 * float((np.abs(spoilt.frames[8]) == np.abs(spoilt.frames[8]).max()).mean())
     assert f"{clipped:.2g} %" in saturated
-    assert "2 %" in saturated
-    assert "4 of 10" in findings.state()

@@ -1,10 +1,7 @@
 """RF sweeps whose length is to be found, and curves that do not belong to their probe."""
 
-from pathlib import Path
-
 from cache import DEFAULT, key_of
 
-from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import Sweep
 from speckle3d.io.curves import read_curves, write_curves
@@ -25,7 +22,7 @@ _CROSSED = {"preset": "crossed", "vectors": 96, "samples": 2600, "length_mm": LE
 _STEPS = {"steps": 41, "step_mm": 0.05, "blocks": 3}
 
 
-def crossing_pair(seed: int, angle_deg: float, folder: Path = DEFAULT) -> tuple[Path, Path]:
+def crossing_pair(seed, angle_deg, folder=DEFAULT):
     """Two tissue sweeps of 24 mm that cross in their middle; the first is the same at all angles."""
     settings = [SimulationSettings(seed=seed, crossing_deg=a, **_CROSSED) for a in (90.0, angle_deg)]
     stem = f"length-{seed}-{key_of(settings[0].model_dump_json())}"
@@ -35,7 +32,7 @@ def crossing_pair(seed: int, angle_deg: float, folder: Path = DEFAULT) -> tuple[
     return paths
 
 
-def short(seed: int, folder: Path = DEFAULT) -> Path:
+def short(seed, folder=DEFAULT):
     """A sweep of 3.6 to 6 mm with both sensors, over tissue or a phantom."""
     settings = SimulationSettings(
         preset=("tissue", "phantom")[seed % 2],
@@ -48,7 +45,7 @@ def short(seed: int, folder: Path = DEFAULT) -> Path:
     return _made(folder / f"short-{seed}-{key_of(settings.model_dump_json())}.h5", settings)
 
 
-def _made(path: Path, settings: SimulationSettings, number: int = 0) -> Path:
+def _made(path, settings, number=0):
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(f".part{number}.h5")
@@ -57,7 +54,7 @@ def _made(path: Path, settings: SimulationSettings, number: int = 0) -> Path:
     return path
 
 
-def stepped_phantom(probe: Probe, attenuation_db_cm_mhz: float, seed: int, folder: Path = DEFAULT) -> Sweep:
+def stepped_phantom(probe, attenuation_db_cm_mhz, seed, folder=DEFAULT):
     """Exact steps over fully developed speckle, as decorrelation curves are measured on."""
     path = folder / f"steps-{seed}-{key_of(f'{probe}{attenuation_db_cm_mhz}{_STEPS}')}.h5"
     if not path.is_file():
@@ -73,9 +70,7 @@ def stepped_phantom(probe: Probe, attenuation_db_cm_mhz: float, seed: int, folde
     return load_sweep(path)
 
 
-def borrowed_curves(
-    focus_mm: float, attenuation_db_cm_mhz: float, folder: Path = DEFAULT
-) -> DecorrelationCurves:
+def borrowed_curves(focus_mm, attenuation_db_cm_mhz, folder=DEFAULT):
     """Curves of a phantom and a lens that are not the sweeps': theirs are 20 mm and 0.5 dB/cm/MHz."""
     probe = Probe(elevation_focus_mm=focus_mm)
     path = folder / f"curves-{key_of(f'{probe}{attenuation_db_cm_mhz}{_STEPS}')}.h5"

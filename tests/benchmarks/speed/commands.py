@@ -15,7 +15,7 @@ LIBRARIES = "import numpy, scipy.optimize, scipy.spatial.transform, numba, h5py,
 COMMAND = [sys.executable, "-m", "speckle3d.cli"]
 
 
-def rows(runs: int) -> list[Row]:
+def rows(runs):
     """Help, and the sweep that comes with the project reconstructed in two modes."""
     bare = seconds([sys.executable, "-c", "import typer, rich.console"], runs)
     helped = seconds([*COMMAND, "--help"], runs)
@@ -37,7 +37,7 @@ def rows(runs: int) -> list[Row]:
     ]
 
 
-def seconds(command: list[str], runs: int) -> float:
+def seconds(command, runs):
     """Median of several runs, after one in which kernels are compiled and files are read from the disk."""
     spent = []
     for _ in range(runs + 1):

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 
 from speed.rows import Row
 
@@ -13,12 +12,12 @@ FRAMES = (300, 1200, 2000)
 TARGET_GB = 0.5
 
 
-def rows(paths: list[Path], curves: Path) -> list[Row]:
+def rows(paths, curves):
     """One row for each sweep."""
     return [one(path, curves) for path in paths]
 
 
-def one(path: Path, curves: Path) -> Row:
+def one(path, curves):
     """Run the command and ask the system for its peak."""
     with tempfile.TemporaryDirectory() as folder:
         modes = ["--drift", "orientation", "--drift", "pose"]

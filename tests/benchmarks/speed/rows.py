@@ -2,7 +2,6 @@
 
 import statistics
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 
@@ -32,18 +31,18 @@ class Row:
     cores: float | None = None
 
     @property
-    def times_peer(self) -> float:
+    def times_peer(self):
         """How many times as fast as the peer."""
         return self.peer_value / self.value if self.falling else self.value / self.peer_value
 
     @property
-    def missed(self) -> bool:
+    def missed(self):
         """Whether the target is."""
         if self.target is None:
             return False
         return self.value > self.target if self.falling else self.value < self.target
 
-    def cells(self) -> tuple[str, ...]:
+    def cells(self):
         """Text of the table's columns."""
         bound = "" if self.target is None else f"{'<=' if self.falling else '>='} {self.target:g}"
         return (
@@ -59,7 +58,7 @@ class Row:
 HEADINGS = ("", "measured", "target", "cores busy", "peer or limit", "times as fast")
 
 
-def print_table(rows: list[Row]) -> None:
+def print_table(rows):
     """Print rows as a table in Markdown, so that it can be put on a page."""
     cells = [HEADINGS, *(row.cells() for row in rows)]
     widths = [max(len(line[k]) for line in cells) for k in range(len(HEADINGS))]
@@ -79,7 +78,7 @@ class Timing:
     spread: tuple[float, float]
 
 
-def timed(function: Callable[[], object], runs: int) -> Timing:
+def timed(function, runs):
     """Time a function, after one run in which kernels are loaded."""
     function()
     walls, busy = [], []

@@ -27,13 +27,13 @@ RATE_HZ, READ_S, FILTERED_S = 256.0, 3600.0, 600.0
 PLANE_MS, IMAGES_S, READ_MB_S, READ_TIMES, FILTERED = 50.0, 3.0, 50.0, 3.0, 250e3
 
 
-def legacy(made: dict[str, np.ndarray]) -> bytes:
+def legacy(made):
     """A log of calibrated samples and quaternions in Xsens' older messages."""
     layout = DataLayout(OutputMode.CALIBRATED | OutputMode.ORIENTATION, OutputSettings.COUNTER)
     return configured(layout, period=450) + b"".join(legacy_messages(made, layout))
 
 
-def text(made: dict[str, np.ndarray]) -> bytes:
+def text(made):
     """A log as MT9's program exports it."""
     names = ("accelerometer_m_s2", "gyroscope_rad_s", "magnetometer_au")
     rows = np.column_stack([made["time_s"], *(made[name] for name in names)]).tolist()
@@ -62,7 +62,7 @@ def differences(equations, start, free):
     )
 
 
-def plane(runs: int) -> list[Row]:
+def plane(runs):
     """All of a plane's calibration, and its least squares beside SciPy's with finite differences."""
     lines = scan_plane(np.random.default_rng(0), LINES, line_noise_mm=0.2).lines
     solution, equations = calibrate_plane(lines), Plane().equations(lines)
@@ -84,7 +84,7 @@ def plane(runs: int) -> list[Row]:
     ]
 
 
-def images(runs: int, seed: int = 601) -> list[Row]:
+def images(runs, seed=601):
     """A calibration from two crossing sweeps, 20 mm and 20 degrees off at most."""
     crossing, start = prepared(seed), displaced(np.random.default_rng(183))
     taken = timed(lambda: calibrate_from_sweeps(crossing, start, ImageFit()), runs)
@@ -92,7 +92,7 @@ def images(runs: int, seed: int = 601) -> list[Row]:
     return [Row(what, taken.seconds, "s", target=IMAGES_S, falling=True, cores=taken.cores)]
 
 
-def logs(runs: int) -> list[Row]:
+def logs(runs):
     """Reading each kind of log: megabytes per second, and memory at most over the file's size."""
     made = samples(int(RATE_HZ * READ_S), RATE_HZ)
     rows = []
@@ -114,13 +114,13 @@ def logs(runs: int) -> list[Row]:
     return rows
 
 
-def _bytes(log: ImuLog) -> int:
+def _bytes(log):
     arrays = (log.time_s, log.accelerometer_m_s2, log.gyroscope_rad_s, log.magnetometer_au, log.counter)
     quaternions = 0 if log.world_from_sensor is None else 32 * len(log)
     return sum(array.nbytes for array in arrays if array is not None) + quaternions
 
 
-def filtering(runs: int) -> list[Row]:
+def filtering(runs):
     """Orientation of a recording by every method, beside VQF alone, on line or off line as the method is."""
     made = samples(int(RATE_HZ * FILTERED_S), RATE_HZ)
     vectors = [made[name] for name in ("gyroscope_rad_s", "accelerometer_m_s2", "magnetometer_au")]
@@ -139,6 +139,6 @@ def filtering(runs: int) -> list[Row]:
     return rows
 
 
-def rows(runs: int) -> list[Row]:
+def rows(runs):
     """All of them."""
     return [*plane(runs), *logs(runs), *filtering(runs), *images(min(runs, 3))]

@@ -1,13 +1,10 @@
 """Tracking a sweep: frames per second beside the transforms alone, cores kept busy."""
 
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 from scipy import fft
 
-from speckle3d.core.curves import DecorrelationCurves
-from speckle3d.core.sweep import Sweep
 from speckle3d.core.threads import cores, on_one_thread
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.intensity import IntensityExtractor
@@ -20,7 +17,7 @@ MOST_TIMES = 5.0
 FRAMES = 20
 
 
-def rows(paths: list[Path], curves: DecorrelationCurves, runs: int) -> list[Row]:
+def rows(paths, curves, runs):
     """One row for each sweep on all cores, and for the first on one."""
     made = []
     for number, path in enumerate([paths[0], *paths]):
@@ -47,7 +44,7 @@ def rows(paths: list[Path], curves: DecorrelationCurves, runs: int) -> list[Row]
     return made
 
 
-def ratio(row: Row) -> Row:
+def ratio(row):
     """Time of a frame over that of its transforms on one core."""
     return Row(
         f"{row.what}: a frame's time over its transforms'",
@@ -58,13 +55,13 @@ def ratio(row: Row) -> Row:
     )
 
 
-def transforms_per_second(sweep: Sweep, runs: int) -> float:
+def transforms_per_second(sweep, runs):
     """Frames whose samples go to the band's spectrum and back in a second on one core, and nothing else."""
     plan = IntensityExtractor.for_sweep(sweep)._plan
     frame = np.asarray(sweep.frames[0], dtype=np.float32)
     band = np.zeros((frame.shape[0], plan.out_length), dtype=np.complex64)
 
-    def some() -> None:
+    def some():
         for _ in range(FRAMES):
             fft.rfft(frame, plan.length, axis=1)
             fft.ifft(band, axis=1)
