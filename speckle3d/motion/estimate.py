@@ -11,10 +11,11 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
+from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import Coherence, estimate_coherence
+from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coherence
 from speckle3d.motion.lens import with_fitted_lens
 from speckle3d.motion.planes import (
     LEAST_CORRELATION,
@@ -142,10 +143,25 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
         if left and sheet and coherence.rows:
             path = path * coherence.scale
             problem = replace(problem, curves=with_fitted_lens(problem.curves, coherence.rows, sheet))
+    if problem.curves.of_tissue:
+        coherence = replace(coherence, scale_sigma=_disagreement(problem, table, pairs))
     slopes = weigh_slopes(pairs, coherence.scale_sigma, problem.planes)
     pairs = pairs.scaled(coherence.scale)
     edges, solved = solve_planes(problem, table, slopes.applied(pairs), with_covariance=True)
     return Motion(problem, table, pairs, coherence, slopes, edges, solved.poses, solved.covariance)
+
+
+def _disagreement(problem: MotionProblem, table: CorrelationTable, pairs: PairPlanes) -> float:
+    """Standard error of the scale of distances read as they are, by what rows of patches disagree."""
+    correlation = table.correlation[pairs.row]
+    distance, _ = patch_distances(problem, correlation, fully_developed(correlation.shape[1]))
+    offset, yaw, tilt = pairs.coefficients.T[:, :, None]
+    plane = np.abs(offset + yaw * problem.levers.lateral_mm + tilt * problem.levers.lever_mm)
+    with np.errstate(divide="ignore"):
+        logarithm = np.where(pairs.used, np.log(distance / plane), np.nan)
+    by_row = np.moveaxis(problem.patches.rows_of(logarithm), 1, 0)
+    rows = np.array([np.nanmedian(row) for row in by_row if np.isfinite(row).any()])
+    return float(np.hypot(CURVES_SIGMA, 1.2533 * robust_sigma(rows) / np.sqrt(rows.size)))
 
 
 def solve_planes(
