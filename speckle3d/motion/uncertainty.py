@@ -98,7 +98,8 @@ def joint_errors(
     poses = world_from_image[0].inv() * world_from_image
     common = _common_factors(poses, centre_mm, shared or SharedErrors(0.0, 0.0, np.zeros(2)))
     rest = covariance - np.einsum("mia,mib->iab", common, common)
-    size = np.sqrt(np.maximum(np.diagonal(rest, axis1=1, axis2=2), 1e-24))
+    # In units of the whole, and no less than nothing: what all have in common may be more than a frame's own.
+    size = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 1e-24))
     value, axes = np.linalg.eigh(rest / (size[:, :, None] * size[:, None, :]))
     root = size[:, :, None] * (axes * np.sqrt(np.maximum(value, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
     way = np.maximum(_travel(poses, centre_mm), 1e-6)

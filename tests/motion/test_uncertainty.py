@@ -95,6 +95,15 @@ def test_what_is_shared_stretches_and_what_has_grown_is_a_random_walk():
         assert apart @ apart == pytest.approx(expected, rel=0.02)
 
 
+def test_a_frame_that_claims_less_than_all_share_claims_no_more_than_both():
+    slanted = RigidTransform.from_translation(np.outer(np.arange(51), [0.03, 0.02, 0.2]))
+    common = shared_covariance(slanted, CENTRE_MM, CLAIMS)
+    claimed = np.tile(np.diag([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3]) ** 2, (len(slanted), 1, 1))
+    found = joint_errors(claimed, slanted, CENTRE_MM, CLAIMS).covariance()
+    most = np.diagonal(claimed + common, axis1=1, axis2=2)
+    assert (np.diagonal(found, axis1=1, axis2=2) <= 1.01 * most + 1e-12).all()
+
+
 def test_the_claim_of_two_frames_does_not_hang_on_rounding():
     """A direction that is as good as certain stays so, however the covariance is rounded."""
     claimed = grown(ONE_WAY)
