@@ -2,8 +2,14 @@
 
 import contextlib
 import io
+import socket
 import sys
 
+RF = (
+    "--sampling-rate-hz", 2e8 / 3, "--vector-pitch-mm", 0.3, "--speed-of-sound-m-s", 1540,
+    "--centre-frequency-hz", 7.5e6, "--bandwidth-hz", 5e6, 10e6,
+)  # fmt: skip
+"""What nobody sends of the shipped sweep."""
 SMALL = ("--vectors", "26", "--samples", "1800", "--seed", "5")
 
 
@@ -26,3 +32,18 @@ def run_command(*arguments):
     finally:
         sys.argv = before
     return told.getvalue()
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return taken.getsockname()[1]
+
+
+def read_until(process, words):
+    """The first line of its stderr that has these words."""
+    lines = []
+    for line in process.stderr:
+        lines.append(line)
+        if words in line:
+            return line.strip()
+    raise AssertionError("".join(lines))

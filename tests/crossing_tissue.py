@@ -7,7 +7,7 @@ probe, gain differs between the sweeps, part of the speckle is each sweep's own,
 between. Poses drift by errors that vary along the sweep as random walks do: nothing here is a polynomial.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -45,8 +45,6 @@ class PairCase:
         Of what it differs by between the sweeps, and along each.
     turn_per_mm : float
         Standard deviation of false tilt and yaw, rad/mm.
-    odd : bool
-        A hand that stops, reverses a little, leans and wanders more.
     """
 
     seed: int
@@ -60,7 +58,6 @@ class PairCase:
     varying: float = 0.03
     turn_per_mm: float = 0.002
     sensed: bool = False
-    odd: bool = False
     mirrored: bool = False
 
 
@@ -156,17 +153,14 @@ def _moved_field(rng, rms_mm):
 def _hand(case, rng, number, angle_deg):
     """True poses of the frames: the second sweep starts turned about the middle, off it by a few mm."""
     duration = case.frames / FRAME_RATE_HZ
-    motion = HandMotion()
-    if case.odd:
-        motion = replace(
-            motion, speed_variation=0.8, pauses=3, drift_mm=1.2, wander_rad=np.deg2rad(2.0), wobble_mm=0.3
-        )
     middle = np.array([GRID.width_mm / 2, 0.0, case.length_mm / 2])
     start = turned_about(np.array([0.0, 0.0, 0.0]), np.deg2rad(angle_deg * number + rng.normal(0, 3.0)))
     off = rng.normal(0.0, [1.5, 0.3, 1.5]) * number
     lean = Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, [3.0, 0.0, 3.0])) * number)
     start = RigidTransform.from_components(off, lean) * start * RigidTransform.from_translation(-middle)
-    path = hand_sweep(case.length_mm, duration, GRID.width_mm, motion, start, RigidTransform.identity(), rng)
+    path = hand_sweep(
+        case.length_mm, duration, GRID.width_mm, HandMotion(), start, RigidTransform.identity(), rng
+    )
     return path.medium_from_image(np.arange(case.frames) / FRAME_RATE_HZ)
 
 

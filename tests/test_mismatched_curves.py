@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from speckle3d.core.curves import SpeckleSize, TiltResponse
-from speckle3d.core.errors import InsufficientDataError, MismatchError
+from speckle3d.core.errors import MismatchError
 from speckle3d.pipeline import track
 
 
@@ -24,10 +24,6 @@ def turned_over(curves):
     return replace(curves, correlation=rho, cells=cells, tilt=tilt, speckle=size)
 
 
-def of_other_depths(sweep, first_mm):
-    return replace(sweep, grid=replace(sweep.grid, first_sample_depth_mm=first_mm))
-
-
 def at_rate(sweep, factor):
     signal = replace(sweep.signal, sampling_rate_hz=factor * sweep.signal.sampling_rate_hz)
     grid = replace(sweep.grid, sample_spacing_mm=signal.sample_spacing_mm)
@@ -43,12 +39,12 @@ def test_right_curves_raise_no_doubt(tracked, part, curves):
 
 
 def test_reversed_curves_are_refused(part, curves):
-    with pytest.raises(MismatchError, match=r"^phantom: curves: expected all depths to tell the same dist"):
+    with pytest.raises(MismatchError, match="all depths"):
         track(part, turned_over(curves))
 
 
 def test_scaled_distances_are_refused(part, curves):
-    with pytest.raises(MismatchError, match=r"^phantom: curves: expected tilt"):
+    with pytest.raises(MismatchError, match="tilt"):
         track(part, replace(curves, distance_mm=1.5 * curves.distance_mm))
 
 
@@ -63,11 +59,3 @@ def test_curves_and_sweep_at_another_sampling_rate_are_refused(part, curves):
     key = replace(curves.key, signal=other.signal)
     with pytest.raises(MismatchError, match=r"^phantom: (images: expected echoes|the curves do not match)"):
         track(other, replace(curves, key=key))
-
-
-@pytest.mark.slow
-def test_a_sweep_whose_depth_is_wrong_by_ten_millimetres_is_refused(part, curves):
-    # By the curves as they are, or by the path that they give once depths have straightened them.
-    refusals = (MismatchError, InsufficientDataError)
-    with pytest.raises(refusals, match=r"^phantom: (curves: expected|images: expected frames equally alike)"):
-        track(of_other_depths(part, 10.0), curves)

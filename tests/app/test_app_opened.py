@@ -5,9 +5,8 @@ import pytest
 from imu_logs import samples
 
 import speckle3d.app
-from speckle3d.app.opened import opened, pages_of
+from speckle3d.app.opened import pages_of
 from speckle3d.cli import main
-from speckle3d.core.errors import Speckle3DError
 from xsens.logs.samples import ImuLog
 from xsens.logs.textlogs import write_csv
 
@@ -49,24 +48,6 @@ def test_what_has_no_page_is_one_line_and_exit_code_2(shipped, log, tmp_path, ca
         told = capsys.readouterr().err.splitlines()
         assert (end.value.code, len(told)) == (2, 1), (arguments, told)
         assert "expected" in told[0]
-
-
-@pytest.mark.slow
-def test_a_port_without_a_sensor_is_an_error_and_leaves_nothing(tmp_path):
-    import os
-    import tty
-
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    (tmp_path / "port").symlink_to(os.ttyname(slave))
-    out = tmp_path / "out.mtb"
-    try:
-        with pytest.raises(Speckle3DError, match="expected a sensor"), opened(tmp_path / "port", out):
-            pass
-    finally:
-        os.close(master)
-        os.close(slave)
-    assert not out.exists()
 
 
 def test_a_notebook_shows_the_same_pages(log):

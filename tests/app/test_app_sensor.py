@@ -12,7 +12,6 @@ from xsens.fusion.field import Trust
 from xsens.fusion.online import OnlineState
 from xsens.fusion.orient import orient
 from xsens.live.monitor import LiveState
-from xsens.logs.samples import Gap, ImuLog
 
 
 @pytest.fixture(scope="module")
@@ -46,19 +45,6 @@ def test_columns_are_those_of_the_fusion(readings, motion, found):
     for k in (0, 500, len(stream) - 1):
         held = readings.orientation_at(float(stream.time_s[k] - motion.log.time_s[0]))
         assert (held * stream.world_from_sensor[k].inv()).magnitude() < 1e-6
-
-
-def test_a_log_without_readings_shows_the_sensors_own_and_says_why_nothing_is_judged():
-    turns = Rotation.from_euler("z", np.linspace(0, 90, 50)[:, None], degrees=True)
-    log = ImuLog(np.arange(50) / 50, world_from_sensor=turns, gaps=(Gap(9, 3, 0.08),), source="own")
-    shown = LogReadings(log)
-    trust, sentence = shown.judgement()
-    assert (trust, "no readings of one" in sentence) == (Trust.UNKNOWN, True)
-    assert shown.columns()["heading"][-1] == pytest.approx(90.0)
-    assert shown.gaps_s() == [pytest.approx(9 / 50)]
-    facts = dict(shown.facts(1.0))
-    assert facts["orientation"].startswith("the sensor's own")
-    assert "3 samples in 1 gaps" in facts["lost"]
 
 
 def live(elapsed_s, heading_deg=0.0, started=True, stray=0.01, disturbed=False, **more):

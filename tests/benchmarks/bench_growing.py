@@ -1,9 +1,9 @@
 """A recording killed at random moments: what was appended before is read, whole and in order.
 
 Run: ``python tests/benchmarks/bench_growing.py [KILLS] [SEED]`` (200 and 1; some minutes). Each kill: a
-process writes frames and readings of both sensors as fast as it can, and says after each frame how many there
-are; SIGKILL at a time drawn evenly from zero to `LONGEST_S`. Then the sweep must be read, hold at least the
-frames that were told of, and each of its frames and readings must be the one that was written.
+process writes frames as fast as it can and says after each how many there are; SIGKILL at a time drawn evenly
+from zero to `LONGEST_S`. Then the sweep must be read, hold at least the frames that were told of, and each
+must be the one that was written.
 """
 
 import os
@@ -32,9 +32,6 @@ KINDS = (
     (sweep_examples.iq_sweep(frames=2), None),
     (sweep_examples.bmode_sweep(frames=2), "gzip"),
 )
-POSES = sweep_examples.poses(64)
-READINGS = 3
-"""Of each sensor between two frames."""
 
 
 def frame(sweep, i):
@@ -44,17 +41,12 @@ def frame(sweep, i):
 
 def write(path, sweep, compression, told):
     """Write until killed; what is told is in the file."""
-    matrices = POSES.as_matrix()
-    quaternions = POSES.rotation.as_quat(scalar_first=True)
     dtype = getattr(sweep.frames, "stored_dtype", sweep.frames.dtype)
     with GrowingSweep(path, sweep.grid, sweep.signal, dtype, compression) as growing:
         os.write(told, struct.pack("i", 0))
         for i in range(10**6):
             growing.append(frame(sweep, i), 0.04 * i)
             os.write(told, struct.pack("i", i + 1))
-            for k in range(READINGS * i, READINGS * (i + 1)):
-                growing.append_pose(0.01 * k, matrices[k % 64], k % 7 != 3)
-                growing.append_orientation(0.01 * k, quaternions[k % 64])
 
 
 def killed(path, sweep, compression, wait_s):
@@ -91,17 +83,6 @@ def faults(path, sweep, count):
     if any(not np.array_equal(read.frames[i], frame(sweep, i)) for i in range(len(read))):
         wrong.append("another frame")
     np.testing.assert_allclose(read.frame_time_s, 0.04 * np.arange(len(read)))
-    # The last readings wait for the next frame, or 0.2 s.
-    held = READINGS * (count - 1) if count > 1 else 0
-    for sensor in (read.tracker, read.orientation):
-        if sensor is None:
-            wrong += [f"{held} readings, got none"] if held else []
-            continue
-        k = np.round(sensor.readings.time_s / 0.01).astype(int)
-        poses = sensor.readings.world_from_sensor
-        turns = getattr(poses, "rotation", poses).as_matrix()
-        if k[-1] < held - 2 or np.abs(turns - POSES[k % 64].rotation.as_matrix()).max() > 1e-9:
-            wrong.append(f"other readings, or too few: {k[-1]} of {held}")
     read.frames.close()
     return "; ".join(wrong)
 

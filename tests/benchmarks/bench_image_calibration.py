@@ -10,13 +10,15 @@ import argparse
 import os
 import sys
 import time
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 from cache import simulated_pair
+from crossing_scenes import displaced
 from options import parsed
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from calibration.images.similarity import prepare
 from calibration.images.solver import calibrate_from_sweeps
@@ -56,17 +58,12 @@ def prepared(seed):
     return prepare(*map(opened, simulated_pair(settings)))
 
 
-def displaced(rng):
-    turn = Rotation.from_euler("xyz", rng.uniform(-20.0, 20.0, 3), degrees=True)
-    return TRUTH * RigidTransform.from_components(rng.uniform(-20.0, 20.0, 3), turn)
-
-
 def study(crossing, starts):
     """Errors of the image's centre along its axes, wall clock and processor time, by start."""
     rng = np.random.default_rng(183)
     rows = []
     for number in range(starts):
-        start, wall, cpu = displaced(rng), time.perf_counter(), time.process_time()
+        start, wall, cpu = displaced(TRUTH, rng), time.perf_counter(), time.process_time()
         try:
             found = calibrate_from_sweeps(crossing, start, ImageFit()).sensor_from_image
             error = (TRUTH.inv() * found).apply(crossing.centre_mm) - crossing.centre_mm

@@ -18,7 +18,7 @@ from options import parsed
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("part", nargs="*", choices=("sweeps", "crossing"), help="by default both")
+    parser.add_argument("part", nargs="*", help="sweeps, crossing; by default both")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--seeds", type=int, default=6, help="RF sweeps of each case")
     parser.add_argument("--share", type=float, default=1.0, help="of the cheaper cases")

@@ -3,40 +3,19 @@
 import json
 import re
 import signal
-import socket
 import subprocess
 import time
 
 import numpy as np
 import pytest
-from commands import command
+from commands import RF, command, free_port, read_until
 
 import speckle3d as s3
 from speckle3d.io.reconstructions import read_reconstruction
 
-RF = (
-    "--sampling-rate-hz", 2e8 / 3, "--vector-pitch-mm", 0.3, "--speed-of-sound-m-s", 1540,
-    "--centre-frequency-hz", 7.5e6, "--bandwidth-hz", 5e6, 10e6,
-)  # fmt: skip
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return taken.getsockname()[1]
-
 
 def started(*arguments):
     return subprocess.Popen(command(*arguments), stderr=subprocess.PIPE, text=True)
-
-
-def read_until(process, words):
-    """Lines of its stderr up to one that has these words."""
-    lines = []
-    for line in process.stderr:
-        lines.append(line)
-        if words in line:
-            return lines
-    raise AssertionError("".join(lines))
 
 
 @pytest.fixture

@@ -58,15 +58,3 @@ def test_the_same_curves_as_the_published_powers_of_t():
     for a in range(6):
         left = powers - basis[1:, a, 1:] @ np.linalg.lstsq(basis[1:, a, 1:], powers)[0]
         assert np.abs(left).max() < 1e-12
-
-
-def test_distance_curves_turn_round_with_the_probe_and_leave_in_plane_motion_alone():
-    poses, chain = chain_of(4, frames=100, curves="distance", turns=1)
-    steps = elevational_steps(poses, CENTRE_MM)
-    constant = np.zeros((6, 5))
-    constant[:, 1] = 1.0
-    values = chain.values(constant.ravel())[1:]
-    for axis in ("z", "tilt", "yaw"):
-        np.testing.assert_allclose(values[:, AXES.index(axis)], steps / np.abs(steps).sum())
-    for axis in ("x", "y", "roll"):
-        np.testing.assert_allclose(values[:, AXES.index(axis)], 1 / 99)

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 import speckle3d as s3
-from speckle3d.core.errors import MismatchError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.grid import ImageGrid
-from speckle3d.core.sweep import RFSettings, Sweep
 from speckle3d.live.tracking import LiveTracker
 from speckle3d.matching.quality import FrameFlag
 from speckle3d.pipeline import track
@@ -72,15 +69,6 @@ def test_a_frame_of_noise_is_flagged_and_the_sweep_goes_on(shipped):
     assert not any(each.flags for each in told[13:])
     whole = track(sweep.part(0, 20), curves).image
     assert apart_mm(sweep, tracker.poses, whole)[[11, 14, 19]].max() < 0.1
-
-
-def test_curves_of_another_probe_are_refused_before_any_frame(shipped):
-    _, curves = shipped_part(shipped)
-    signal = RFSettings(40e6, 1540.0, 5e6, (3e6, 7e6))
-    grid = ImageGrid(48, 1200, 0.3, signal.sample_spacing_mm)
-    other = Sweep(np.zeros((1, 48, 1200), np.int16), grid, signal, np.zeros(1))
-    with pytest.raises(MismatchError):
-        LiveTracker(other, curves)
 
 
 def test_text_on_the_images_is_left_out_as_it_is_afterwards(shipped):

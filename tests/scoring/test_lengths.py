@@ -13,7 +13,7 @@ from speckle3d.scoring.lengths import (
     read_end,
     travelled_mm,
 )
-from speckle3d.scoring.references import Reference, error_rows, sweep_curves
+from speckle3d.scoring.references import error_rows, sweep_curves
 
 
 def straight(length_mm, tilt_rad=0.0):
@@ -61,14 +61,11 @@ def test_the_references_length_is_its_own_whatever_is_compared_with_it():
     assert len({row.reference_mm for row in rows}) == 1
     # The tracker's own length is the reference's, whether anything is compared with it or not.
     own = abs(travelled_mm("tracker", tracker, CENTRE_MM))
-    reference = Reference.over_all("tracker", tracker)
-    every = error_rows({"image": image, "tracker": tracker}, reference, CENTRE_MM)
-    alone = error_rows({"tracker": tracker}, None, CENTRE_MM)
-    assert [row.mode for row in every] == ["image", "tracker"]
-    assert {row.estimate_mm for row in (every[1], *alone)} == {own} == {rows[0].reference_mm}
+    (alone,) = error_rows({"tracker": tracker}, None, CENTRE_MM)
+    assert alone.estimate_mm == own == rows[0].reference_mm
     # And so is its error, which is of the jitter at its ends, whatever the length between them.
     (beside,) = compare_modes({"tracker": tracker}, truth, CENTRE_MM, end_frames=1)
-    assert every[1].sigma_mm == beside.sigma_mm == rows[0].reference_sigma_mm > 0
+    assert beside.sigma_mm == rows[0].reference_sigma_mm > 0
     # Its curve begins where the line through its first readings does.
     drawn = sweep_curves({"tracker": tracker}, CENTRE_MM).modes["tracker"][0]
     assert abs(read_end(drawn)) == pytest.approx(own)

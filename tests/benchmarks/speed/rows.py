@@ -71,11 +71,10 @@ def print_table(rows):
 
 @dataclass(frozen=True)
 class Timing:
-    """Median seconds of several runs and the processors they kept busy; `spread` is least and most."""
+    """Median seconds of several runs and the processors they kept busy."""
 
     seconds: float
     cores: float
-    spread: tuple[float, float]
 
 
 def timed(function, runs):
@@ -87,4 +86,4 @@ def timed(function, runs):
         function()
         walls.append(time.perf_counter() - began)
         busy.append((time.process_time() - spent) / walls[-1])
-    return Timing(statistics.median(walls), statistics.median(busy), (min(walls), max(walls)))
+    return Timing(statistics.median(walls), statistics.median(busy))

@@ -5,8 +5,9 @@ import tracemalloc
 from pathlib import Path
 
 import numpy as np
-from bench_image_calibration import displaced, prepared
+from bench_image_calibration import TRUTH, prepared
 from calibration_examples import scan_plane
+from crossing_scenes import displaced
 from imu_logs import calibration, configured, legacy_messages, mt9_bin, mtdata2_messages, samples
 from scipy import optimize
 from vqf import VQF, offlineVQF
@@ -86,7 +87,7 @@ def plane(runs):
 
 def images(runs, seed=601):
     """A calibration from two crossing sweeps, 20 mm and 20 degrees off at most."""
-    crossing, start = prepared(seed), displaced(np.random.default_rng(183))
+    crossing, start = prepared(seed), displaced(TRUTH, np.random.default_rng(183))
     taken = timed(lambda: calibrate_from_sweeps(crossing, start, ImageFit()), runs)
     what = "calibration from two sweeps, 160 frames each"
     return [Row(what, taken.seconds, "s", target=IMAGES_S, falling=True, cores=taken.cores)]

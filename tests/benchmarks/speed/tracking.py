@@ -38,8 +38,6 @@ def rows(paths, curves, runs):
                 cores=ours.cores,
             )
         )
-        slowest, fastest = (len(sweep) / s for s in reversed(ours.spread))
-        print(f"{made[-1].what}: {slowest:.0f} to {fastest:.0f} frames/s in {runs} runs")
     made += [ratio(row) for row in made[1:]]
     return made
 

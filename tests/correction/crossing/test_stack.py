@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.correction.crossing.stack import ImageStack
 
@@ -19,13 +18,3 @@ def test_pools_intensity_before_the_logarithm():
     np.testing.assert_allclose(stack.images(1)[0], expected, atol=0.016)
     assert stack.grid.sample_spacing_mm == pytest.approx(30 * 0.0115)
     assert stack.grid.first_sample_depth_mm == pytest.approx(0.5 + 14.5 * 0.0115)
-
-
-def test_names_a_frame_that_was_not_kept():
-    stack, other = ImageStack(GRID), ImageStack(GRID)
-    for index in (0, 1, 3):
-        stack.keep(index, np.ones((8, 64), np.float32))
-    other.take(0, stack.kept(0, 2))
-    assert len(other) == 2
-    with pytest.raises(InsufficientDataError, match="frame 2"):
-        stack.images(4)
