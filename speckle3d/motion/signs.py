@@ -17,9 +17,10 @@ from speckle3d.motion.planes import PairPlanes
 
 HYPOTHESES = 8
 """Paths that are followed; 4 move lengths by at most 0.06 %."""
-RELATIVE_ERROR = 0.1
+RELATIVE_ERROR, TISSUE_ERROR = 0.1, 0.25
 """Of distances, besides their covariance. Sweeps whose distances are all a quarter short keep their signs;
-with 0.25 the lengths of 41 simulated sweeps are right to 1.33 % rms, with 0.1 to 1.30."""
+with 0.25 the lengths of 41 simulated sweeps are right to 1.33 % rms, with 0.1 to 1.30. Where structure is not
+adapted to (curves of tissue) a half of a person's sweep of bone folds with 0.1."""
 TREND_MM = 0.3
 """Travel over which a direction is remembered: a few frames of a hand-held sweep."""
 TURNING_COST = 2.0
@@ -58,6 +59,7 @@ def likeliest_path(
     frames: int,
     strangers: Strangers,
     known: FloatArray | None = None,
+    relative_error: float = RELATIVE_ERROR,
 ) -> FloatArray:
     """Follow the most likely paths: elevational position and slope along x of one frame after the other.
 
@@ -81,7 +83,7 @@ def likeliest_path(
     """
     rules = PathRules(
         HYPOTHESES,
-        RELATIVE_ERROR,
+        relative_error,
         PLACED,
         CAP,
         TURNING_COST,
