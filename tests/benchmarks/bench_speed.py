@@ -45,7 +45,7 @@ def main():
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--cache", type=Path, default=DEFAULT)
     parser.add_argument("--only", nargs="*", choices=PARTS, default=[], help=f"parts: {', '.join(PARTS)}")
-    options = parsed(parser, runs=1, only=["simulation"])
+    options = parsed(parser, runs=1, only=["commands"])
     folder, runs = options.cache, options.runs
     curves_file = folder / "curves-of-bench.h5"
 

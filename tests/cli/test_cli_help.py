@@ -46,9 +46,6 @@ def test_an_output_is_an_argument_or_an_option_in_every_spelling(run, tmp_path, 
     code, _, err = run("simulate", *(word.format(out) for word in words), *small)
     assert code == 0, err
     assert out.exists()
-    code, _, err = run("convert", out, *(word.format(tmp_path / "t.h5") for word in words))
-    assert code == 0, err
-    assert (tmp_path / "t.h5").exists()
 
 
 def test_every_setting_is_printed_with_what_it_is_and_its_default(run):

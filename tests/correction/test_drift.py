@@ -41,8 +41,7 @@ def medians(seeds, settings, half=False, **options):
     return np.median(found, axis=0)
 
 
-# Bounds: twice the 0.14 to 0.3 % and 0.07 degrees that tests/benchmarks/bench_drift.py measures on other
-# seeds; without correction 15 % and 1.5 degrees.
+# Bounds: twice the 0.14 to 0.3 % and 0.07 degrees measured on other seeds; uncorrected 15 % and 1.5 degrees.
 @pytest.mark.parametrize("settings", [TIME, DISTANCE], ids=["time", "distance"])
 @pytest.mark.parametrize("outliers", [0.0, 0.05])
 def test_length_and_tilt_drift_are_removed_through_a_jittery_tracker(settings, outliers):

@@ -73,18 +73,11 @@ def test_with_a_tracker_lengths_are_no_worse_than_the_better_of_both_and_their_c
 
 
 @pytest.mark.slow
-def test_outliers_and_wander_of_a_tracker_move_the_poses_little():
+def test_outliers_of_a_tracker_move_the_poses_little():
     made = scene(7, noise=0.7)
     rng = np.random.default_rng(7)
     many = len(made.tracker.readings.time_s)
     wild = np.where(rng.random((many, 1)) < 0.05, rng.choice([-3.0, 3.0], (many, 3)), 0.0)
-    kept = np.exp(-0.02 / 1.0)
-    wander = rng.standard_normal((many, 3))
-    for k in range(1, many):
-        wander[k] = kept * wander[k - 1] + np.sqrt(1.0 - kept**2) * wander[k]
     clean = fuse(*made.given(), tracker=made.tracker)
     spiked = fuse(*made.given(), tracker=moved(made.tracker, wild))
     assert abs(path_mm(spiked.poses) - path_mm(clean.poses)) < np.sqrt(clean.covariance[-1, 2, 2])
-    wandering = fuse(*made.given(), tracker=moved(made.tracker, 0.3 * wander))
-    assert wandering.log_scale_sigma > 1.5 * clean.log_scale_sigma
-    assert abs(path_mm(wandering.poses) - path_mm(made.truth)) < 3.0 * np.sqrt(wandering.covariance[-1, 2, 2])
