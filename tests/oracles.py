@@ -190,24 +190,6 @@ def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
     return [s for count, misfit, s in tried if count == most and misfit <= closest + 1e-9]
 
 
-def cut_at(point, images, image_from_world, pixels, max_gap_mm):
-    """Grey level of a world point between the nearest images on either side of it; None without support."""
-    best = [None, None]
-    for image, matrix in zip(images, image_from_world, strict=True):
-        x, y, q = matrix @ np.append(point, 1.0)
-        u, v = (x - pixels[2]) / pixels[0], (y - pixels[3]) / pixels[1]
-        if not (0 <= u <= image.shape[0] - 1 and 0 <= v <= image.shape[1] - 1):
-            continue
-        level = ndimage.map_coordinates(image.astype(float), [[u], [v]], order=1)[0]
-        side = 0 if q >= 0 else 1
-        if np.isfinite(level) and (best[side] is None or abs(q) < best[side][0]):
-            best[side] = abs(q), level
-    if None in best or best[0][0] + best[1][0] > max_gap_mm:
-        return None
-    (near, level), (far, other) = best
-    return level + near / (near + far) * (other - level)
-
-
 def elevational_width_mm(beam):
     """Full two-way thickness of a beam at each depth, by the pulse's power summed over lateral positions.
 

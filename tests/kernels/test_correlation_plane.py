@@ -24,15 +24,3 @@ def test_correlation_is_the_echo_models_and_the_derivative_its_own(d, c, gain):
     assert predict(d, c, gain)[0] == pytest.approx(expected, rel=1e-12)
     before, after = (predict(d + side * step, c, gain)[0] for side in (-1, 1))
     assert predict(d, c, gain)[1] == pytest.approx((after - before) / (2 * step), rel=1e-5, abs=1e-9)
-
-
-@pytest.mark.parametrize("of_echo", [True, False])
-def test_variance_of_phantom_speckle_is_that_of_its_cells_and_a_floor(of_echo):
-    floors = []
-    for d in (0.1, 0.4, 0.9):
-        rho, _, variance = predict(d, of_echo=of_echo)
-        both = 2 * rho * (1 - rho) ** 2 / CELLS + (1 - rho) ** 2 / CELLS**2, (1 - rho**2) ** 2 / CELLS
-        floors.append(np.sqrt(variance - both[not of_echo]))
-    # What interpolation between samples leaves, and no number of cells removes: a few thousandths.
-    np.testing.assert_allclose(floors, floors[0], rtol=1e-6)
-    assert 0.001 < floors[0] < 0.005
