@@ -42,55 +42,42 @@ def assert_same(got, expected, where=""):
         assert got == expected, where
 
 
-@pytest.mark.parametrize("name", list(old_files.sweeps()))
-def test_sweeps(name):
-    assert_same(load_sweep(old_files.FOLDER / f"{name}.h5"), old_files.sweeps()[name][0])
+RECORDINGS = ("growing", "growing_gzip", "killed")
+"""Of a live session, closed, compressed, and left by a process that was killed."""
+CONTENTS = (
+    (load_sweep, {name: sweep for name, (sweep, _) in old_files.sweeps().items()}),
+    (read_curves, old_files.curves()),
+    (read_calibration, old_files.calibrations()),
+    (read_reconstruction, old_files.reconstructions()),
+)
+FILES = {name: (read, content) for read, contents in CONTENTS for name, content in contents.items()}
 
 
-@pytest.mark.parametrize("name", list(old_files.curves()))
-def test_curves(name):
-    assert_same(read_curves(old_files.FOLDER / f"{name}.h5"), old_files.curves()[name])
+@pytest.fixture(scope="module", params=["version 0.1", "this version"])
+def folder(request, tmp_path_factory):
+    """The set as version 0.1 wrote it, and written now."""
+    if request.param == "version 0.1":
+        return old_files.FOLDER
+    made = tmp_path_factory.mktemp("made")
+    old_files.write_all(made)
+    return made
 
 
-@pytest.mark.parametrize("name", list(old_files.calibrations()))
-def test_calibrations(name):
-    assert_same(read_calibration(old_files.FOLDER / f"{name}.h5"), old_files.calibrations()[name])
+def test_the_set_is_whole(folder):
+    assert {path.stem for path in folder.iterdir()} == {*FILES, *RECORDINGS}
 
 
-@pytest.mark.parametrize("name", list(old_files.reconstructions()))
-def test_reconstructions(name):
-    assert_same(read_reconstruction(old_files.FOLDER / f"{name}.h5"), old_files.reconstructions()[name])
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_is_read_as_what_was_written(folder, name):
+    read, content = FILES[name]
+    assert_same(read(folder / f"{name}.h5"), content)
 
 
-def assert_recording(path):
-    whole, got = old_files.sweeps()["rf"][0], load_sweep(path)
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_recording_is_read_as_what_was_appended(folder, name):
+    whole, got = old_files.sweeps()["rf"][0], load_sweep(folder / f"{name}.h5")
     assert_same(got.grid, whole.grid)
     np.testing.assert_array_equal([got.frames[i] for i in range(len(got))], whole.frames)
     assert_same(got.frame_time_s, whole.frame_time_s)
     assert_same(got.tracker.readings.world_from_sensor, old_files.POSES[[0, 1, 3]])
     assert_same(got.orientation.readings.world_from_sensor, old_files.TURNS)
-
-
-RECORDINGS = ("growing", "growing_gzip", "killed")
-"""Of a live session, closed, compressed, and left by a process that was killed."""
-
-
-@pytest.mark.parametrize("name", RECORDINGS)
-def test_recordings(name):
-    assert_recording(old_files.FOLDER / f"{name}.h5")
-
-
-def test_this_version_reads_what_it_writes(tmp_path):
-    """The same set, written now."""
-    old_files.write_all(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in old_files.FOLDER.iterdir()}
-    for name, (sweep, _) in old_files.sweeps().items():
-        assert_same(load_sweep(tmp_path / f"{name}.h5"), sweep)
-    for name, curves in old_files.curves().items():
-        assert_same(read_curves(tmp_path / f"{name}.h5"), curves)
-    for name, calibration in old_files.calibrations().items():
-        assert_same(read_calibration(tmp_path / f"{name}.h5"), calibration)
-    for name, reconstruction in old_files.reconstructions().items():
-        assert_same(read_reconstruction(tmp_path / f"{name}.h5"), reconstruction)
-    for name in RECORDINGS:
-        assert_recording(tmp_path / f"{name}.h5")
