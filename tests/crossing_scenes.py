@@ -60,17 +60,19 @@ def crossing_sweeps(
     grid=None,
     jitter=(0.1, 0.05),
     speckle=True,
+    fan_deg=FAN_DEG,
+    crossing_deg=90.0,
 ):
     """Two sweeps of one scene, and the true sensor_from_image; jitter in mm and degrees."""
     rng = np.random.default_rng(seed)
     grid = grid or ImageGrid(64, 240, 0.45, 0.14)
-    side = max(LENGTH_MM, grid.width_mm) + 14.0 + grid.depth_mm * np.tan(np.deg2rad(FAN_DEG / 2.0))
+    side = max(LENGTH_MM, grid.width_mm) + 14.0 + grid.depth_mm * np.tan(np.deg2rad(fan_deg / 2.0))
     size = np.array([side, grid.depth_mm + 12.0, side])
     level, sheets = tissue(rng, size)
     made = []
     for number in range(2):
         grey = seen_by(rng, level, sheets, 2 - 2 * number) if speckle else level
-        poses = _path(rng, frames, 90.0 * number, grid, size)
+        poses = _path(rng, frames, fan_deg, crossing_deg * number, grid, size)
         images = _frames(grey, poses, grid)
         sensor = poses * MOUNTING.inv() * _jitter(rng, frames, jitter)
         time_s = np.arange(frames) * 0.04
@@ -91,11 +93,11 @@ def centre_error_mm(found, truth, grid):
     return (truth.inv() * found).apply(grid.centre_mm) - grid.centre_mm
 
 
-def _path(rng, frames, turn_deg, grid, size_mm):
+def _path(rng, frames, fan_deg, turn_deg, grid, size_mm):
     """A slow sweep along z that tilts as it goes, turned about the depth axis, with a hand's wander."""
     s = np.linspace(-0.5, 0.5, frames) + 0.02 * np.sin(np.linspace(0, 9.0, frames) + rng.uniform(0, 6))
     wander = np.cumsum(rng.normal(0, 1, (frames, 6)), axis=0) / np.sqrt(frames)
-    tilt = np.deg2rad(FAN_DEG) * s + 0.01 * wander[:, 3]
+    tilt = np.deg2rad(fan_deg) * s + 0.01 * wander[:, 3]
     turned = rotation_from_fixed_angles(0.01 * wander[:, 5], 0.01 * wander[:, 4], tilt)
     place = np.column_stack([0.5 * wander[:, 0], 0.3 * wander[:, 1], LENGTH_MM * s])
     middle = RigidTransform.from_translation([-grid.width_mm / 2.0, 0.0, 0.0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from browsers import needs_browser, opened, viewing
-from phantom_pages import by_command, place, require_same, run_and_save, told
+from phantom_pages import place, told
 from phantom_recordings import wire_recording
 
 from speckle3d.io.points import read_points
@@ -63,16 +63,3 @@ def test_points_are_found_moved_deleted_and_added_by_mouse(page, recording):
     told(page, "phantom-told", "frame 0: 9 points")
     again = saved(page, path, "again.csv")
     assert again.pixels[(again.frame == 0) & (again.wire == 1)][0] == pytest.approx(first, abs=1.5)
-
-
-def test_the_calibration_is_the_commands_with_the_points_that_were_saved(page, recording, tmp_path):
-    path = recording[0]
-    field = page.get_by_label("leave out")
-    field.fill("0")
-    field.press("Enter")
-    table = run_and_save(page, "wires-cal.h5")
-    assert "left out by hand" in table
-    result, out = path.with_name("wires-cal.h5"), tmp_path / "again.h5"
-    assert "--points" in result.with_suffix(".txt").read_text()
-    assert by_command(result, out) == table.strip()
-    require_same(result, out)

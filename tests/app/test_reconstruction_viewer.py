@@ -37,16 +37,6 @@ def click(page, cut, x, y):
     page.mouse.click(*page.evaluate(PLACE, [cut, x, y]))
 
 
-def test_it_fits_on_the_screen_and_cuts_are_as_high_as_it(page):
-    assert page.evaluate("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]") == [
-        1366, 768
-    ]  # fmt: skip
-    (_, top), (_, bottom) = (page.evaluate(PLACE, ["cut-frame", 0.0, depth]) for depth in (0.0, 10.0))
-    assert bottom - top > 100
-    box = page.locator(".js-plotly-plot").first.bounding_box()
-    assert box["y"] + box["height"] <= 768
-
-
 def test_a_click_moves_the_other_cuts_and_its_points_are_measured(page):
     before = page.evaluate(TITLE, "cut-frame"), page.evaluate(TITLE, "cut-depth")
     for x, y in ((0.6, 3.0), (2.0, 9.0)):

@@ -29,7 +29,7 @@ def main():
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"any of: {', '.join(KINDS)}; or all")
     parser.add_argument("--share", type=float, default=1.0, help="of the trials")
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    options = parsed(parser, share=0.02)
+    options = parsed(parser, share=0.02, kinds=["clock", "motions", "plane"])
     if unknown := sorted(set(options.kinds) - set(KINDS)):
         parser.error(f"expected kinds among {', '.join(KINDS)}, got {', '.join(unknown)}")
     missed = 0
