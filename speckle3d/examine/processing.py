@@ -23,12 +23,14 @@ SMOOTHED = 21
 """Frames over which tissue goes by: what changes more slowly is no effect of speed."""
 USABLE_SHARE = 0.8
 """Of the frames in which a patch must be usable to be compared from frame to frame."""
-LEAST_FRAMES = 12
-AVERAGED_SLOPE = -0.2
+LEAST_FRAMES = 24
+"""Pairs of neighbouring frames: of parts of simulated sweeps with fewer, one in twenty falls as steeply by
+chance, and most means of two frames do not."""
+AVERAGED_SLOPE = -0.25
 """Logarithm of the grey levels' spread over correlation lost from frame to frame, below which frames are
-averages. Simulated sweeps of two physics have -0.1 to 0.04; means of two frames -0.3 to -0.6, of three -0.6
-to -1, half of the last frame kept -1.1 to -1.8; bone at 0.5 mm a frame -0.16."""
-CONFIDENCE = 0.8
+averages. Simulated sweeps of two physics have -0.21 to 0.1; means of two frames -0.37 to -0.7, of three -0.5
+to -1.4, half of the last frame kept -1.1 to -1.8; bone at 0.5 mm a frame -0.16."""
+CONFIDENCE = 0.9
 SHORT_BY_SPREAD = 3.0
 """Length lost over what is lost of the spread: 2 to first order, simulated sweeps have 2 to 4."""
 SHORT_REFUSED = 0.03

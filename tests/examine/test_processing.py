@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from accuracy_set import INDEPENDENT
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.examine.processing import shortening, structure_openness
+from speckle3d.io.load import load_sweep
 from speckle3d.matching.frames import match_sweep
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.pipeline import matcher_for, track
@@ -17,11 +19,16 @@ from speckle3d.simulation.receiver import received
 SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
 
 
+def b_mode(sweep):
+    """Grey levels of a sweep of echoes, in memory."""
+    made = received(sweep, dynamic_range_db=60.0)
+    return replace(made, frames=np.stack([made.frames[k] for k in range(len(made))]))
+
+
 @pytest.fixture(scope="module")
 def grey(sweep):
-    """B-mode of the shipped phantom, in memory."""
-    made = received(sweep.part(0, 64), dynamic_range_db=60.0)
-    return replace(made, frames=np.stack([made.frames[k] for k in range(len(made))]))
+    """B-mode of the shipped phantom."""
+    return b_mode(sweep.part(0, 64))
 
 
 def averaged(sweep, count):
@@ -49,6 +56,11 @@ def test_frames_of_one_moment_each_are_not_doubted(grey):
     matches = matched(grey)
     assert shortening(matches) == 0.0
     assert structure_openness(matches) == 0.0
+
+
+@pytest.mark.skipif(not INDEPENDENT.is_dir(), reason="no sweeps of another physics at hand")
+def test_an_even_hand_over_tissue_is_not_doubted():
+    assert shortening(matched(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))) == 0.0
 
 
 @pytest.mark.parametrize("count", [2, 3])
