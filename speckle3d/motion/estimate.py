@@ -25,7 +25,7 @@ from speckle3d.motion.planes import (
     pair_planes,
     patch_distances,
 )
-from speckle3d.motion.signs import RELATIVE_ERROR, TISSUE_ERROR, Strangers, likeliest_path, on_path
+from speckle3d.motion.signs import RELATIVE_ERROR, UNADAPTED_ERROR, Strangers, likeliest_path, on_path
 from speckle3d.motion.trajectory import Trajectory, edges_of, solve_trajectory, unjoined
 from speckle3d.motion.uncertainty import SlopeWeights, claimed_covariance, weigh_slopes
 
@@ -127,8 +127,8 @@ def estimate_motion(problem: MotionProblem, table: CorrelationTable, sound: Bool
     """
     models = fully_developed(table.correlation.shape[1])
     alike, determined = pair_planes(problem, table, alike_pairs(problem, table), models)
-    error = TISSUE_ERROR if problem.curves.of_tissue else RELATIVE_ERROR
-    path = likeliest_path(alike[determined], problem.frames, strangers(problem, table), None, error)
+    apart = strangers(problem, table)
+    path = likeliest_path(alike[determined], problem.frames, apart, None, UNADAPTED_ERROR)
     sheet, tilt = problem.curves.nominal, problem.curves.tilt
     lens_rounds = LENS_ROUNDS if sheet and problem.curves.origin == "data sheet" else 0
     for left in range(lens_rounds, -1, -1):
@@ -204,7 +204,7 @@ def _signed_planes(
             f"expected frame pairs whose patches determine a plane, got none in {len(table)} pairs of "
             f"{table.correlation.shape[1]} patches: is the image wide enough, and do the curves fit it?"
         )
-    error = TISSUE_ERROR if problem.curves.of_tissue else RELATIVE_ERROR
+    error = UNADAPTED_ERROR if problem.curves.of_tissue else RELATIVE_ERROR
     apart = strangers(problem, table.where(sound))
     return on_path(planes, likeliest_path(planes, problem.frames, apart, None, error))
 
