@@ -39,6 +39,9 @@ STRUCTURE_BALANCE = 0.8
 """Ratio of the distances of the 10th and the 90th percentile of decibels from their median, below which
 structure is seen in place of speckle. Simulated speckle has 1.4 to 1.6, smoothed by 5 x 5 samples 0.85 to 1;
 a sweep of muscle and bone has 0.43, and keeps half its correlation over 2.5 times what a sheet says."""
+LEAST_BALANCE = 0.1
+"""Taken where it is less: zero where a tenth of the samples and the median have one grey level, as in images
+that are black for the most part, or of four levels. Lengths are then open by a factor of 64."""
 
 
 def structure_openness(matches: MatchedSweep) -> float:
@@ -46,7 +49,7 @@ def structure_openness(matches: MatchedSweep) -> float:
 
     Structure only stays alike for longer: the curves' width lies between once and twice this above speckle's.
     """
-    return max(0.0, float(np.log(STRUCTURE_BALANCE / matches.texture.balance())))
+    return max(0.0, float(np.log(STRUCTURE_BALANCE / max(matches.texture.balance(), LEAST_BALANCE))))
 
 
 def processing_doubts(structure: float, short: float) -> tuple[Doubt, ...]:

@@ -63,6 +63,11 @@ def test_an_even_hand_over_tissue_is_not_doubted():
     assert shortening(matched(b_mode(load_sweep(INDEPENDENT / "tissue_reverse.h5")))) == 0.0
 
 
+def test_images_black_for_the_most_part_leave_lengths_open(grey):
+    dark = np.maximum(grey.frames - np.quantile(grey.frames, 0.8), 0.0).astype(np.uint8)
+    assert 0.0 < structure_openness(matched(replace(grey, frames=dark))) < np.inf
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_means_of_frames_are_refused(grey, count):
     sweep = averaged(grey, count)
