@@ -50,7 +50,13 @@ _RULE = re.compile(r"\b(With|Not with) (--[\w-]+(?: or --[\w-]+)*)[:.]")
 _CHOICE = re.compile(r"\bOne of ((?:[A-Z]+|--[\w-]+) or --[\w-]+)")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
 _FUSED = "`fused` takes any sensor there is, `crossed` a second sweep"
+_ANY_VIEWER = "frames are cut here, and volumes by any viewer, as 3D Slicer"
 _REMOVED = {
+    ("reslice", "--volume"): _ANY_VIEWER,
+    ("reslice", "--state"): _ANY_VIEWER,
+    ("reslice", "--outlines"): "`view` and the report of `compare` draw where frames are",
+    ("images", "--clock"): "`calibrate clock --by images` finds the offset, --time-offset-s takes it",
+    ("images", "--scales"): "calipers tell pixel sizes better; --pixel-mm takes them",
     ("images", "--method"): "there is one optimiser, which finds what Nelder-Mead did",
     ("reconstruct", "inertial"): _FUSED,
     ("compare", "inertial"): _FUSED,

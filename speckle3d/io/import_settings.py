@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import PathLike
@@ -24,8 +24,9 @@ _FOLDER_FILE = "import.toml"
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Size = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
-Hertz = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e4)]
+LEAST_HZ = 1e4
 """Of ultrasound or of its sampling: less is a number in MHz or kHz."""
+Hertz = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=LEAST_HZ)]
 
 
 class ImportSettings(BaseModel):
@@ -105,6 +106,13 @@ class ImportSettings(BaseModel):
         default_factory=dict,
         description="arrays of a MATLAB file by what they are, as rf = 'RcvData'; of others, data = which",
     )
+
+    @field_validator("demodulation_frequency_hz")
+    @classmethod
+    def _is_in_hertz(cls, value: float | None) -> float | None:
+        if value and value < LEAST_HZ:
+            raise ValueError(f"Input should be 0 or at least {LEAST_HZ:g}")
+        return value
 
 
 class MissingSettingsError(InvalidInputError):

@@ -192,6 +192,11 @@ def open_posed(
         return replace(posed_at(sweep, chosen, reconstruction), chosen_for=why)
     if sweep_file is not None:
         raise InvalidInputError(f"{path}: expected a reconstruction beside --sweep, got a recording")
+    if mode not in (None, *REFERENCES):
+        raise InvalidInputError(
+            f"--mode: expected {' or '.join(REFERENCES)} of a recording, got {mode!r}: "
+            "make its reconstruction first (speckle3d reconstruct)"
+        )
     stated = settings or ImportSettings()
     sizes = {k: v for k, v in fitted_pixels(calibrations).items() if k not in stated.model_fields_set}
     sweep, range_is_known = _load(path, stated.model_copy(update=sizes), dynamic_range_db)

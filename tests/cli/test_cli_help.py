@@ -70,6 +70,9 @@ def test_every_setting_is_printed_with_what_it_is_and_its_default(run):
             "--paper: expected no --drift",
         ),
         (("imu", "orient", "{sweep}", "--into", "{sweep}"), "--replace replaces it"),
+        (("volume", "{sweep}", "-o", "v.nrrd", "--mode", "image"), "make its reconstruction first"),
+        (("reslice", "{sweep}", "-o", "c.png", "--state=s.nrrd"), "--state=s.nrrd was removed: "),
+        (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
     ],
 )
 def test_what_is_refused_is_refused_before_work(refused, monkeypatch, tmp_path, shipped, arguments, expected):
