@@ -93,6 +93,7 @@ class _FrameSet:
             compression_opts=_GZIP_LEVEL if compression == "gzip" else None, shuffle=compression is not None,
         )  # fmt: skip
         values = {**vars(signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
+        values["first_vector_mm"] = grid.first_vector_mm or None
         self.node.attrs.update({name: value for name, value in values.items() if value is not None})
         put(file, "fan", grid.fan)
         file.attrs["version"] = version if grid.fan is None else FAN_VERSION

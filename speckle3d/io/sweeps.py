@@ -149,7 +149,8 @@ def _read_image(clock: _Clock) -> tuple[FileFrames, ImageGrid, RFSettings | BMod
         else:
             sizes = read_attribute(node, "column_pitch_mm"), read_attribute(node, "row_spacing_mm")
         fan = read_record(require_group(file, "fan"), FanLines) if has_member(file, "fan") else None
-        grid = ImageGrid(vectors, samples, *sizes, first_mm, fan=fan)
+        left_mm = read_attribute(node, "first_vector_mm", 0.0)
+        grid = ImageGrid(vectors, samples, *sizes, first_mm, fan=fan, first_vector_mm=left_mm)
         return slices.frames(shape, kind, stored_dtype=dtype), grid, signal
 
 

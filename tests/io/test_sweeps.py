@@ -9,6 +9,7 @@ from speckle3d.core.errors import FileError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.load import load_sweep
+from speckle3d.io.plus.write import write_sequence
 from speckle3d.io.sweep_writer import write_sweep
 
 
@@ -88,3 +89,16 @@ def test_a_fan_of_vectors_is_stored_whole(tmp_path):
     assert load_sweep(tmp_path / "s.h5").grid == fan
     with h5py.File(tmp_path / "s.h5") as file:
         assert file.attrs["version"] == 3
+
+
+@pytest.mark.parametrize("name", ["s.h5", "s.mha"])
+def test_images_beside_the_middle_stay_there(tmp_path, name):
+    sweep = sweep_examples.rf_sweep()
+    aside = replace(sweep, grid=replace(sweep.grid, first_vector_mm=5.0))
+    write = write_sweep if name.endswith(".h5") else write_sequence
+    write(tmp_path / name, aside)
+    got = load_sweep(tmp_path / name)
+    there = [
+        each.tracker.sensor_from_image.apply(np.append(each.grid.mm(0, 0), 0.0)) for each in (aside, got)
+    ]
+    np.testing.assert_allclose(there[1], there[0], atol=1e-9)

@@ -19,9 +19,6 @@ from typing import Self
 from speckle3d.core.errors import FileError
 from speckle3d.io.igtl.messages import HEADER, MessageError, Received, body_bytes, decode
 
-DEFAULT_PORT = 18944
-"""Registered for OpenIGTLink."""
-
 STALL_S = 10.0
 """Longest time that a message may take."""
 

@@ -212,7 +212,8 @@ def _add_sensors(frames: list[dict[str, str]], sweep: Sweep) -> list[str]:
             if isinstance(mounting, Rotation):
                 mounting = RigidTransform.from_rotation(mounting)
             skew_rad = sensor.image_skew_rad if isinstance(sensor, Tracker) else 0.0
-            pixels = image_matrix(mounting, *sizes, skew_rad)
+            first = RigidTransform.from_translation([grid.first_vector_mm, 0.0, 0.0])
+            pixels = image_matrix(mounting * first, *sizes, skew_rad)
             _add(frames, f"{IMAGE}To{own}", np.tile(pixels, (len(frames), 1, 1)))
     return omitted if sweep.truth is None else [*omitted, "the true poses"]
 
