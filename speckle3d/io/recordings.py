@@ -270,7 +270,7 @@ class Recording:
         if "dynamic_range_db" in values:
             own_sigma_db = 0.0 if self.settings.dynamic_range_db else self.range_sigma_db
             is_assumed = self.needed["dynamic_range_db"].is_assumed
-            sigma_db = self._range[1] if self._range and is_assumed else own_sigma_db
+            sigma_db = self._range[1] if is_assumed and self._range else own_sigma_db
             signal = BModeSettings(values["dynamic_range_db"], self.full_scale, sigma_db)
             pitch, spacing = values.get("column_pitch_mm"), values["row_spacing_mm"]
         else:

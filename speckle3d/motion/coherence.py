@@ -230,7 +230,7 @@ def _binned(
     return binned, (np.append(0, edges) + np.append(edges, len(path) - 1)) / 2
 
 
-def _standard_error(values: FloatArray, prior: int) -> float:
+def standard_error(values: FloatArray, prior: int) -> float:
     """Standard error of the median of finite values, by their own scatter and `prior` more of `ROW_SIGMA`."""
     finite = values[np.isfinite(values)]
     count, spread = finite.size, robust_sigma(finite) if finite.size > 2 else ROW_SIGMA
@@ -286,12 +286,12 @@ def estimate_coherence(
     known, line = np.isfinite(rows.logarithm), (0.0, 0.0)
     if known.sum() > 2:
         line = theilslopes(rows.logarithm[known], rows.depth_mm[known])[:2]
-    by_row = _standard_error(
+    by_row = standard_error(
         rows.logarithm - np.polyval(line, rows.depth_mm), PRIOR_ROWS if most_share else 0
     )
     # Of few frames and rows, patches scatter more than structure's layers.
     left = own - np.polyval(line, np.tile(problem.patches.depth_mm, centres.size))
-    by_patch = _standard_error(left[clear], 0)
+    by_patch = standard_error(left[clear], 0)
     errors = max(by_row, by_patch), np.ptp(medians) / np.sqrt(12.0), CURVES_SIGMA
     sigma = float(np.linalg.norm(errors))
     if problem.curves.of_tissue:

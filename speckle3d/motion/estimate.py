@@ -11,11 +11,10 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.leastsquares import robust_sigma
 from speckle3d.core.reconstruction import FramePairs, SharedErrors
 from speckle3d.core.relative import MIRROR, RelativePoses
 from speckle3d.matching.table import CorrelationTable
-from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coherence
+from speckle3d.motion.coherence import CURVES_SIGMA, Coherence, estimate_coherence, standard_error
 from speckle3d.motion.lens import with_fitted_lens
 from speckle3d.motion.planes import (
     LEAST_CORRELATION,
@@ -162,7 +161,7 @@ def _disagreement(problem: MotionProblem, table: CorrelationTable, pairs: PairPl
         logarithm = np.where(pairs.used, np.log(distance / plane), np.nan)
     by_row = np.moveaxis(problem.patches.rows_of(logarithm), 1, 0)
     rows = np.array([np.nanmedian(row) for row in by_row if np.isfinite(row).any()])
-    return float(np.hypot(CURVES_SIGMA, 1.2533 * robust_sigma(rows) / np.sqrt(rows.size)))
+    return float(np.hypot(CURVES_SIGMA, standard_error(rows, 0)))
 
 
 def solve_planes(
