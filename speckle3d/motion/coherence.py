@@ -286,9 +286,7 @@ def estimate_coherence(
     known, line = np.isfinite(rows.logarithm), (0.0, 0.0)
     if known.sum() > 2:
         line = theilslopes(rows.logarithm[known], rows.depth_mm[known])[:2]
-    by_row = standard_error(
-        rows.logarithm - np.polyval(line, rows.depth_mm), PRIOR_ROWS if most_share else 0
-    )
+    by_row = standard_error(rows.logarithm - np.polyval(line, rows.depth_mm), PRIOR_ROWS if most_share else 0)
     # Of few frames and rows, patches scatter more than structure's layers.
     left = own - np.polyval(line, np.tile(problem.patches.depth_mm, centres.size))
     by_patch = standard_error(left[clear], 0)
