@@ -51,6 +51,9 @@ _CHOICE = re.compile(r"\bOne of ((?:[A-Z]+|--[\w-]+) or --[\w-]+)")
 _OUTPUT = re.compile(r"(?:-o|--output=)(.+)|-o|--output", re.DOTALL)
 _FUSED = "`fused` takes any sensor there is, `crossed` a second sweep"
 _ANY_VIEWER = "frames are cut here, and volumes by any viewer, as 3D Slicer"
+_OF_SIMULATE = (
+    "mounting floor-slope-deg roll-range-deg yaw-range-deg depth-range-mm wobble-hz drift-mm tremor-mm"
+)
 _REMOVED = {
     ("reslice", "--volume"): _ANY_VIEWER,
     ("reslice", "--state"): _ANY_VIEWER,
@@ -60,6 +63,11 @@ _REMOVED = {
     ("images", "--method"): "there is one optimiser, which finds what Nelder-Mead did",
     ("reconstruct", "inertial"): _FUSED,
     ("compare", "inertial"): _FUSED,
+    ("plane", "--stages"): "there are always three: angles, distances, all",
+    ("simulate", "--reverse"): "--preset reversal comes back",
+    **dict.fromkeys(
+        (("simulate", f"--{name}") for name in _OF_SIMULATE.split()), "what it was by default stays"
+    ),
 }
 """Words of commands that older versions took, and what replaces them."""
 

@@ -73,6 +73,7 @@ def test_every_setting_is_printed_with_what_it_is_and_its_default(run):
         (("volume", "{sweep}", "-o", "v.nrrd", "--mode", "image"), "make its reconstruction first"),
         (("reslice", "{sweep}", "-o", "c.png", "--state=s.nrrd"), "--state=s.nrrd was removed: "),
         (("calibrate", "images", "a", "b", "-o", "c.h5", "--scales"), "--pixel-mm takes them"),
+        (("simulate", "s.h5", "--tremor-mm", "0"), "what it was by default stays"),
     ],
 )
 def test_what_is_refused_is_refused_before_work(refused, monkeypatch, tmp_path, shipped, arguments, expected):
