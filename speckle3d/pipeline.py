@@ -237,7 +237,7 @@ def track(
     require_placed(flags, sweep.name)
 
     attenuation = estimate_attenuation(curves, matches.texture.spectra(flags == 0))
-    structure = 0.0 if curves.of_tissue else structure_openness(matches)
+    structure = 0.0 if curves.of_tissue else structure_openness(matches.texture)
     if structure:
         curves = replace(stretched(curves, np.array(structure)), of_tissue=True)
     problem = motion_problem(attenuation.applied(curves), matcher, len(sweep), settings)

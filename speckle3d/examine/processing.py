@@ -18,6 +18,7 @@ from scipy.stats import theilslopes
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.doubts import Doubt
 from speckle3d.matching.frames import MatchedSweep
+from speckle3d.matching.texture import Texture
 
 SMOOTHED = 21
 """Frames over which tissue goes by: what changes more slowly is no effect of speed."""
@@ -44,12 +45,12 @@ LEAST_BALANCE = 0.1
 that are black for the most part, or of four levels. Lengths are then open by a factor of 64."""
 
 
-def structure_openness(matches: MatchedSweep) -> float:
+def structure_openness(texture: Texture) -> float:
     """How much wider than speckle's curves those of a sweep that shows structure may be, as a logarithm.
 
     Structure only stays alike for longer: the curves' width lies between once and twice this above speckle's.
     """
-    return max(0.0, float(np.log(STRUCTURE_BALANCE / max(matches.texture.balance(), LEAST_BALANCE))))
+    return max(0.0, float(np.log(STRUCTURE_BALANCE / max(texture.balance(), LEAST_BALANCE))))
 
 
 def processing_doubts(structure: float, short: float) -> tuple[Doubt, ...]:

@@ -28,10 +28,12 @@ from speckle3d.core.geometry import mirrored
 from speckle3d.core.relative import RelativePoses
 from speckle3d.core.sweep import BModeSettings, Sweep
 from speckle3d.core.threads import on_one_thread
+from speckle3d.examine.processing import structure_openness
 from speckle3d.matching.frames import FrameByFrame, ImageSink, ready_frame
 from speckle3d.matching.quality import DrawnOver, FrameFeatures, FrameFlag, flag_frames
 from speckle3d.matching.schedule import PairSchedule
 from speckle3d.matching.table import CorrelationTable
+from speckle3d.matching.texture import FRAMES, Texture
 from speckle3d.motion.estimate import Motion, alike_pairs, elevation_of, estimate_motion, strangers
 from speckle3d.motion.planes import pair_planes
 from speckle3d.motion.signs import likeliest_path, on_path
@@ -126,6 +128,7 @@ class LiveTracker:
         self._drawn, self._clear = DrawnOver(matcher.patches), np.ones(len(matcher.patches), dtype=bool)
         self._matched = FrameByFrame(matcher, PairSchedule(self._config.trajectory))
         self._problem = motion_problem(curves, matcher, 1, self._config)
+        self._texture = Texture(example.signal, matcher)
         self._features: list[FrameFeatures] = []
         self._tables: list[CorrelationTable] = []
         self._flags = np.zeros(0, dtype=np.int64)
@@ -164,8 +167,11 @@ class LiveTracker:
         if motion is None:
             return float("nan")
         # Live, no spectrum tells how much more than the phantom the tissue attenuates.
-        curves_sigma = motion.problem.curves.mismatch(self._config.curves.same_probe)
-        return float(np.hypot(motion.coherence.scale_sigma, curves_sigma))
+        curves = motion.problem.curves
+        curves_sigma = curves.mismatch(self._config.curves.same_probe)
+        # Nor are curves stretched for structure: lengths are up to exp(2 structure) times as long.
+        short = 0.0 if curves.of_tissue else np.expm1(2.0 * structure_openness(self._texture))
+        return float(np.linalg.norm([motion.coherence.scale_sigma, curves_sigma, short]))
 
     @property
     def flags(self) -> IntArray:
@@ -198,6 +204,8 @@ class LiveTracker:
             self.images(number, ready.echo.intensity)
         if isinstance(self._example.signal, BModeSettings):
             self._drawn.keep(frame)
+            if number % EVERY == 0 and number < EVERY * FRAMES:
+                self._texture.keep(number, ready.echo, ready.features.usable)
         table = self._matched.advance(number, ready.frame)
         with self._lock:
             self._keep(ready.features, table)

@@ -55,7 +55,7 @@ def matched(sweep):
 def test_frames_of_one_moment_each_are_not_doubted(grey):
     matches = matched(grey)
     assert shortening(matches) == 0.0
-    assert structure_openness(matches) == 0.0
+    assert structure_openness(matches.texture) == 0.0
 
 
 @pytest.mark.skipif(not INDEPENDENT.is_dir(), reason="no sweeps of another physics at hand")
@@ -65,7 +65,7 @@ def test_an_even_hand_over_tissue_is_not_doubted():
 
 def test_images_black_for_the_most_part_leave_lengths_open(grey):
     dark = np.maximum(grey.frames - np.quantile(grey.frames, 0.8), 0.0).astype(np.uint8)
-    assert 0.0 < structure_openness(matched(replace(grey, frames=dark))) < np.inf
+    assert 0.0 < structure_openness(matched(replace(grey, frames=dark)).texture) < np.inf
 
 
 @pytest.mark.parametrize("count", [2, 3])

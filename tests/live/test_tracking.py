@@ -80,3 +80,12 @@ def test_text_on_the_images_is_left_out_as_it_is_afterwards(shipped):
     tracker, _ = live(sweep, curves)
     tracker.revise()
     assert apart_mm(sweep, tracker.poses, track(sweep, curves).image).max() < 0.03
+
+
+def test_images_that_show_no_speckle_leave_the_length_open(shipped):
+    sweep = received(shipped_part(shipped, 6)[0], dynamic_range_db=60.0)
+    frames = np.stack([sweep.frames[k] for k in range(len(sweep))])
+    dark = np.maximum(frames - np.quantile(frames, 0.6), 0.0).astype(np.uint8)
+    for images, least, most in (frames, 0.05, 0.3), (dark, 1.0, np.inf):
+        grey = replace(sweep, frames=images)
+        assert least < live(grey, data_sheet_curves(SHEET, grey))[0].length_sigma < most
