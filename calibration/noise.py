@@ -8,8 +8,8 @@ small: derivatives are taken at poses and points corrected by what the residuals
 
 References
 ----------
-.. [1] F. R. Helmert, "Die Ausgleichungsrechnung nach der Methode der kleinsten Quadrate", Teubner, 1907; W. A.
-   Fuller, "Measurement error models", Wiley, 1987.
+.. [1] F. R. Helmert, "Die Ausgleichungsrechnung nach der Methode der kleinsten Quadrate", Teubner, 1907;
+   W. A. Fuller, "Measurement error models", Wiley, 1987.
 .. [2] H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal",
    Biometrika 58, 1971 (restricted maximum likelihood, REML).
 .. [3] A. C. Harvey and G. D. A. Phillips, Biometrika 66, 1979 (generalised least squares by a Kalman filter).
