@@ -117,7 +117,8 @@ class _Viewer:
             if (picture := session.picture()) is not None:
                 levels, grid = picture
                 pitch_mm = (grid.vector_pitch_mm, grid.sample_spacing_mm)
-                _show(self._picture[1], levels.T, (0.0, grid.first_sample_depth_mm), pitch_mm)
+                first_mm = (grid.first_vector_mm, grid.first_sample_depth_mm)
+                _show(self._picture[1], levels.T, first_mm, pitch_mm)
             self._draw_path()
         if shown[1] != self._shown[1] and (volume := session.voxels) is not None:
             middle = volume.voxels[volume.shape[0] // 2].astype(np.float32)
