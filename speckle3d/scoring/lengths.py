@@ -191,8 +191,7 @@ def compare_modes(
 
     >>> import numpy as np
     >>> import speckle3d as s3
-    >>> from scipy.signal import find_peaks
-    from scipy.spatial.transform import RigidTransform
+    >>> from scipy.spatial.transform import RigidTransform
     >>> along_z = np.outer(np.linspace(0, 10, 51), [0, 0, 1])
     >>> truth, image = (RigidTransform.from_translation(k * along_z) for k in (1.0, 1.05))
     >>> (row,) = s3.compare_modes({"image": image}, truth, centre_mm=[19, 20, 0], end_frames=1)
