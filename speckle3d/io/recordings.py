@@ -217,7 +217,7 @@ class Recording:
         if "sampling_rate_hz" not in own and spacing.value is not None:
             own["sampling_rate_hz"] = rate_by_spacing(spacing, self.settings, own)
         if "dynamic_range_db" in names and own.get("dynamic_range_db", Value()).value is None and self._range:
-            source = f"{_ASSUMED}, +- {self._range[1]:.1f} dB by its speckle"
+            source = f"{_ASSUMED}, +- {self._range[1]:.1f} by its speckle"
             own["dynamic_range_db"] = Value(round(self._range[0], 1), source)
         return {name: own.get(name, Value()) for name in names}
 
