@@ -12,6 +12,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from pages import ROOT, ran
 
+WIDTH = 160
+"""Letters of a line that are shown."""
+
 
 def shortened(printed, shown):
     """What was printed, cut where the page cuts it."""
@@ -20,19 +23,20 @@ def shortened(printed, shown):
         first = before.index("...")
         last = len(before) - first - 1
         lines = [*lines[:first], "...", *(lines[-last:] if last else [])]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    return "".join(f"{line[:WIDTH]}...\n" if len(line) > WIDTH else f"{line.rstrip()}\n" for line in lines)
 
 
 def write_outputs(page):
     """Run a page, and put what it prints in place of what it shows."""
-    text, printed = page.read_text(encoding="utf-8"), ""
+    text, printed = page.read_text(encoding="utf-8"), None
     with tempfile.TemporaryDirectory() as folder:
         empty = Path(folder) / "empty"
         empty.mkdir()
         for language, block, output in ran(page, empty):
-            if language == "text":
+            if language == "text" and printed is not None:
                 text = text.replace(f"```text\n{block}```", f"```text\n{shortened(printed, block)}```", 1)
-            printed = output or printed
+            # What is only shown, as a console's lines, has not been run.
+            printed = output if language in ("sh", "python") else None
     page.write_text(text, encoding="utf-8")
 
 
