@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -16,6 +17,10 @@ _CLEANING_S = 3.0
 """Time after the first of these signals in which others are not heard: temporary files are removed in it.
 
 A closed terminal sends two at once."""
+
+
+_AGAIN_S = 0.01
+"""After which a signal is sent again that came where nothing can be raised."""
 
 
 class ToldToStopError(KeyboardInterrupt):
@@ -47,8 +52,11 @@ def stoppable() -> Iterator[list[int]]:
     heard: list[int] = []
     first_s = 0.0
 
-    def stop(number: int, _frame: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         nonlocal first_s
+        if _swallows(frame):
+            threading.Timer(_AGAIN_S, signal.raise_signal, [number]).start()
+            return
         if not heard:
             first_s = time.monotonic()
             heard.append(number)
@@ -64,3 +72,12 @@ def stoppable() -> Iterator[list[int]]:
                 from speckle3d.core.threads import end_threads
 
                 end_threads()
+
+
+def _swallows(frame: FrameType | None) -> bool:
+    """Whether what is raised here is lost: in finalizers and callbacks of weak references."""
+    while frame is not None:
+        if frame.f_code.co_name == "__del__" or frame.f_code.co_filename == weakref.__file__:
+            return True
+        frame = frame.f_back
+    return False

@@ -10,6 +10,7 @@ import pytest
 from commands import command
 
 from speckle3d import cli
+from speckle3d.cli.signals import ToldToStopError, stoppable
 from speckle3d.io.reconstructions import read_reconstruction
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals as POSIX has them")
@@ -107,3 +108,17 @@ def test_two_runs_into_one_folder_and_one_that_is_killed(bench, reconstructed, r
     assert code == 0, err
     assert {path.name for path in out.iterdir()} == set(before)
     assert set(read_reconstruction(out / "reconstruction.h5").poses) == {"image"}
+
+
+def test_a_signal_in_a_finalizer_is_not_lost():
+    class Finalized:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    def interrupted():
+        Finalized()
+        time.sleep(5.0)
+
+    with stoppable() as heard, pytest.raises(ToldToStopError):
+        interrupted()
+    assert heard == [signal.SIGTERM]
