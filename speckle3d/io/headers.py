@@ -313,8 +313,8 @@ def _header(path: Path, fields: dict[str, str], is_nrrd: bool, start: int) -> Se
         return said("", *meta_names)[:1] in ("T", "t", "1")
 
     stored = tuple(map(int, said("sizes", "DimSize").split()))
-    told = said("kinds", "Kinds").lower().split()
-    kinds = told if len(told) == len(stored) else ["domain"] * len(stored)
+    stated = said("kinds", "Kinds").lower().split()
+    kinds = stated if len(stated) == len(stored) else ["domain"] * len(stored)
     spatial = [i for i, kind in enumerate(kinds) if kind in _SPACE]
     frame_axis = next((i for i, kind in enumerate(kinds) if kind in _TIME), None)
     colours = {*range(len(stored))} - {*spatial, frame_axis}
@@ -353,7 +353,7 @@ def _header(path: Path, fields: dict[str, str], is_nrrd: bool, start: int) -> Se
     data, start = (_beside(path, file), 0) if file else (path, start)
     return SequenceHeader(
         str(path), own, frames, size, spacing, stored, frame_axis,
-        kinds is told and {*told} <= {"domain", "space"},
+        kinds is stated and {*stated} <= {"domain", "space"},
         channels * int(said("", "ElementNumberOfChannels") or "1"),
         None if frame_axis is None else _frame_times(said, frame_axis, size[2]), axes, origin,
         _number_type(word, is_big, f"{path}: type"), data,

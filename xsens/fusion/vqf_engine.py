@@ -43,8 +43,8 @@ def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Es
             "the methods vqf and vqf-online need the package vqf, got none installed: pip install vqf, "
             "which may need a C++ compiler, or choose smoother or filter"
         ) from error
-    there = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
-    magnetic = magnetic and there.size > 0
+    known = np.flatnonzero(np.isfinite(stretch.field_au[:, 0]))
+    magnetic = magnetic and known.size > 0
     place = np.cumsum(stretch.step_s) - stretch.step_s[0]
     mean_s = float(place[-1]) / max(len(place) - 1, 1) or float(stretch.step_s[0])
     # Losses make the mean step longer than the median, bursts shorter: at most two for one.
@@ -57,7 +57,7 @@ def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Es
     rate[0] = stretch.rate_rad_s[0]
     force, field = _at(grid, place, stretch.force_m_s2), None
     if magnetic:
-        field = _at(grid, place[there], stretch.field_au[there])
+        field = _at(grid, place[known], stretch.field_au[known])
     find = vqf.offlineVQF if offline else vqf.VQF(step_s).updateBatch
     estimate = find(rate, force, field, *([step_s] if offline else []))
     xyzw = estimate["quat9D" if magnetic else "quat6D"][:, [1, 2, 3, 0]]

@@ -139,8 +139,8 @@ def _samples(table: TextTable) -> Parts:
 
 def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:
     """Columns as an array, shape (rows, keys); None if one is missing."""
-    there = [columns[key] for key in keys if key in columns]
-    return np.stack(there, axis=1) if len(there) == len(keys) else None
+    vectors = [columns[key] for key in keys if key in columns]
+    return np.stack(vectors, axis=1) if len(vectors) == len(keys) else None
 
 
 def _claim(table: TextTable, plain: bool, dot: bool) -> Claim:

@@ -135,14 +135,14 @@ def along_curve(
     smooth : bool
         Join the points by a spline.
     """
-    there = opened.poses[opened.reference]
-    axis = np.asarray(_mean_directions(there)[1] if down is None else down)
+    poses = opened.poses[opened.reference]
+    axis = np.asarray(_mean_directions(poses)[1] if down is None else down)
     # As far along its columns as there is something.
-    along = (frame_outlines(grid, there) - curve_mm[0]) @ axis / max(float(np.linalg.norm(axis)), 1e-9)
+    along = (frame_outlines(grid, poses) - curve_mm[0]) @ axis / max(float(np.linalg.norm(axis)), 1e-9)
     sheet = curved_sheet(curve_mm, axis, (along.min(), along.max()), pixel_mm, smooth)
     if down is None:
         # Depth counts from the probe where the curve begins, as the nearest frame has it.
-        at = there.inv().apply(curve_mm[0])
+        at = poses.inv().apply(curve_mm[0])
         depth = float(at[np.argmin(np.abs(at[:, 2])), 1])
         sheet = replace(sheet, first_mm=(0.0, sheet.first_mm[1] + depth))
     return _carried(opened, sheet, f"along a curve through {len(curve_mm)} points")
@@ -150,19 +150,19 @@ def along_curve(
 
 def _carried(opened: OpenedModes, cut: AnyCut, words: str, frame: int = 0) -> Place:
     """A cut of the reference's world at the poses of every mode, by the frame it hangs on."""
-    there = opened.poses[opened.reference]
-    moves = {mode: each[frame] * there[frame].inv() for mode, each in opened.poses.items()}
+    poses = opened.poses[opened.reference]
+    moves = {mode: each[frame] * poses[frame].inv() for mode, each in opened.poses.items()}
     if isinstance(cut, CurvedSheet):
         sheets = {
             mode: replace(cut, base_mm=move.apply(cut.base_mm), down=move.rotation.apply(cut.down))
             for mode, move in moves.items()
         }
-        return Place(sheets, ("along the curve", _name(cut.down, there)), words)
+        return Place(sheets, ("along the curve", _name(cut.down, poses)), words)
     planes = {
         mode: replace(cut, world_from_plane=move * cut.world_from_plane) for mode, move in moves.items()
     }
     right, down = cut.world_from_plane.rotation.as_matrix().T[:2]
-    return Place(planes, (_name(right, there), _name(down, there)), words)
+    return Place(planes, (_name(right, poses), _name(down, poses)), words)
 
 
 def _mean_directions(world_from_image: RigidTransform) -> FloatArray:

@@ -141,10 +141,10 @@ def outcomes(name, seed, cache):
 def figures(found):
     """Text of one mode's errors."""
     refused = [each for each in found if isinstance(each, str)]
-    told = np.abs([each for each in found if not isinstance(each, str)])
-    if not len(told):
+    errors = np.abs([each for each in found if not isinstance(each, str)])
+    if not len(errors):
         return f"all refused; {'; '.join(refused)}"
-    error, tilt, claimed = told.T
+    error, tilt, claimed = errors.T
     wrong = int(((error > 3 * claimed) & (error > 3.0)).sum())
     return (
         f"length {np.median(error):.2f} % (90th {np.percentile(error, 90):.2f}), claimed "
