@@ -24,13 +24,13 @@ from speckle3d.io.plus.layout import Layout
 from speckle3d.io.plus.transforms import (
     IMAGE,
     ORIENTATION,
+    Names,
     Poses,
     fixed_transform,
     image_skew_rad,
     names_of,
     pixel_axes,
     sensor_from_image,
-    tracked_orientation,
     tracked_poses,
 )
 from speckle3d.io.plus.write import own_values
@@ -39,7 +39,6 @@ from speckle3d.io.readers import Reader
 from speckle3d.io.recordings import Recording, Value, differs, rate_of
 
 _DEVICE = "the device set"
-_OWN, _NO_VALUES = "as this package wrote it", ("probe", "full_scale", "dynamic_range_sigma_db")
 _CARRIER = ("demodulation_frequency_hz", "centre_frequency_hz", "sampling_rate_hz")
 
 
@@ -65,8 +64,7 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
         If the header names no such transform, or no sample of it is valid.
     """
     header, given = read_header(path), settings or ImportSettings()
-    poses, times = _poses(header, given, _device(given)), _times(header, given)
-    readings, notes = _timed(poses, times)
+    readings, notes = _timed(_poses(header, given, _device(given)), _times(header, given.frame_rate_hz))
     if readings is None:
         raise InvalidInputError(
             f"{path}: expected tracked poses (fields like ProbeToTrackerTransform), got {lacking_poses(path)}"
@@ -94,16 +92,14 @@ def open_sequence(path: Path, settings: ImportSettings) -> Recording:
         If it, or the device set beside it, cannot be read or does not make sense.
     """
     header, device = read_header(path), _device(settings)
-    layout = Layout.of(header, device.image_orientation)
+    layout = Layout.of(header, device.text("PortUsImageOrientation") or None)
     kinds = {"UltrasoundImageType": layout.kind, "UltrasoundImageOrientation": layout.orientation}
     kind, orientation = (
         word if name in header.fields else f"{word} (assumed)" for name, word in kinds.items()
     )
     rows = [
-        ("container", "NrrdImage" if header.is_nrrd else "MetaImage", ""),
+        ("container", header.container, ""),
         ("size", _shown(header.size), ""),
-        ("images not valid", str(len([*filter(None, _faults(header))])), ""),
-        ("spacing", _shown(header.spacing_mm or ()) or "unknown", "mm" if header.spacing_mm else ""),
         ("image type", kind, ""),
         ("image orientation", orientation, ""),
         ("transforms", ", ".join(names_of(header.frames)) or "none", ""),
@@ -116,89 +112,92 @@ def open_sequence(path: Path, settings: ImportSettings) -> Recording:
 def _recording(
     header: SequenceHeader, settings: ImportSettings, device: DeviceSet, layout: Layout
 ) -> Recording:
-    path, own = header.path, own_values(header.path, header.fields)
-    _require_images(header, layout, settings)
-    times, faults = _times(header, settings), _faults(header)
-    images, remarks = np.flatnonzero(~np.array(faults, dtype=bool)), list[str]()
-    if times is not None:
-        images, remarks = usable("images", times[: len(faults)], faults)
-    if not images.size:
-        raise InvalidInputError(f"{path}: ImageStatus: expected a valid frame with a time, got none")
-    poses = _poses(header, settings, device)
-    pixels = _image_to_probe(header, settings, device, layout, poses)
-    measured, where = Value(), path
-    if pixels is not None:
-        where = f"{device.path if pixels.said_by == _DEVICE else path}: {pixels.source}"
-        measured = replace(pixels, value=pixel_axes(pixels.value, where))
-    spacing = header.spacing_mm
-    spacing = None if spacing is None else spacing[::-1] if layout.has_lines_in_rows else spacing
-    if measured.value and spacing and not own and differs(measured.value, spacing):
-        text = f"pixels of {_shown(measured.value)} mm, {measured.source}: the file says {_shown(spacing)}"
-        remarks.append(text)
-    # The sampling rate of RF is known better than by a calibration.
-    sizes = [Value(spacing, "ElementSpacing" if spacing else "")]
-    if not layout.is_rf:
-        sizes = [measured, *sizes, Value(device.pixel_mm(header.size), "device set", _DEVICE)]
-    pixel = next((size for size in sizes if size.value is not None), Value())
-    values = _values(header, layout, device, pixel) | {
-        name: Value(value, "as this package wrote it")
-        for name, value in own.items()
-        if name not in _NO_VALUES
-    }
-    frames = _frames(header, layout, images)
-    if layout.is_complex:
-        demodulation, centre, rate = (
-            getattr(settings, name) or values.get(name, Value()).value for name in _CARRIER
-        )
-        # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
-        share = None if demodulation or not (centre and rate) else carried_share(frames, centre, rate)
-        if share is not None and share <= -CARRIED[0]:
-            frames = _frames(header, replace(layout, conjugated=True), images)
-            remarks.append("Q has the other sign in the file, as its phase tells: turned")
-    readings, lost = _timed(poses, times)
-    tracker, chain = None, [*poses.chain] if poses is not None else []
-    if poses is not None and poses.pixels is None and pixels is not None:
-        chain.insert(0, f"{device.names.image}To{poses.tool}")
-    if readings is not None and pixels is not None:
-        first_mm = settings.first_sample_depth_mm
-        first_mm = own.get("first_sample_depth_mm", 0.0) if first_mm is None else first_mm
-        mounting = sensor_from_image(pixels.value, first_mm, where)
-        tracker = Tracker(readings, mounting, image_skew_rad=image_skew_rad(pixels.value, where))
-    elif readings is not None:
-        tracker = Tracker(readings)
-    return Recording(
-        Path(path),
-        settings,
-        frames,
-        values,
-        time_s=None if times is None else times[images],
-        tracker=tracker,
-        orientation=_orientation(header, times),
-        chain=" * ".join(chain),
-        probe=settings.probe or own.get("probe") or device.probe,
-        full_scale=own.get("full_scale", 255.0),
-        range_sigma_db=own.get("dynamic_range_sigma_db", 0.0),
-        assumptions=("parallel lines",) if layout.is_rf and not own else (),
-        rows=(("tracker of", " * ".join(chain) or "none", ""),),
-        remarks=(*remarks, *lost, *_remarks(header, settings, device, layout, poses)),
-    )
-
-
-def _require_images(header: SequenceHeader, layout: Layout, settings: ImportSettings) -> None:
-    """Refuse what is no sequence of images of lines."""
+    path, frames, count = header.path, header.frames, header.frame_count
     if 0 in header.size or max(header.size[:2]) == 1:
-        what = ": the recording of a tracker, for --poses" if names_of(header.frames) else ""
-        raise InvalidInputError(
-            f"{header.path}: expected pixels of images, got images of size {_shown(header.size[:2])}{what}"
-        )
+        what = ": the recording of a tracker, for --poses" if names_of(frames) else ""
+        size = _shown(header.size[:2])
+        raise InvalidInputError(f"{path}: expected pixels of images, got images of size {size}{what}")
     if header.is_volume and not settings.frame_rate_hz:
         raise InvalidInputError(
-            f"{header.path}: expected a sequence of images, got a volume, whose third axis is in space "
+            f"{path}: expected a sequence of images, got a volume, whose third axis is in space "
             "by its Kinds; if it is time, say so by --frame-rate-hz"
         )
     layout.require_lines(header)
     if header.packing == "raw":
         header.images()  # maps them, and refuses a file that ends early
+    # Older files of PLUS tell images that are not valid in Status alone.
+    statuses = [{frame.get("ImageStatus"), frame.get("Status")} for frame in frames[:count]]
+    faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
+    faults += [""] * (count - len(faults))
+    times, notes = _times(header, settings.frame_rate_hz), list[str]()
+    images = np.flatnonzero(~np.array(faults, dtype=bool))
+    if times is not None:
+        images, notes = usable("images", times[:count], faults)
+    if not images.size:
+        raise InvalidInputError(f"{path}: ImageStatus: expected a valid frame with a time, got none")
+    own, poses = own_values(path, header.fields), _poses(header, settings, device)
+    pixels = _image_to_probe(header, settings, device, layout, poses)
+    spacing, measured = header.spacing_mm, Value()
+    where = path if pixels is None else f"{path}: {pixels.source}"
+    if spacing is not None and layout.has_lines_in_rows:
+        spacing = spacing[::-1]
+    if pixels is not None:
+        measured = replace(pixels, value=pixel_axes(pixels.value, where))
+    if measured.value and spacing and not own and differs(measured.value, spacing):
+        text = f"pixels of {_shown(measured.value)} mm, {measured.source}: the file says {_shown(spacing)}"
+        notes.append(text)
+    # The sampling rate of RF is known better than by a calibration.
+    sizes = [Value(spacing, "ElementSpacing" if spacing else "")]
+    if not layout.is_rf:
+        sizes = [measured, *sizes, Value(device.pixel_mm(header.size), "device set", _DEVICE)]
+    pixel = next((size for size in sizes if size.value is not None), Value())
+    values = _values(header, layout, device, pixel)
+    values |= {name: Value(value, "as this package wrote it") for name, value in own.items() if "_" in name}
+    stacked = _frames(header, layout, images)
+    if layout.is_complex:
+        demodulation, centre, rate = (
+            getattr(settings, name) or values.get(name, Value()).value for name in _CARRIER
+        )
+        # Depth runs backwards in lines that are stored from the far end on, and so does their phase.
+        share = None if demodulation or not (centre and rate) else carried_share(stacked, centre, rate)
+        if share is not None and share <= -CARRIED[0]:
+            stacked = _frames(header, replace(layout, conjugated=True), images)
+            notes.append("Q has the other sign in the file, as its phase tells: turned")
+    readings, lost = _timed(poses, times)
+    tracker = None if readings is None else Tracker(readings)
+    chain = [] if poses is None else [*poses.chain]
+    if pixels is not None and poses is not None and poses.pixels is None:
+        chain.insert(0, f"{device.names.image}To{poses.tool}")
+    if tracker is not None and pixels is not None:
+        given_mm = settings.first_sample_depth_mm
+        first_mm = own.get("first_sample_depth_mm", 0.0) if given_mm is None else given_mm
+        mounting = sensor_from_image(pixels.value, first_mm, where)
+        skew_rad = image_skew_rad(pixels.value, where)
+        tracker = replace(tracker, sensor_from_image=mounting, image_skew_rad=skew_rad)
+    orientation, name = None, f"{ORIENTATION}ToWorld"
+    if name in names_of(frames):  # the stream that this package writes
+        turns, _ = _timed(tracked_poses(path, frames, name, "none", Names()), times)
+        matrix = fixed_transform(path, header.fields, frames, f"{IMAGE}To{ORIENTATION}")
+        turn = None if matrix is None else sensor_from_image(matrix, 0.0, path).rotation
+        if turns is not None:
+            orientation = OrientationSensor(
+                TimedRotations(turns.time_s, turns.world_from_sensor.rotation), turn
+            )
+    return Recording(
+        Path(path),
+        settings,
+        stacked,
+        values,
+        time_s=None if times is None else times[images],
+        tracker=tracker,
+        orientation=orientation,
+        chain=" * ".join(chain),
+        probe=settings.probe or own.get("probe") or device.text("TransducerName"),
+        full_scale=own.get("full_scale", 255.0),
+        assumptions=("parallel lines",) if layout.is_rf and not own else (),
+        rows=(("tracker of", " * ".join(chain) or "none", ""),),
+        remarks=(*notes, *lost, *_remarks(header, settings, device, layout, poses)),
+    )
 
 
 def _device(settings: ImportSettings) -> DeviceSet:
@@ -217,32 +216,20 @@ def _timed(poses: Poses | None, times: FloatArray | None) -> tuple[TimedPoses | 
     return timed_poses(times[: len(poses.faults)], poses.matrices, poses.faults)
 
 
-def _times(header: SequenceHeader, settings: ImportSettings) -> FloatArray | None:
-    """Time of every frame: of a rate that is given, or as the file has it."""
-    rate, count = settings.frame_rate_hz, _count(header)
-    return _stamps(header) if rate is None else np.arange(count) / rate
+def _times(header: SequenceHeader, rate_hz: float | None = None) -> FloatArray | None:
+    """Time of every frame: of a rate, or by its stamp or its axis, NaN where it has none.
 
-
-def _stamps(header: SequenceHeader) -> FloatArray | None:
-    """Time of every frame by its stamp or its axis, NaN where it has none; stamps all the same are none."""
-    stamps = np.full(_count(header), np.nan)
+    Stamps all the same are none.
+    """
+    count = max(header.frame_count if 0 not in header.stored else 0, len(header.frames))
+    if rate_hz is not None:
+        return np.arange(count) / rate_hz
+    stamps = np.full(count, np.nan)
     for i, frame in enumerate(header.frames):
         with suppress(ValueError):
             stamps[i] = float(frame.get("Timestamp", "nan"))
     different = np.unique(stamps[np.isfinite(stamps)]).size
-    return header.index_s if different < min(2, stamps.size) else stamps
-
-
-def _count(header: SequenceHeader) -> int:
-    return max(header.frame_count if 0 not in header.stored else 0, len(header.frames))
-
-
-def _faults(header: SequenceHeader) -> list[str]:
-    """Why each image is not valid, empty where it is; older files of PLUS say so in Status alone."""
-    count = header.frame_count
-    statuses = [{frame.get("ImageStatus"), frame.get("Status")} for frame in header.frames[:count]]
-    faults = ["" if status <= {None, "OK"} else "not valid by their status" for status in statuses]
-    return faults + [""] * (count - len(faults))
+    return header.index_s if different < min(2, count) else stamps
 
 
 def _frames(header: SequenceHeader, layout: Layout, images: IntArray) -> FileFrames:
@@ -259,25 +246,24 @@ def _frames(header: SequenceHeader, layout: Layout, images: IntArray) -> FileFra
 
 def _values(header: SequenceHeader, layout: Layout, device: DeviceSet, pixel: Value) -> dict[str, Value]:
     """What a sweep of this kind needs, and where file or device set have it."""
-    values, stamps = dict[str, Value](), _stamps(header)
+    values, stamps = dict[str, Value](), _times(header)
     if stamps is not None and (rate := rate_of(stamps[np.isfinite(stamps)])):
         values["frame_rate_hz"] = Value(rate, "of its time stamps")
     across, down = (replace(pixel, value=size) for size in pixel.value or (None, None))
     vectors, samples = layout.shape(header.size)
     scan = Value(None, "ScanConversion of the device set", _DEVICE)
+    radii_mm, width_mm = device.scan("RadiusStartMm", "RadiusStopMm"), device.scan("TransducerWidthMm")
     if device.is_curved and (layout.is_rf or layout.has_lines_in_rows):
-        values["line_angles_deg"] = replace(scan, value=device.angles_deg)
+        values["line_angles_deg"] = replace(scan, value=device.scan("ThetaStartDeg", "ThetaStopDeg"))
         values["array_radius_mm"] = scan
-        if device.radii_mm is not None and samples > 1:
-            near, far = device.radii_mm
+        if radii_mm is not None and samples > 1:
+            near, far = radii_mm
             values["array_radius_mm"] = replace(scan, value=near)
             values["row_spacing_mm"] = replace(scan, value=(far - near) / (samples - 1))
-    elif not layout.is_rf:
-        values |= {"column_pitch_mm": across, "row_spacing_mm": down}
-    elif down.value is not None:
-        values |= {"vector_pitch_mm": across, "row_spacing_mm": down}
-    elif device.width_mm is not None:
-        values["vector_pitch_mm"] = replace(scan, value=device.width_mm / vectors)
+    elif not layout.is_rf or down.value is not None:
+        values |= {f"{'vector' if layout.is_rf else 'column'}_pitch_mm": across, "row_spacing_mm": down}
+    elif width_mm is not None:
+        values["vector_pitch_mm"] = replace(scan, value=width_mm[0] / vectors)
     return values
 
 
@@ -298,18 +284,6 @@ def _image_to_probe(
     # The device set's is for the image that the machine shows, not for the lines it was made of.
     matrix = None if layout.is_rf else device.transform(names.image, tool)
     return None if matrix is None else Value(matrix, f"{names.image}To{tool}", _DEVICE)
-
-
-def _orientation(header: SequenceHeader, times: FloatArray | None) -> OrientationSensor | None:
-    """The orientation sensor that this package wrote; None where there is none."""
-    readings, _ = _timed(tracked_orientation(header.path, header.frames), times)
-    if readings is None:
-        return None
-    name = f"{IMAGE}To{ORIENTATION}"
-    matrix = fixed_transform(header.path, header.fields, header.frames, name)
-    mounting = None if matrix is None else sensor_from_image(matrix, 0.0, header.path).rotation
-    turned = TimedRotations(readings.time_s, readings.world_from_sensor.rotation)
-    return OrientationSensor(turned, mounting)
 
 
 def _remarks(

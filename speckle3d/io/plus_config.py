@@ -13,17 +13,15 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from xml.etree.ElementTree import Element
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.files import PathLike
 from speckle3d.core.geometry import transforms_from_matrices
 from speckle3d.core.wires import WirePhantom
-from speckle3d.io.plus.device_set import device_set, read_xml, vector
+from speckle3d.io.plus.device_set import DeviceSet, read_xml, vector
 
 _PATTERN_WIRES = {"NWire": 3, "CoplanarParallelWires": None}
 """How many wires a pattern of each type has."""
@@ -57,24 +55,28 @@ def read_wire_phantom(path: PathLike) -> WireConfig:
     FileError
         If the file cannot be read.
     InvalidInputError
-        Naming the element that is missing or wrong. A document with a type declaration is refused, because
-        the entities it may declare can grow without bounds.
+        Naming the element that is missing or wrong.
     """
-    root = read_xml(path)
-    with naming(str(path)):
-        segmentation = root.find(".//Segmentation")
-        return WireConfig(_phantom(path, root), *(() if segmentation is None else _hints(segmentation)))
+    device = DeviceSet(str(path), read_xml(path))
+    with naming(device.path):
+        spacing, clip = device.numbers("Segmentation", 1, "ApproximateSpacingMmPerPixel"), None
+        corner = device.numbers("Segmentation", 2, "ClipRectangleOrigin")
+        size = device.numbers("Segmentation", 2, "ClipRectangleSize")
+        if corner is not None and size is not None:
+            (left, top), (right, bottom) = corner, np.add(corner, size) - 1
+            clip = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+        return WireConfig(_phantom(device), None if spacing is None else spacing[0], clip)
 
 
-def _phantom(path: PathLike, root: Element) -> WirePhantom:
+def _phantom(device: DeviceSet) -> WirePhantom:
     names: list[str] = []
     ends, patterns = [], []
-    for number, pattern in enumerate(root.iterfind(".//PhantomDefinition/Geometry/Pattern")):
+    for number, pattern in enumerate(device.root.iterfind(".//PhantomDefinition/Geometry/Pattern")):
         kind, wires = pattern.get("Type", ""), pattern.findall("Wire")
-        wanted = _PATTERN_WIRES.get(kind) or len(wires) or "some"
-        if kind not in _PATTERN_WIRES or len(wires) != wanted:
+        count = _PATTERN_WIRES.get(kind) or len(wires) or "some"
+        if kind not in _PATTERN_WIRES or len(wires) != count:
             raise InvalidInputError(
-                f"Pattern[{number}]: expected Type {' or '.join(_PATTERN_WIRES)} with {wanted} elements "
+                f"Pattern[{number}]: expected Type {' or '.join(_PATTERN_WIRES)} with {count} elements "
                 f"Wire, got {kind!r} with {len(wires)}"
             )
         patterns.append(tuple(range(len(names), len(names) + len(wires))))
@@ -83,31 +85,9 @@ def _phantom(path: PathLike, root: Element) -> WirePhantom:
             ends.append([vector(wire, f"EndPoint{end}", 3) for end in ("Front", "Back")])
     if not names:
         raise InvalidInputError("PhantomDefinition/Geometry: expected elements Pattern with wires, got none")
-    pose = _phantom_pose(path, root)
+    phantom = device.text("PhantomCoordinateFrame", "Phantom")
+    reference = device.text("ReferenceCoordinateFrame", "Reference")
+    matrix, pose = device.transform(phantom, reference), None
+    if matrix is not None:
+        pose = transforms_from_matrices(matrix[None], f"{phantom} to {reference}")[0]
     return WirePhantom(tuple(names), np.reshape(ends, (-1, 2, 3)), tuple(patterns), pose)
-
-
-def _phantom_pose(path: PathLike, root: Element) -> RigidTransform | None:
-    """Find the phantom in PLUS's reference frame, whichever way round the file has it."""
-    algorithm = root.find(".//vtkPlusProbeCalibrationAlgo")
-    named = {} if algorithm is None else algorithm.attrib
-    phantom = named.get("PhantomCoordinateFrame", "Phantom")
-    reference = named.get("ReferenceCoordinateFrame", "Reference")
-    matrix = device_set(str(path), root).transform(phantom, reference)
-    if matrix is None:
-        return None
-    pose: RigidTransform = transforms_from_matrices(matrix[None], f"{phantom} to {reference}")[0]
-    return pose
-
-
-def _hints(segmentation: Element) -> tuple[float | None, FloatArray | None]:
-    """Size of a pixel and the part of images in which dots are looked for."""
-    spacing, clip = None, None
-    if "ApproximateSpacingMmPerPixel" in segmentation.attrib:
-        (spacing,) = vector(segmentation, "ApproximateSpacingMmPerPixel", 1)
-    if {"ClipRectangleOrigin", "ClipRectangleSize"} <= segmentation.attrib.keys():
-        left, top = vector(segmentation, "ClipRectangleOrigin", 2)
-        columns, rows = vector(segmentation, "ClipRectangleSize", 2)
-        right, bottom = left + columns - 1, top + rows - 1
-        clip = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-    return spacing, clip

@@ -101,8 +101,6 @@ class Recording:
         of the frame rate, from 0.
     chain : str
         Transforms that the tracker's poses were made of.
-    range_sigma_db : float
-        Standard deviation of the file's dynamic range, where that was estimated.
     asked : mapping of str to str
         Settings to ask for in place of others, as the probe's model for a distance.
     assumptions : tuple of str
@@ -128,7 +126,6 @@ class Recording:
     probe: str = ""
     name: str = ""
     full_scale: float = 255.0
-    range_sigma_db: float = 0.0
     asked: Mapping[str, str] = field(default_factory=dict)
     assumptions: tuple[str, ...] = ()
     rows: tuple[Row, ...] = ()
@@ -268,9 +265,8 @@ class Recording:
             times = np.arange(frames.shape[0]) / float(rate_hz)
         signal: RFSettings | BModeSettings
         if "dynamic_range_db" in values:
-            own_sigma_db = 0.0 if self.settings.dynamic_range_db else self.range_sigma_db
             is_assumed = self.needed["dynamic_range_db"].is_assumed
-            sigma_db = self._range[1] if is_assumed and self._range else own_sigma_db
+            sigma_db = self._range[1] if is_assumed and self._range else 0.0
             signal = BModeSettings(values["dynamic_range_db"], self.full_scale, sigma_db)
             pitch, spacing = values.get("column_pitch_mm"), values["row_spacing_mm"]
         else:

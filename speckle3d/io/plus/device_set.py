@@ -12,6 +12,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -30,7 +31,6 @@ from speckle3d.io.recordings import Recording, Row
 from speckle3d.io.text import numbers
 
 _PLACES = (".//CoordinateDefinitions/Transform", ".//CalibrationResults/Transform")
-_ALGORITHMS = (".//vtkPlusProbeCalibrationAlgo", ".//vtkProbeCalibrationAlgo", ".//fCal")
 _HAIR = 0.1
 """Pixels by which a rectangle is wider, so that rounding loses none of its own."""
 _ARC_POINTS = 128
@@ -53,21 +53,14 @@ def read_xml(path: PathLike) -> Element:
     FileError
         If the file cannot be read.
     InvalidInputError
-        If it is no XML, or has a type declaration: the entities it may declare can grow without bounds.
+        If it is no XML.
     """
     with reading(path), open_regular(path) as stream:
         text = stream.read()
     try:
-        return ElementTree.fromstring(text, ElementTree.XMLParser(target=_PlainTree()))
+        return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise InvalidInputError(f"{path}: expected well-formed XML, got: {error}") from error
-
-
-class _PlainTree(ElementTree.TreeBuilder):
-    """The tree of a document without a type declaration, so that it has no entities of its own."""
-
-    def doctype(self, name: str, *_: object) -> None:
-        raise ValueError(f"a document type declaration ({name})")
 
 
 def vector(element: Element, attribute: str, count: int) -> tuple[float, ...]:
@@ -83,40 +76,34 @@ class Clip:
 
     Attributes
     ----------
-    columns, rows : tuple of float, optional
-        First and last.
+    rectangle : tuple of float, optional
+        Left, top, right and bottom.
     fan : tuple of float, optional
         Column and row of the apex, the radii, and the angles in degrees from straight down.
     """
 
-    columns: tuple[float, float] | None = None
-    rows: tuple[float, float] | None = None
-    fan: tuple[float, float, float, float, float, float] | None = None
+    rectangle: tuple[float, ...] | None = None
+    fan: tuple[float, ...] | None = None
 
     def __str__(self) -> str:
-        parts = []
-        if self.columns is not None and self.rows is not None:
-            parts.append("columns {:g} to {:g}, rows {:g} to {:g}".format(*self.columns, *self.rows))
-        if self.fan is not None:
-            parts.append(
-                "fan about {:g}, {:g} from {:g} to {:g} pixels, {:g} to {:g} degrees".format(*self.fan)
-            )
-        return "; ".join(parts)
+        parts = {
+            "columns {0:g} to {2:g}, rows {1:g} to {3:g}": self.rectangle,
+            "fan about {:g}, {:g} from {:g} to {:g} pixels, {:g} to {:g} degrees": self.fan,
+        }
+        return "; ".join(text.format(*part) for text, part in parts.items() if part is not None)
 
     def is_part_of(self, size: tuple[int, ...]) -> bool:
         """Whether something of images of a size (x, y) is left out."""
-        sides = zip((self.columns, self.rows), size, strict=False)
-        return self.fan is not None or any(
-            side is not None and (side[0] > 0 or side[1] < length - 1) for side, length in sides
-        )
+        left, top, right, bottom = self.rectangle or (0, 0, *size[:2])
+        return self.fan is not None or max(left, top, size[0] - 1 - right, size[1] - 1 - bottom) > 0
 
     def region_text(self, grid: ImageGrid) -> str | None:
         """The part as a region of images in mm; None where it is all of them."""
-        outlines = []
         if not self.is_part_of((grid.vectors, grid.samples)):
             return None
-        if self.columns is not None and self.rows is not None:
-            (left, right), (top, bottom) = np.add([self.columns, self.rows], [-_HAIR, _HAIR])
+        outlines = []
+        if self.rectangle is not None:
+            left, top, right, bottom = np.add(self.rectangle, [-_HAIR, -_HAIR, _HAIR, _HAIR])
             outlines.append(np.array([(left, top), (right, top), (right, bottom), (left, bottom)]))
         if self.fan is not None:
             x, y, inner, outer, first, stop = self.fan
@@ -139,46 +126,82 @@ class DeviceSet:
 
     Attributes
     ----------
-    names : Names
-        Of the coordinate frames.
-    origin_frame : str
-        Frame of the transducer's face, in mm.
-    transforms : dict
-        Fixed transforms, shape (4, 4), by the frames from which and to which they lead.
-    image_orientation : str, optional
-        Of the machine's own images, as UF.
-    probe : str
-        Model of the transducer.
-    geometry : str
-        Of the transducer, as LINEAR; empty where the set does not say.
-    width_mm : float, optional
-        Of the transducer.
-    radii_mm, angles_deg : tuple of float, optional
-        First and last sample's distance from where the lines of a curved array meet, and its first and last
-        line's angle from straight down.
-    output_size, output_mm : tuple, optional
-        Pixels along x and y of the image that PLUS makes of lines, and their distances.
-    clip : Clip, optional
+    root : Element
+        First element of the document.
     """
 
     path: str = ""
-    names: Names = field(default_factory=Names)
-    origin_frame: str = "TransducerOrigin"
-    transforms: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
-    image_orientation: str | None = None
-    probe: str = ""
-    geometry: str = ""
-    width_mm: float | None = None
-    radii_mm: tuple[float, float] | None = None
-    angles_deg: tuple[float, float] | None = None
-    output_size: tuple[float, ...] | None = None
-    output_mm: tuple[float, ...] | None = None
-    clip: Clip | None = None
+    root: Element = field(default_factory=lambda: Element("PlusConfiguration"))
+
+    def numbers(self, tag: str, count: int, *names: str) -> tuple[float, ...] | None:
+        """Numbers of the first of some attributes that the first element of a tag has."""
+        element = self.root.find(f".//{tag}")
+        name = None if element is None else next((name for name in names if name in element.attrib), None)
+        if element is None or name is None:
+            return None
+        with naming(self.path):
+            return vector(element, name, count)
+
+    def text(self, name: str, default: str = "") -> str:
+        """An attribute that all elements with it share; the default where none has it, or they differ."""
+        values = {element.attrib[name] for element in self.root.iter() if name in element.attrib}
+        return values.pop() if len(values) == 1 else default
+
+    @cached_property
+    def names(self) -> Names:
+        """Of the coordinate frames."""
+        usual = Names()
+        return Names(
+            self.text("ImageCoordinateFrame", usual.image),
+            self.text("ProbeCoordinateFrame", usual.probe),
+            self.text("ToolReferenceFrame", usual.tracker),
+        )
+
+    @cached_property
+    def transforms(self) -> dict[tuple[str, str], FloatArray]:
+        """Fixed transforms, shape (4, 4), by the frames from which and to which they lead."""
+        with naming(self.path):
+            return {
+                (element.get("From", ""), element.get("To", "")): np.reshape(
+                    vector(element, "Matrix", 16), (4, 4)
+                )
+                for place in _PLACES
+                for element in self.root.iterfind(place)
+            }
+
+    @property
+    def geometry(self) -> str:
+        """Of the transducer, as LINEAR; empty where the set does not say."""
+        return self.text("TransducerGeometry").upper()
 
     @property
     def is_curved(self) -> bool:
         """Whether the transducer's lines spread."""
         return self.geometry not in ("", "LINEAR")
+
+    def scan(self, *names: str) -> tuple[float, ...] | None:
+        """Numbers by which the machine makes an image of lines, if all are there."""
+        values = [self.numbers("ScanConversion", 1, name) or () for name in names]
+        return sum(values, ()) if all(values) else None
+
+    @cached_property
+    def clip(self) -> Clip | None:
+        """Clip and fan of a volume reconstruction; names without a unit are those of older versions [1]_."""
+
+        def numbers(count: int, *names: str) -> tuple[float, ...] | None:
+            return self.numbers("VolumeReconstruction", count, *names)
+
+        rectangle = fan = None
+        corner, size = numbers(2, "ClipRectangleOrigin"), numbers(2, "ClipRectangleSize")
+        if corner is not None and size is not None and min(size) > 0:
+            # PLUS counts the pixel behind the rectangle, too (vtkIGSIOPasteSliceIntoVolume).
+            rectangle = (*corner, *np.add(corner, size).tolist())
+        angles, apex = numbers(2, "FanAnglesDeg", "FanAngles"), numbers(2, "FanOriginPixel", "FanOrigin")
+        outer = numbers(1, "FanRadiusStopPixel", "FanDepth")
+        if angles and apex and outer and angles[0] != angles[1]:
+            inner = numbers(1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
+            fan = (*apex, *inner, *outer, *sorted(angles))
+        return None if rectangle is fan is None else Clip(rectangle, fan)
 
     def transform(self, start: str, end: str) -> FloatArray | None:
         """Product of the transforms, or their inverses, on the shortest way between two frames, if any."""
@@ -191,13 +214,14 @@ class DeviceSet:
                     waiting.append(target)
         return reached.get(end)
 
-    def pixel_mm(self, size: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        """Distances of columns and rows of the image, whose size is (x, y), mm; None if unknown."""
-        for end in (self.names.probe, self.origin_frame):
+    def pixel_mm(self, size: tuple[float, ...] | None = None) -> tuple[float, ...] | None:
+        """Distances of columns and rows of the image, by default the machine's, mm; None if unknown."""
+        for end in (self.names.probe, self.text("TransducerOriginCoordinateFrame", "TransducerOrigin")):
             if (matrix := self.transform(self.names.image, end)) is not None:
                 return pixel_axes(matrix, f"{self.path}: {self.names.image} to {end}")
-        is_of_size = self.output_size is None or (size is not None and tuple(size[:2]) == self.output_size)
-        return self.output_mm if is_of_size else None
+        own = self.numbers("ScanConversion", 2, "OutputImageSizePixel")
+        is_of_size = own is None or size is None or size[:2] == own
+        return self.numbers("ScanConversion", 2, "OutputImageSpacingMmPerPixel") if is_of_size else None
 
 
 def read_device_set(path: PathLike) -> DeviceSet:
@@ -208,7 +232,7 @@ def read_device_set(path: PathLike) -> DeviceSet:
     FileError
         If the file cannot be read.
     InvalidInputError
-        Naming the element that is wrong, or if the document is another.
+        If the document is another; what is wrong in it is told when it is asked for.
     """
     root = read_xml(path)
     if root.tag not in [*_DOCUMENTS][:2]:
@@ -216,100 +240,29 @@ def read_device_set(path: PathLike) -> DeviceSet:
             f"{path}: expected a device set of PLUS (PlusConfiguration), or a ProbeCalibrationResult, "
             f"got {root.tag}"
         )
-    with naming(str(path)):
-        return device_set(str(path), root)
-
-
-def device_set(path: str, root: Element) -> DeviceSet:
-    """What a document says, its first element being `root`."""
-    usual, named = Names(), dict[str, str]()
-    for place in _ALGORITHMS:
-        for element in root.iterfind(place):
-            named |= element.attrib
-    scan = root.find(".//ScanConversion")
-    scan = Element("none") if scan is None else scan
-    width = _values(scan, 1, "TransducerWidthMm")
-    return DeviceSet(
-        path,
-        Names(
-            named.get("ImageCoordinateFrame", usual.image),
-            named.get("ProbeCoordinateFrame", usual.probe),
-            _attribute(root, "ToolReferenceFrame") or usual.tracker,
-        ),
-        named.get("TransducerOriginCoordinateFrame", "TransducerOrigin"),
-        {
-            (one.get("From", ""), one.get("To", "")): np.reshape(vector(one, "Matrix", 16), (4, 4))
-            for place in _PLACES
-            for one in root.iterfind(place)
-        },
-        _attribute(root, "PortUsImageOrientation"),
-        scan.get("TransducerName", ""),
-        scan.get("TransducerGeometry", "").upper(),
-        None if width is None else width[0],
-        _both(scan, "RadiusStartMm", "RadiusStopMm"),
-        _both(scan, "ThetaStartDeg", "ThetaStopDeg"),
-        _values(scan, 2, "OutputImageSizePixel"),
-        _values(scan, 2, "OutputImageSpacingMmPerPixel"),
-        _clip(root.find(".//VolumeReconstruction")),
-    )
-
-
-def _both(element: Element, *names: str) -> tuple[float, float] | None:
-    """Two numbers, if both are there."""
-    first, last = (_values(element, 1, name) for name in names)
-    return None if first is None or last is None else (first[0], last[0])
-
-
-def _clip(element: Element | None) -> Clip | None:
-    """Clip and fan of a volume reconstruction; names without a unit are those of older versions [1]_."""
-    if element is None:
-        return None
-    origin, size = _values(element, 2, "ClipRectangleOrigin"), _values(element, 2, "ClipRectangleSize")
-    columns = rows = None
-    if origin is not None and size is not None and min(size) > 0:
-        # PLUS counts the pixel behind the rectangle, too (vtkIGSIOPasteSliceIntoVolume).
-        columns, rows = ((first, first + count) for first, count in zip(origin, size, strict=True))
-    angles = _values(element, 2, "FanAnglesDeg", "FanAngles")
-    apex = _values(element, 2, "FanOriginPixel", "FanOrigin")
-    outer = _values(element, 1, "FanRadiusStopPixel", "FanDepth")
-    inner = _values(element, 1, "FanRadiusStartPixel", "FanRadiusStart") or (0.0,)
-    fan = None
-    if angles is not None and apex is not None and outer is not None and angles[0] != angles[1]:
-        fan = (apex[0], apex[1], inner[0], outer[0], min(angles), max(angles))
-    return None if columns is None and fan is None else Clip(columns, rows, fan)
-
-
-def _values(element: Element, count: int, *names: str) -> tuple[float, ...] | None:
-    """Numbers of the first of some attributes that there is."""
-    return next((vector(element, name, count) for name in names if name in element.attrib), None)
-
-
-def _attribute(root: Element, name: str) -> str | None:
-    """Value of an attribute that all elements with it share; None where none has it, or they differ."""
-    values = {element.get(name) for element in root.iter() if name in element.attrib}
-    return values.pop() if len(values) == 1 else None
+    return DeviceSet(str(path), root)
 
 
 def _open(path: Path, settings: ImportSettings) -> Recording:
-    root = read_xml(path)
-    if root.tag not in _DOCUMENTS:
-        raise InvalidInputError(
-            f"{path}: expected a document of PLUS ({', '.join(_DOCUMENTS)}), got {root.tag}"
-        )
-    what, use = _DOCUMENTS[root.tag]
+    device = DeviceSet(str(path), read_xml(path))
+    tag = device.root.tag
+    if tag not in _DOCUMENTS:
+        raise InvalidInputError(f"{path}: expected a document of PLUS ({', '.join(_DOCUMENTS)}), got {tag}")
+    what, use = _DOCUMENTS[tag]
     rows: list[Row] = [("content", what, "")]
-    if root.tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
-        rows.append(("time offset of the tracker", f"{-vector(root, 'TrackerLagSec', 1)[0]:+.4f}", "s"))
+    if tag == "TemporalCalibrationResults":  # whose sign is the other way round: a lag is negative there
+        rows.append(
+            ("time offset of the tracker", f"{-vector(device.root, 'TrackerLagSec', 1)[0]:+.4f}", "s")
+        )
     if use == _CONFIG:
-        device = read_device_set(path)
-        pixel = device.pixel_mm(device.output_size)
-        if root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
+        pixel, transducer = device.pixel_mm(), f"{device.text('TransducerName')} {device.geometry}"
+        if device.root.find(".//PhantomDefinition/Geometry/Pattern/Wire") is not None:
             use += ", --phantom of calibrate wires"
         rows += [
             *((f"{a} to {b}", "transform", "") for a, b in device.transforms),
             ("pixel", "unknown" if pixel is None else " x ".join(f"{mm:.5f} mm" for mm in pixel), ""),
-            ("transducer", f"{device.probe} {device.geometry}".strip() or "not said", ""),
-            ("clip of volumes", "none" if device.clip is None else str(device.clip), ""),
+            ("transducer", transducer.strip() or "not said", ""),
+            ("clip of volumes", str(device.clip or "none"), ""),
         ]
     fault = InvalidInputError(f"{path}: expected a recording, got {what} of PLUS, which is for {use}")
     return Recording(path, settings, rows=(*rows, ("for", use, "")), fault=fault)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
-from speckle3d.io.pose_paths import ROUNDING_TOLERANCE, rigid
+from speckle3d.io.pose_paths import rigid
 from speckle3d.io.text import numbers
 
 SKEW_TOLERANCE = 0.1
@@ -44,7 +44,7 @@ class Poses:
     chain : tuple of str
         Transforms from the tool to the world, in the order in which they are applied.
     matrices : ndarray, shape (n, 4, 4)
-        Rigid; the identity where there is no valid one.
+        Rigid to rounding; the identity where there is no valid one.
     faults : list of str
         Why there is none; empty where there is.
     pixels : ndarray, shape (4, 4), optional
@@ -72,7 +72,7 @@ def tracked_poses(
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
 
-    The tool may be the image itself, as in ``ImageToReference``: poses are then the nearest rigid ones.
+    The tool may be the image itself, as in ``ImageToReference``.
 
     Parameters
     ----------
@@ -105,23 +105,14 @@ def tracked_poses(
     matrices, faults = _column(path, frames, name)
     pixels, chain = None, [name]
     if tool == names.image:
-        matrices, own, pixels = _poses_of_pixels(path, name, matrices, faults)
-    else:
-        matrices, own = rigid(matrices)
+        matrices, pixels = _image_poses(matrices, faults, f"{path}: {name}Transform")
     if fixed != "none":
         world_from_reference, others = _column(path, frames, fixed)
         world_from_reference, odd = rigid(world_from_reference)
         matrices = np.asarray(np.linalg.inv(world_from_reference) @ matrices)
-        own = _first(own, others, odd)
+        faults = [next(filter(None, reasons), "") for reasons in zip(faults, others, odd, strict=True)]
         chain.append(_back(fixed))
-    return Poses(tool, tuple(chain), matrices, _first(faults, own), pixels)
-
-
-def tracked_orientation(path: str, frames: Sequence[Fields]) -> Poses | None:
-    """Read the orientation sensor's stream that this package writes; None where there is none."""
-    name = f"{ORIENTATION}ToWorld"
-    there = name in names_of(frames)
-    return tracked_poses(path, frames, name, "none", Names()) if there else None
+    return Poses(tool, tuple(chain), matrices, faults, pixels)
 
 
 def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: str) -> FloatArray | None:
@@ -245,11 +236,6 @@ def _usual(there: Sequence[str], names: Names) -> str | None:
     return None
 
 
-def _first(*faults: list[str]) -> list[str]:
-    """The first fault of each frame."""
-    return [next(filter(None, column), "") for column in zip(*faults, strict=True)]
-
-
 def _column(path: str, frames: Sequence[Fields], name: str) -> tuple[FloatArray, list[str]]:
     """One transform by frame, or the inverse of what is held; the identity where not valid, and why."""
     is_back = not any(f"{name}Transform" in frame for frame in frames)
@@ -267,25 +253,26 @@ def _column(path: str, frames: Sequence[Fields], name: str) -> tuple[FloatArray,
     return matrices, faults
 
 
-def _poses_of_pixels(
-    path: str, name: str, matrices: FloatArray, missing: list[str]
-) -> tuple[FloatArray, list[str], FloatArray | None]:
-    """Split transforms of pixels to mm into the image's poses and its pixels, the same in all frames."""
-    poses, faults, rows = np.tile(np.eye(4), (len(matrices), 1, 1)), [""] * len(matrices), list[int]()
-    sizes, given = np.linalg.norm(matrices[:, :3, :2], axis=1), [not fault for fault in missing]
-    middle = np.median(sizes[given], axis=0)
-    for i in np.flatnonzero(given).tolist():
-        try:
-            poses[i] = sensor_from_image(matrices[i], 0.0, f"{path}: {name}Transform[{i}]").as_matrix()
-        except InvalidInputError:
-            if not rows and not any(given[i + 1 :]):
-                raise
-            faults[i] = "whose pixels make no sense"
-            continue
-        rows.append(i)
-        if (np.abs(sizes[i] / middle - 1.0) > ROUNDING_TOLERANCE).any():
-            faults[i] = f"whose pixels are not of {middle[0]:.6g} x {middle[1]:.6g} mm"
-    if not rows:
-        return poses, faults, None
-    leaning, (column_mm, row_mm) = image_skew_rad(matrices[rows[0]], path), middle.tolist()
-    return poses, faults, image_matrix(RigidTransform.identity(), column_mm, row_mm, 0.0, leaning)
+def _image_poses(
+    matrices: FloatArray, faults: Sequence[str], where: str
+) -> tuple[FloatArray, FloatArray | None]:
+    """Split transforms of pixels to mm into the image's poses and its pixels, those of the middle size.
+
+    Where a frame's pixels are others, its pose is not rigid.
+    """
+    valid = np.flatnonzero([not fault for fault in faults])
+    if not valid.size:
+        return matrices, None
+    right_handed = valid[np.linalg.det(matrices[valid, :3, :3]) >= 0]
+    rows = right_handed if right_handed.size else valid
+    widths = np.linalg.norm(matrices[rows, :3, 0], axis=1)
+    usual = matrices[rows[np.argsort(widths)[widths.size // 2]]]
+    sensor_from_image(usual, 0.0, where)  # refuses what is no calibration
+    pixels = image_matrix(
+        RigidTransform.identity(), *pixel_axes(usual, where), 0.0, image_skew_rad(usual, where)
+    )
+    poses = matrices.copy()
+    across = np.cross(poses[:, :3, 0], poses[:, :3, 1])
+    # The third column, which may be anything, becomes that of a plane's pixels.
+    poses[:, :3, 2] = across * (pixels[2, 2] / np.linalg.norm(np.cross(pixels[:3, 0], pixels[:3, 1])))
+    return poses @ np.linalg.inv(pixels), pixels

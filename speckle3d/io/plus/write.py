@@ -9,7 +9,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,7 @@ from speckle3d.core.files import PathLike
 from speckle3d.core.progress import Progress
 from speckle3d.core.sweep import OrientationSensor, RFSettings, Sweep, Tracker, stored_dtype
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.headers import (
-    GZIP,
-    NRRD_NAMES,
-    ZLIB,
-    header_bytes,
-    meta_start,
-    meta_type,
-    nrrd_type,
-    packer,
-    put_packed_size,
-)
+from speckle3d.io.headers import NRRD_NAMES, meta_header, nrrd_header, write_image
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.plus.transforms import IMAGE, ORIENTATION, image_matrix
 from speckle3d.io.text import numbers
@@ -59,12 +49,11 @@ def own_values(path: str, fields: Mapping[str, str]) -> dict[str, Any]:
         Naming the field that does not make sense.
     """
     own: dict[str, Any] = {}
-    for name in (*ImportSettings.model_fields, "full_scale", "dynamic_range_sigma_db"):
-        if (text := fields.get(_PREFIX + name)) is not None and name != "probe":
-            values = numbers(text, 2 if name == "bandwidth_hz" else 1, f"{path}: {_PREFIX}{name}")
-            own[name] = values if len(values) == 2 else values[0]
-        elif text is not None:
-            own[name] = text
+    for name in (*ImportSettings.model_fields, "full_scale"):
+        if (text := fields.get(_PREFIX + name)) is not None:
+            count = 2 if name == "bandwidth_hz" else 1
+            values = text if name == "probe" else numbers(text, count, f"{path}: {_PREFIX}{name}")
+            own[name] = values[0] if len(values) == 1 else values
     return own
 
 
@@ -104,7 +93,8 @@ def write_sequence(
     FileError
         If the file cannot be written.
     """
-    target, name = Path(path), Path(path).name.lower()
+    target = Path(path)
+    name = target.name.lower()
     if not name.endswith(SUFFIXES):
         raise InvalidInputError(f"{path}: expected a name ending in {' or '.join(SUFFIXES)}")
     if sweep.grid.fan is not None:
@@ -120,23 +110,20 @@ def write_sequence(
     if dtype.kind == "c":
         dtype = np.dtype(np.int16 if stored_dtype(sweep.frames) == np.int16 else np.float32)
     shape = (*_pixels(sweep.frames[0]).shape[::-1], len(sweep))
-    if is_nrrd:
-        encoding = "gzip" if compressed else "raw"
-        head = _nrrd_header(fields, frames, shape, nrrd_type(dtype), encoding, name.endswith(_OF_SLICER))
-    else:
-        head = _meta_header(fields, frames, shape, meta_type(dtype), 0 if compressed else None)
-    pack = packer(GZIP if is_nrrd else ZLIB) if compressed else None
-    with atomic_path(target) as place, place.open("wb") as file:
-        file.write(head)
+
+    def planes() -> Iterator[npt.NDArray[Any]]:
         for i in range(len(sweep)):
-            raw = _pixels(sweep.frames[i]).astype(dtype.newbyteorder("<"), order="C").data.cast("B")
-            file.write(raw if pack is None else pack.compress(raw))
+            yield _pixels(sweep.frames[i]).astype(dtype, copy=False)
             if progress is not None:
                 progress(i + 1, len(sweep))
-        if pack is not None:
-            file.write(pack.flush())
-            if not is_nrrd:
-                put_packed_size(file, head, file.tell() - len(head))
+
+    def header(packed_bytes: int | None) -> str:
+        if is_nrrd:
+            return _nrrd_header(fields, frames, shape, dtype, compressed, name.endswith(_OF_SLICER))
+        return _meta_header(fields, frames, shape, dtype, packed_bytes)
+
+    with atomic_path(target) as part:
+        write_image(part, header, planes(), compressed, is_nrrd)
     return omitted
 
 
@@ -166,8 +153,11 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     frames = _timed(times_s)
     for name, matrices in transforms.items():
         _add(frames, name, matrices)
+    shape, fields = (0, 0, len(frames)), {"ElementSpacing": "1 1 1"}
     with atomic_path(path) as part:
-        part.write_bytes(_meta_header({}, frames, (0, 0, len(frames)), "UCHAR", None))
+        write_image(
+            part, lambda _: _meta_header(fields, frames, shape, np.dtype("u1"), None), (), False, False
+        )
 
 
 def _timed(times_s: FloatArray) -> list[dict[str, str]]:
@@ -180,7 +170,7 @@ def _add(
 ) -> None:
     """Give each frame a transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
     for i, (frame, matrix) in enumerate(zip(frames, matrices, strict=True)):
-        frame[f"{name}Transform"] = " ".join(map(_text, matrix.ravel()))
+        frame[f"{name}Transform"] = _text(matrix)
         frame[f"{name}TransformStatus"] = "OK" if valid is None or valid[i] else "INVALID"
 
 
@@ -234,13 +224,13 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
     if own.pop("dynamic_range_sigma_db", 0.0):
         del own["dynamic_range_db"]  # which is estimated from the images as it was
     own |= {"first_sample_depth_mm": grid.first_sample_depth_mm, **dict(zip(names, sizes, strict=False))}
-    texts = {name: " ".join(map(_text, np.ravel(value))) for name, value in own.items()}
+    texts = {name: _text(value) for name, value in own.items()}
     if sweep.probe:
         texts["probe"] = " ".join(sweep.probe.split())
     return {
         "UltrasoundImageOrientation": "FM" if is_rf else "MF",
         "UltrasoundImageType": kind,
-        "ElementSpacing": " ".join(map(_text, (*spacing, 1.0))),
+        "ElementSpacing": _text((*spacing, 1.0)),
         "Offset": "0 0 0",
         "TransformMatrix": "1 0 0 0 1 0 0 0 1",
         "CenterOfRotation": "0 0 0",
@@ -249,96 +239,63 @@ def _standard_fields(sweep: Sweep) -> dict[str, str]:
     }
 
 
-def _text(value: float) -> str:
-    """Write a number so that reading gives it back exactly."""
-    return repr(float(value)).removesuffix(".0")
+def _text(values: npt.ArrayLike) -> str:
+    """Write numbers so that reading gives them back exactly."""
+    return " ".join(repr(value).removesuffix(".0") for value in np.ravel(values).astype(float).tolist())
 
 
-def _frame_lines(frames: list[dict[str, str]], sign: str) -> list[str]:
-    return [
-        f"Seq_Frame{i:04d}_{name}{sign}{value}"
-        for i, frame in enumerate(frames)
-        for name, value in frame.items()
-    ]
+def _frame_fields(frames: list[dict[str, str]]) -> dict[str, str]:
+    return {
+        f"Seq_Frame{i:04d}_{name}": value for i, frame in enumerate(frames) for name, value in frame.items()
+    }
 
 
 def _meta_header(
     fields: dict[str, str],
     frames: list[dict[str, str]],
     shape: tuple[int, int, int],
-    kind: str,
-    packed: int | None,
-) -> bytes:
-    lines = [
-        *meta_start(packed),
-        f"DimSize = {_spaced(shape)}",
-        f"ElementType = MET_{kind}",
-        "Kinds = domain domain list",
-        *(f"{name} = {value}" for name, value in {"ElementSpacing": "1 1 1", **fields}.items()),
-        *_frame_lines(frames, " = "),
-        "ElementDataFile = LOCAL",
-    ]
-    return header_bytes(lines)
+    dtype: np.dtype[Any],
+    packed_bytes: int | None,
+) -> str:
+    return meta_header(shape, dtype, "domain domain list", fields | _frame_fields(frames), packed_bytes)
 
 
 def _nrrd_header(
     fields: dict[str, str],
     frames: list[dict[str, str]],
     shape: tuple[int, int, int],
-    kind: str,
-    encoding: str,
+    dtype: np.dtype[Any],
+    compressed: bool,
     is_slicers: bool,
-) -> bytes:
+) -> str:
     """Header of images with an axis of frames: in a plane, as PLUS writes them, or as Slicer's.
 
     Slicer's are one pixel thick in space; transforms count pixels from its origin.
     """
-    plain = dict(fields)
-    x, y, *_ = plain.pop("ElementSpacing").split()
-    axes = [
-        "dimension: 3",
-        "space dimension: 2",
-        f"sizes: {_spaced(shape)}",
-        f"space directions: ({x},0) (0,{y}) none",
-        "kinds: domain domain list",
-        "space origin: (0,0)",
-    ]
-    index = []
-    if is_slicers:
-        axes = [
-            "dimension: 4",
-            "space: right-anterior-superior",
-            f"sizes: {shape[0]} {shape[1]} 1 {shape[2]}",
-            f"space directions: ({x},0,0) (0,{y},0) (0,0,1) none",
-            "kinds: domain domain domain list",
-            'labels: "" "" "" "time"',
-            'units: "" "" "" "s"',
-            "space origin: (0,0,0)",
-        ]
-        # Slicer finds what belongs together by frames' times; it rounds those of transforms to 1 ms.
-        times = [f"{float(frame['Timestamp']):.3f}" for frame in frames]
-        told = _spaced(times if len({*times}) == len(times) else range(len(times)))
-        # Up to version 5.6 Slicer knew the axis of frames as the first.
-        index = [
-            line
-            for axis in (3, 0)
-            for line in (f"axis {axis} index type:=numeric", f"axis {axis} index values:={told}")
-        ]
-        index.insert(0, "DataNodeClassName:=vtkMRMLScalarVolumeNode")
-    lines = [
-        "NRRD0004",
-        f"type: {kind}",
-        *axes,
-        "endian: little",
-        f"encoding: {encoding}",
-        *(f"{_NRRD_NAMES.get(key, key)}:={value}" for key, value in plain.items()),
-        *_frame_lines(frames, ":="),
-        # Slicer reads the transforms up to the first line of more than 1,000 characters.
-        *index,
-        "",
-    ]
-    return header_bytes(lines)
-
-
-def _spaced(values: Iterable[object]) -> str:
-    return " ".join(map(str, values))
+    plain = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()} | _frame_fields(frames)
+    x, y, _ = plain.pop("ElementSpacing").split()
+    width, height, count = shape
+    if not is_slicers:
+        axes = f"""dimension: 3
+space dimension: 2
+sizes: {width} {height} {count}
+space directions: ({x},0) (0,{y}) none
+kinds: domain domain list
+space origin: (0,0)"""
+        return nrrd_header(4, dtype, axes, plain, compressed)
+    axes = f"""dimension: 4
+space: right-anterior-superior
+sizes: {width} {height} 1 {count}
+space directions: ({x},0,0) (0,{y},0) (0,0,1) none
+kinds: domain domain domain list
+labels: "" "" "" "time"
+units: "" "" "" "s"
+space origin: (0,0,0)"""
+    # Slicer finds what belongs together by frames' times; it rounds those of transforms to 1 ms.
+    times = [f"{float(frame['Timestamp']):.3f}" for frame in frames]
+    values = " ".join(times if len({*times}) == count else map(str, range(count)))
+    # Slicer reads the transforms up to the first line of more than 1,000 characters.
+    plain["DataNodeClassName"] = "vtkMRMLScalarVolumeNode"
+    for axis in (3, 0):  # up to version 5.6 Slicer knew the axis of frames as the first
+        plain |= {f"axis {axis} index type": "numeric", f"axis {axis} index values": values}
+    return nrrd_header(4, dtype, axes, plain, compressed)

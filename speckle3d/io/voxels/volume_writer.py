@@ -26,7 +26,7 @@ from speckle3d.core.labels import LabelMap, Segment
 from speckle3d.core.printable import printable
 from speckle3d.core.volume import Volume
 from speckle3d.io.hdf5 import atomic_path
-from speckle3d.io.headers import GZIP, ZLIB, header_bytes, meta_start, meta_type, nrrd_type, packer
+from speckle3d.io.headers import meta_header, nrrd_header, write_image
 from speckle3d.io.voxels.segments import segment_fields
 
 SUFFIXES = (".nrrd", ".mha", ".nii.gz", ".nii")
@@ -83,16 +83,10 @@ def write_volume(path: PathLike, volume: Volume, compress: bool = True) -> None:
         if ".nii" in suffix:
             _write_nifti(part, volume, {**volume.fields, **plain}, is_labels)
             return
-        raw = volume.voxels.T.astype(volume.voxels.dtype.newbyteorder("<"), order="C", copy=False)
-        content = raw.data.cast("B")
-        if compress:
-            pack = packer(GZIP if suffix == ".nrrd" else ZLIB)
-            content = pack.compress(content) + pack.flush()
         fields = {f"{PREFIX}{name}": value for name, value in volume.fields.items()} | plain
-        head = _nrrd_header if suffix == ".nrrd" else _meta_header
-        with part.open("wb") as file:
-            file.write(head(volume, fields, len(content) if compress else None))
-            file.write(content)
+        fields = {name: _escaped(value) for name, value in fields.items()}
+        header, is_nrrd = _nrrd_header if suffix == ".nrrd" else _meta_header, suffix == ".nrrd"
+        write_image(part, lambda size: header(volume, fields, size), volume.voxels.T, compress, is_nrrd)
 
 
 class VolumeWriter:
@@ -194,44 +188,29 @@ def _write_nifti(path: Path, volume: Volume, fields: Mapping[str, str], is_label
     nibabel.save(image, path)
 
 
-def _nrrd_header(volume: Volume, fields: Mapping[str, str], packed_size: int | None) -> bytes:
+def _nrrd_header(volume: Volume, fields: Mapping[str, str], packed_bytes: int | None) -> str:
     *steps, origin = (f"({_texts(column, ',')})" for column in volume.world_from_index[:3].T)
-    return header_bytes(
-        [
-            "NRRD0005",
-            f"type: {nrrd_type(volume.voxels.dtype)}",
-            "dimension: 3",
-            "space: left-posterior-superior",
-            f"sizes: {_texts(volume.shape)}",
-            f"space directions: {' '.join(steps)}",
-            "kinds: domain domain domain",
-            "endian: little",
-            f"encoding: {'raw' if packed_size is None else 'gzip'}",
-            'space units: "mm" "mm" "mm"',
-            f"space origin: {origin}",
-            *(f"{name}:={_escaped(value)}" for name, value in fields.items()),
-            "",
-        ]
-    )
+    axes = f"""dimension: 3
+space: left-posterior-superior
+sizes: {_texts(volume.shape)}
+space directions: {" ".join(steps)}
+kinds: domain domain domain
+space units: "mm" "mm" "mm"
+space origin: {origin}"""
+    return nrrd_header(5, volume.voxels.dtype, axes, fields, packed_bytes is not None)
 
 
-def _meta_header(volume: Volume, fields: Mapping[str, str], packed_size: int | None) -> bytes:
+def _meta_header(volume: Volume, fields: Mapping[str, str], packed_bytes: int | None) -> str:
     pose = volume.world_from_grid
-    return header_bytes(
-        [
-            *meta_start(packed_size),
-            f"TransformMatrix = {_texts(pose.rotation.as_matrix().T.ravel())}",
-            f"Offset = {_texts(pose.translation)}",
-            "CenterOfRotation = 0 0 0",
-            f"ElementSpacing = {_texts(volume.spacing_mm)}",
-            f"DimSize = {_texts(volume.shape)}",
-            # As PLUS tells a volume from a sequence of frames.
-            "Kinds = domain domain domain",
-            *(f"{name} = {_escaped(value)}" for name, value in fields.items()),
-            f"ElementType = MET_{meta_type(volume.voxels.dtype)}",
-            "ElementDataFile = LOCAL",
-        ]
-    )
+    place = {
+        "TransformMatrix": _texts(pose.rotation.as_matrix().T.ravel()),
+        "Offset": _texts(pose.translation),
+        "CenterOfRotation": "0 0 0",
+        "ElementSpacing": _texts(volume.spacing_mm),
+    }
+    # Kinds as PLUS tells a volume from a sequence of frames.
+    kinds = "domain domain domain"
+    return meta_header(volume.shape, volume.voxels.dtype, kinds, {**place, **fields}, packed_bytes)
 
 
 def require_suffix(path: Path, is_labels: bool = False) -> str:

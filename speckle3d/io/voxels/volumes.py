@@ -192,10 +192,13 @@ def _read_nifti(path: Path) -> tuple[npt.NDArray[Any], FloatArray, dict[str, str
     FileError
         In nibabel's words, if it is truncated or damaged.
     """
-    with reading(path, Exception):  # a damaged file shows in whatever nibabel happens to stumble over
+    with (
+        naming(str(path)),
+        reading(path, Exception),
+    ):  # a damaged file shows in whatever nibabel happens to stumble over
         image: Any = nibabel.load(path)
         voxels = np.asanyarray(image.dataobj)
-        factor = mm_per(image.header.get_xyzt_units()[0], str(path))
+        factor = mm_per(image.header.get_xyzt_units()[0])
         is_labels = image.header.get_intent()[0] == LABELS
     while voxels.ndim > 3 and voxels.shape[-1] == 1:
         voxels = voxels[..., 0]
