@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +47,7 @@ class FileSet:
     def replaced(self, folder: Path) -> Iterator[Path]:
         """Yield an empty folder to write the set into; if the block succeeds, it takes the old set's place.
 
-        A folder that does not exist appears whole; after a failure it still does not, nor those above it.
+        A folder that does not exist appears whole; after a failure it still does not.
 
         Raises
         ------
@@ -62,7 +62,6 @@ class FileSet:
         for name in self.names if existed else ():
             require_target(folder / name)
         base, name = (folder, self.primary) if existed else (folder.parent, folder.name)
-        above = [parent for parent in (base, *base.parents) if not parent.exists()]
         make_folder(base)
         part = base / f".part-{name}"
         try:
@@ -83,10 +82,6 @@ class FileSet:
             raise type(error)(str(error).replace(str(part), str(given))) from error
         except OSError as error:
             raise cannot_write(given / self.primary, error) from error
-        finally:
-            for parent in above:
-                with suppress(OSError):  # it holds the result
-                    parent.rmdir()
 
     def _put_in_place(self, part: Path, folder: Path) -> None:
         for name in (*self.others, *self.derived):

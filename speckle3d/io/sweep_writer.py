@@ -8,17 +8,19 @@ either as there are times.
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
 import h5py
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
+from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError, Speckle3DError, naming
 from speckle3d.core.geometry import require_finite, rotations_from_quaternions, transforms_from_matrices
 from speckle3d.core.grid import ImageGrid
@@ -34,16 +36,7 @@ from speckle3d.core.sweep import (
     stored_dtype,
 )
 from speckle3d.core.threads import ahead
-from speckle3d.io.hdf5 import (
-    PathLike,
-    atomic_path,
-    find_member,
-    has_member,
-    open_hdf5,
-    opened,
-    reading,
-    require_target,
-)
+from speckle3d.io.hdf5 import PathLike, find_member, open_hdf5, reading, require_target
 from speckle3d.io.meanings import label
 from speckle3d.io.records import put, reserve, trim, written
 from speckle3d.io.sweeps import (
@@ -55,6 +48,7 @@ from speckle3d.io.sweeps import (
     SAMPLE_TYPES,
     VERSION,
     SweepSlices,
+    open_sweep,
     require_sample_type,
 )
 
@@ -66,62 +60,58 @@ _GZIP_LEVEL = 1
 """Higher ones take several times as long for echoes and save no more than 2 %."""
 
 
-class _FrameSet:
-    """The data set ``/rf``, ``/iq`` or ``/bmode`` of a file that is being written, and what describes it."""
+def _create_frames(
+    file: h5py.File,
+    grid: ImageGrid,
+    signal: RFSettings | BModeSettings,
+    dtype: npt.DTypeLike | None,
+    compression: Compression,
+) -> h5py.Dataset:
+    """Data set ``/rf``, ``/iq`` or ``/bmode`` of a new file, without frames, and what describes them."""
+    name, version = "bmode", VERSION
+    sizes = {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
+    if isinstance(signal, RFSettings):
+        name, version = ("iq", IQ_VERSION) if signal.are_complex else ("rf", VERSION)
+        sizes = {"vector_pitch_mm": grid.vector_pitch_mm}
+    kind = np.dtype(dtype or SAMPLE_TYPES[name][0])
+    require_sample_type(name, kind, f"/{name}")
+    shape = (grid.vectors, grid.samples, *((2,) if name == "iq" and kind == np.int16 else ()))
+    node = file.create_dataset(
+        name, (0, *shape), kind, maxshape=(None, *shape), chunks=(1, *shape), compression=compression,
+        compression_opts=_GZIP_LEVEL if compression == "gzip" else None, shuffle=compression is not None,
+    )  # fmt: skip
+    values = {**vars(signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
+    values["first_vector_mm"] = grid.first_vector_mm or None
+    node.attrs.update({name: value for name, value in values.items() if value is not None})
+    put(file, "fan", grid.fan)
+    file.attrs["version"] = version if grid.fan is None else FAN_VERSION
+    return node
 
-    def __init__(
-        self,
-        file: h5py.File,
-        path: PathLike,
-        grid: ImageGrid,
-        signal: RFSettings | BModeSettings,
-        dtype: npt.DTypeLike | None,
-        compression: Compression,
-    ) -> None:
-        name, version = "bmode", VERSION
-        sizes = {"column_pitch_mm": grid.vector_pitch_mm, "row_spacing_mm": grid.sample_spacing_mm}
-        if isinstance(signal, RFSettings):
-            name, version = ("iq", IQ_VERSION) if signal.are_complex else ("rf", VERSION)
-            sizes = {"vector_pitch_mm": grid.vector_pitch_mm}
-        kind, self._where = np.dtype(dtype or SAMPLE_TYPES[name][0]), f"{path}: /{name}"
-        require_sample_type(name, kind, self._where)
-        self._shape, self._are_complex, self.count = (grid.vectors, grid.samples), name == "iq", 0
-        self._file, self._kind, self._is_packed = file.id, kind, compression is not None
-        shape = (*self._shape, *((2,) if self._are_complex and kind == np.int16 else ()))
-        self.node = file.create_dataset(
-            name, (0, *shape), kind, maxshape=(None, *shape), chunks=(1, *shape), compression=compression,
-            compression_opts=_GZIP_LEVEL if compression == "gzip" else None, shuffle=compression is not None,
-        )  # fmt: skip
-        values = {**vars(signal), **sizes, "first_sample_depth_mm": grid.first_sample_depth_mm}
-        values["first_vector_mm"] = grid.first_vector_mm or None
-        self.node.attrs.update({name: value for name, value in values.items() if value is not None})
-        put(file, "fan", grid.fan)
-        file.attrs["version"] = version if grid.fan is None else FAN_VERSION
 
-    def append(self, frame: npt.NDArray[Any]) -> None:
-        """Write the next frame, shape (vector, sample), and hand it to the operating system.
+def _append_frame(node: h5py.Dataset, frame: npt.NDArray[Any]) -> None:
+    """Write the next frame, shape (vector, sample), and hand it to the operating system.
 
-        Raises
-        ------
-        InvalidInputError
-            If its shape or type is another, or it holds NaN.
-        """
-        where, wanted = f"{self._where}[{self.count}]", np.complex64 if self._are_complex else self._kind
-        if frame.shape != self._shape or not np.can_cast(frame.dtype, wanted, "same_kind"):
-            got = f"{frame.dtype}, {frame.shape}"
-            raise InvalidInputError(f"{where}: expected a frame of {wanted}, shape {self._shape}, got {got}")
-        if frame.dtype.kind in "fc":
-            require_finite(frame, where)
-        stored = np.ascontiguousarray(frame, wanted)
-        if stored.dtype != self._kind:  # pairs of int16, as which they were read
-            stored = stored.view(np.float32).reshape(*self._shape, 2).astype(self._kind)
-        reserve(self._file, stored.nbytes)
-        self.node.id.set_extent((self.count + 1, *stored.shape))
-        if self._is_packed:
-            self.node[self.count] = stored
-        else:
-            self.node.id.write_direct_chunk((self.count, *(0,) * stored.ndim), stored)
-        self.count += 1
+    Raises
+    ------
+    InvalidInputError
+        If its shape or type is another, or it holds NaN.
+    """
+    count, *shape = node.shape
+    kind = np.dtype(np.complex64) if node.name == "/iq" else node.dtype
+    if frame.shape != (*shape[:2],) or not np.can_cast(frame.dtype, kind, "same_kind"):
+        got = f"{frame.dtype}, {frame.shape}"
+        raise InvalidInputError(f"frame {count}: expected {kind}, shape {shape[:2]}, got {got}")
+    if frame.dtype.kind in "fc":
+        require_finite(frame, f"frame {count}")
+    stored = np.ascontiguousarray(frame, kind)
+    if kind != node.dtype:  # pairs of int16, as which they were read
+        stored = stored.view(np.float32).reshape(shape).astype(node.dtype)
+    reserve(node.file.id, stored.nbytes)
+    node.id.set_extent((count + 1, *shape))
+    if node.compression is None:
+        node.id.write_direct_chunk((count, *(0,) * stored.ndim), stored)
+    else:
+        node[count] = stored
 
 
 def write_sweep(
@@ -166,10 +156,10 @@ def write_sweep(
     frames = sweep.frames
     # Frames that are computed when they are read are made on all cores.
     made = (ahead if getattr(frames, "computed", False) else map)(frames.__getitem__, range(len(sweep)))
-    with written(path, FORMAT) as file:
-        images = _FrameSet(file, path, sweep.grid, sweep.signal, stored_dtype(frames), compression)
+    with naming(str(path)), written(path, FORMAT) as file:
+        node = _create_frames(file, sweep.grid, sweep.signal, stored_dtype(frames), compression)
         for i, frame in enumerate(made):
-            images.append(frame)
+            _append_frame(node, frame)
             if progress is not None:
                 progress(i + 1, len(sweep))
         put(file, "frame_time_s", sweep.frame_time_s)
@@ -198,7 +188,7 @@ def _copy_unknown(source: PathLike, file: h5py.File) -> None:
 def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     """Put an orientation sensor's stream into a sweep file, in place of the one it may hold.
 
-    The file is copied, changed and put back in one step, so that it is never half written.
+    The file is written anew, without compression, and put back in one step, so that it is never half written.
 
     Raises
     ------
@@ -207,41 +197,33 @@ def attach_orientation(path: PathLike, sensor: OrientationSensor) -> None:
     InvalidInputError
         If it is no sweep file.
     """
-    with opened(path, FORMAT, (VERSION, IQ_VERSION, FAN_VERSION)) as file:
-        has_one = has_member(file, "orientation")
-    with atomic_path(path) as part:
-        shutil.copyfile(path, part)
-        with h5py.File(part, "r+", locking=False) as file:
-            reserve(file.id)
-            if has_one:
-                del file["orientation"]
-            _write_sensor(file, sensor)
-        trim(part)
+    sweep = open_sweep(Path(path)).ready
+    assert sweep is not None
+    write_sweep(path, replace(sweep, orientation=sensor))
 
 
 def _write_sensor(file: h5py.File, sensor: OrientationSensor | Tracker) -> None:
-    readings = sensor.readings
+    readings, mounting = sensor.readings, sensor.sensor_from_image
     values: dict[str, Any] = {"time_s": readings.time_s, "time_offset_s": sensor.time_offset_s}
     if isinstance(sensor, Tracker):
-        values["world_from_sensor"] = readings.world_from_sensor
-        values["valid"] = np.ones(len(readings), dtype=bool)
+        name, values["world_from_sensor"] = "tracker", readings.world_from_sensor
         values["image_skew_rad"] = sensor.image_skew_rad or None
     else:
-        values["quaternion"] = readings.world_from_sensor
-        values |= {name: getattr(sensor, name) for name in INERTIAL}
-    name = "tracker" if isinstance(sensor, Tracker) else "orientation"
+        name, values["quaternion"] = "orientation", readings.world_from_sensor
+        values |= {vector: getattr(sensor, vector) for vector in INERTIAL}
     put(file, name, values)
-    _put_mounting(file[name], sensor.sensor_from_image)
-
-
-def _put_mounting(group: h5py.Group, mounting: RigidTransform | Rotation | None) -> None:
-    """Write where the image is on a sensor."""
     if isinstance(mounting, RigidTransform):
-        group.attrs["sensor_from_image"] = mounting.as_matrix()
+        file[name].attrs["sensor_from_image"] = mounting.as_matrix()
     elif mounting is not None:
-        group.attrs["sensor_from_image_wxyz"] = mounting.as_quat(scalar_first=True)
+        file[name].attrs["sensor_from_image_wxyz"] = mounting.as_quat(scalar_first=True)
 
 
+_STREAMS: dict[str, dict[str, tuple[int, ...]]] = {
+    "/": {"frame_time_s": ()},
+    "tracker": {"world_from_sensor": (4, 4), "valid": (), "time_s": ()},
+    "orientation": {"quaternion_wxyz": (4,), "time_s": ()},
+}
+"""Groups whose data sets grow row by row, by the shape of a row. Times last: what has a time is whole."""
 _ROWS_PER_CHUNK = 128
 """A chunk is written again with every value that is added to it."""
 
@@ -265,10 +247,6 @@ class GrowingSweep:
         As for `write_sweep`.
     probe : str
         Name of probe and preset.
-    sensor_from_image : RigidTransform or Rotation, optional
-        Calibration of the tracker or the orientation sensor.
-    time_offset_s : float
-        Added to the times of the sensor's readings, they are image times.
 
     Raises
     ------
@@ -300,11 +278,9 @@ class GrowingSweep:
         compression: Compression = None,
         *,
         probe: str = "",
-        sensor_from_image: RigidTransform | Rotation | None = None,
-        time_offset_s: float = 0.0,
     ) -> None:
-        self.path = require_target(path)
-        with self._writing():
+        self.path, self._last_s = require_target(path), dict.fromkeys(_STREAMS, -np.inf)
+        with naming(str(path)), self._writing():
             try:
                 self._file = file = h5py.File(self.path, "x", libver="latest")
             except FileExistsError as error:
@@ -313,16 +289,13 @@ class GrowingSweep:
                 reserve(file.id)
                 file.attrs["format"] = FORMAT
                 put(file, "probe", probe or None)
-                self._frames = _FrameSet(file, path, grid, signal, dtype, compression)
-                # Times last: what has a time is whole.
-                self._clock = _Stream(file, {"frame_time_s": ()})
-                tracker, orientation = (file.create_group(name) for name in ("tracker", "orientation"))
-                self._tracker = _Stream(tracker, {"world_from_sensor": (4, 4), "valid": (), "time_s": ()})
-                self._orientation = _Stream(orientation, {"quaternion_wxyz": (4,), "time_s": ()})
-                for group in (tracker, orientation):
-                    group.attrs["time_offset_s"] = time_offset_s
-                is_pose = isinstance(sensor_from_image, RigidTransform)
-                _put_mounting(tracker if is_pose else orientation, sensor_from_image)
+                self._frames = _create_frames(file, grid, signal, dtype, compression)
+                for group, shapes in _STREAMS.items():
+                    for name, shape in shapes.items():
+                        file.require_group(group).create_dataset(
+                            name, (0, *shape), "?" if name == "valid" else "f8", maxshape=(None, *shape),
+                            chunks=(_ROWS_PER_CHUNK, *shape), fillvalue=None if name == "valid" else np.nan,
+                        )  # fmt: skip
                 file[GROWING] = np.uint8(1)
                 label(file)
                 file.swmr_mode = True
@@ -344,14 +317,15 @@ class GrowingSweep:
             if kind is None:
                 raise
         finally:
+            is_empty = not len(self)
             self._file.close()
             trim(self.path)
-            if not len(self):  # no sweep is without frames
+            if is_empty:  # no sweep is without frames
                 self.path.unlink(missing_ok=True)
 
     def __len__(self) -> int:
         """Frames in the file."""
-        return self._frames.count
+        return len(self._frames)
 
     def append(self, frame: npt.NDArray[Any], time_s: float) -> None:
         """Write the next frame, shape (vector, sample), taken at image time `time_s`.
@@ -364,14 +338,12 @@ class GrowingSweep:
         NoSpaceError
             If the disk is full.
         """
-        self._clock.require_after(time_s)
-        with self._writing():
-            self._frames.append(frame)
-            self._frames.node.flush()
-            self._clock.append(time_s)
+        with self._row("/", time_s):
+            _append_frame(self._frames, frame)
+            self._frames.flush()
 
-    def append_pose(self, time_s: float, matrix: npt.ArrayLike, valid: bool = True) -> None:
-        """Write a tracker's reading: world_from_sensor, shape (4, 4), mm; of an invalid one any numbers.
+    def append_pose(self, time_s: float, matrix: FloatArray, valid: bool = True) -> None:
+        """Write a tracker's reading: world_from_sensor, shape (4, 4), mm, at its time.
 
         Raises
         ------
@@ -380,10 +352,10 @@ class GrowingSweep:
         """
         pose = np.asarray(matrix if valid else np.eye(4))
         transforms_from_matrices(pose[None], f"{self.path}: /tracker at {time_s} s")
-        with self._writing():
-            self._tracker.append(pose, valid, time_s)
+        with self._row("tracker", time_s, pose, valid):
+            pass
 
-    def append_orientation(self, time_s: float, quaternion_wxyz: npt.ArrayLike) -> None:
+    def append_orientation(self, time_s: float, quaternion_wxyz: FloatArray) -> None:
         """Write an orientation sensor's reading: world_from_sensor, scalar first.
 
         Raises
@@ -393,8 +365,24 @@ class GrowingSweep:
         """
         where = f"{self.path}: /orientation at {time_s} s"
         rotations_from_quaternions(np.asarray(quaternion_wxyz)[None], where)
-        with self._writing():
-            self._orientation.append(quaternion_wxyz, time_s)
+        with self._row("orientation", time_s, quaternion_wxyz):
+            pass
+
+    @contextmanager
+    def _row(self, group: str, time_s: float, *values: Any) -> Iterator[None]:
+        """Write a row of a group after the block, its time last, and hand it to the operating system."""
+        last_s = self._last_s[group]
+        if not (np.isfinite(time_s) and time_s > last_s):
+            raise InvalidInputError(f"{self.path}: {group}: expected a time after {last_s} s, got {time_s}")
+        with naming(str(self.path)), self._writing():
+            yield
+            reserve(self._file.id)
+            for name, value in zip(_STREAMS[group], (*values, time_s), strict=True):
+                node = self._file[group][name]
+                node.resize(len(node) + 1, axis=0)
+                node[-1] = value
+                node.id.flush()
+            self._last_s[group] = time_s
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
@@ -405,33 +393,3 @@ class GrowingSweep:
         except (OSError, RuntimeError) as error:
             failure = error if isinstance(error, OSError) else OSError(str(error))
             raise cannot_write(self.path, failure) from error
-
-
-class _Stream:
-    """Data sets of a group that grow row by row, the last data set last."""
-
-    def __init__(self, group: h5py.Group, shapes: dict[str, tuple[int, ...]]) -> None:
-        self._where, self._file = f"{group.file.filename}: {group.name}", group.file.id
-        self.nodes = [
-            group.create_dataset(
-                name, (0, *shape), "?" if name == "valid" else "f8", maxshape=(None, *shape),
-                chunks=(_ROWS_PER_CHUNK, *shape), fillvalue=None if name == "valid" else np.nan,
-            )
-            for name, shape in shapes.items()
-        ]  # fmt: skip
-        self._time_s = -np.inf
-
-    def require_after(self, time_s: float) -> None:
-        """Raise unless a time is after that of the last row."""
-        if not (np.isfinite(time_s) and time_s > self._time_s):
-            raise InvalidInputError(f"{self._where}: expected a time after {self._time_s} s, got {time_s}")
-
-    def append(self, *values: Any) -> None:
-        """Write a row, its time last, and hand it to the operating system."""
-        self.require_after(values[-1])
-        reserve(self._file)
-        for node, value in zip(self.nodes, values, strict=True):
-            node.resize(len(node) + 1, axis=0)
-            node[-1] = value
-            node.id.flush()
-        self._time_s = values[-1]

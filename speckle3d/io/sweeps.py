@@ -69,7 +69,7 @@ def from_pairs(pairs: npt.NDArray[np.int16]) -> npt.NDArray[np.complex64]:
     return pairs.astype(np.float32).view(np.complex64)[..., 0]
 
 
-def _open(path: Path, _: ImportSettings) -> Recording:
+def open_sweep(path: Path, _: ImportSettings | None = None) -> Recording:
     """Read a sweep file; its frames stay on disk until they are asked for."""
     with opened(path, FORMAT, (VERSION, IQ_VERSION, FAN_VERSION)) as file:
         clock = _Clock.of(file, "frame_time_s")
@@ -215,5 +215,5 @@ def _read_mounting(
 
 
 READER = Reader(
-    FORMAT, None, _open, claims_hdf5=lambda file: file_format(file) == FORMAT, takes_settings=False
+    FORMAT, None, open_sweep, claims_hdf5=lambda file: file_format(file) == FORMAT, takes_settings=False
 )

@@ -90,29 +90,33 @@ class Layout:
             raise InvalidInputError(
                 f"{path}: UltrasoundImageOrientation: expected as MF, FM or MFA, got {self.orientation}"
             )
-        if self.is_complex and size[1 - self._pair_axis] % 2:
-            raise InvalidInputError(f"{path}: expected I and Q in pairs, got {size[1 - self._pair_axis]}")
+        if self.is_complex and self._lines(size)[self._pair_axis] % 2:
+            raise InvalidInputError(f"{path}: expected I and Q in pairs, got images of size {size}")
 
     def frame(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Turn pixels, shape (y, x), into samples, shape (vector, sample): marked and far sides last."""
+        lines = pixels if self.has_lines_in_rows else pixels.T
         if self.is_complex:
-            pairs = np.moveaxis(pixels, self._pair_axis, 0)
+            pairs = np.moveaxis(lines, self._pair_axis, 0)
             joined = pairs[0::2].astype(np.complex64)
-            joined.imag = -pairs[1::2].astype(np.float32) if self.conjugated else pairs[1::2]
-            pixels = np.moveaxis(joined, 0, self._pair_axis)
-        return self._flipped(pixels if self.has_lines_in_rows else pixels.T)
+            joined.imag = pairs[1::2]
+            lines = np.moveaxis(joined.conj() if self.conjugated else joined, 0, self._pair_axis)
+        lines = lines[:, ::-1] if "N" in self.orientation[:2] else lines
+        return lines[::-1] if "U" in self.orientation[:2] else lines
 
     def shape(self, size: tuple[int, ...]) -> tuple[int, int]:
         """Vectors and samples of an image of a size (x, y)."""
-        y, x = (size[1 - axis] // (1 + (self.is_complex and axis == self._pair_axis)) for axis in (0, 1))
-        return (y, x) if self.has_lines_in_rows else (x, y)
+        lines = self._lines(size)
+        if self.is_complex:
+            lines[self._pair_axis] //= 2
+        vectors, samples = lines
+        return vectors, samples
+
+    def _lines(self, size: tuple[int, ...]) -> list[int]:
+        """Lines of an image of a size (x, y), and numbers in each."""
+        return [*size[1::-1]] if self.has_lines_in_rows else [*size[:2]]
 
     @property
     def _pair_axis(self) -> int:
-        """Axis of (y, x) along which I and Q alternate."""
-        return int(self.has_lines_in_rows == (self.kind == "RF_IQ_LINE"))
-
-    def _flipped(self, frame: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Turn lines round, and their order; shape (vector, sample) in and out."""
-        frame = frame[:, ::-1] if "N" in self.orientation[:2] else frame
-        return frame[::-1] if "U" in self.orientation[:2] else frame
+        """Axis of (line, number) along which I and Q alternate."""
+        return int(self.kind == RF_TYPES[1])
