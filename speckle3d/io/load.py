@@ -96,12 +96,6 @@ def load_landmarks(path: PathLike) -> Landmarks | None:
     return challenge.read_landmarks(path) if kind_of(path) == challenge.FORMAT else None
 
 
-def import_notes(path: PathLike, settings: ImportSettings | None = None) -> list[str]:
-    """Tell what `load_sweep` assumed, measured or left out of a recording."""
-    reader = find_reader(path)
-    return [] if reader is None else recording_of(reader, Path(path), settings_for(path, settings)).notes
-
-
 def import_record(path: PathLike) -> ImportRecord | None:
     """Settings that a file beside a recording gives; None where there is none, or it would not be read."""
     beside, reader = settings_file(path), find_reader(path)

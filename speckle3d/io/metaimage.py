@@ -76,7 +76,7 @@ def read_poses(path: PathLike, settings: ImportSettings | None = None) -> Tracke
 
 def lacking_poses(path: PathLike) -> str:
     """Say which transforms an image sequence holds, if not those of the usual names."""
-    names = names_of(read_header(path).frames)
+    names = names_of(read_header(path))
     return f"{', '.join(names)}: name the sensor's with --transform" if names else "none"
 
 
@@ -102,7 +102,7 @@ def open_sequence(path: Path, settings: ImportSettings) -> Recording:
         ("size", _shown(header.size), ""),
         ("image type", kind, ""),
         ("image orientation", orientation, ""),
-        ("transforms", ", ".join(names_of(header.frames)) or "none", ""),
+        ("transforms", ", ".join(names_of(header)) or "none", ""),
     ]
     if settings.plus_config is not None:
         rows.append(("device set", settings.plus_config, ""))
@@ -114,7 +114,7 @@ def _recording(
 ) -> Recording:
     path, frames, count = header.path, header.frames, header.frame_count
     if 0 in header.size or max(header.size[:2]) == 1:
-        what = ": the recording of a tracker, for --poses" if names_of(frames) else ""
+        what = ": the recording of a tracker, for --poses" if names_of(header) else ""
         size = _shown(header.size[:2])
         raise InvalidInputError(f"{path}: expected pixels of images, got images of size {size}{what}")
     if header.is_volume and not settings.frame_rate_hz:
@@ -175,9 +175,9 @@ def _recording(
         skew_rad = image_skew_rad(pixels.value, where)
         tracker = replace(tracker, sensor_from_image=mounting, image_skew_rad=skew_rad)
     orientation, name = None, f"{ORIENTATION}ToWorld"
-    if name in names_of(frames):  # the stream that this package writes
-        turns, _ = _timed(tracked_poses(path, frames, name, "none", Names()), times)
-        matrix = fixed_transform(path, header.fields, frames, f"{IMAGE}To{ORIENTATION}")
+    if name in names_of(header):  # the stream that this package writes
+        turns, _ = _timed(tracked_poses(header, name, "none", Names()), times)
+        matrix = fixed_transform(header, f"{IMAGE}To{ORIENTATION}")
         turn = None if matrix is None else sensor_from_image(matrix, 0.0, path).rotation
         if turns is not None:
             orientation = OrientationSensor(
@@ -205,8 +205,7 @@ def _device(settings: ImportSettings) -> DeviceSet:
 
 
 def _poses(header: SequenceHeader, settings: ImportSettings, device: DeviceSet) -> Poses | None:
-    asked, reference = settings.tracker_transform, settings.reference_transform
-    return tracked_poses(header.path, header.frames, asked, reference, device.names)
+    return tracked_poses(header, settings.tracker_transform, settings.reference_transform, device.names)
 
 
 def _timed(poses: Poses | None, times: FloatArray | None) -> tuple[TimedPoses | None, list[str]]:
@@ -278,7 +277,7 @@ def _image_to_probe(
         return Value(poses.pixels, f"{poses.chain[0]}Transform")
     tool = names.probe if poses is None else poses.tool
     for name in (f"{names.image}To{tool}", "Calibration"):  # the second is of Ibis
-        matrix = fixed_transform(header.path, header.fields, header.frames, name)
+        matrix = fixed_transform(header, name)
         if matrix is not None:
             return Value(matrix, f"{name}Transform")
     # The device set's is for the image that the machine shows, not for the lines it was made of.
@@ -291,7 +290,7 @@ def _remarks(
 ) -> list[str]:
     """Tell what contradicts, and which poses were not used."""
     count, notes = header.frame_count, list[str]()
-    if poses is None and names_of(header.frames) and settings.tracker_transform is None:
+    if poses is None and names_of(header) and settings.tracker_transform is None:
         notes.append(f"no tracker: the header's transforms are {lacking_poses(header.path)}")
     if len(header.frames) not in (0, count):
         notes.append(f"the header has fields of {len(header.frames)} frames for {count} images")

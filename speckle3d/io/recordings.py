@@ -7,6 +7,7 @@ at once. Readers fill a `Recording`; it makes the sweep, describes itself and te
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -204,29 +205,34 @@ class Recording:
         names += ["row_spacing_mm", "dynamic_range_db"] if is_grey else ["speed_of_sound_m_s", *_RATES]
         if dtype.kind == "c":
             names.append("demodulation_frequency_hz")
-        times, given_rate = self._timed[0], self.settings.frame_rate_hz is not None
-        if given_rate or (times is None and self.frames.shape[0] > 1):
+        if self.settings.frame_rate_hz is not None or (self._timed[0] is None and self.frames.shape[0] > 1):
             names.append("frame_rate_hz")
-        own = {"column_pitch_mm": self.values.get("vector_pitch_mm", Value())} | ASSUMED | {**self.values}
-        if given_rate and times is not None:
-            own = {"frame_rate_hz": Value(rate_of(times), "of its times")} | own
-        spacing = own.get("row_spacing_mm", Value())
-        if "sampling_rate_hz" not in own and spacing.value is not None:
-            own["sampling_rate_hz"] = rate_by_spacing(spacing, self.settings, own)
-        if "dynamic_range_db" in names and own.get("dynamic_range_db", Value()).value is None and self._range:
+        own, times = self._own, self._timed[0]
+        if times is not None:
+            own.setdefault("frame_rate_hz", Value(rate_of(times), "of its times"))
+        if "dynamic_range_db" in names and own["dynamic_range_db"].value is None and self._range:
             source = f"{_ASSUMED}, +- {self._range[1]:.1f} by its speckle"
             own["dynamic_range_db"] = Value(round(self._range[0], 1), source)
-        return {name: own.get(name, Value()) for name in names}
+        return {name: own[name] for name in names}
+
+    @cached_property
+    def _own(self) -> defaultdict[str, Value]:
+        """Numbers that the recording gives, or all scanners have."""
+        own = defaultdict(Value, ASSUMED | {**self.values})
+        own.setdefault("column_pitch_mm", own["vector_pitch_mm"])
+        if (spacing := own["row_spacing_mm"]).value is not None and "sampling_rate_hz" not in own:
+            own["sampling_rate_hz"] = rate_by_spacing(spacing, self.settings, own)
+        return own
 
     @cached_property
     def _range(self) -> tuple[float, float] | None:
         """Dynamic range by the images' speckle where nobody gives it, and its standard deviation, dB."""
         if self.settings.dynamic_range_db is not None:
             return None
-        names, own = ("column_pitch_mm", "row_spacing_mm"), {**self.values}
-        own.setdefault("column_pitch_mm", own.get("vector_pitch_mm", Value()))
-        known = [getattr(self.settings, name) or own.get(name, Value()).value for name in names]
-        pitch_mm, spacing_mm = (one or USUAL_PIXEL_MM for one in known)
+        pitch_mm, spacing_mm = (
+            getattr(self.settings, name) or self._own[name].value or USUAL_PIXEL_MM
+            for name in ("column_pitch_mm", "row_spacing_mm")
+        )
         return estimate_dynamic_range(self.frames, pitch_mm, spacing_mm, self.full_scale)
 
     @cached_property

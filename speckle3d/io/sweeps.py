@@ -59,6 +59,12 @@ KNOWN = frozenset({"rf", "iq", "bmode", "frame_time_s", "orientation", "tracker"
 SAMPLE_TYPES = {"rf": ("int16", "float32"), "iq": ("complex64", "int16"), "bmode": ("uint8",)}
 """Types that the samples of each kind may have in the file; int16 of I/Q in pairs, I first."""
 
+_STORED: dict[str, tuple[str, str, tuple[int, ...], Callable[[FloatArray, str], Any]]] = {
+    "orientation": ("quaternion_wxyz", "sensor_from_image_wxyz", (4,), rotations_from_quaternions),
+    "tracker": ("world_from_sensor", "sensor_from_image", (4, 4), transforms_from_matrices),
+}
+"""Of each sensor, its data set of readings, its attribute of the image's place, and the shape of both."""
+
 
 class SweepSlices(HDF5Slices):
     """Opens the frames of a sweep file."""
@@ -83,8 +89,8 @@ def open_sweep(path: Path, _: ImportSettings | None = None) -> Recording:
             grid=grid,
             signal=signal,
             frame_time_s=clock.time_s,
-            orientation=_read_orientation(file),
-            tracker=_read_tracker(file),
+            orientation=_read_sensor(file, "orientation"),
+            tracker=_read_sensor(file, "tracker"),
             truth=None if truth is None else read_transforms(truth, "world_from_image", count),
             name=printable(path.stem),
             probe=read_text(file, "probe", ""),
@@ -166,52 +172,37 @@ def read_signal(node: Node, kind: str) -> RFSettings | BModeSettings:
     return read_record(node, BModeSettings) if kind == "bmode" else read_record(node, RFSettings)
 
 
-def _read_orientation(file: h5py.File) -> OrientationSensor | None:
-    if not has_member(file, "orientation"):
+def _read_sensor(file: h5py.File, name: str) -> Any:
+    """The orientation sensor or the tracker; None where there is none, or none of its readings is valid."""
+    if not has_member(file, name):
         return None
-    group = require_group(file, "orientation")
-    clock = _Clock.of(group)
-    if not clock.time_s.size:
-        return None
-    where = locate(group, "quaternion_wxyz")
-    rotations = rotations_from_quaternions(clock.rows("quaternion_wxyz", 4), where)
-    vectors = {name: clock.rows(name, 3) for name in INERTIAL if has_member(group, name)}
-    for vector, values in vectors.items():
-        require_finite(values, locate(group, vector))
-    mounting = _read_mounting(group, "sensor_from_image_wxyz", (4,), rotations_from_quaternions)
-    offset_s = read_attribute(group, "time_offset_s", default=0.0)
-    with naming(locate(group)):
-        return OrientationSensor(TimedRotations(clock.time_s, rotations), mounting, offset_s, **vectors)
-
-
-def _read_tracker(file: h5py.File) -> Tracker | None:
-    if not has_member(file, "tracker"):
-        return None
-    group = require_group(file, "tracker")
-    clock = _Clock.of(group)
+    group = require_group(file, name)
+    clock, vectors = _Clock.of(group), dict[str, FloatArray]()
     valid = np.ones(clock.time_s.size, dtype=bool)
     if has_member(group, "valid"):
         valid = clock.rows("valid", dtype=np.bool_)
     if not valid.any():
         return None
-    matrices = clock.rows("world_from_sensor", 4, 4)
+    readings, mounting, shape, check = _STORED[name]
+    values = clock.rows(readings, *shape)
     # Invalid samples may hold anything; replaced, not dropped, so that indices in messages stay right.
-    matrices[~valid] = np.eye(4)
-    poses = transforms_from_matrices(matrices, locate(group, "world_from_sensor"))
-    mounting = _read_mounting(group, "sensor_from_image", (4, 4), transforms_from_matrices)
-    offset_s, skew_rad = (read_attribute(group, name, 0.0) for name in ("time_offset_s", "image_skew_rad"))
+    values[~valid] = np.eye(4)[0] if shape == (4,) else np.eye(4)
+    world_from_sensor, sensor_from_image = check(values, locate(group, readings))[valid], None
+    if mounting in group.attrs:
+        numbers = read_vector_attribute(group, mounting, math.prod(shape))
+        sensor_from_image = check(numbers.reshape(1, *shape), f"{locate(group)} attribute {mounting}")[0]
+    for vector in INERTIAL:
+        if has_member(group, vector):
+            vectors[vector] = clock.rows(vector, 3)[valid]
+            require_finite(vectors[vector], locate(group, vector))
+    offset_s, skew_rad = (read_attribute(group, key, 0.0) for key in ("time_offset_s", "image_skew_rad"))
+    times = clock.time_s[valid]
     with naming(locate(group)):
-        return Tracker(TimedPoses(clock.time_s[valid], poses[valid]), mounting, offset_s, skew_rad)
-
-
-def _read_mounting(
-    group: h5py.Group, name: str, shape: tuple[int, ...], check: Callable[[FloatArray, str], Any]
-) -> Any:
-    """Where the image is on a sensor, by an attribute; None if it has none."""
-    if name not in group.attrs:
-        return None
-    numbers = read_vector_attribute(group, name, math.prod(shape))
-    return check(numbers.reshape(1, *shape), f"{locate(group)} attribute {name}")[0]
+        if name == "tracker":
+            return Tracker(TimedPoses(times, world_from_sensor), sensor_from_image, offset_s, skew_rad)
+        return OrientationSensor(
+            TimedRotations(times, world_from_sensor), sensor_from_image, offset_s, **vectors
+        )
 
 
 READER = Reader(

@@ -22,7 +22,7 @@ import numpy as np
 import sweep_examples
 
 from speckle3d.core.errors import Speckle3DError
-from speckle3d.io.load import import_notes, load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.sweep_writer import GrowingSweep
 
 LONGEST_S = 0.6
@@ -78,7 +78,7 @@ def faults(path, sweep, count):
     wrong = []
     if not len(read) >= count:
         wrong.append(f"{count} frames, got {len(read)}")
-    if not import_notes(path):
+    if not open_recording(path).notes:
         wrong.append("nobody says that it was not closed")
     if any(not np.array_equal(read.frames[i], frame(sweep, i)) for i in range(len(read))):
         wrong.append("another frame")

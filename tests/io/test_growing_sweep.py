@@ -11,7 +11,7 @@ import sweep_examples
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.parts import locks
 from speckle3d.core.sweep import stored_dtype
-from speckle3d.io.load import import_notes, load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.sweep_writer import GrowingSweep
 
 SWEEPS = {
@@ -35,9 +35,9 @@ def test_what_was_appended_is_read_while_it_grows_and_when_it_is_closed(tmp_path
             assert len(found) == len(target) == i + 1
             np.testing.assert_array_equal(found.frames[i], sweep.frames[i])
             assert (found.tracker, found.orientation) == (None, None)
-            assert f"{i + 1} frames so far" in import_notes(path)[0]
+            assert f"{i + 1} frames so far" in open_recording(path).notes[0]
             found.frames.close()
-    assert not any("frames" in note for note in import_notes(path))
+    assert not any("frames" in note for note in open_recording(path).notes)
 
 
 def test_a_file_that_is_there_stays_as_it_is(tmp_path):

@@ -6,7 +6,7 @@ from image_examples import grey, tracked, write_mha
 
 from speckle3d.io.describe import describe
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.load import import_notes, import_record, load_sweep
+from speckle3d.io.load import import_record, load_sweep, open_recording
 from speckle3d.io.sweep_writer import write_sweep
 
 BMODE = ImportSettings(column_pitch_mm=0.1, row_spacing_mm=0.2, dynamic_range_db=60.0)
@@ -33,13 +33,18 @@ def test_what_settings_override_is_told_with_what_the_file_says(tmp_path):
     )
     rows = values(path)
     assert rows["sampling rate"][0] == "80"
-    notes = import_notes(path)
+    notes = open_recording(path).notes
     assert notes[0].startswith("sampling rate 80 MHz, given by import.toml: the file says 40 (of samples")
     assert not any("vector pitch" in note for note in notes)  # 0.2005 is within 1 %
     option = ImportSettings(vector_pitch_mm=0.05)
-    assert "vector pitch 0.05 mm, given: the file says 0.2 (ElementSpacing)" in import_notes(path, option)
+    assert (
+        "vector pitch 0.05 mm, given: the file says 0.2 (ElementSpacing)"
+        in open_recording(path, option).notes
+    )
     rated = ImportSettings(frame_rate_hz=20.0)
-    assert "frame rate 20 Hz, given: the file says 10 (of its time stamps)" in import_notes(path, rated)
+    assert (
+        "frame rate 20 Hz, given: the file says 10 (of its time stamps)" in open_recording(path, rated).notes
+    )
 
 
 def test_settings_that_were_in_force_are_told_and_a_sweep_file_has_none(tmp_path):

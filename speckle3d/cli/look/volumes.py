@@ -58,7 +58,7 @@ def open_sweep_at(modes: Sequence[str | None], source: Path, stated: Statement) 
     Of a recording it is told what was assumed of its images; nothing where a calibration gives its pixels.
     """
     from speckle3d.io.import_settings import MissingSettingsError
-    from speckle3d.io.load import import_notes
+    from speckle3d.io.load import open_recording
     from speckle3d.study.posed import open_posed
 
     opened = [open_posed(source, mode, *stated) for mode in modes]
@@ -66,7 +66,9 @@ def open_sweep_at(modes: Sequence[str | None], source: Path, stated: Statement) 
         # Grey levels as stored need no dynamic range.
         ranged = stated[1].model_copy(update={"dynamic_range_db": 60.0})
         with suppress(MissingSettingsError):
-            notes(line for line in import_notes(source, ranged) if not line.startswith("dynamic range"))
+            notes(
+                line for line in open_recording(source, ranged).notes if not line.startswith("dynamic range")
+            )
     notes(opened[0].notes())
     return opened
 

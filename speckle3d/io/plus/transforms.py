@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.geometry import nearest_rotation
+from speckle3d.io.headers import SequenceHeader
 from speckle3d.io.pose_paths import rigid
 from speckle3d.io.text import numbers
 
@@ -29,8 +30,6 @@ IMAGE = "Image"
 ORIENTATION = "OrientationSensor"
 """Name of the frame of an orientation sensor, which PLUS's devices do not use: its transform to World is a
 rotation alone."""
-
-Fields = Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class Names:
 
 
 def tracked_poses(
-    path: str, frames: Sequence[Fields], asked: str | None, reference: str | None, names: Names
+    header: SequenceHeader, asked: str | None, reference: str | None, names: Names
 ) -> Poses | None:
     """Read the poses of a tool, seen from the reference if there is one.
 
@@ -90,7 +89,7 @@ def tracked_poses(
     InvalidInputError
         If a transform that was asked for is not there.
     """
-    there = names_of(frames)
+    there = names_of(header)
     name = _usual(there, names) if asked is None else asked.removesuffix("Transform")
     if name is None or name == "none":
         return None
@@ -101,13 +100,15 @@ def tracked_poses(
         fixed = "none"
     for one in {name, fixed} - {"none"}:
         if one not in there and _back(one) not in there:
-            raise InvalidInputError(f"{path}: expected a transform {one}, got {', '.join(there) or 'none'}")
-    matrices, faults = _column(path, frames, name)
+            raise InvalidInputError(
+                f"{header.path}: expected a transform {one}, got {', '.join(there) or 'none'}"
+            )
+    matrices, faults = _column(header, name)
     pixels, chain = None, [name]
     if tool == names.image:
-        matrices, pixels = _image_poses(matrices, faults, f"{path}: {name}Transform")
+        matrices, pixels = _image_poses(matrices, faults, f"{header.path}: {name}Transform")
     if fixed != "none":
-        world_from_reference, others = _column(path, frames, fixed)
+        world_from_reference, others = _column(header, fixed)
         world_from_reference, odd = rigid(world_from_reference)
         matrices = np.asarray(np.linalg.inv(world_from_reference) @ matrices)
         faults = [next(filter(None, reasons), "") for reasons in zip(faults, others, odd, strict=True)]
@@ -115,7 +116,7 @@ def tracked_poses(
     return Poses(tool, tuple(chain), matrices, faults, pixels)
 
 
-def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: str) -> FloatArray | None:
+def fixed_transform(header: SequenceHeader, name: str) -> FloatArray | None:
     """Read a transform that all frames share, or the whole file has; None where there is none.
 
     Raises
@@ -124,15 +125,17 @@ def fixed_transform(path: str, fields: Fields, frames: Sequence[Fields], name: s
         If frames differ.
     """
     key = f"{name}Transform"
-    if key in fields:
-        return np.reshape(numbers(fields[key], 16, f"{path}: {key}"), (4, 4))
-    matrices, faults = _column(path, frames, name)
+    if key in header.fields:
+        return np.reshape(numbers(header.fields[key], 16, f"{header.path}: {key}"), (4, 4))
+    matrices, faults = _column(header, name)
     matrices = matrices[[not fault for fault in faults]]
     if not len(matrices):
         return None
     off = np.ptp(matrices, axis=0).max()
     if off > _FIXED_TOLERANCE * max(1.0, np.abs(matrices).max()):
-        raise InvalidInputError(f"{path}: {key}: expected one for all frames, got some {off:.3g} apart")
+        raise InvalidInputError(
+            f"{header.path}: {key}: expected one for all frames, got some {off:.3g} apart"
+        )
     first: FloatArray = matrices[0]
     return first
 
@@ -215,9 +218,9 @@ def ends(name: str) -> tuple[str, str]:
     return (parts[1], parts[2]) if parts else (name, "")
 
 
-def names_of(frames: Sequence[Fields]) -> list[str]:
+def names_of(header: SequenceHeader) -> list[str]:
     """Names of the transforms of any frame, as ``ProbeToTracker``."""
-    names = {name for frame in frames for name in frame if name.endswith("Transform")}
+    names = {name for frame in header.frames for name in frame if name.endswith("Transform")}
     return sorted(name.removesuffix("Transform") for name in names)
 
 
@@ -236,8 +239,9 @@ def _usual(there: Sequence[str], names: Names) -> str | None:
     return None
 
 
-def _column(path: str, frames: Sequence[Fields], name: str) -> tuple[FloatArray, list[str]]:
+def _column(header: SequenceHeader, name: str) -> tuple[FloatArray, list[str]]:
     """One transform by frame, or the inverse of what is held; the identity where not valid, and why."""
+    frames = header.frames
     is_back = not any(f"{name}Transform" in frame for frame in frames)
     key = f"{_back(name) if is_back else name}Transform"
     matrices, faults = np.tile(np.eye(4), (len(frames), 1, 1)), [""] * len(frames)
@@ -246,7 +250,7 @@ def _column(path: str, frames: Sequence[Fields], name: str) -> tuple[FloatArray,
             faults[i] = "without a valid pose"
             continue
         try:
-            matrix = np.reshape(numbers(frame[key], 16, path), (4, 4))
+            matrix = np.reshape(numbers(frame[key], 16, key), (4, 4))
             matrices[i] = np.linalg.inv(matrix) if is_back else matrix
         except (InvalidInputError, np.linalg.LinAlgError):
             faults[i] = "whose pose is not 16 finite numbers, or has no inverse"

@@ -34,6 +34,7 @@ SUFFIXES = (".mha", ".nrrd")
 _OF_SLICER = ".seq.nrrd"
 """With four axes, the last of them the frames, as 3D Slicer reads it [3]_; other NRRD files have three."""
 
+_KINDS = "domain domain list"
 _NRRD_NAMES = {name: nrrd for nrrd, name in NRRD_NAMES.items()}
 
 _PREFIX = "Speckle3D_"
@@ -101,10 +102,10 @@ def write_sequence(
         raise InvalidInputError(
             f"{path}: expected parallel vectors, got a fan's, which a sequence does not hold: write .h5"
         )
-    fields, frames = _standard_fields(sweep), _timed(sweep.frame_time_s)
-    omitted = _add_sensors(frames, sweep)
+    fields = _standard_fields(sweep) | _timed(sweep.frame_time_s)
+    omitted = _add_sensors(fields, sweep)
     for transform, matrices in (transforms or {}).items():
-        _add(frames, transform, matrices)
+        _add(fields, transform, matrices)
         fields["ElementSpacing"] = "1 1 1"
     dtype, is_nrrd = sweep.frames.dtype, name.endswith(".nrrd")
     if dtype.kind == "c":
@@ -118,9 +119,10 @@ def write_sequence(
                 progress(i + 1, len(sweep))
 
     def header(packed_bytes: int | None) -> str:
-        if is_nrrd:
-            return _nrrd_header(fields, frames, shape, dtype, compressed, name.endswith(_OF_SLICER))
-        return _meta_header(fields, frames, shape, dtype, packed_bytes)
+        if not is_nrrd:
+            return meta_header(shape, dtype, _KINDS, fields, packed_bytes)
+        times = sweep.frame_time_s if name.endswith(_OF_SLICER) else None
+        return _nrrd_header(fields, times, shape, dtype, compressed)
 
     with atomic_path(target) as part:
         write_image(part, header, planes(), compressed, is_nrrd)
@@ -150,35 +152,31 @@ def write_transforms(path: PathLike, times_s: FloatArray, transforms: Mapping[st
     FileError
         If the file cannot be written.
     """
-    frames = _timed(times_s)
+    fields = {"ElementSpacing": "1 1 1", **_timed(times_s)}
     for name, matrices in transforms.items():
-        _add(frames, name, matrices)
-    shape, fields = (0, 0, len(frames)), {"ElementSpacing": "1 1 1"}
+        _add(fields, name, matrices)
+    header = meta_header((0, 0, times_s.size), np.dtype(np.uint8), _KINDS, fields, None)
     with atomic_path(path) as part:
-        write_image(
-            part, lambda _: _meta_header(fields, frames, shape, np.dtype("u1"), None), (), False, False
-        )
+        write_image(part, lambda _: header, (), False, False)
 
 
-def _timed(times_s: FloatArray) -> list[dict[str, str]]:
-    """Fields of each frame, with its time."""
-    return [{"Timestamp": _text(time)} for time in times_s.tolist()]
+def _timed(times_s: FloatArray) -> dict[str, str]:
+    """Fields of frames with their times."""
+    return {f"Seq_Frame{i:04d}_Timestamp": _text(time) for i, time in enumerate(times_s)}
 
 
-def _add(
-    frames: list[dict[str, str]], name: str, matrices: FloatArray, valid: BoolArray | None = None
-) -> None:
+def _add(fields: dict[str, str], name: str, matrices: FloatArray, valid: BoolArray | None = None) -> None:
     """Give each frame a transform, shape (n, 4, 4), by a name as ``ProbeToTracker``."""
-    for i, (frame, matrix) in enumerate(zip(frames, matrices, strict=True)):
-        frame[f"{name}Transform"] = _text(matrix)
-        frame[f"{name}TransformStatus"] = "OK" if valid is None or valid[i] else "INVALID"
+    for i, matrix in enumerate(matrices):
+        fields[f"Seq_Frame{i:04d}_{name}Transform"] = _text(matrix)
+        is_valid = valid is None or valid[i]
+        fields[f"Seq_Frame{i:04d}_{name}TransformStatus"] = "OK" if is_valid else "INVALID"
 
 
-def _add_sensors(frames: list[dict[str, str]], sweep: Sweep) -> list[str]:
+def _add_sensors(fields: dict[str, str], sweep: Sweep) -> list[str]:
     """Give each frame the sensors' poses, and tell what a sequence does not hold of the sweep."""
-    times, grid, omitted = sweep.frame_time_s, sweep.grid, list[str]()
-    for frame in frames:
-        frame["ImageStatus"] = "OK"
+    times, grid, omitted, count = sweep.frame_time_s, sweep.grid, list[str](), len(sweep)
+    fields |= {f"Seq_Frame{i:04d}_ImageStatus": "OK" for i in range(count)}
     sizes = grid.vector_pitch_mm, grid.sample_spacing_mm, grid.first_sample_depth_mm
     sensors: tuple[tuple[Tracker | OrientationSensor | None, str, str], ...] = (
         (sweep.tracker, "Probe", "Tracker"), (sweep.orientation, ORIENTATION, "World")
@@ -187,16 +185,16 @@ def _add_sensors(frames: list[dict[str, str]], sweep: Sweep) -> list[str]:
         if sensor is None:
             continue
         at = times - sensor.time_offset_s
-        covered, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (len(frames), 1, 1))
+        covered, matrices = sensor.readings.covers(at), np.tile(np.eye(4), (count, 1, 1))
         if covered.any():
             posed = sensor.readings.at(at[covered]).as_matrix()
             size = posed.shape[-1]  # 3 of rotations
             matrices[np.flatnonzero(covered), :size, :size] = posed
-        _add(frames, f"{own}To{world}", matrices, covered)
+        _add(fields, f"{own}To{world}", matrices, covered)
         if sensor is sweep.orientation or not np.array_equal(sensor.readings.time_s, at[covered]):
             omitted.append(
                 f"the {sensor.label}'s {len(sensor.readings)} readings with all that it measured: "
-                f"{np.count_nonzero(covered)} interpolated ones are at the times of {len(frames)} frames"
+                f"{np.count_nonzero(covered)} interpolated ones are at the times of {count} frames"
             )
         if (mounting := sensor.sensor_from_image) is not None:
             if isinstance(mounting, Rotation):
@@ -204,7 +202,7 @@ def _add_sensors(frames: list[dict[str, str]], sweep: Sweep) -> list[str]:
             skew_rad = sensor.image_skew_rad if isinstance(sensor, Tracker) else 0.0
             first = RigidTransform.from_translation([grid.first_vector_mm, 0.0, 0.0])
             pixels = image_matrix(mounting * first, *sizes, skew_rad)
-            _add(frames, f"{IMAGE}To{own}", np.tile(pixels, (len(frames), 1, 1)))
+            _add(fields, f"{IMAGE}To{own}", np.tile(pixels, (count, 1, 1)))
     return omitted if sweep.truth is None else [*omitted, "the true poses"]
 
 
@@ -244,43 +242,26 @@ def _text(values: npt.ArrayLike) -> str:
     return " ".join(repr(value).removesuffix(".0") for value in np.ravel(values).astype(float).tolist())
 
 
-def _frame_fields(frames: list[dict[str, str]]) -> dict[str, str]:
-    return {
-        f"Seq_Frame{i:04d}_{name}": value for i, frame in enumerate(frames) for name, value in frame.items()
-    }
-
-
-def _meta_header(
-    fields: dict[str, str],
-    frames: list[dict[str, str]],
-    shape: tuple[int, int, int],
-    dtype: np.dtype[Any],
-    packed_bytes: int | None,
-) -> str:
-    return meta_header(shape, dtype, "domain domain list", fields | _frame_fields(frames), packed_bytes)
-
-
 def _nrrd_header(
     fields: dict[str, str],
-    frames: list[dict[str, str]],
+    slicer_times_s: FloatArray | None,
     shape: tuple[int, int, int],
     dtype: np.dtype[Any],
     compressed: bool,
-    is_slicers: bool,
 ) -> str:
     """Header of images with an axis of frames: in a plane, as PLUS writes them, or as Slicer's.
 
     Slicer's are one pixel thick in space; transforms count pixels from its origin.
     """
-    plain = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()} | _frame_fields(frames)
+    plain = {_NRRD_NAMES.get(name, name): value for name, value in fields.items()}
     x, y, _ = plain.pop("ElementSpacing").split()
     width, height, count = shape
-    if not is_slicers:
+    if slicer_times_s is None:
         axes = f"""dimension: 3
 space dimension: 2
 sizes: {width} {height} {count}
 space directions: ({x},0) (0,{y}) none
-kinds: domain domain list
+kinds: {_KINDS}
 space origin: (0,0)"""
         return nrrd_header(4, dtype, axes, plain, compressed)
     axes = f"""dimension: 4
@@ -292,7 +273,7 @@ labels: "" "" "" "time"
 units: "" "" "" "s"
 space origin: (0,0,0)"""
     # Slicer finds what belongs together by frames' times; it rounds those of transforms to 1 ms.
-    times = [f"{float(frame['Timestamp']):.3f}" for frame in frames]
+    times = [f"{time:.3f}" for time in slicer_times_s]
     values = " ".join(times if len({*times}) == count else map(str, range(count)))
     # Slicer reads the transforms up to the first line of more than 1,000 characters.
     plain["DataNodeClassName"] = "vtkMRMLScalarVolumeNode"
