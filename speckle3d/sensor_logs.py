@@ -47,16 +47,16 @@ def _inside_probe(path: Path) -> ImuLog | None:
     if find_reader(path) is not READER:
         return None
     samples = sensor_of(path)
-    clock, fit = timeline(Stamps(time_s=samples.time_s)), samples.fit
-    found = "is not used: it does not agree with gravity" if fit is None else f"is {MEANING}"
+    clock, rotations = timeline(Stamps(time_s=samples.time_s)), samples.world_from_sensor
+    meaning = () if rotations is None else (f"the sensor's quaternion is {MEANING}",)
     log = ImuLog(
         clock.time_s,
         samples.accelerometer_m_s2,
         samples.gyroscope_rad_s,
-        samples.magnetometer_gauss,
-        world_from_sensor=None if fit is None else fit.world_from_sensor,
+        samples.magnetometer_au,
+        world_from_sensor=rotations,
         gaps=_pauses(clock.gaps),
-        notes=(*clock.notes, f"the sensor's quaternion {found}", *samples.remarks),
+        notes=(*clock.notes, *meaning, *samples.remarks),
         source=path.name,
     )
     return measured(log)

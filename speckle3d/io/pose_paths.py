@@ -44,17 +44,16 @@ def rising(times: FloatArray) -> IntArray:
 
     Of equal times the first one stays (patience sorting).
     """
-    tails, last, before = list[float](), list[int](), np.full(times.size + 1, -1)
+    tails, last, before = list[float](), list[int](), dict[int, int]()
     for i in np.flatnonzero(np.isfinite(times)).tolist():
         place = bisect_left(tails, times[i])
-        if place < len(tails) and tails[place] == times[i]:
-            continue
-        before[i] = last[place - 1] if place else -1
-        tails[place : place + 1], last[place : place + 1] = [times[i]], [i]
-    chosen, i = [], last[-1] if last else -1
+        if place == len(tails) or times[i] < tails[place]:
+            before[i] = last[place - 1] if place else -1
+            tails[place : place + 1], last[place : place + 1] = [times[i]], [i]
+    chosen, i = list[int](), last[-1] if last else -1
     while i >= 0:
         chosen.append(i)
-        i = int(before[i])
+        i = before[i]
     return np.array(chosen[::-1], dtype=int)
 
 
@@ -78,12 +77,11 @@ def usable(what: str, time_s: FloatArray, faults: Sequence[str] | None = None) -
     """
     reasons = np.array(faults or [""] * time_s.size, dtype=object)
     reasons[(reasons == "") & ~np.isfinite(time_s)] = "without a time"
-    rows = np.flatnonzero(reasons == "")
-    rows = rows[rising(time_s[rows])]
-    other = np.setdiff1d(np.flatnonzero(reasons == ""), rows)
-    repeated = np.isin(time_s[other], time_s[rows])
-    reasons[other] = np.where(repeated, "with a repeated time", "with a time out of order")
-    return rows, left_out(what, time_s.size, Counter(filter(None, reasons)), time_s[rows])
+    rows = rising(np.where(reasons == "", time_s, np.nan))
+    late = np.setdiff1d(np.flatnonzero(reasons == ""), rows)
+    is_repeat = np.isin(time_s[late], time_s[rows])
+    reasons[late] = np.where(is_repeat, "with a repeated time", "with a time out of order")
+    return rows, _left_out(what, time_s.size, Counter(filter(None, reasons)), time_s[rows])
 
 
 def timed_poses(
@@ -100,26 +98,25 @@ def timed_poses(
 
 def rigid(matrices: FloatArray) -> tuple[FloatArray, list[str]]:
     """Make rounded rotations exact; a matrix farther off becomes the identity, with the reason."""
-    r, bottom = matrices[:, :3, :3], matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    r, is_finite = matrices[:, :3, :3], np.isfinite(matrices).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2))
-        near = finite & (np.maximum(off, np.abs(bottom).max(axis=1)) < ROUNDING_TOLERANCE)
-    near[near] = np.linalg.det(r[near]) > 0
+        gram = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2))
+        bottom = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1)
+        is_proper = np.linalg.det(r) > 0
+    near = is_finite & is_proper & (np.maximum(gram, bottom) < ROUNDING_TOLERANCE)
     exact = np.tile(np.eye(4), (len(r), 1, 1))
     exact[near, :3, 3] = matrices[near, :3, 3]
     exact[near, :3, :3] = nearest_rotation(r[near])
-    reasons = np.where(finite, np.where(near, "", "whose pose is not rigid"), "whose pose is not finite")
+    reasons = np.where(is_finite, np.where(near, "", "whose pose is not rigid"), "whose pose is not finite")
     return exact, reasons.tolist()
 
 
-def left_out(what: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
+def _left_out(what: str, total: int, reasons: Mapping[str, int], time_s: FloatArray) -> list[str]:
     """Tell how many rows are left out and why, and the longest gap between those that stay."""
-    dropped = {reason: count for reason, count in reasons.items() if count}
-    if not dropped:
+    if not any(reasons.values()):
         return []
-    listed = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
-    text = f"{what}: {sum(dropped.values())} of {total} left out ({listed})"
+    listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items() if count)
+    text = f"{what}: {sum(reasons.values())} of {total} left out ({listed})"
     if time_s.size > 1:
         i = int(np.argmax(np.diff(time_s)))
         text += f"; the longest gap is {time_s[i + 1] - time_s[i]:.3g} s, after {time_s[i]:.3f} s"
@@ -163,52 +160,54 @@ def _without_jumps(readings: TimedPoses) -> tuple[TimedPoses, list[str]]:
 
     Where that leaves out more than a fifth, poses are single placements and not a path: all stay.
     """
-    matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
-    origin = matrices[:, None, :3, 3]
-    points = np.concatenate([origin, origin + _LEVER_MM * matrices[:, :3, :3].transpose(0, 2, 1)], axis=1)
+    poses, time_s, numbers = readings.world_from_sensor, readings.time_s, np.arange(len(readings))
+
+    def moved_mm(i: IntArray, k: IntArray) -> FloatArray:
+        step = poses[i].inv() * poses[k]
+        shift_mm = np.linalg.norm(step.translation, axis=-1)
+        return np.asarray(np.maximum(shift_mm, _LEVER_MM * step.rotation.magnitude()))
 
     def is_jump(i: IntArray, k: IntArray) -> BoolArray:
-        moved = np.linalg.norm(points[i] - points[k], axis=-1).max(axis=-1)
-        return np.asarray(moved > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k]))
+        return moved_mm(i, k) > _SLACK_MM + _FASTEST_MM_S * np.abs(time_s[i] - time_s[k])
 
-    numbers = np.arange(len(readings))
-    jumps = numbers[1:][is_jump(numbers[1:], numbers[:-1])]
+    def reached(pieces: list[IntArray]) -> IntArray:
+        rows = pieces[0]
+        for piece in pieces[1:]:
+            rows = rows if is_jump(rows[-1:], piece[:1]) else np.append(rows, piece)
+        return rows
+
+    jumps = numbers[1:][is_jump(numbers[:-1], numbers[1:])]
     if not jumps.size:
         return readings, []
     # A tool that is lost is often written as the identity: such pieces count for nothing.
-    pieces = [piece for piece in np.split(numbers, jumps) if (matrices[piece] != np.eye(4)).any()]
-    largest = max(range(len(pieces)), key=lambda k: pieces[k].size, default=-1)
-    rows = pieces[largest] if pieces else numbers[:0]
-    for piece in pieces[largest + 1 :]:
-        rows = rows if is_jump(piece[:1], rows[-1:]) else np.append(rows, piece)
-    for piece in pieces[:largest][::-1]:
-        rows = rows if is_jump(piece[-1:], rows[:1]) else np.append(piece, rows)
-    worst = int(jumps[0])
-    moved_mm = np.linalg.norm(points[worst] - points[worst - 1], axis=-1).max()
-    jump = f"{moved_mm:.3g} mm in {1e3 * (time_s[worst] - time_s[worst - 1]):.3g} ms at {time_s[worst]:.3f} s"
+    is_seen = (poses.as_matrix() != np.eye(4)).any(axis=(1, 2))
+    pieces = [piece for piece in np.split(numbers, jumps) if is_seen[piece].any()]
+    largest = int(np.argmax([piece.size for piece in pieces]))
+    earlier = reached([piece[::-1] for piece in pieces[largest::-1]])[::-1]
+    rows = np.union1d(earlier, reached(pieces[largest:]))
+    worst = jumps[:1]
+    moved, took_s = moved_mm(worst - 1, worst)[0], np.diff(time_s)[worst - 1][0]
+    jump = f"{moved:.3g} mm in {1e3 * took_s:.3g} ms at {time_s[worst][0]:.3f} s"
     if rows.size < (1.0 - _MOST_JUMPING) * len(readings):
         return readings, [f"poses: {jumps.size} jumps that no hand makes, as {jump}: all are kept"]
-    notes = left_out(
-        "poses", len(readings), {f"after jumps, as {jump}": len(readings) - rows.size}, time_s[rows]
-    )
-    return replace(readings, time_s=time_s[rows], world_from_sensor=readings.world_from_sensor[rows]), notes
+    reasons = {f"after jumps, as {jump}": len(readings) - rows.size}
+    notes = _left_out("poses", len(readings), reasons, time_s[rows])
+    return replace(readings, time_s=time_s[rows], world_from_sensor=poses[rows]), notes
 
 
 def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> list[str]:
     """Tell the longest run of one pose while images change."""
-    matrices, time_s = readings.world_from_sensor.as_matrix(), readings.time_s
+    matrices = readings.world_from_sensor.as_matrix()
     changes = np.flatnonzero((matrices[1:] != matrices[:-1]).any(axis=(1, 2))) + 1
-    runs = np.split(np.arange(len(readings)), changes)
-    lengths = np.array([run.size for run in runs])
-    odd = lengths > max(_MOST_ALIKE, _MOST_TIMES * float(np.median(lengths)))
-    if changes.size == 0 or not odd.any():
+    runs = np.split(readings.time_s, changes)
+    lengths, longest = [run.size for run in runs], max(runs, key=len)
+    odd = np.count_nonzero(np.array(lengths) > max(_MOST_ALIKE, _MOST_TIMES * float(np.median(lengths))))
+    inside = np.flatnonzero((frame_time_s >= longest[0]) & (frame_time_s <= longest[-1]))
+    if not changes.size or not odd or inside.size < 2:
         return []
-    first_s, last_s = time_s[runs[int(np.argmax(lengths))][[0, -1]]]
-    inside = np.flatnonzero((frame_time_s >= first_s) & (frame_time_s <= last_s))
-    if inside.size < 2 or np.array_equal(sweep.frames[int(inside[0])], sweep.frames[int(inside[-1])]):
+    if np.array_equal(*(sweep.frames[int(i)] for i in inside[[0, -1]])):
         return []
     return [
-        f"poses: {np.count_nonzero(odd)} run(s) of one pose while images change, the longest of "
-        f"{lengths.max()} poses, {last_s - first_s:.3g} s from {first_s:.3f} s: the tracker's output stood "
-        "still"
+        f"poses: {odd} run(s) of one pose while images change, the longest of {longest.size} poses, "
+        f"{np.ptp(longest):.3g} s from {longest[0]:.3f} s: the tracker's output stood still"
     ]

@@ -33,7 +33,6 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -66,89 +65,42 @@ class SensorSamples:
     ----------
     time_s : ndarray, shape (m,)
         On the frames' clock.
-    accelerometer_g, gyroscope_rad_s : ndarray, shape (m, 3)
-        As in the file.
-    magnetometer_gauss : ndarray, shape (m, 3), optional
-    quaternion : ndarray, shape (m, 4), optional
-        q0 to q3.
-    remarks : tuple of str
+    accelerometer_m_s2 : ndarray, shape (m, 3)
+        Specific force: what is measured, or against it, as the quaternion's z tells; against it where the
+        quaternion is not believed, as in both public recordings.
+    gyroscope_rad_s : ndarray, shape (m, 3)
+    magnetometer_au : ndarray, shape (m, 3), optional
+    world_from_sensor : Rotation, optional
+        None where there is no quaternion, or it does not agree with gravity.
+    rows : list of Row
+        What the sensor recorded, and how well its quaternion agrees with gravity.
+    remarks : list of str
         Samples left out, and what is odd of the others.
     """
 
     time_s: FloatArray
-    accelerometer_g: FloatArray
+    accelerometer_m_s2: FloatArray
     gyroscope_rad_s: FloatArray
-    magnetometer_gauss: FloatArray | None
-    quaternion: FloatArray | None
-    remarks: tuple[str, ...]
-
-    @cached_property
-    def fit(self) -> Fit | None:
-        """The quaternion where it agrees with gravity; None where there is none, or it does not."""
-        norms = np.linalg.norm(self.accelerometer_g, axis=1)
-        felt = norms > 0
-        if self.quaternion is None or not felt.any():
-            return None
-        turned = Rotation.from_quat(self.quaternion, scalar_first=True)
-        along = turned[felt].apply(self.accelerometer_g[felt])[:, 2] / norms[felt]
-        sign = 1.0 if along.mean() >= 0 else -1.0
-        off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
-        return Fit(turned, sign, float(off)) if off < _MOST_OFF_DEG else None
-
-    @property
-    def accelerometer_m_s2(self) -> FloatArray:
-        """Specific force, shape (m, 3): what is measured, or against it, as the quaternion's z tells.
-
-        Against it where the quaternion is not believed, as in both public recordings.
-        """
-        return (-1.0 if self.fit is None else self.fit.vertical) * G_M_S2 * self.accelerometer_g
+    magnetometer_au: FloatArray | None
+    world_from_sensor: Rotation | None
+    rows: list[Row]
+    remarks: list[str]
 
     @property
     def orientation(self) -> OrientationSensor | None:
         """Stream of a sweep, whose world is z up; None where the quaternion is not believed."""
-        if self.fit is None:
+        if self.world_from_sensor is None:
             return None
         return OrientationSensor(
-            TimedRotations(self.time_s, self.fit.world_from_sensor),
+            TimedRotations(self.time_s, self.world_from_sensor),
             accelerometer_m_s2=self.accelerometer_m_s2,
             gyroscope_rad_s=self.gyroscope_rad_s,
-            magnetometer_au=self.magnetometer_gauss,
+            magnetometer_au=self.magnetometer_au,
         )
-
-    def rows(self) -> list[Row]:
-        """Tell what the sensor recorded, and whether its quaternion agrees with gravity."""
-        rows = [("sensor, longest pause", f"{np.diff(self.time_s).max(initial=0.0):.3f}", "s")]
-        if self.fit is None:
-            words = "none in the file" if self.quaternion is None else "none that agrees with gravity"
-            return [*rows, ("quaternion", f"{words}: see `speckle3d imu orient`", "")]
-        sign = "specific force" if self.fit.vertical > 0 else "gravity (against the world's z): negated"
-        return [
-            *rows,
-            ("quaternion", f"{MEANING} (checked against the accelerometer)", ""),
-            ("quaternion, off the vertical", f"{self.fit.off_vertical_deg:.2f}", "deg RMS"),
-            ("accelerometer taken as", sign, ""),
-        ]
-
-
-@dataclass(frozen=True)
-class Fit:
-    """The quaternion's rotations, and how well they agree with gravity.
-
-    Attributes
-    ----------
-    vertical : float
-        1 where the measured acceleration points along the world's z, -1 where against it.
-    off_vertical_deg : float
-        RMS angle of the acceleration from it.
-    """
-
-    world_from_sensor: Rotation
-    vertical: float
-    off_vertical_deg: float
 
 
 def read_samples(member: Member) -> SensorSamples:
-    """Read the sensor's samples.
+    """Read the sensor's samples, and check their quaternion against gravity.
 
     Raises
     ------
@@ -158,38 +110,59 @@ def read_samples(member: Member) -> SensorSamples:
         If no sample is of use.
     """
     documents = [text for text in re.split(r"^---.*$", member.text(), flags=re.MULTILINE) if text.strip()]
-    table, stamps = np.full((len(documents), 13), np.nan), np.full(len(documents), np.nan)
-    for i, text in enumerate(documents):
+    table = np.full((len(documents), 14), np.nan)
+    for row, text in zip(table, documents, strict=True):
         # What cannot be read stays without a time or a value.
         with suppress(InvalidInputError, ValueError, TypeError, LookupError, AttributeError):
             fields = parsed(text, member.where)
             turn = fields.get("orientation") or {}
             values = [fields.get(name) for name in _NAMES] + [turn.get(f"q{k}") for k in range(4)]
-            table[i] = [float(value or "nan") for value in values]
-            stamps[i] = int(fields["timestamp"]) / 1e9
-    wanted = np.isfinite(table).mean(axis=0) > 0.5  # a magnetometer and a quaternion are in some files alone
+            row[1:] = [float(value or "nan") for value in values]
+            row[0] = int(fields["timestamp"]) / 1e9
+    stamps, table = table[:, 0], table[:, 1:]
+    wanted = np.isfinite(table).sum(axis=0) > 0.5 * len(
+        table
+    )  # a magnetometer and a quaternion are in some files alone
     table[:, ~wanted] = 0.0
-    sound = np.isfinite(table).all(axis=1)
+    sound = np.isfinite(table).all(axis=1) & table[:, :3].any(axis=1)
     if wanted[9:].all():
         sound &= np.abs(np.linalg.norm(table[:, 9:], axis=1) - 1.0) < RIGID_TOLERANCE
     faults = np.where(sound, "", "without a value, or a quaternion of unit length").astype(object)
     repeats = np.flatnonzero(sound)[1:][(np.diff(table[sound], axis=0) == 0).all(axis=1)]
     faults[repeats] = "with the values of the one before"
-    rows, remarks = usable("samples of the sensor", stamps, faults.tolist())
-    if not rows.size or not wanted[:6].all():
+    places, remarks = usable("samples of the sensor", stamps, faults.tolist())
+    if not places.size or not wanted[:6].all():
         raise InvalidInputError(f"{member.where}: expected samples of the sensor, got none of use")
-    accelerometer, gyroscope, magnetometer, quaternion = np.split(table[rows], [3, 6, 9], axis=1)
-    norm_g = float(np.median(np.linalg.norm(accelerometer, axis=1)))
-    if not _LEAST_G <= norm_g <= _MOST_G:
+    time_s, parts = stamps[places], np.split(table[places], [3, 6, 9], axis=1)
+    measured_g, gyroscope, magnetometer, wxyz = parts
+    norms = np.linalg.norm(measured_g, axis=1)
+    if not _LEAST_G <= np.median(norms) <= _MOST_G:
         remarks.append(
-            f"the accelerometer's median norm is {norm_g:.3g} g, and 1 g is felt at rest: its unit or scale "
-            "is another than assumed"
+            f"the accelerometer's median norm is {np.median(norms):.3g} g, and 1 g is felt at rest: its unit "
+            "or scale is another than assumed"
         )
-    return SensorSamples(
-        stamps[rows],
-        accelerometer,
-        gyroscope,
-        magnetometer if wanted[6:9].all() else None,
-        quaternion if wanted[9:].all() else None,
-        tuple(remarks),
-    )
+    rows: list[Row] = [("sensor, longest pause", f"{np.diff(time_s).max(initial=0.0):.3f}", "s")]
+    turned, sign, fault = None, -1.0, "is missing"
+    if wanted[9:].all():
+        turned = Rotation.from_quat(wxyz, scalar_first=True)
+        along = turned.apply(measured_g)[:, 2] / norms
+        sign = 1.0 if along.mean() >= 0 else -1.0
+        off = np.rad2deg(np.sqrt(np.mean(np.arccos(np.clip(sign * along, -1.0, 1.0)) ** 2)))
+        meaning = "specific force" if sign > 0 else "gravity (against the world's z): negated"
+        rows += [
+            ("quaternion", f"{MEANING} (checked against the accelerometer)", ""),
+            ("quaternion, off the vertical", f"{off:.2f}", "deg RMS"),
+            ("accelerometer taken as", meaning, ""),
+        ]
+        if off >= _MOST_OFF_DEG:
+            turned, sign, fault = None, -1.0, "does not agree with gravity"
+            del rows[1:]
+    if turned is None:
+        rows.append(("quaternion", f"{fault}: see `speckle3d imu orient`", ""))
+        remarks.append(
+            f"the sensor's quaternion {fault}: the sweep has no orientation, which `speckle3d imu orient "
+            f"{member.path} --into SWEEP.h5` finds"
+        )
+    force = sign * G_M_S2 * measured_g
+    field = magnetometer if wanted[6:9].all() else None
+    return SensorSamples(time_s, force, gyroscope, field, turned, rows, remarks)

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import re
 import tarfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.files import open_regular
 from speckle3d.io.hdf5 import reading
 
@@ -35,7 +36,7 @@ class Member:
         Of the member.
     start, size : int
         First byte in the file, and number of bytes.
-    recording : tuple of str
+    recording : str
         Folder and name of the recording that it is of.
     kind : str
         rf, iq, env or imu.
@@ -47,7 +48,7 @@ class Member:
     name: str
     start: int
     size: int
-    recording: tuple[str, str] = ("", "")
+    recording: str = ""
     kind: str = ""
     is_raw: bool = False
 
@@ -93,15 +94,10 @@ class Files:
 
 def is_package(path: Path, start: bytes) -> bool:
     """Whether a file or folder looks like a package, or one file of one."""
-    try:
-        if path.is_file() and (match := _NAME.fullmatch(path.name)):
-            members = _members(path)
-            is_described = any(one.kind == match["kind"] and not one.is_raw for one in members)
-            return is_described and any(one.path == path and one.is_own for one in members)
-        if path.is_dir() or path.suffix.lower() == ".tar" or start[257:262] == b"ustar":
+    is_part = path.is_file() and _NAME.fullmatch(path.name)
+    if is_part or path.is_dir() or path.suffix.lower() == ".tar" or start[257:262] == b"ustar":
+        with suppress(OSError, ValueError):
             return any(member.is_own for member in _members(path))
-    except (OSError, ValueError):
-        pass
     return False
 
 
@@ -121,47 +117,35 @@ def find_files(path: Path) -> Files:
         If it holds several recordings or none.
     """
     members = _members(path)
-    own = {member.recording for member in members if member.is_own}
+    own = sorted({member.recording for member in members if member.is_own})
     if len(own) != 1:
-        names = ", ".join("/".join(one).removeprefix("./") for one in sorted(own))
         raise InvalidInputError(
             f"{path}: expected files of one recording, as 2024-05-01_rf.raw and _rf.yml, got "
-            f"{len(own)}: {names}: give the raw file of one (of a tar file: unpack it first)"
+            f"{len(own)}: {', '.join(own)}: give the raw file of one (of a tar file: unpack it first)"
         )
-    (recording,) = own
     raw, yml = (
-        {one.kind: one for one in members if one.recording == recording and one.is_raw == is_raw}
+        {one.kind: one for one in members if one.recording == own[0] and one.is_raw == is_raw}
         for is_raw in (True, False)
     )
-    return Files(path, recording[1], raw, yml)
+    return Files(path, Path(own[0]).name, raw, yml)
 
 
 def _members(path: Path) -> list[Member]:
     """Files of a folder or a tar file with the names of a package's; of a file, those of its recording."""
-    match = None if path.is_dir() else _NAME.fullmatch(path.name)
-    if match is not None:
-        kinds = {"rf", "iq", "env", "imu"} if match["kind"] == "imu" else {match["kind"], "imu"}
-        siblings = _members(path.parent)
-        return [one for one in siblings if one.recording[1] == (match["name"] or "") and one.kind in kinds]
-    members = []
-    with reading(path):
+    with reading(path, tarfile.TarError):
         if path.is_dir():
             places = [(file, file.name, 0, file.stat().st_size) for file in sorted(path.iterdir())]
+        elif part := _NAME.fullmatch(path.name):
+            kinds = {"rf", "iq", "env", "imu"} if part["kind"] == "imu" else {part["kind"], "imu"}
+            siblings = _members(path.parent)
+            return [one for one in siblings if one.recording == (part["name"] or "") and one.kind in kinds]
         else:
-            places = [(path, *entry) for entry in _tar_entries(path)]
+            # It is read to its end, so that one cut short is refused.
+            with open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
+                places = [(path, one.name, one.offset_data, one.size) for one in archive if one.isfile()]
+    members = []
     for file, name, start, size in places:
-        if match := _NAME.fullmatch(Path(name).name):
-            recording = str(Path(name).parent), match["name"] or ""
-            members.append(Member(file, name, start, size, recording, match["kind"], match["what"] == "raw"))
+        if part := _NAME.fullmatch(Path(name).name):
+            recording = str(Path(name).with_name(part["name"])) if part["name"] else str(Path(name).parent)
+            members.append(Member(file, name, start, size, recording, part["kind"], part["what"] == "raw"))
     return members
-
-
-def _tar_entries(path: Path) -> list[tuple[str, int, int]]:
-    """Name, first byte and size of each file in a tar file."""
-    with open_regular(path) as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
-        entries = [(one.name, one.offset_data, one.size) for one in archive if one.isfile()]
-        length = stream.seek(0, 2)
-    for name, start, size in entries:
-        if start + size > length:
-            raise FileError(f"{path}: {name}: ends early: {length - start} of {size} bytes")
-    return entries

@@ -19,7 +19,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import ComplexArray
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -37,37 +36,30 @@ _SAMPLES = {"RF": ("<i2", 1, np.int16), "IQ": ("<i2", 2, np.complex64), "envelop
 
 @dataclass(frozen=True)
 class ClariusFile:
-    """Frames of a raw file, whose header was checked against its yml.
+    """Frames of a raw file.
 
     Attributes
     ----------
-    frames, lines, samples : int
-    kept : pair of slice
-        Lines and samples kept of each frame.
+    size : tuple of int
+        Frames, lines and samples.
+    part : pair of slice
+        Lines and samples to take of each frame.
     turns : ndarray, shape (sample,), optional
-        Complex factors of the samples kept, the same in all frames.
+        Complex factors of the samples taken, the same in all frames.
     """
 
     member: Member
     kind: str
-    frames: int
-    lines: int
-    samples: int
-    kept: tuple[slice, slice] = (slice(None), slice(None))
+    size: tuple[int, int, int]
+    part: tuple[slice, slice] = (slice(None), slice(None))
     turns: ComplexArray | None = None
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape (frame, vector, sample)."""
-        lines, samples = self.kept
-        return self.frames, len(range(self.lines)[lines]), len(range(self.samples)[samples])
 
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the frames."""
         return np.dtype(_SAMPLES[self.kind][2])
 
-    def records(self) -> npt.NDArray[Any]:
+    def records(self) -> Any:
         """Frames as they lie in the file: ``time`` in ns and ``samples``, shape (line, sample, part).
 
         Raises
@@ -76,68 +68,63 @@ class ClariusFile:
             If the file ends early.
         """
         dtype, parts, _ = _SAMPLES[self.kind]
-        member, packed = self.member, unpacked(self.member)
-        with reading(member.where):  # of more samples than memory has places for
-            record = np.dtype([("time", "<u8"), ("samples", dtype, (self.lines, self.samples, parts))])
-        size = member.size if packed is None else len(packed)
-        whole = (size - HEADER.size) // record.itemsize
-        if whole < self.frames:
-            raise FileError(f"{member.where}: ends early: {whole} of {self.frames} frames")
-        if packed is not None:
-            return np.frombuffer(packed, record, self.frames, HEADER.size)
-        return np.memmap(member.path, record, "r", member.start + HEADER.size, (self.frames,))
+        held, (count, lines, samples) = _content(self.member), self.size
+        with reading(self.member.where):  # of more samples than memory has places for
+            record = np.dtype([("time", "<u8"), ("samples", dtype, (lines, samples, parts))])
+        whole = (len(held) - HEADER.size) // record.itemsize
+        if whole < count:
+            raise FileError(f"{self.member.where}: ends early: {whole} of {count} frames")
+        return np.frombuffer(held, record, count, HEADER.size)
 
     def __call__(self) -> ReadFrame:
         """Map or unpack the file."""
         samples = self.records()["samples"]
 
-        def frame(i: int) -> npt.NDArray[Any]:
-            part: Any = samples[i][self.kept]
+        def frame(i: int) -> Any:
+            part = samples[i][self.part]
             pairs = part.astype(np.float32).view(np.complex64) if self.kind == "IQ" else part
-            return np.asarray(pairs[..., 0] if self.turns is None else pairs[..., 0] * self.turns)
+            return pairs[..., 0] if self.turns is None else pairs[..., 0] * self.turns
 
         return frame
 
 
-def read_header(member: Member, said: Description) -> ClariusFile:
-    """Read the header of a raw file.
+def open_raw(member: Member, said: Description) -> ClariusFile:
+    """Open a raw file.
 
     Raises
     ------
     InvalidInputError
-        If it contradicts the yml.
+        If its header contradicts the yml.
     """
-    packed = unpacked(member)
-    head = (member.read(HEADER.size) if packed is None else packed[: HEADER.size]).ljust(HEADER.size, b"\0")
     dtype, parts, _ = _SAMPLES[said.kind]
-    expected = (int(said.number("frames")), said.lines, said.samples, parts * np.dtype(dtype).itemsize)
-    got = HEADER.unpack(head)[1:]
+    size = int(said.number("frames")), said.lines, said.samples
+    expected = (*size, parts * np.dtype(dtype).itemsize)
+    got = HEADER.unpack(bytes(_content(member)[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
     if got != expected or 0 in got:
         raise InvalidInputError(
             f"{member.where}: header: expected frames, lines, samples and bytes of a sample of {said.kind} "
             f"as in the yml, {expected}, got {got}"
         )
-    return ClariusFile(member, said.kind, *got[:3])
+    return ClariusFile(member, said.kind, size)
 
 
-def unpacked(member: Member) -> bytes | None:
-    """Content of a file packed by lzop; None of another."""
-    if not member.name.endswith(".lzo"):
-        return None
+def _content(member: Member) -> Any:
+    """Bytes of a file, unpacked where it is packed by lzop."""
     with reading(member.where):
-        return _unpacked(member, member.path.stat().st_mtime_ns)
+        if member.name.endswith(".lzo"):
+            return _unpacked(member, member.path.stat().st_mtime_ns)
+        return np.memmap(member.path, np.uint8, "r", member.start, (member.size,))
 
 
 @lru_cache(1)
 def _unpacked(member: Member, _: int) -> bytes:
     lzo = extra_module("lzallright", "clarius", "a file packed by lzop (.lzo)").LZOCompressor
-    content, at, parts = member.read(), len(_MAGIC), list[bytes]()
+    content, parts = member.read(), list[bytes]()
     if not content.startswith(_MAGIC):
         raise FileError(f"{member.where}: expected a file of lzop (.lzo), got another")
-    is_newer = struct.unpack_from(">H", content, at)[0] >= 0x0940
-    at += 8 if is_newer else 5
-    (flags,) = struct.unpack_from(">I", content, at)
-    at += 4 + (4 if flags & 0x800 else 0) + (12 if is_newer else 8)
+    # Behind the versions, the method and the level: flags, a filter, mode, time, the name and a check sum.
+    (flags,) = struct.unpack_from(">I", content, 17)
+    at = 37 if flags & 0x800 else 33
     at += 1 + content[at] + 4
     plain, packs = (sum(bool(flags & bit) for bit in bits) for bits in ((0x1, 0x100), (0x2, 0x200)))
     check = zlib.adler32 if flags & 0x1 else zlib.crc32

@@ -23,17 +23,14 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.package import Member
+from speckle3d.io.import_settings import LEAST_HZ
 
 _KINDS = {"rf": "RF", "iq": "IQ", "b pre-scan": "envelope", "envelope": "envelope", "b": "envelope"}
 _GAIN_LINE = re.compile(r"^tgc:.*(?:\n[ \t]+-.*)*$", re.MULTILINE)
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\s\d]*)\s*")
-_UNITS = {
-    "": {"": 1.0},
-    "Hz": {"hz": 1.0, "khz": 1e3, "mhz": 1e6},
-    "mm": {"mm": 1.0, "cm": 10.0, "um": 1e-3, "µm": 1e-3},
-    "m/s": {"m/s": 1.0},
-    "deg": {"°": 1.0, "deg": 1.0},
-}
+_SIZES = {"khz": 1e3, "mhz": 1e6, "cm": 10.0, "um": 1e-3, "µm": 1e-3}
+"""Of units in Hz and mm."""
+_UNITS = {**dict.fromkeys(("", "hz", "mm", "m/s", "°", "deg"), 1.0), **_SIZES}
 
 
 def parsed(text: str, where: str) -> dict[str, Any]:
@@ -62,6 +59,8 @@ class Description:
     ----------
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
+    rate_hz : float
+        Sampling rate.
 
     Raises
     ------
@@ -74,11 +73,12 @@ class Description:
     def __init__(self, member: Member) -> None:
         self.where = member.where
         self.values = parsed(_GAIN_LINE.sub("", member.text()), self.where)
-        self.kind = _KINDS.get(self.text("type").strip().lower(), "")
-        if not self.kind or self.text("compression").lower() not in ("", "none"):
+        self.kind, packing = _KINDS.get(self.text("type").strip().lower(), ""), self.text("compression")
+        self.rate_hz = self.number("sampling rate")
+        if not self.kind or packing.lower() not in ("", "none") or self.rate_hz < LEAST_HZ:
             raise InvalidInputError(
-                f"{self.where}: type, compression: expected RF, IQ or B pre-scan, and none, got "
-                f"{self.text('type')} and {self.text('compression')}"
+                f"{self.where}: type, compression, sampling rate: expected RF, IQ or B pre-scan, none, and a "
+                f"rate in MHz, got {self.text('type')}, {packing} and {self.rate_hz:g} Hz"
             )
         self.lines = int(self.number("size", "number of lines"))
         self.samples = int(self.number("size", "samples per line"))
@@ -96,13 +96,13 @@ class Description:
         value = self.field(*names)
         return printable(value[:60]) if isinstance(value, str) else ""
 
-    def count(self, *names: str | int) -> int:
-        """Length of a list; 0 where there is none."""
+    def rows(self, *names: str | int) -> range:
+        """Numbers of a list's items; none where there is no list."""
         value = self.field(*names)
-        return len(value) if isinstance(value, list) else 0
+        return range(len(value) if isinstance(value, list) else 0)
 
-    def number(self, *names: str | int, unit: str = "") -> float:
-        """A number with its unit, as ``"60 MHz"``, in the base unit `unit`.
+    def number(self, *names: str | int) -> float:
+        """A number in Hz, mm, m/s or degrees, as of ``"60 MHz"``.
 
         Raises
         ------
@@ -110,23 +110,16 @@ class Description:
             Naming the field that is missing or has another unit.
         """
         parts = _NUMBER.fullmatch(self.text(*names))
-        factor = None if parts is None else _UNITS[unit].get(parts[2].lower())
-        value = np.nan if parts is None or factor is None else float(parts[1]) * factor
-        if not np.isfinite(value) or (unit == "Hz" and value <= 0):
+        value = np.nan if parts is None else float(parts[1]) * _UNITS.get(parts[2].lower(), np.nan)
+        if not np.isfinite(value):
             got = self.text(*names) or f"a {type(self.field(*names)).__name__}"
-            expected = f"a number of {unit}" if unit else "a number"
             place = ": ".join(map(str, names))
-            raise InvalidInputError(f"{self.where}: {place}: expected {expected}, got {got}")
+            raise InvalidInputError(f"{self.where}: {place}: expected a number and its unit, got {got}")
         return value
 
-    def optional(self, *names: str | int, unit: str = "") -> float | None:
+    def optional(self, *names: str | int) -> float | None:
         """A number, or None where there is none."""
-        return None if self.field(*names) in (None, "", "~") else self.number(*names, unit=unit)
-
-    @property
-    def probe(self) -> str:
-        """Model of the probe; empty where only its measures, or nothing, is said."""
-        return self.text("probe")
+        return None if self.field(*names) in (None, "", "~") else self.number(*names)
 
     @cached_property
     def places(self) -> FloatArray:
@@ -134,21 +127,19 @@ class Description:
 
         Files may give the first and the last alone.
         """
-        rows = [
-            (self.number("lines", i, "rx element"), self.number("lines", i, "angle", unit="deg"))
-            for i in range(self.count("lines"))
-        ]
-        if len(rows) not in (2, self.lines) or not rows:
+        names = ("rx element", "angle")
+        rows = [[self.number("lines", i, name) for name in names] for i in self.rows("lines")]
+        if len(rows) == 2:
+            return np.asarray(np.linspace(*np.array(rows), self.lines))
+        if len(rows) != self.lines or not rows:
             raise InvalidInputError(f"{self.where}: lines: expected {self.lines} lines, got {len(rows)}")
-        if len(rows) == self.lines:
-            return np.array(rows)
-        return np.asarray(np.linspace(np.array(rows[0]), np.array(rows[1]), self.lines))
+        return np.array(rows)
 
     @property
-    def region(self) -> tuple[slice, slice] | None:
-        """Lines and samples of the region of interest."""
+    def region(self) -> tuple[slice, slice]:
+        """Lines and samples of the region of interest; all of them by default."""
         if not self.field("roi"):
-            return None
+            return slice(0, self.lines), slice(0, self.samples)
         parts = []
         for name, length in (("line", self.lines), ("sample", self.samples)):
             start, end = (int(self.number("roi", f"{side} {name}")) for side in ("start", "end"))
@@ -160,18 +151,15 @@ class Description:
         return parts[0], parts[1]
 
     @property
-    def receive(self) -> tuple[float, float, float] | None:
+    def receive(self) -> tuple[float, ...] | None:
         """Demodulation frequency at depth 0, Hz, at a depth, and that depth, mm; linear between [2]_.
 
         None in older files, and where it differs between foci or filters.
         """
-        fields = ("shallowfreq", "Hz"), ("deepfreq", "Hz"), ("filterdepth", "mm")
+        fields = ("shallowfreq", "deepfreq", "filterdepth")
         ends = {
-            tuple(self.number("focus", i, "receive", k, name, unit=unit) for name, unit in fields)
-            for i in range(self.count("focus"))
-            for k in range(self.count("focus", i, "receive"))
+            tuple(self.number("focus", i, "receive", k, name) for name in fields)
+            for i in self.rows("focus")
+            for k in self.rows("focus", i, "receive")
         }
-        if len(ends) != 1:
-            return None
-        shallow_hz, deep_hz, depth_mm = ends.pop()
-        return shallow_hz, deep_hz, depth_mm
+        return ends.pop() if len(ends) == 1 else None

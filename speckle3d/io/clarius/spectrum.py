@@ -9,6 +9,8 @@ RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import csd
@@ -47,17 +49,16 @@ def band_hz(
     chosen = sorted({0, count // 2, count - 1})
     spectra = len(chosen) * (vectors - 1) * (2 * samples // length - 1)
     shared, power = np.zeros(length), np.zeros(length)
+    cross = partial(csd, fs=sampling_rate_hz, nperseg=length, return_onesided=False, detrend=False)
     for i in chosen:
         lines = frames[i] - (frames[i].mean(axis=1, keepdims=True) if shift_hz is None else 0.0)
         level = np.sqrt(uniform_filter1d(np.mean(np.abs(lines) ** 2, axis=0), length))
         lines = lines / np.where(level > 0, level, 1.0)
-        for other, mean in ((lines[1:], shared), (lines[:-1], power)):
-            _, cross = csd(lines[:-1], other, nperseg=length, return_onesided=False, detrend=False)
-            mean += cross.real.mean(axis=0)
-    frequency = np.fft.fftfreq(length, 1 / sampling_rate_hz) + (shift_hz or 0.0)
-    # Real samples have each frequency twice.
-    order = np.argsort(frequency[: length // 2] if shift_hz is None else frequency)
-    frequency, shared, power = frequency[order], shared[order], power[order]
+        frequency, density = cross(lines[:-1], lines[1:])
+        shared += density.real.mean(axis=0)
+        power += cross(lines[:-1], lines[:-1])[1].real.mean(axis=0)
+    frequency = np.fft.fftshift(frequency) + (shift_hz or 0.0)
+    shared, power = np.fft.fftshift(shared), np.fft.fftshift(power)
     near = np.flatnonzero((frequency > 0.5 * transmit_hz) & (frequency < 2 * transmit_hz))
     if not near.size:
         return None

@@ -92,6 +92,11 @@ def samples_of(tmp_path, text):
     return read_samples(Member(path, path.name, 0, path.stat().st_size))
 
 
+def off_deg(samples):
+    (off,) = (value for name, value, _ in samples.rows if name == "quaternion, off the vertical")
+    return float(off)
+
+
 def moving(degrees=25.0):
     return examples.sensor_of(examples.swayed(TIMES_S, degrees), TIMES_S)
 
@@ -101,12 +106,22 @@ def test_accelerometer_becomes_specific_force_whatever_its_sign(tmp_path, sign):
     sensor = moving()
     other = replace(sensor, accelerometer_m_s2=sign * sensor.accelerometer_m_s2)
     samples = samples_of(tmp_path, examples.sensor_text(other))
-    assert samples.fit.off_vertical_deg < 0.6  # noise of 0.05 m/s^2 tilts by 0.4 deg
+    assert off_deg(samples) < 0.6  # noise of 0.05 m/s^2 tilts by 0.4 deg
     np.testing.assert_allclose(
         samples.orientation.accelerometer_m_s2, sensor.accelerometer_m_s2, rtol=1e-12, atol=1e-14
     )
-    apart = samples.fit.world_from_sensor.inv() * sensor.readings.world_from_sensor
+    apart = samples.world_from_sensor.inv() * sensor.readings.world_from_sensor
     assert apart.magnitude().max() < 1e-9
+
+
+def test_a_quaternion_that_contradicts_gravity_is_not_used(tmp_path):
+    """Scalar last, as other makers write it."""
+    text = examples.sensor_text(moving())
+    for old, new in (("q0", "qw"), ("q1", "q0"), ("q2", "q1"), ("q3", "q2"), ("qw", "q3")):
+        text = text.replace(f"{old}:", f"{new}:")
+    samples = samples_of(tmp_path, text)
+    assert samples.orientation is None
+    assert any("gravity" in remark for remark in samples.remarks)
 
 
 @pytest.mark.parametrize(
@@ -122,20 +137,20 @@ def test_one_bad_sample_is_left_out_and_counted(tmp_path, change):
     rows[7] = change(rows[7])
     samples = samples_of(tmp_path, "---\n".join(rows))
     np.testing.assert_array_equal(samples.time_s, np.delete(whole.time_s, 7))
-    np.testing.assert_array_equal(samples.quaternion, np.delete(whole.quaternion, 7, axis=0))
+    np.testing.assert_array_equal(samples.gyroscope_rad_s, np.delete(whole.gyroscope_rad_s, 7, axis=0))
     assert any(f"1 of {len(rows)} left out" in remark for remark in samples.remarks)
 
 
 @pytest.mark.realdata
 @pytest.mark.parametrize(
-    ("name", "count", "norm", "off_deg", "dip_deg"),
+    ("name", "count", "norm", "off", "dip_deg"),
     [("carotid/carotid", 84, 0.921, 0.75, 73), ("wirephantom/phantom", 57, 0.955, 0.47, 61)],
 )
-def test_real_sensors(realdata, name, count, norm, off_deg, dip_deg):
+def test_real_sensors(realdata, name, count, norm, off, dip_deg):
     samples = sensor_of(realdata / "clarius" / f"{name}_imu.yml")
     assert samples.time_s.size == count
-    assert samples.fit.vertical == -1.0
-    assert samples.fit.off_vertical_deg == pytest.approx(off_deg, abs=0.01)
+    assert off_deg(samples) == pytest.approx(off, abs=0.01)
+    assert any("negated" in value for _, value, _ in samples.rows)
     made = samples.orientation
     norms = np.linalg.norm(made.accelerometer_m_s2, axis=1)
     assert np.median(norms) == pytest.approx(norm * 9.80665, abs=0.01)
