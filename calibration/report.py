@@ -14,11 +14,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.beam import BeamBias
-from calibration.points import ANGLES, CHAIN, SCALES
+from calibration.points import CHAIN, SCALES
 from calibration.solution import Solution
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.calibration import Calibration, FramesUsed, Parameter, readable
-from speckle3d.core.geometry import roll_yaw_tilt, skew
+from speckle3d.core.calibration import Calibration, FramesUsed, Parameter
+from speckle3d.core.geometry import skew
 from speckle3d.core.tables import text_rows
 
 USED, DROPPED = "#0072B2", "#D55E00"
@@ -27,10 +27,6 @@ USED, DROPPED = "#0072B2", "#D55E00"
 IMAGE_POSE = ("gamma", "beta", "alpha", "x", "y", "z")
 """Tilt, yaw, roll and displacements: small angles in frames that lie on the image."""
 
-ANGLES_IN_WORDS = ("roll (alpha)", "yaw (beta)", "tilt (gamma)")
-"""About the image's z, y and x axes."""
-
-_LONGEST_REASONS = 6
 _MOST_NAMED = 20
 
 
@@ -110,33 +106,9 @@ def _parameters(solution: Solution) -> tuple[Parameter, ...]:
     )
 
 
-def rows_of(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """What was found as description, value with its 95 % interval, and unit, angles in degrees."""
-    rows = [("method", calibration.method, ""), ("sensor", calibration.sensor, "")]
-    rows += [one.row() for one in calibration.parameters if one.name not in ANGLES]
-    angles = np.rad2deg(roll_yaw_tilt(calibration.rotation))
-    errors = np.rad2deg(np.sqrt(np.diag(calibration.covariance)[2::-1]))
-    rows += [
-        (name, f"{angle:.3f} +- {1.96 * error:.3f} (95 %)", "deg")
-        for name, angle, error in zip(ANGLES_IN_WORDS, angles, errors, strict=True)
-    ]
-    used = f"{len(calibration.frames.used)} of {calibration.frames.given}"
-    left = "RMS residual" if calibration.rms_unit else "correlation lost"
-    rows += [
-        (left, *readable(calibration.rms, calibration.rms_unit)),
-        ("condition number", f"{calibration.condition_number:.1f}", ""),
-        ("frames used", used, ""),
-    ]
-    reasons = list(calibration.frames.reasons().items())[:_LONGEST_REASONS]
-    rows += [(f"dropped: {reason}", str(count), "frames") for reason, count in reasons]
-    if calibration.time_offset_s is not None:
-        rows.append(("sensor clock offset", f"{calibration.time_offset_s:+.4f}", "s"))
-    return [*rows, ("verdict", calibration.verdict, "")]
-
-
 def text_report(calibration: Calibration, beam: Sequence[BeamBias] = (), notes: Sequence[str] = ()) -> str:
     """Aligned table, the matrix in PLUS's form, and what a thick beam would do."""
-    lines = text_rows(rows_of(calibration)).splitlines()
+    lines = text_rows(calibration.rows()).splitlines()
     if dropped := sorted(calibration.frames.dropped.items()):
         named = [f"  {number}: {reason}" for number, reason in dropped[:_MOST_NAMED]]
         more = len(dropped) - _MOST_NAMED

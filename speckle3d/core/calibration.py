@@ -11,10 +11,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
+from speckle3d.core.geometry import roll_yaw_tilt
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import Sweep
 
 SENSORS = ("tracker", "orientation")
+
+_ANGLES = {"alpha": "roll (alpha)", "beta": "yaw (beta)", "gamma": "tilt (gamma)"}
+_LONGEST_REASONS = 6
+"""How many reasons for dropped frames rows tell."""
 
 
 def readable(value: float, unit: str) -> tuple[str, str]:
@@ -137,6 +142,27 @@ class Calibration:
             raise InvalidInputError(f"covariance: expected shape {(size, size)}, got {self.covariance.shape}")
         if self.pixel_mm is not None and not ((self.pixel_mm > 0) & (self.pixel_mm < np.inf)).all():
             raise InvalidInputError(f"pixel_mm: expected values above zero, got {self.pixel_mm}")
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Description, value with its 95 % interval, and unit, angles in degrees, for people."""
+        rows = [("method", self.method, ""), ("sensor", self.sensor, "")]
+        rows += [one.row() for one in self.parameters if one.name not in _ANGLES]
+        angles = np.rad2deg(roll_yaw_tilt(self.rotation))
+        errors = np.rad2deg(np.sqrt(np.diag(self.covariance)[2::-1]))
+        rows += [
+            (name, f"{angle:.3f} +- {1.96 * error:.3f} (95 %)", "deg")
+            for name, angle, error in zip(_ANGLES.values(), angles, errors, strict=True)
+        ]
+        rows += [
+            ("RMS residual" if self.rms_unit else "correlation lost", *readable(self.rms, self.rms_unit)),
+            ("condition number", f"{self.condition_number:.1f}", ""),
+            ("frames used", f"{len(self.frames.used)} of {self.frames.given}", ""),
+        ]
+        reasons = list(self.frames.reasons().items())[:_LONGEST_REASONS]
+        rows += [(f"dropped: {reason}", str(count), "frames") for reason, count in reasons]
+        if self.time_offset_s is not None:
+            rows.append(("sensor clock offset", f"{self.time_offset_s:+.4f}", "s"))
+        return [*rows, ("verdict", self.verdict, "")]
 
     @property
     def sensor_from_image(self) -> RigidTransform:

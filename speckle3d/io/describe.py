@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.calibration import Calibration, Parameter, readable
 from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.files import PathLike
-from speckle3d.core.geometry import elevational_steps, roll_yaw_tilt
+from speckle3d.core.geometry import elevational_steps
 from speckle3d.core.labels import LabelMap
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import BModeSettings, RFSettings, Sweep, stored_dtype
@@ -41,23 +40,21 @@ def describe(path: PathLike) -> list[Row]:
     if Path(path).is_file() and is_volume(path):
         return [("format", "volume", ""), *_describe_volume(path)]
     if (reader := find_reader(path)) is None:
-        kind = family_format(path)
-        if kind not in _DESCRIBERS:
+        if (tell := _DESCRIBERS.get(kind := family_format(path))) is None:
             raise InvalidInputError(f"{path}: expected {' or '.join(_DESCRIBERS)}, got {kind}")
-        return [("format", kind, ""), *_DESCRIBERS[kind](path)]
+        return [("format", kind, ""), *tell(path)]
     recording = recording_of(reader, Path(path), settings_for(path))
     rows = [("format", reader.format, ""), *recording.describe()]
     try:
-        return [*rows, *sweep_rows(recording.sweep)]
+        return [*rows, *_sweep_rows(recording.sweep)]
     except (InvalidInputError, FileError) as error:
         if len(rows) == 1:
             raise
         return [*rows, ("sweep", f"none: {error}", "")]
 
 
-def sweep_rows(sweep: Sweep) -> list[Row]:
-    """Tell what a sweep holds."""
-    grid, stored, tracker = sweep.grid, stored_dtype(sweep.frames), sweep.tracker
+def _sweep_rows(sweep: Sweep) -> list[Row]:
+    grid, stored = sweep.grid, stored_dtype(sweep.frames)
     narrow = "" if sweep.frames.dtype == stored else f", stored as pairs of {stored}"
     rows = [
         ("frames", str(len(sweep)), ""),
@@ -70,24 +67,24 @@ def sweep_rows(sweep: Sweep) -> list[Row]:
         ("depth", f"{grid.first_sample_depth_mm:.2f} to {grid.depth_mm:.2f}", "mm"),
     ]
     if grid.fan is not None:
-        first, last = np.rad2deg(grid.angle_rad([0, grid.vectors - 1]))
-        rows.append(("array radius", f"{grid.fan.radius_mm:.4g}", "mm"))
-        rows.append(("vectors from straight down", f"{first:.4g} to {last:.4g}", "deg"))
+        angles_deg = np.rad2deg(grid.angle_rad([0, grid.vectors - 1]))
+        rows.append(number_row("array_radius_mm", grid.fan.radius_mm))
+        rows.append(number_row("line_angles_deg", angles_deg))
     rows += _signal_rows(sweep.signal)
-    for name, sensor in (("orientation sensor", sweep.orientation), ("tracker", tracker)):
+    sensors = {"orientation sensor": sweep.orientation, "tracker": sweep.tracker}
+    for name, sensor in sensors.items():
         if sensor is None:
             rows.append((name, "none", ""))
             continue
-        covered = np.count_nonzero(sensor.covers(sweep.frame_time_s))
         rows += [
             (name, str(len(sensor.readings)), "samples"),
             *_rate_rows(f"{name} ", sensor.readings.time_s, "samples/s"),
-            (f"{name} covers", str(covered), "frames"),
+            (f"{name} covers", str(np.count_nonzero(sensor.covers(sweep.frame_time_s))), "frames"),
             (f"{name} calibrated", "no" if sensor.sensor_from_image is None else "yes", ""),
             (f"{name} time offset", f"{sensor.time_offset_s:g}", "s"),
         ]
-    if tracker is not None and tracker.image_skew_rad:
-        rows.append(("image axes off square", f"{np.rad2deg(tracker.image_skew_rad):.3g}", "deg"))
+    if sweep.tracker is not None and sweep.tracker.image_skew_rad:
+        rows.append(("image axes off square", f"{np.rad2deg(sweep.tracker.image_skew_rad):.3g}", "deg"))
     return [*rows, ("truth", "no" if sweep.truth is None else "yes", "")]
 
 
@@ -108,7 +105,7 @@ def _rate_rows(name: str, times: FloatArray, unit: str) -> list[Row]:
 
 def _describe_reconstruction(path: PathLike) -> list[Row]:
     result = read_reconstruction(path)
-    made, pairs, times = result.provenance, result.pairs, result.frame_time_s
+    pairs, times = result.pairs, result.frame_time_s
     rows = [("frames", str(times.size), ""), *_rate_rows("", times, "frames/s")]
     for mode, poses in result.poses.items() if times.size else ():
         length_mm = abs(elevational_steps(poses, result.grid.centre_mm).sum())
@@ -116,11 +113,11 @@ def _describe_reconstruction(path: PathLike) -> list[Row]:
     rows += [
         ("frame pairs", str(0 if pairs is None else len(pairs)), ""),
         ("patches", str(0 if pairs is None else len(pairs.patch_centre_mm)), ""),
-        *_source_rows(made),
-        *((f"calibration of {one.sensor}", one.path, "") for one in made.calibrations),
+        *_source_rows(result.provenance),
+        *((f"calibration of {one.sensor}", one.path, "") for one in result.provenance.calibrations),
     ]
-    if made.imported is not None:
-        rows.append((f"import settings of {made.imported.name}", made.imported.settings_json, ""))
+    if (imported := result.provenance.imported) is not None:
+        rows.append((f"import settings of {imported.name}", imported.settings_json, ""))
     return rows
 
 
@@ -130,37 +127,8 @@ def _source_rows(source: Any) -> list[Row]:
 
 
 def _describe_calibration(path: PathLike) -> list[Row]:
-    held = read_calibration(path)
-    offset = "unknown" if held.time_offset_s is None else f"{held.time_offset_s:+.4f}"
-    return [
-        ("method", held.method, ""),
-        ("sensor", held.sensor, ""),
-        *_mounting_rows(held),
-        *((f"parameter {name}", value, unit) for name, value, unit in map(Parameter.row, held.parameters)),
-        ("RMS residual", *readable(held.rms, held.rms_unit)),
-        ("condition number", f"{held.condition_number:.1f}", ""),
-        ("time offset", offset, "" if held.time_offset_s is None else "s"),
-        ("frames used", f"{len(held.frames.used)} of {held.frames.given}", ""),
-        *((f"dropped: {reason}", str(n), "frames") for reason, n in held.frames.reasons().items()),
-        ("verdict", held.verdict, ""),
-        *_source_rows(held.source),
-    ]
-
-
-def _mounting_rows(held: Calibration) -> list[Row]:
-    """Where the image is, angles in degrees, and how well that is known about and along the image's axes."""
-    spread = np.sqrt(np.diag(held.covariance))
-    angles = np.rad2deg(roll_yaw_tilt(held.rotation))
-    rows: list[Row] = [
-        ("sensor_from_image roll, yaw, tilt", _listed(angles), "deg"),
-        ("standard error, tilt, yaw, roll", _listed(np.rad2deg(spread[:3])), "deg"),
-    ]
-    if held.translation_mm is not None:
-        rows.append(("sensor_from_image x, y, z", _listed(held.translation_mm), "mm"))
-        rows.append(("standard error along the image's x, y, z", _listed(spread[3:]), "mm"))
-    if held.pixel_mm is not None:
-        rows.append(("pixel", " x ".join(f"{size:.5f}" for size in held.pixel_mm), "mm"))
-    return rows
+    calibration = read_calibration(path)
+    return [*calibration.rows(), *_source_rows(calibration.source)]
 
 
 def _listed(values: FloatArray) -> str:
@@ -179,31 +147,27 @@ def _describe_volume(path: PathLike) -> list[Row]:
         *((printable(name), text, "") for name, text in volume.fields.items()),
     ]
     if not isinstance(volume, LabelMap):
-        held = volume.voxels[np.isfinite(volume.voxels)]
-        told = f"{held.min():g} to {held.max():g}" if held.size else "none"
-        return [*rows, ("levels found", told, "")]
-    for segment in volume.segments:
-        count = np.count_nonzero(volume.voxels == segment.value)
-        rows.append((f"label {segment.value}", f"{segment.name}: {count}", "voxels"))
-    return rows
+        levels = volume.voxels[np.isfinite(volume.voxels)]
+        extent = f"{levels.min():g} to {levels.max():g}" if levels.size else "none"
+        return [*rows, ("levels found", extent, "")]
+    counts = {one: np.count_nonzero(volume.voxels == one.value) for one in volume.segments}
+    return rows + [(f"label {one.value}", f"{one.name}: {n}", "voxels") for one, n in counts.items()]
 
 
 def _describe_curves(path: PathLike) -> list[Row]:
     held = curves.read_curves(path)
-    key, parts = held.key, ("tilt", "speckle", "spectrum")
     half = [np.interp(-0.5, -row, held.distance_mm) for row in held.correlation]
     return [
-        ("probe", key.probe or "not named", ""),
+        ("probe", held.key.probe or "not named", ""),
         ("origin", held.origin, ""),
-        *_signal_rows(key.signal),
-        ("vector pitch", f"{key.vector_pitch_mm:.4g}", "mm"),
-        ("patches", f"{key.patch_width_mm:g} x {key.patch_height_mm:g}", "mm"),
-        ("correlation of", key.correlation_of, ""),
+        *_signal_rows(held.key.signal),
+        number_row("vector_pitch_mm", held.key.vector_pitch_mm),
+        ("patches", f"{held.key.patch_width_mm:g} x {held.key.patch_height_mm:g}", "mm"),
+        ("correlation of", held.key.correlation_of, ""),
         ("depths", f"{held.depth_mm.size}, {held.depth_mm[0]:.1f} to {held.depth_mm[-1]:.1f}", "mm"),
         ("distances", f"up to {held.distance_mm[-1]:.2f}", "mm"),
         ("correlation halves at", f"{min(half):.2f} to {max(half):.2f}", "mm"),
         ("frame pairs", str(held.pairs_used), ""),
-        *((part, "no" if getattr(held, part) is None else "yes", "") for part in parts),
         ("lengths read with them, 95 %", f"+- {196 * held.scale_sigma:.1f}", "%"),
     ]
 
