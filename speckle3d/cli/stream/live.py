@@ -219,7 +219,7 @@ class _Sender:
     def trouble(self) -> str:
         """What is wrong; empty if nothing is."""
         state, words = self._connection.state, []
-        if not state.connected:
+        if not state.peers:
             why = f" ({state.last_failure})" if state.last_failure else ""
             words.append(f"waiting for {self._name}{why}")
         elif state.silent_s > _SILENT_S:
@@ -231,7 +231,7 @@ class _Sender:
 
     def has_left(self) -> bool:
         """Whether it has been away for as long as one that does not come back."""
-        if self._connection.state.connected:
+        if self._connection.state.peers:
             self._left_s = None
         elif self._left_s is None:
             self._left_s = time.monotonic()

@@ -92,7 +92,7 @@ def play(
             server.receive(0.0)
             dropped = server.state.dropped
             slow = f", {dropped} messages dropped: a client is too slow" if dropped else ""
-            note(f"{sent} frames sent to {server.clients} client(s){slow}")
+            note(f"{sent} frames sent to {server.state.peers} client(s){slow}")
 
         for turn in range(sys.maxsize if loop else 1):
             for message in played(read, frames, grid, upright, names, shift_s + turn * round_s):

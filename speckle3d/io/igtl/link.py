@@ -24,47 +24,45 @@ STALL_S = 10.0
 
 _LOOK_S = 0.005
 """Between two looks at what another thread does."""
-_CONNECT_S = 5.0
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
-"""Between two attempts to connect; doubled from one to the next."""
+_CONNECT_S, _PAUSE_S = 5.0, 0.5
+"""Longest time to connect, and between two attempts."""
 _MOST_RECEIVED, _MOST_SENDING = 256, 64
 """Messages not yet taken, for which the peer then waits; and not yet sent, of which the oldest go."""
 _PIECE_BYTES = 2**20
 
 
-@dataclass(frozen=True)
+@dataclass
 class LinkState:
-    """What has happened on a connection.
+    """What has happened on the connections of an end so far.
 
     Attributes
     ----------
-    connected : bool
-        For a server, whether there is a client.
-    messages : int
-        Received and understood.
+    peers : int
+        Connected now.
     refused : int
         Messages that made no sense; `last_refused` says why the last one did not.
-    reconnections : int
-        Times the connection was lost and found again; for a server, clients beyond the first.
     dropped : int
-        Messages to the peer that it was too slow for.
-    silent_s : float
-        Time since the last byte came.
+        Messages to a peer that it was too slow for.
+    heard_s : float
+        When the last message came.
     last_failure : str
-        Why the connection was lost, or there is none.
+        Why a connection was lost, or there is none.
     """
 
-    connected: bool = False
-    messages: int = 0
+    peers: int = 0
     refused: int = 0
     last_refused: str = ""
-    reconnections: int = 0
     dropped: int = 0
-    silent_s: float = 0.0
+    heard_s: float = field(default_factory=time.monotonic)
     last_failure: str = ""
 
+    @property
+    def silent_s(self) -> float:
+        """Time since the last message came."""
+        return time.monotonic() - self.heard_s
 
-@dataclass
+
+@dataclass(eq=False)
 class _Peer:
     """Messages to send to a connected peer."""
 
@@ -81,12 +79,10 @@ class End:
     """
 
     def __init__(self) -> None:
+        self.state = LinkState()
         self._inbox: queue.Queue[Received] = queue.Queue(_MOST_RECEIVED)
         self._peers: list[_Peer] = []
         self._loop, self._over = asyncio.new_event_loop(), asyncio.Event()
-        self._made = self._dropped = self._messages = self._refused = 0
-        self._last_refused = self._last_failure = ""
-        self._heard_s = time.monotonic()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> Self:
@@ -125,18 +121,10 @@ class End:
     def send(self, message: bytes) -> None:
         """Send a packed message to all peers, without waiting for any: a slow one loses the oldest ones."""
         for peer in list(self._peers):
-            self._dropped += len(peer.outbox) == peer.outbox.maxlen
+            self.state.dropped += len(peer.outbox) == peer.outbox.maxlen
             peer.outbox.append(message)
             with suppress(RuntimeError):  # closed meanwhile
                 self._loop.call_soon_threadsafe(peer.wake.set)
-
-    @property
-    def state(self) -> LinkState:
-        """What has happened so far."""
-        return LinkState(
-            bool(self._peers), self._messages, self._refused, self._last_refused, max(self._made - 1, 0),
-            self._dropped, time.monotonic() - self._heard_s, self._last_failure,
-        )  # fmt: skip
 
     async def _serve(self) -> None:
         """Make connections, for ever."""
@@ -157,13 +145,14 @@ class End:
         peer = _Peer()
         tasks = [asyncio.create_task(self._read(reader)), asyncio.create_task(self._write(peer, writer))]
         self._peers.append(peer)
-        self._made += 1
+        self.state.peers += 1
         try:
             await asyncio.gather(*tasks)
         except (OSError, MessageError) as error:
-            self._last_failure = str(error)
+            self.state.last_failure = str(error)
         finally:
             self._peers.remove(peer)
+            self.state.peers -= 1
             for task in tasks:
                 task.cancel()
             writer.transport.abort()
@@ -184,27 +173,20 @@ class End:
                 async with asyncio.timeout(STALL_S):
                     start += await reader.readexactly(HEADER.size - 1)
                     body = await reader.readexactly(body_bytes(start))
-                self._heard_s = time.monotonic()
             except EOFError as error:
                 raise ConnectionError("closed by the peer within a message") from error
             except TimeoutError as error:
                 raise ConnectionError(f"expected a whole message within {STALL_S:g} s") from error
-            except MessageError as error:
-                self._refuse(error)
-                raise
+            self.state.heard_s = time.monotonic()
             try:
                 message = decode(start, body)
             except MessageError as error:
-                self._refuse(error)
+                self.state.refused, self.state.last_refused = self.state.refused + 1, str(error)
                 continue
             while self._inbox.full():
                 await asyncio.sleep(_LOOK_S)
             self._inbox.put_nowait(message)
-            self._messages += 1
         raise ConnectionError("closed by the peer")
-
-    def _refuse(self, error: MessageError) -> None:
-        self._refused, self._last_refused = self._refused + 1, str(error)
 
 
 def _until(is_so: Callable[[], bool], timeout_s: float) -> bool:
@@ -242,19 +224,14 @@ class Connection(End):
         self._address = host, port
 
     async def _serve(self) -> None:
-        pause_s = _FIRST_PAUSE_S
         while True:
-            before = self._messages
             try:
                 async with asyncio.timeout(_CONNECT_S):
                     streams = await asyncio.open_connection(*self._address, limit=_PIECE_BYTES)
                 await self._talk(*streams)
             except (OSError, UnicodeError) as error:  # Unicode: a host that cannot be a name
-                self._last_failure = str(error)
-            # A server that closes at once is no better than none.
-            is_better = self._messages > before
-            pause_s = _FIRST_PAUSE_S if is_better else min(2 * pause_s, _LONGEST_PAUSE_S)
-            await asyncio.sleep(pause_s)
+                self.state.last_failure = str(error)
+            await asyncio.sleep(_PAUSE_S)
 
 
 class Server(End):
@@ -290,11 +267,6 @@ class Server(End):
     def drain(self, timeout_s: float) -> bool:
         """Wait until all clients were sent everything; whether they were in time."""
         return _until(lambda: not any(one.outbox or one.is_sending for one in list(self._peers)), timeout_s)
-
-    @property
-    def clients(self) -> int:
-        """How many are connected."""
-        return len(self._peers)
 
     async def _serve(self) -> None:
         async def welcome(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
