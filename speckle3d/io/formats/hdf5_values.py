@@ -15,7 +15,7 @@ from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import has_member, locate, read_checked
-from speckle3d.io.recordings import Value
+from speckle3d.io.recordings import Value, step_of
 
 ENVELOPE_RANGE_DB = 80.0
 """Of grey levels made here unless another is given: 0.31 dB a level, while speckle itself spreads by 5.6
@@ -66,6 +66,32 @@ def band_about(values: Mapping[str, Value], share: float | None, place: str) -> 
     return {"bandwidth_hz": Value((centre.value * (1 - share / 2), centre.value * (1 + share / 2)), place)}
 
 
+def fan_values(
+    angle_rad: FloatArray, radius_mm: FloatArray, face_mm: float, where: str, said: str
+) -> dict[str, Value]:
+    """Numbers of lines that meet, by their angles and by the distances of samples from where they meet.
+
+    Parameters
+    ----------
+    face_mm : float
+        Distance from there to the array's face.
+
+    Raises
+    ------
+    InvalidInputError
+        If angles or distances are not evenly spaced.
+    """
+    step_of(angle_rad, f"{where}, angles of the lines")
+    array_mm = max(0.0, round(face_mm, 6))
+    numbers: dict[str, Any] = {
+        "array_radius_mm": array_mm,
+        "line_angles_deg": tuple(np.rad2deg(angle_rad[[0, -1]]).tolist()),
+        "row_spacing_mm": step_of(radius_mm, f"{where}, depths"),
+        "first_sample_depth_mm": float(radius_mm[0]) - array_mm,
+    }
+    return {name: Value(value, said) for name, value in numbers.items()}
+
+
 def text_of(value: Any) -> str:
     """Text of what HDF5 holds, of the first if there are several; empty of None."""
     first = next(iter(np.ravel("" if value is None else value)), "")
@@ -79,15 +105,15 @@ class Grid:
     Attributes
     ----------
     shape : tuple of int
-        Into which the numbers are put, the last axis running fastest.
-    axes : tuple of int
-        Where vectors and samples are among its axes; others have length 1.
+        Vectors and samples of a frame.
+    across : bool
+        Whether the vectors run fastest in the file, and not the samples.
     pairs : bool
         Whether the last axis is I and Q.
     """
 
     shape: tuple[int, ...]
-    axes: tuple[int, int]
+    across: bool = False
     pairs: bool = False
 
     def __call__(self, *parts: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -96,9 +122,11 @@ class Grid:
             parts = parts[0][..., 0], parts[0][..., 1]
         elif parts[0].dtype.names:
             parts = parts[0]["real"], parts[0]["imag"]
-        size = [self.shape[axis] for axis in self.axes]
-        turned = [np.moveaxis(part.reshape(self.shape), self.axes, (0, 1)).reshape(size) for part in parts]
-        return turned[0] if len(turned) == 1 else turned[0] + np.complex64(1j) * turned[1]
+        places = self.shape[::-1] if self.across else self.shape
+        frame, *imaginary = (
+            part.reshape(places).T if self.across else part.reshape(places) for part in parts
+        )
+        return frame + np.complex64(1j) * imaginary[0] if imaginary else frame
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError, naming
-from speckle3d.core.files import open_regular
 from speckle3d.core.geometry import require_finite
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Frames
@@ -39,7 +39,7 @@ from speckle3d.io.formats.hdf5_values import Grid, text_of
 from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import SIGNATURE, find_member, open_hdf5, reading
 from speckle3d.io.import_settings import ImportSettings
-from speckle3d.io.readers import Reader
+from speckle3d.io.readers import Reader, first_bytes
 from speckle3d.io.recordings import Recording, Row, Value, step_of
 
 FORMAT = "MATLAB"
@@ -47,6 +47,7 @@ USER_BLOCK = 512
 """Bytes of text before the HDF5 part of version 7.3."""
 
 _DATA = (("rf",), ("iq",), ("i", "q"), ("bmode",))
+_ROLES = {role for data in _DATA for role in data}
 _POSITIONS = ("x_mm", "z_mm", "time_s")
 _SCALED = re.compile(r"(?P<name>[^*/]+?)\s*(?:(?P<sign>[*/])\s*(?P<factor>[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?))?")
 _MOST_SHOWN, _MOST_LEVELS, _MOST_ELEMENTS = 12, 4, 8
@@ -54,7 +55,7 @@ _MOST_SHOWN, _MOST_LEVELS, _MOST_ELEMENTS = 12, 4, 8
 
 
 def _is_new(start: bytes) -> bool:
-    return start[USER_BLOCK : USER_BLOCK + len(SIGNATURE)] == SIGNATURE
+    return start[USER_BLOCK:].startswith(SIGNATURE)
 
 
 def _claims(_: Path, start: bytes) -> bool:
@@ -63,83 +64,10 @@ def _claims(_: Path, start: bytes) -> bool:
 
 def open_matlab(path: Path, settings: ImportSettings) -> Recording:
     """Read the arrays that a mapping names; without one, list the arrays and what to write."""
-    variables = _Variables(path)
-    listed = sorted(variables.arrays(), key=lambda one: -int(np.prod(one[1].shape)))[:_MOST_SHOWN]
+    variables: Any = open_hdf5(path) if _is_new(first_bytes(path)) else _loaded(path)
+    listed = sorted(_arrays(variables), key=lambda one: -int(np.prod(one[1].shape)))[:_MOST_SHOWN]
     rows: list[Row] = [(f"array {printable(name)}", _size(node), _kind(node)) for name, node in listed]
-    return Recording.of(path, settings, rows, lambda: _recording(variables, settings, rows))
-
-
-@dataclass(frozen=True)
-class _Element:
-    """One struct of a struct array in HDF5, whose fields are lists of references."""
-
-    group: h5py.Group
-    index: int
-
-
-class _Variables:
-    """Variables of a file: arrays in structs, struct arrays and cells, all with their axes in reverse."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        with open_regular(path) as stream:
-            self.is_new = _is_new(stream.read(USER_BLOCK + len(SIGNATURE)))
-        self.root: Any = open_hdf5(path) if self.is_new else _loaded(path)
-
-    def array(self, name: str) -> Any:
-        """The array of a name as MATLAB's; the only struct may be counted or not.
-
-        Raises
-        ------
-        InvalidInputError
-            If there is none of numbers.
-        """
-        plain = name.replace(" ", "")
-        for wanted in (plain, re.sub(r"[({]1[)}]", "", plain)):
-            if (node := dict(self.arrays(wanted)).get(wanted)) is not None:
-                return node
-        known = ", ".join(printable(label) for label, _ in self.arrays()) or "none"
-        raise InvalidInputError(f"{self.path}: expected an array {printable(name)}, got {known}")
-
-    def arrays(self, wanted: str = "") -> Iterator[tuple[str, Any]]:
-        """Names and arrays of numbers, of the first elements of lists; or those along the way to a name."""
-        return self._walk(self.root, "", 0, wanted)
-
-    def _walk(self, node: Any, name: str, level: int, wanted: str) -> Iterator[tuple[str, Any]]:
-        if _is_numeric(node):
-            if 0 not in node.shape:
-                yield name, node.T if isinstance(node, np.ndarray) else node
-            return
-        elements = 0
-        for label, child in self._children(node) if level <= _MOST_LEVELS else ():
-            elements += label[:1] in ("(", "{")
-            if wanted.startswith(name + label) if wanted else elements <= _MOST_ELEMENTS:
-                yield from self._walk(child, name + label, level + bool(label), wanted)
-
-    def _children(self, node: Any) -> Iterator[tuple[str, Any]]:
-        """What is inside a node, and what MATLAB adds to its name; nothing for an only struct."""
-        if isinstance(node, dict):
-            yield from node.items()
-        elif isinstance(node, np.void):
-            yield from ((f".{name}", node[name]) for name in node.dtype.names or ())
-        elif isinstance(node, np.ndarray) and (node.dtype.names or node.dtype == object):
-            form = "{{{}}}" if not node.dtype.names else "({})" if node.size > 1 else ""
-            yield from ((form.format(k), element) for k, element in enumerate(node.ravel("F"), start=1))
-        elif isinstance(node, _Element):
-            for name in node.group:
-                yield f".{name}", self._followed(find_member(node.group, name), node.index)
-        elif _is_list(node):
-            yield from ((f"{{{k + 1}}}", self._followed(node, k)) for k in range(node.size))
-        elif isinstance(node, h5py.Group):
-            fields = {name: find_member(node, name) for name in map(str, node) if not name.startswith("#")}
-            lists = [value for value in fields.values() if _is_list(value) and not _class(value)]
-            if lists and node.name != "/":
-                yield from ((f"({k + 1})", _Element(node, k)) for k in range(lists[0].size))
-            else:
-                yield from ((name if node.name == "/" else f".{name}", fields[name]) for name in fields)
-
-    def _followed(self, node: h5py.Dataset, k: int) -> Any:
-        return self.root[node[()].ravel()[k]]
+    return Recording.of(path, settings, rows, lambda: _recording(path, variables, settings, rows))
 
 
 def _loaded(path: Path) -> dict[str, Any]:
@@ -149,6 +77,70 @@ def _loaded(path: Path) -> dict[str, Any]:
     with warnings.catch_warnings(), reading(path, Exception):
         warnings.simplefilter("ignore")
         return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+
+
+def _array(variables: Any, name: str) -> Any:
+    """The array of a name as MATLAB's; the only struct may be counted or not.
+
+    Raises
+    ------
+    InvalidInputError
+        If there is none of numbers.
+    """
+    plain = name.replace(" ", "")
+    for wanted in (plain, re.sub(r"[({]1[)}]", "", plain)):
+        if (node := dict(_arrays(variables, wanted)).get(wanted)) is not None:
+            return node
+    known = ", ".join(printable(label) for label, _ in _arrays(variables)) or "none"
+    raise InvalidInputError(f"expected an array {printable(name)}, got {known}")
+
+
+def _arrays(node: Any, wanted: str = "", name: str = "", level: int = 0) -> Iterator[tuple[str, Any]]:
+    """Names and arrays of numbers, of the first elements of lists; or those along the way to a name.
+
+    All have their axes in reverse.
+    """
+    if _is_numeric(node):
+        if 0 not in node.shape:
+            yield name, node.T if isinstance(node, np.ndarray) else node
+        return
+    elements = 0
+    for label, child in _children(node) if level <= _MOST_LEVELS else ():
+        elements += label[:1] in ("(", "{")
+        if wanted.startswith(name + label) if wanted else elements <= _MOST_ELEMENTS:
+            yield from _arrays(child, wanted, name + label, level + bool(label))
+
+
+def _children(node: Any) -> Iterator[tuple[str, Any]]:
+    """What is inside a node, and what MATLAB adds to its name; nothing for an only struct."""
+    if isinstance(node, dict):
+        yield from node.items()
+    elif isinstance(node, partial):
+        yield from node()
+    elif isinstance(node, np.void):
+        yield from ((f".{name}", node[name]) for name in node.dtype.names or ())
+    elif isinstance(node, np.ndarray) and (node.dtype.names or node.dtype == object):
+        form = "{{{}}}" if not node.dtype.names else "({})" if node.size > 1 else ""
+        yield from ((form.format(k), element) for k, element in enumerate(node.ravel("F"), start=1))
+    elif _is_list(node):
+        yield from ((f"{{{k + 1}}}", _element(node, k)) for k in range(node.size))
+    elif isinstance(node, h5py.Group):
+        dot = "" if node.name == "/" else "."
+        fields = {f"{dot}{name}": find_member(node, name) for name in node if not str(name).startswith("#")}
+        # Fields of a struct array are lists of references that are no cells.
+        lists = [field for field in fields.values() if dot and _is_list(field) and not _class(field)]
+        if not lists:
+            yield from fields.items()
+        for k in range(lists[0].size if lists else 0):
+            yield f"({k + 1})", partial(_struct, fields, k)
+
+
+def _struct(fields: Mapping[str, Any], k: int) -> Iterator[tuple[str, Any]]:
+    return ((name, _element(field, k)) for name, field in fields.items())
+
+
+def _element(node: h5py.Dataset, k: int) -> Any:
+    return node.file[node[()].ravel()[k]]
 
 
 def _is_numeric(node: Any) -> bool:
@@ -175,19 +167,17 @@ class _Greys:
 
     def __call__(self, *parts: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Make a frame."""
-        made = self.grid(*parts).astype(np.float64)
-        if not np.array_equal(made, np.rint(np.clip(made, 0, 255))):
+        frame = self.grid(*parts)
+        if not np.isin(frame, np.arange(256)).all():
             raise InvalidInputError("bmode: expected grey levels, whole numbers from 0 to 255, got others")
-        return made.astype(np.uint8)
+        return frame.astype(np.uint8)
 
 
-def _recording(variables: _Variables, settings: ImportSettings, rows: list[Row]) -> Recording:
-    path, arrays = variables.path, settings.arrays
-    where = f"{path}: arrays"
-    roles = {role for data in _DATA for role in data}
-    if unknown := sorted({*arrays} - {*roles, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
-        raise InvalidInputError(f"{where}: expected {', '.join(sorted(roles))}, axes, got {unknown[0]}")
-    data = next((data for data in _DATA if {*data} == roles & {*arrays}), None)
+def _recording(path: Path, variables: Any, settings: ImportSettings, rows: list[Row]) -> Recording:
+    arrays, where = settings.arrays, f"{path}: arrays"
+    if unknown := sorted({*arrays} - {*_ROLES, *_POSITIONS, *ImportSettings.model_fields, "axes"}):
+        raise InvalidInputError(f"{where}: expected {', '.join(sorted(_ROLES))}, axes, got {unknown[0]}")
+    data = next((data for data in _DATA if {*data} == _ROLES & {*arrays}), None)
     if data is None:
         listed = ", ".join(f"{name.removeprefix('array ')} {size} {kind}" for name, size, kind in rows)
         raise InvalidInputError(
@@ -195,107 +185,99 @@ def _recording(variables: _Variables, settings: ImportSettings, rows: list[Row])
             f'"NAME" and axes = "sample, vector, frame" below [arrays] in {path.name}.toml beside it; there '
             f"are {listed or 'none'}"
         )
-    nodes = [variables.array(arrays[role]) for role in data]
     with naming(where):
+        nodes = [_array(variables, arrays[role]) for role in data]
         if len({node.shape for node in nodes}) > 1:
             raise InvalidInputError(f"expected arrays of one size, got {' and '.join(map(_size, nodes))}")
         if _kind(nodes[0]).startswith("complex") != (data == ("iq",)):
             raise InvalidInputError(f"{data[0]}: expected complex numbers as iq alone, got {_kind(nodes[0])}")
-        axes = _axes(arrays.get("axes", ""), nodes[0])
-    lengths = {"frame": 1} | {name: length for name, length in axes if name != "-"}
-    shape = lengths["frame"], lengths["vector"], lengths["sample"]
-    frames = _frames(variables, nodes, [name for name, _ in axes], shape, data)
-    values, times = _numbers(variables, arrays, shape)
+        lengths, names = _axes(arrays.get("axes", ""), nodes[0])
+        shape = lengths["frame"], lengths["vector"], lengths["sample"]
+        values, times = _numbers(variables, arrays, shape)
+    frames = _frames(path, nodes, names, shape, data)
     rows += [("read", f"{role}: {arrays[role]} {_size(nodes[0])}", _kind(nodes[0])) for role in data]
     rows.append(("axes", arrays["axes"], ""))
-    if not variables.is_new:
+    if isinstance(frames, np.ndarray):
         rows.append(("frames", "held in memory: MATLAB 7.3 files are read one by one", ""))
     return Recording(path, settings, frames, values, time_s=times)
 
 
-def _axes(text: str, node: Any) -> list[tuple[str, int]]:
-    """Names and lengths of axes in MATLAB's order, with those of length 1 that it leaves out at its end."""
+def _axes(text: str, node: Any) -> tuple[dict[str, int], list[str]]:
+    """Lengths of axes by their names, and the names in the file's order; - for axes of length 1."""
     names = [name.strip() for name in text.split(",")]
-    sizes = [*node.shape[::-1], *(1,) * (len(names) - node.ndim)]
-    axes = list(zip(names, sizes, strict=False))
-    named = sorted({*names} - {"-"})
-    is_each = named in (["frame", "sample", "vector"], ["sample", "vector"])
-    is_once = all(names.count(name) == 1 for name in named)
-    is_flat = all(length == 1 for name, length in axes if name == "-")
-    if not (is_each and is_once and is_flat) or len(names) < len(sizes):
+    sizes = [*node.shape[::-1], *(1,) * (len(names) - node.ndim)]  # MATLAB leaves out last ones of length 1
+    lengths = {"frame": 1} | dict(zip(names, sizes, strict=False))
+    plain = sorted(name for name in names if name != "-")
+    is_flat = all(size == 1 for name, size in zip(names, sizes, strict=False) if name == "-")
+    if (
+        plain not in (["frame", "sample", "vector"], ["sample", "vector"])
+        or not is_flat
+        or len(names) < len(sizes)
+    ):
         raise InvalidInputError(
             f"axes: expected sample, vector, frame once each, and - for axes of length 1, of {_size(node)}, "
             f"got {printable(text) or 'none'}"
         )
-    return axes
+    return lengths, names[: node.ndim][::-1]
 
 
 def _frames(
-    variables: _Variables,
-    nodes: list[Any],
-    names: list[str],
-    shape: tuple[int, int, int],
-    data: tuple[str, ...],
+    path: Path, nodes: list[Any], names: list[str], shape: tuple[int, int, int], data: tuple[str, ...]
 ) -> Frames:
     dtype: Any = np.complex64
     if data == ("bmode",):
         dtype = np.uint8
     elif data == ("rf",):
         dtype = np.int16 if nodes[0].dtype in (np.int8, np.uint8, np.int16) else np.float32
-    rest = [name for name in names if name != "frame"][::-1]
-    lengths = {"-": 1, "vector": shape[1], "sample": shape[2]}
-    grid = Grid(tuple(lengths[name] for name in rest), (rest.index("vector"), rest.index("sample")))
+    grid = Grid(shape[1:], across="sample" in names[: names.index("vector")] if "vector" in names else False)
     turn = _Greys(grid) if data == ("bmode",) else grid
-    place = nodes[0].ndim - 1 - names.index("frame") if "frame" in names else -1
-    axis = place if place >= 0 else None
-    if variables.is_new:
-        stored = tuple(node.name for node in nodes)
-        return HDF5Slices(variables.path, stored, turn, axis).frames(shape, dtype)
-    made = np.empty(shape, dtype)
+    axis = names.index("frame") if "frame" in names else None
+    if isinstance(nodes[0], h5py.Dataset):
+        return HDF5Slices(path, tuple(node.name for node in nodes), turn, axis).frames(shape, dtype)
+    frames = np.empty(shape, dtype)
     for i in range(shape[0]):
-        made[i] = turn(*(node if axis is None else node.take(i, axis) for node in nodes))
-    if made.dtype.kind in "fc":
-        require_finite(made, f"{variables.path}: {data[0]}")
-    return made
+        frames[i] = turn(*(node if axis is None else node.take(i, axis) for node in nodes))
+    if frames.dtype.kind in "fc":
+        require_finite(frames, f"{path}: {data[0]}")
+    return frames
 
 
 def _numbers(
-    variables: _Variables, arrays: Mapping[str, str], shape: tuple[int, int, int]
+    variables: Any, arrays: Mapping[str, str], shape: tuple[int, int, int]
 ) -> tuple[dict[str, Value], FloatArray | None]:
     """Numbers that arrays give, and times."""
     values, times = dict[str, Value](), None
     lengths = {"x_mm": shape[1], "z_mm": shape[2], "time_s": shape[0], "bandwidth_hz": 2}
     for name in sorted({*arrays} & {*_POSITIONS, *ImportSettings.model_fields}):
-        numbers, where = _scaled(variables, name, arrays[name]), f"{variables.path}: {name}"
+        numbers, said = _scaled(variables, name, arrays[name]), f"in {arrays[name]}"
         if name not in lengths and np.ptp(numbers) == 0:
             numbers = numbers[:1]
         if numbers.size != lengths.get(name, 1):
             raise InvalidInputError(
-                f"{where} = {arrays[name]}: expected {lengths.get(name, 1)} number(s), got {numbers.size}: "
+                f"{name} = {arrays[name]}: expected {lengths.get(name, 1)} number(s), got {numbers.size}: "
                 f"are axes = {arrays['axes']} in this order?"
             )
-        said = f"in {arrays[name]}"
         if name == "time_s":
             times = numbers
         elif name == "x_mm":
-            values["vector_pitch_mm"] = Value(step_of(numbers, where), said)
+            values["vector_pitch_mm"] = Value(step_of(numbers, name), said)
         elif name == "z_mm":
-            values["row_spacing_mm"] = Value(step_of(numbers, where), said)
+            values["row_spacing_mm"] = Value(step_of(numbers, name), said)
             values["first_sample_depth_mm"] = Value(float(numbers[0]), said)
         else:
             values[name] = Value(tuple(numbers.tolist()) if numbers.size > 1 else float(numbers[0]), said)
     return values, times
 
 
-def _scaled(variables: _Variables, name: str, text: str) -> FloatArray:
+def _scaled(variables: Any, name: str, text: str) -> FloatArray:
     """Numbers of an array, in one row, times the factor behind its name."""
-    parts, where = _SCALED.fullmatch(text.strip()), f"{variables.path}: {name}"
-    if parts is None or not float(parts["factor"] or 1.0):
-        raise InvalidInputError(f"{where}: expected as NAME, NAME * 1e6 or NAME / 2, got {printable(text)}")
-    values = np.asarray(variables.array(parts["name"])[()])
+    parts = _SCALED.fullmatch(text.strip())
+    factor = float(parts["factor"] or 1.0) if parts else 0.0
+    if parts is None or not factor:
+        raise InvalidInputError(f"{name}: expected as NAME, NAME * 1e6 or NAME / 2, got {printable(text)}")
+    values = np.asarray(_array(variables, parts["name"])[()])
     if values.dtype.kind not in "fiu" or (name != "time_s" and not np.isfinite(values).all()):
-        raise InvalidInputError(f"{where} = {printable(text)}: expected finite numbers, got others")
-    factor = float(parts["factor"] or 1.0)
+        raise InvalidInputError(f"{name} = {printable(text)}: expected finite numbers, got others")
     flat = values.astype(np.float64).ravel()
     return flat / factor if parts["sign"] == "/" else flat * factor
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -26,7 +25,16 @@ import numpy as np
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, band_about, flat, grey_frames, single, text_of, values_of
+from speckle3d.io.formats.hdf5_values import (
+    Grid,
+    band_about,
+    fan_values,
+    flat,
+    grey_frames,
+    single,
+    text_of,
+    values_of,
+)
 from speckle3d.io.frames import FileFrames, HDF5Slices
 from speckle3d.io.hdf5 import (
     file_format,
@@ -38,7 +46,7 @@ from speckle3d.io.hdf5 import (
 )
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.io.readers import Reader
-from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing, step_of
+from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_spacing
 
 FORMAT = "USTB .uff"
 
@@ -81,7 +89,7 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         if kind == _CHANNELS:
             values |= values_of(file, {"speed_of_sound_m_s": f"{other}/sound_speed"})
     shape = count, lines, samples
-    source = HDF5Slices(path, parts, Grid(shape[1:], (0, 1)), axis)
+    source = HDF5Slices(path, parts, Grid(shape[1:]), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
     if is_complex and count and settings.demodulation_frequency_hz is None:
         with naming(str(path)):
@@ -144,25 +152,17 @@ def _scan(group: h5py.Group, said: str) -> tuple[int, int, dict[str, Value]]:
     """Lines and samples of a scan, and where they lie."""
     scan, where = require_group(group, "scan"), locate(group, "scan")
     kind = text_of(scan.attrs.get("class"))
-    if kind not in (_LINEAR, _SECTOR):
-        raise InvalidInputError(
-            f"{where}: expected a {_LINEAR} or {_SECTOR}, got {kind or 'none'}: beamform onto one of them"
-        )
     if kind == _LINEAR:
         x_mm, z_mm = 1e3 * flat(scan, "x_axis"), 1e3 * flat(scan, "z_axis")
         return x_mm.size, z_mm.size, grid_values(x_mm, z_mm, where, said)
+    if kind != _SECTOR:
+        raise InvalidInputError(
+            f"{where}: expected a {_LINEAR} or {_SECTOR}, got {kind or 'none'}: beamform onto one of them"
+        )
     angle, radius_mm = flat(scan, "azimuth_axis"), 1e3 * flat(scan, "depth_axis")
-    step_of(angle, f"{where}, azimuth_axis")
     # Depths are from where the lines meet, which is above the array's face if it is curved.
-    above_mm = radius_mm[0] * np.cos(angle[0]) - 1e3 * flat(scan, "z")[0]
-    array_mm = max(0.0, round(float(above_mm), 6))
-    numbers: dict[str, Any] = {
-        "array_radius_mm": array_mm,
-        "line_angles_deg": tuple(np.rad2deg(angle[[0, -1]]).tolist()),
-        "row_spacing_mm": step_of(radius_mm, f"{where}, depth_axis"),
-        "first_sample_depth_mm": float(radius_mm[0]) - array_mm,
-    }
-    return angle.size, radius_mm.size, {name: Value(value, said) for name, value in numbers.items()}
+    face_mm = radius_mm[0] * np.cos(angle[0]) - 1e3 * flat(scan, "z")[0]
+    return angle.size, radius_mm.size, fan_values(angle, radius_mm, float(face_mm), where, said)
 
 
 def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:
@@ -171,17 +171,15 @@ def _frame_axis(node: h5py.Dataset, pixels: int) -> tuple[int | None, int]:
     MATLAB leaves out axes of length 1 at its end, which is the beginning in the file; pyuff keeps MATLAB's
     order.
     """
-    shape = node.shape
-    full = len(shape) == 4
-    reverse = shape[-1:] == (pixels,) and set(shape[1:-1] if full else shape[:-1]) <= {1}
-    forward = shape[:1] == (pixels,) and set(shape[1:3]) <= {1}
-    if len(shape) > 4 or not (reverse or forward) or (full and reverse and forward):
+    shape, is_full = node.shape, len(node.shape) == 4
+    singles = shape[1:3] if is_full else (*shape[1:], *shape[:-1])
+    axes = [axis for axis, end in ((0, -1), (3, 0)) if shape[end:][:1] == (pixels,)]
+    if len(shape) > 4 or not axes or (is_full and len(axes) > 1) or {*singles} - {1, pixels}:
         raise InvalidInputError(
             f"{locate(node)}: expected {pixels} pixels of one channel and one wave, summed, got (MATLAB's "
             f"order) {shape[::-1]}"
         )
-    axis = 0 if reverse else 3
-    return (axis, shape[axis]) if full else (None, 1)
+    return (axes[0], shape[axes[0]]) if is_full else (None, 1)
 
 
 READER = Reader(FORMAT, None, open_uff, claims_hdf5=is_uff)

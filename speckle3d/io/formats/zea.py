@@ -30,7 +30,15 @@ from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
-from speckle3d.io.formats.hdf5_values import Grid, band_about, grey_frames, single, text_of, values_of
+from speckle3d.io.formats.hdf5_values import (
+    Grid,
+    band_about,
+    fan_values,
+    grey_frames,
+    single,
+    text_of,
+    values_of,
+)
 from speckle3d.io.frames import HDF5Slices
 from speckle3d.io.hdf5 import (
     file_format,
@@ -81,53 +89,51 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
     values = values_of(file, places)
     percent = single(file, f"{scan}/bandwidth_percent") or 0.0
     values |= band_about(values, percent / 100.0, f"in {scan}/bandwidth_percent")
-    is_beamformed, is_image = kind == "beamformed_data", node.dtype == np.uint8
-    channels = node.shape[3] if is_beamformed and node.ndim == 4 else 1
-    if not (
-        (node.dtype.kind == "f" or (is_image and kind.startswith("image")))
-        and node.ndim in (3, 3 + is_beamformed)
-        and channels in (1, 2)
+    is_image, is_beamformed = node.dtype == np.uint8, kind == "beamformed_data"
+    shape, channels = node.shape[:3], node.shape[3:] if is_beamformed else ()
+    is_sound = node.dtype.kind == "f" or (is_image and kind.startswith("image"))
+    if (
+        not is_sound
+        or len(shape) != 3
+        or node.shape != (*shape, *channels)
+        or channels not in ((), (1,), (2,))
     ):
         raise InvalidInputError(
             f"{locate(node)}: expected echoes of shape (frame, z, x), of beamformed_data (frame, z, x, 1 or "
             f"2), got {node.shape} {node.dtype}"
         )
-    count, first, second = node.shape[:3]
-    group, left_mm, x_first = name.removesuffix("/values"), None, False
+    group, left_mm, x_first, is_placed = name.removesuffix("/values"), None, False, False
     if group != name and has_member(file, f"{group}/coordinates"):
-        coordinates = require_dataset(file, f"{group}/coordinates")
-        x_mm, z_mm, x_first = _pixels(coordinates, (count, first, second))
-        left_mm = float(x_mm[0])
-        values |= grid_values(x_mm, z_mm, locate(coordinates), "of the coordinates")
-    trailing = node.shape[3:] if channels == 1 else ()
-    grid = Grid((first, second, *trailing), (0, 1) if x_first else (1, 0), channels == 2)
-    shape = (count, first, second) if x_first else (count, second, first)
-    source = HDF5Slices(path, (name,), grid)
+        coordinates, is_placed = require_dataset(file, f"{group}/coordinates"), True
+        numbers, left_mm, x_first = _pixels(coordinates, shape)
+        values |= numbers
+    lines, samples = shape[1:] if x_first else shape[:0:-1]
+    is_complex = channels == (2,)
+    source = HDF5Slices(path, (name,), Grid((lines, samples), not x_first, is_complex))
     if is_beamformed or is_image:
-        dtype = np.uint8 if is_image else np.complex64 if channels == 2 else np.float32
-        frames = source.frames(shape, dtype)
+        dtype = np.uint8 if is_image else np.complex64 if is_complex else np.float32
+        frames = source.frames((shape[0], lines, samples), dtype)
     else:
         is_db, given_db = kind != "envelope_data", settings.dynamic_range_db
-        frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, given_db)
+        frames, values["dynamic_range_db"] = grey_frames(source, (shape[0], lines, samples), is_db, given_db)
     shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
     shift_hz = shifts.pop() if len(shifts) == 1 else None
-    if channels == 2 and shift_hz and left_mm is not None and settings.demodulation_frequency_hz is None:
+    if is_complex and shift_hz and is_placed and settings.demodulation_frequency_hz is None:
         rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
         words = "of scan/demodulation_frequency and the phase of the data"
         with naming(str(path)):
-            by_phase = demodulation_of(frames, shift_hz, rate_hz)
-        values["demodulation_frequency_hz"] = Value(by_phase, words)
+            values["demodulation_frequency_hz"] = Value(demodulation_of(frames, shift_hz, rate_hz), words)
     tracker, remarks = _tracker(file, left_mm)
     return Recording(
         path,
         settings,
         frames,
         values,
-        time_s=_times(file, group, scan, count),
+        time_s=_times(file, group, scan, shape[0]),
         tracker=tracker,
         chain=_POSES,
         probe=settings.probe or text_of(file.attrs.get("probe_name", file.attrs.get("probe"))),
-        assumptions=("parallel lines",) if left_mm is None else (),
+        assumptions=() if is_placed else ("parallel lines",),
         remarks=tuple(remarks),
     )
 
@@ -149,19 +155,18 @@ def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> tuple[str,
         if isinstance(find_member(file, f"{home}data/{kind}{end}"), h5py.Dataset)
         and asked in ("", f"{home}data/{kind}", f"{home}data/{kind}{end}")
     ]
+    if not arrays:
+        raise InvalidInputError(f"{path}: expected {' or '.join(_READ[:3])}, got {_contents(file)}")
     # What came before scan conversion may be polar, and says nothing of it without coordinates.
     is_old = not asked and not any(name.endswith("/values") for name, _, _ in arrays)
     order = [*_READ[3:], *_READ[:3]] if is_old else [*_READ]
-    kinds = sorted({kind for _, _, kind in arrays}, key=order.index)
-    arrays = [one for one in arrays if one[2] == kinds[0]]
-    if not arrays:
-        raise InvalidInputError(f"{path}: expected {' or '.join(_READ[:3])}, got {_contents(file)}")
-    if len(arrays) > 1:
+    first, *others = sorted(arrays, key=lambda one: order.index(one[2]))
+    if names := [name for name, _, kind in others if kind == first[2]]:
         raise InvalidInputError(
-            f"{path}: expected one track, got {', '.join(name for name, *_ in arrays)}: say which by "
-            f'arrays = {{ data = "{arrays[0][0]}" }} in {path.name}.toml beside it'
+            f"{path}: expected one track, got {first[0]}, {', '.join(names)}: say which by "
+            f'arrays = {{ data = "{first[0]}" }} in {path.name}.toml beside it'
         )
-    return arrays[0]
+    return first
 
 
 def _contents(file: h5py.File) -> str:
@@ -174,23 +179,42 @@ def _contents(file: h5py.File) -> str:
     return (", ".join(names) or "nothing") + advice
 
 
-def _pixels(node: h5py.Dataset, shape: tuple[int, int, int]) -> tuple[FloatArray, FloatArray, bool]:
-    """Lateral positions and depths of a Cartesian grid, mm, and whether the first axis is lateral.
+def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value], float | None, bool]:
+    """Where the pixels of a Cartesian or polar grid lie, the same in all frames.
 
-    It must be the same in all frames.
+    Returns
+    -------
+    values : dict of str to Value
+    left_mm : float or None
+        Lateral place of the first of parallel lines; None of a fan's.
+    x_first : bool
+        Whether the first axis counts lines.
     """
-    if node.shape != (*shape, 3) or not shape[0]:
+    if node.shape != (*shape, 3) or 0 in shape:
         raise InvalidInputError(f"{locate(node)}: expected shape {(*shape, 3)}, got {node.shape}")
     start, middle, end = (1e3 * node[i].astype(np.float64) for i in (0, shape[0] // 2, shape[0] - 1))
+    said, where = "of the coordinates", locate(node)
+
+    def is_zero(*off: FloatArray) -> bool:
+        return max(np.abs(one).max() for one in off) <= _TOLERANCE_MM
+
     for x_first in (False, True):
-        x, y, z = (start.swapaxes(0, 1) if x_first else start).transpose(2, 0, 1)
-        off = [x - x[:1], z - z[:, :1], y - y[0, 0], middle - start, end - start]
-        is_flat = all(np.abs(one).max() <= _TOLERANCE_MM for one in off)
-        if is_flat and np.ptp(x) > 0 and np.ptp(z) > 0:
-            return x[0], z[:, 0], x_first
+        x, y, z = (start if x_first else start.swapaxes(0, 1)).transpose(2, 0, 1)
+        if not is_zero(y - y[0, 0], middle - start, end - start):
+            break
+        if is_zero(x - x[:, :1], z - z[:1]) and np.ptp(x) * np.ptp(z) > 0:
+            return grid_values(x[:, 0], z[0], where, said), float(x[0, 0]), x_first
+        # Lines meet where the distance from all of them is least.
+        angle = np.arctan2(x[:, -1] - x[:, 0], z[:, -1] - z[:, 0])
+        normals = np.column_stack([np.cos(angle), -np.sin(angle)])
+        apex = np.linalg.lstsq(normals, normals[:, 0] * x[:, 0] + normals[:, 1] * z[:, 0])[0]
+        radius = np.hypot(x[0] - apex[0], z[0] - apex[1])
+        across, down = np.outer(np.sin(angle), radius), np.outer(np.cos(angle), radius)
+        if is_zero(x - apex[0] - across, z - apex[1] - down) and np.ptp(angle) > 0:
+            return fan_values(angle, radius, -float(apex[1]), where, said), None, x_first
     raise InvalidInputError(
-        f"{locate(node)}: expected pixels on a Cartesian grid in one plane, the same in all frames, got "
-        "others, as of a polar image: beamform onto zea's cartesian_pixel_grid, or scan-convert it"
+        f"{locate(node)}: expected pixels on a Cartesian or polar grid in one plane, the same in all frames, "
+        "got others: beamform onto zea's cartesian_pixel_grid, or scan-convert them"
     )
 
 
@@ -216,11 +240,10 @@ def _times(file: h5py.File, group: str, scan: str, count: int) -> FloatArray | N
 
 
 def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, list[str]]:
-    """The probe's poses, with the image on the probe where the file says where its pixels lie."""
+    """The probe's poses, with the image on the probe where the file says where its lines lie."""
     if (node := find_member(file, _POSES)) is None:
         return None, []
-    named = find_member(node, "rotation_representation")
-    kind = text_of(None if named is None else named[()])
+    kind = text_of(node["rotation_representation"][()]) if "rotation_representation" in node else ""
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
     is_euler = kind == "euler_xyz"
@@ -231,11 +254,11 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     matrices = np.full((count, 4, 4), np.nan)
     matrices[:, :3, 3], matrices[:, 3] = 1e3 * places, [0.0, 0.0, 0.0, 1.0]
     sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | is_euler)
-    if is_euler:
-        turned = Rotation.from_euler("xyz", turns[sound])
-    else:
-        turned = Rotation.from_quat(turns[sound], scalar_first=kind == "quaternion_wxyz")
-    matrices[sound, :3, :3] = turned.as_matrix()
+    matrices[sound, :3, :3] = (
+        Rotation.from_euler("xyz", turns[sound])
+        if is_euler
+        else Rotation.from_quat(turns[sound], scalar_first=kind == "quaternion_wxyz")
+    ).as_matrix()
     readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
     if readings is None:
         return None, [*notes, f"{_POSES}: no pose is of use"]
