@@ -42,16 +42,13 @@ class ClariusFile:
     ----------
     size : tuple of int
         Frames, lines and samples.
-    part : pair of slice
-        Lines and samples to take of each frame.
     turns : ndarray, shape (sample,), optional
-        Complex factors of the samples taken, the same in all frames.
+        Complex factors of the samples, the same in all frames.
     """
 
     member: Member
     kind: str
     size: tuple[int, int, int]
-    part: tuple[slice, slice] = (slice(None), slice(None))
     turns: ComplexArray | None = None
 
     @property
@@ -81,9 +78,9 @@ class ClariusFile:
         samples = self.records()["samples"]
 
         def frame(i: int) -> Any:
-            part = samples[i][self.part]
-            pairs = part.astype(np.float32).view(np.complex64) if self.kind == "IQ" else part
-            return pairs[..., 0] if self.turns is None else pairs[..., 0] * self.turns
+            parts = samples[i]
+            echoes = (parts.astype(np.float32).view(np.complex64) if self.kind == "IQ" else parts)[..., 0]
+            return echoes if self.turns is None else echoes * self.turns
 
         return frame
 

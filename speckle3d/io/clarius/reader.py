@@ -36,7 +36,7 @@ from speckle3d.core.errors import FileError, InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import Files, find_files
-from speckle3d.io.clarius.raw import ClariusFile, open_raw
+from speckle3d.io.clarius.raw import open_raw
 from speckle3d.io.clarius.sidecars import Description
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
@@ -110,21 +110,20 @@ def _recording(
     rows.append(("sweep is made from", kind, ""))
     said = described[kind]
     file = open_raw(files.raw[kind], said)
-    file = replace(file, part=_part(file, said))
-    first_element, per_line = _place(said, file)
-    rows.append(("first line at element", f"{first_element:g}, taken as the image's left", ""))
-    count, lines, samples = file.size[0], *(one.stop - one.start for one in file.part)
+    elements = _elements(said)
+    per_line = step_of(elements, f"{said.where}: lines of one place a packet are no image: rx element")
+    rows.append(("first line at element", f"{elements[0]:g}, taken as the image's left", ""))
 
     own_speed = said.optional("vsound") or said.optional("speed of sound")
     rate_hz = settings.sampling_rate_hz or said.rate_hz
     spacing_mm = 1e3 * (settings.speed_of_sound_m_s or own_speed or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
     delay, first_mm = said.optional("delay samples"), None
     # Less than a sample above the array is 0: the delay is a whole number of samples.
-    if delay is not None and (after := delay + file.part[1].start - BEFORE_DEPTH_S * rate_hz) > -1.0:
+    if delay is not None and (after := delay - BEFORE_DEPTH_S * rate_hz) > -1.0:
         first_mm = max(after, 0.0) * spacing_mm
     pitch, centre_hz = _pitch(said, per_line, settings), said.optional("transmit frequency")
     probe = settings.probe or said.text("probe")
-    spreading = _spreading(said, first_element + per_line * np.array([0, lines - 1]), per_line, pitch, probe)
+    spreading = _spreading(said, elements[[0, -1]], per_line, pitch, probe)
     values = {
         "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)", _OWN),
         "vector_pitch_mm": pitch,
@@ -140,7 +139,7 @@ def _recording(
         if receive is not None:
             shallow_hz, deep_hz, filter_mm = receive
             start_mm = first_mm or settings.first_sample_depth_mm or 0.0
-            depths_mm = start_mm + spacing_mm * np.arange(samples)
+            depths_mm = start_mm + spacing_mm * np.arange(said.samples)
             slid_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
             middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, slid_hz))
             values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _OWN)
@@ -158,7 +157,7 @@ def _recording(
                 )
             shift_hz = middle_hz if shift_hz is None else shift_hz
     narrow = np.int16 if said.kind == "IQ" and file.turns is None else None
-    frames = FileFrames(file.member.path, file, (count, lines, samples), file.dtype, narrow)
+    frames = FileFrames(file.member.path, file, file.size, file.dtype, narrow)
     sent_hz, band = settings.centre_frequency_hz or centre_hz, None
     is_known = said.kind == "RF" or (said.kind == "IQ" and shift_hz is not None)
     if settings.bandwidth_hz is None and sent_hz and is_known:
@@ -185,37 +184,16 @@ def _recording(
     )
 
 
-def _part(file: ClariusFile, said: Description) -> tuple[slice, slice]:
-    """Lines and samples to take: the region of interest, if there is nothing beside it in three frames."""
-    read, last = file(), file.size[0] - 1
-    for i in {0, (last + 1) // 2, last}:
-        frame = np.array(read(i))
-        frame[said.region] = 0
-        if frame.any():
-            return slice(0, said.lines), slice(0, said.samples)
-    return said.region
-
-
-def _place(said: Description, file: ClariusFile) -> tuple[float, float]:
-    """Place of the first line in the array, and the distance between lines, in elements.
-
-    Raises
-    ------
-    InvalidInputError
-        Naming the line that is steered, unevenly spaced or repeated.
-    """
+def _elements(said: Description) -> FloatArray:
+    """Elements at which the lines are received; lines that are steered are refused."""
     elements, angle_deg = said.places.T
-    advice = "record without steering and Doppler, or give another of its raw files"
     if (steered := np.flatnonzero(angle_deg)).size:
         raise InvalidInputError(
             f"{said.where}: lines[{steered[0]}]: angle: expected 0 (lines that are not steered), got "
-            f"{angle_deg[steered[0]]:g} deg, and {steered.size} of {said.lines} lines steered: {advice}"
+            f"{angle_deg[steered[0]]:g} deg, and {steered.size} of {said.lines} lines steered: record "
+            "without steering and Doppler, or give another of its raw files"
         )
-    elements = elements[file.part[0]]
-    try:
-        return float(elements[0]), step_of(elements, f"{said.where}: lines, rx element")
-    except InvalidInputError as error:
-        raise InvalidInputError(f"{error}: packets of a Doppler mode are no image: {advice}") from error
+    return elements
 
 
 def _pitch(said: Description, per_line: float, settings: ImportSettings) -> Value:

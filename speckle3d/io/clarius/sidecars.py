@@ -136,21 +136,6 @@ class Description:
         return np.array(rows)
 
     @property
-    def region(self) -> tuple[slice, slice]:
-        """Lines and samples of the region of interest; all of them by default."""
-        if not self.field("roi"):
-            return slice(0, self.lines), slice(0, self.samples)
-        parts = []
-        for name, length in (("line", self.lines), ("sample", self.samples)):
-            start, end = (int(self.number("roi", f"{side} {name}")) for side in ("start", "end"))
-            if not 0 <= start < end < length:
-                raise InvalidInputError(
-                    f"{self.where}: roi: expected {name}s within {length}, got {start} to {end}"
-                )
-            parts.append(slice(start, end + 1))
-        return parts[0], parts[1]
-
-    @property
     def receive(self) -> tuple[float, ...] | None:
         """Demodulation frequency at depth 0, Hz, at a depth, and that depth, mm; linear between [2]_.
 

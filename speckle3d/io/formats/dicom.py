@@ -1,9 +1,9 @@
 """Multi-frame B-mode in DICOM files, read by pydicom (DICOM PS3.3, C.8.5.5, C.8.5.6, C.7.6.5, C.7.6.6).
 
 Where the file describes its regions (Sequence of Ultrasound Regions), the image is cropped to the region of
-2-D tissue, whose Physical Delta X and Y give the size of a pixel: both in cm, so that the image is
-Cartesian, a sector with black corners too. Without regions, Pixel Spacing gives it. Elements that name a
-patient are never loaded.
+2-D tissue, whose Physical Delta X and Y give the size of a pixel: both in cm where the image is Cartesian, a
+sector with black corners too; degrees along X where its columns are the lines of a fan, whose array's radius
+no element tells. Without regions, Pixel Spacing gives it. Elements that name a patient are never loaded.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import FileError, InvalidInputError
@@ -33,8 +32,9 @@ from speckle3d.io.recordings import Recording, Row, Value, differs
 FORMAT = "DICOM"
 
 _MARK, _MARK_BYTE = b"DICM", 128
-_TISSUE, _CM = [1.0, 1.0], [3.0, 3.0]
-"""Region Spatial Format and Data Type of 2-D tissue, and Physical Units of both directions."""
+_TISSUE, _CM, _POLAR = [1.0, 1.0], [3.0, 3.0], [12.0, 3.0]
+"""Region Spatial Format and Data Type of 2-D tissue; Physical Units of X and Y, cm, or degrees and cm."""
+_BOX = [f"RegionLocation{end}" for end in ("MinX0", "MinY0", "MaxX1", "MaxY1")]
 _LOSSY_SPREAD = 12
 """Levels by which the colours of a grey pixel may differ after lossy packing; the tint of a colour map is
 more."""
@@ -78,9 +78,12 @@ class DicomFile:
         """Open nothing: each frame is read from the file anew."""
         return self.read
 
-    def read(self, i: int) -> npt.NDArray[Any]:
+    def read(self, i: int) -> Any:
         """Decode frame i, shape (column, row)."""
-        image = _decoded(self.path, i)[self.part]
+        from pydicom.pixels.utils import pixel_array
+
+        with _reading(f"{self.path}: frame {i}"), open_regular(self.path) as stream:
+            image = np.asarray(pixel_array(stream, index=i))[self.part]
         if image.ndim == 3:
             coloured = np.argwhere(np.ptp(image.astype(np.int16), axis=2) > self.spread)
             if len(coloured):
@@ -90,6 +93,14 @@ class DicomFile:
                 )
             image = np.rint(image.mean(axis=2)).astype(np.uint8)
         return 255 - image.T if self.inverted else image.T
+
+    def is_cut(self, i: int) -> bool:
+        """Whether the file ends before the end of frame i."""
+        try:
+            self.read(i)
+        except FileError:
+            return True
+        return False
 
 
 def open_dicom(path: Path, settings: ImportSettings) -> Recording:
@@ -101,10 +112,7 @@ def open_dicom(path: Path, settings: ImportSettings) -> Recording:
         for _ in header.iterall():  # elements are read from their bytes when first asked for
             pass
     machine = " ".join(str(header[name].value) for name in _MACHINE if name in header)
-    rows: list[Row] = [("scanner", printable(machine), "")] if machine else []
-    rows.append(("transfer syntax", printable(syntax), ""))
-    if header.get("LossyImageCompression") == "01":
-        rows.append(("pixels", "packed with loss, which smooths speckle", ""))
+    rows: list[Row] = [("scanner", printable(machine), ""), ("transfer syntax", printable(syntax), "")]
     return Recording.of(path, settings, rows, lambda: _recording(path, settings, header, rows))
 
 
@@ -112,18 +120,22 @@ def _recording(path: Path, settings: ImportSettings, header: Any, rows: list[Row
     for name, expected in _EXPECTED.items():
         if (got := header.get(name)) not in expected:
             listed = " or ".join(map(str, expected))
-            raise InvalidInputError(f"{path}: {name}: expected {listed}, got {printable(str(got))}")
-    count = int(_numbers(path, header, "NumberOfFrames")[0]) if "NumberOfFrames" in header else 1
-    kind = header.PhotometricInterpretation
+            raise InvalidInputError(f"{name}: expected {listed}, got {printable(str(got))}")
+    count = int(_numbers(header, "NumberOfFrames")[0]) if "NumberOfFrames" in header else 1
     if count < 2:
-        raise InvalidInputError(f"{path}: NumberOfFrames: expected several frames, got a single image")
-    part, values = _place(path, header, rows)
-    is_lossy = header.get("LossyImageCompression") == "01" or "YBR" in kind
-    source = DicomFile(path, part, kind == "MONOCHROME1", _LOSSY_SPREAD if is_lossy else 0)
-    _require_all_frames(path, count)
-    shape = (count, *source.read(count // 2).shape)  # colour is told before a reconstruction begins
+        raise InvalidInputError("NumberOfFrames: expected several frames, got a single image")
+    part, values = _place(header, rows)
+    kind, is_lossy = header.PhotometricInterpretation, header.get("LossyImageCompression") == "01"
+    if is_lossy:
+        rows.append(("pixels", "packed with loss, which smooths speckle", ""))
+    spread = _LOSSY_SPREAD if is_lossy or "YBR" in kind else 0
+    source = DicomFile(path, part, kind == "MONOCHROME1", spread)
+    middle = source.read(count // 2)  # colour is told before a reconstruction begins
+    if source.is_cut(count - 1):
+        whole = bisect(range(count), False, key=source.is_cut)
+        raise FileError(f"{path}: ends early: {whole} of {count} frames")
     times, values["frame_rate_hz"], remarks = _clock(header, count)
-    frames = FileFrames(path, source, shape, np.uint8)
+    frames = FileFrames(path, source, (count, *middle.shape), np.uint8)
     return Recording(path, settings, frames, values, time_s=times, remarks=remarks)
 
 
@@ -137,83 +149,48 @@ def _reading(where: str) -> Iterator[None]:
         yield
 
 
-def _decoded(path: Path, i: int) -> npt.NDArray[Any]:
-    from pydicom.pixels.utils import pixel_array
-
-    with _reading(f"{path}: frame {i}"), open_regular(path) as stream:
-        return np.asarray(pixel_array(stream, index=i))
-
-
-def _require_all_frames(path: Path, count: int) -> None:
-    """Refuse a file that ends before its last frame, telling how many are whole."""
-
-    def is_cut(i: int) -> bool:
-        try:
-            _decoded(path, i)
-        except FileError:
-            return True
-        return False
-
-    _decoded(path, 0)
-    if is_cut(count - 1):
-        whole = bisect(range(count), False, key=is_cut)
-        raise FileError(f"{path}: ends early: {whole} of {count} frames")
-
-
-def _place(path: Path, header: Any, rows: list[Row]) -> tuple[tuple[slice, slice], dict[str, Value]]:
+def _place(header: Any, rows: list[Row]) -> tuple[tuple[slice, slice], dict[str, Value]]:
     """Rows and columns of the image to take, and the size of its pixels; facts tell of it."""
     regions = header.get("SequenceOfUltrasoundRegions") or ()
     if not regions:
         rows.append(("region read", "the whole image, taken for Cartesian tissue: the file names none", ""))
-        spacing = _numbers(path, header, "PixelSpacing") if header.get("PixelSpacing") else []
+        spacing = _numbers(header, "PixelSpacing") if header.get("PixelSpacing") else []
         sizes = zip(("row_spacing_mm", "column_pitch_mm"), spacing, strict=False)
-        values = {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
-        return (slice(None), slice(None)), values
-    kinds = [_numbers(path, one, "RegionSpatialFormat", "RegionDataType") for one in regions]
-    corners = [
-        [
-            int(_numbers(path, one, f"RegionLocation{name}")[0])
-            for name in ("MinX0", "MinY0", "MaxX1", "MaxY1")
-        ]
-        for one in regions
-    ]
+        return (slice(None), slice(None)), {name: Value(mm or None, "PixelSpacing") for name, mm in sizes}
+    kinds = [_numbers(one, "RegionSpatialFormat", "RegionDataType") for one in regions]
+    boxes = [[int(number) for number in _numbers(one, *_BOX)] for one in regions]
     words = [
         ("2-D tissue" if kind == _TISSUE else "RegionSpatialFormat {:g}, RegionDataType {:g}".format(*kind))
-        + " (columns {0} to {2}, rows {1} to {3})".format(*corner)
-        for kind, corner in zip(kinds, corners, strict=True)
+        + " (columns {0} to {2}, rows {1} to {3})".format(*box)
+        for kind, box in zip(kinds, boxes, strict=True)
     ]
     if kinds.count(_TISSUE) != 1:
         listed = "; ".join(words)
-        raise InvalidInputError(
-            f"{path}: expected one region of 2-D tissue, got {kinds.count(_TISSUE)} of {listed}"
-        )
+        raise InvalidInputError(f"expected one region of 2-D tissue, got {kinds.count(_TISSUE)} of {listed}")
     i = kinds.index(_TISSUE)
-    left, top, right, bottom = corners[i]
-    width, height = _numbers(path, header, "Columns", "Rows")
+    region, (left, top, right, bottom) = regions[i], boxes[i]
+    width, height = _numbers(header, "Columns", "Rows")
     if not (0 <= left < right < width and 0 <= top < bottom < height):
+        raise InvalidInputError(f"expected a region within {width:g} x {height:g} pixels, got {words[i]}")
+    units = _numbers(region, "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
+    x_step, y_cm = _numbers(region, "PhysicalDeltaX", "PhysicalDeltaY")
+    if units not in (_CM, _POLAR) or not x_step * y_cm:
         raise InvalidInputError(
-            f"{path}: expected a region within {width:g} x {height:g} pixels, got {words[i]}"
+            "PhysicalUnits and PhysicalDelta of X and Y: expected units 3 and 3 (cm), or 12 and 3 (degrees "
+            f"and cm), and steps other than 0, got {units} and {(x_step, y_cm)}"
         )
-    units = _numbers(path, regions[i], "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
-    x_cm, y_cm = _numbers(path, regions[i], "PhysicalDeltaX", "PhysicalDeltaY")
-    if units != _CM or not x_cm * y_cm:
-        raise InvalidInputError(
-            f"{path}: PhysicalUnits and PhysicalDelta of X and Y: expected units 3 and 3 (cm) and steps "
-            f"other than 0, got {units} and {(x_cm, y_cm)}: a polar image has to be scan-converted first"
-        )
-    values = {
-        "column_pitch_mm": Value(10.0 * abs(x_cm), "PhysicalDeltaX"),
-        "row_spacing_mm": Value(10.0 * abs(y_cm), "PhysicalDeltaY"),
-    }
-    reference = ("ReferencePixelY0", "ReferencePixelPhysicalValueY")
-    if all(name in regions[i] for name in reference):
-        pixel, value_cm = _numbers(path, regions[i], *reference)
-        # The first row taken is the region's last where y falls.
-        depth_mm = 10.0 * (value_cm + ((bottom - top if y_cm < 0 else 0) - pixel) * y_cm)
-        values["first_sample_depth_mm"] = Value(depth_mm, "ReferencePixelY0 and its physical value")
+    values = {"row_spacing_mm": Value(10.0 * abs(y_cm), "PhysicalDeltaY")}
+    if units == _CM:
+        values["column_pitch_mm"] = Value(10.0 * abs(x_step), "PhysicalDeltaX")
+    else:
+        angles_deg = sorted(_along(region, "X", x_step, np.array([0, right - left])))
+        values["line_angles_deg"] = Value(tuple(angles_deg) or None, "ReferencePixelX0 and PhysicalDeltaX")
+    # The first row taken is the region's last where y falls.
+    for depth_cm in _along(region, "Y", y_cm, np.array([bottom - top if y_cm < 0 else 0])):
+        values["first_sample_depth_mm"] = Value(10.0 * depth_cm, "ReferencePixelY0 and its physical value")
     rows.append(("region read", words[i], ""))
     rows += [("region left out", other, "") for k, other in enumerate(words) if k != i]
-    if x_cm < 0:
+    if x_step < 0:
         rows.append(("columns", "run against the file's x (PhysicalDeltaX below 0): left as shown", ""))
     depths = slice(top, bottom + 1)
     if y_cm < 0:
@@ -222,37 +199,47 @@ def _place(path: Path, header: Any, rows: list[Row]) -> tuple[tuple[slice, slice
     return (depths, slice(left, right + 1)), values
 
 
+def _along(region: Any, axis: str, step: float, pixels: FloatArray) -> list[float]:
+    """Physical values of pixels along an axis of a region; none where it has no reference pixel."""
+    reference = (f"ReferencePixel{axis}0", f"ReferencePixelPhysicalValue{axis}")
+    if not all(name in region for name in reference):
+        return []
+    pixel, value = _numbers(region, *reference)
+    return list(map(float, value + (pixels - pixel) * step))
+
+
 def _clock(header: Any, count: int) -> tuple[FloatArray | None, Value, tuple[str, ...]]:
     """Times of the frames where each has its own, else their rate; and what contradicts."""
     with _reading("frame times"):
         steps = np.ravel(np.asarray(header.get("FrameTimeVector") or [], dtype=float))
         numbers = {name: float(header.get(name) or 0.0) for name in _RATES}
-    numbers["FrameTime"] = 1e3 / numbers["FrameTime"] if numbers["FrameTime"] else 0.0
-    said = [(name, rate) for name, rate in numbers.items() if 0 < rate < np.inf]
+    said = [
+        (name, 1e3 / number if name == "FrameTime" else number)
+        for name, number in numbers.items()
+        if 0 < number < np.inf
+    ]
     others = [f"{name} says {other:.4g}" for name, other in said[1:2] if differs(said[0][1], other)]
     rate = Value(said[0][1], ", ".join([said[0][0], *others])) if said else Value()
     if not steps.size:
         return None, rate, ()
-    steps = steps[1:] if steps.size == count else steps
+    steps = steps[int(steps.size == count) :]  # the first of as many as there are frames is 0
     if steps.size != count - 1 or not np.isfinite(steps).all():
         words = f"FrameTimeVector: {steps.size} steps for {count} frames, or some that are no numbers"
         return None, rate, (f"{words}: not used",)
     return np.cumsum([0.0, *steps]) / 1e3, rate, ()
 
 
-def _numbers(where: object, item: Any, *names: str) -> list[float]:
+def _numbers(item: Any, *names: str) -> list[float]:
     """Finite numbers of elements, or of the one element named, as many as it has."""
-    found = list[float]()
+    numbers = list[float]()
     for name in names:
         try:
-            found += np.ravel(np.asarray(item.get(name), dtype=float)).tolist()
+            numbers += np.ravel(np.asarray(item.get(name), dtype=float)).tolist()
         except (TypeError, ValueError):
-            found.append(np.nan)
-        if not np.isfinite(found).all():
-            raise InvalidInputError(
-                f"{where}: {name}: expected numbers, got {printable(str(item.get(name)))}"
-            )
-    return found
+            numbers.append(np.nan)
+        if not np.isfinite(numbers).all():
+            raise InvalidInputError(f"{name}: expected numbers, got {printable(str(item.get(name)))}")
+    return numbers
 
 
 READER = Reader(FORMAT, lambda _, start: start[_MARK_BYTE:].startswith(_MARK), open_dicom)
