@@ -48,11 +48,11 @@ def single(group: h5py.Group, name: str) -> float | None:
     return float(values[0]) if values.size else None
 
 
-def values_of(group: h5py.Group, places: Mapping[str, str], scale: float = 1.0) -> dict[str, Value]:
+def values_of(group: h5py.Group, places: Mapping[str, str]) -> dict[str, Value]:
     """Numbers of a file by the names of their settings, of those that are there and not 0."""
     numbers = {name: single(group, place) for name, place in places.items()}
     return {
-        name: Value(scale * number, f"in {group.name.strip('/')}/{places[name]}".replace("in /", "in "))
+        name: Value(number, f"in {group.name.strip('/')}/{places[name]}".replace("in /", "in "))
         for name, number in numbers.items()
         if number
     }

@@ -22,7 +22,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.io.carrier import demodulation_of
 from speckle3d.io.formats.hdf5_values import (
@@ -62,15 +62,24 @@ def is_uff(file: h5py.File) -> bool:
 def open_uff(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q on a linear or a sector scan; real data of one sign become grey levels."""
     with open_hdf5(path) as file:
-        rows: list[Row] = [("object", f"{name}: {kind}", "") for name, kind in _objects(file).items()]
-        return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
+        objects = _objects(file)
+        rows: list[Row] = [("object", f"{name}: {kind}", "") for name, kind in objects.items()]
+        return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, objects, rows))
 
 
-def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
-    name = _chosen(file, path, settings)
-    group = require_group(file, name)
+def _objects(file: h5py.File) -> dict[str, str]:
+    """Classes of the root's groups, by their names."""
+    nodes = {printable(str(name)): find_member(file, name) for name in file}
+    kinds = {name: text_of(node.attrs.get("class")) for name, node in nodes.items() if node is not None}
+    return {name: kind for name, kind in kinds.items() if kind}
+
+
+def _recording(
+    path: Path, settings: ImportSettings, file: h5py.File, objects: dict[str, str], rows: list[Row]
+) -> Recording:
+    name = _chosen(objects, path, settings)
+    group, data = require_group(file, name), f"{name}/data"
     lines, samples, values = _scan(group, f"in {name}/scan")
-    data = f"{name}/data"
     is_complex = isinstance(find_member(file, data), h5py.Group)
     parts = (f"{data}/real", f"{data}/imag") if is_complex else (data,)
     axis, count = _frame_axis(require_dataset(file, parts[0]), lines * samples)
@@ -81,31 +90,21 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
     values["demodulation_frequency_hz"] = modulation
     if modulation_hz:
         values["centre_frequency_hz"] = replace(modulation, source=f"assumed: {modulation.source[3:]}")
-    values |= values_of(group, {"centre_frequency_hz": "pulse/center_frequency"})
-    if single(group, "pulse/center_frequency"):
+    if sent := values_of(group, {"centre_frequency_hz": "pulse/center_frequency"}):
         share = single(group, "pulse/fractional_bandwidth")
-        values |= band_about(values, share, f"in {name}/pulse/fractional_bandwidth")
-    for other, kind in _objects(file).items():
-        if kind == _CHANNELS:
-            values |= values_of(file, {"speed_of_sound_m_s": f"{other}/sound_speed"})
+        values |= sent | band_about(sent, share, f"in {name}/pulse/fractional_bandwidth")
+    for other in (other for other, kind in objects.items() if kind == _CHANNELS):
+        values |= values_of(file, {"speed_of_sound_m_s": f"{other}/sound_speed"})
     shape = count, lines, samples
     source = HDF5Slices(path, parts, Grid(shape[1:]), axis)
     frames = source.frames(shape, np.complex64 if is_complex else np.float32)
     if is_complex and count and settings.demodulation_frequency_hz is None:
-        with naming(str(path)):
-            _require_phase(frames, values, settings, modulation_hz)
+        _require_phase(frames, values, settings, modulation_hz)
     elif count and not is_complex and (kind := _kind_of(frames)) != "RF":
         is_db = kind == "decibels"
         frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, settings.dynamic_range_db)
         rows.append(("data", f"of one sign: {kind}, made grey levels here", ""))
     return Recording(path, settings, frames, values)
-
-
-def _objects(file: h5py.File) -> dict[str, str]:
-    """Classes of the root's groups, by their names."""
-    nodes = {printable(str(name)): find_member(file, name) for name in file}
-    kinds = {name: text_of(node.attrs.get("class")) for name, node in nodes.items() if node is not None}
-    return {name: kind for name, kind in kinds.items() if kind}
 
 
 def _kind_of(frames: FileFrames) -> str:
@@ -131,21 +130,21 @@ def _require_phase(
         )
 
 
-def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> str:
+def _chosen(objects: dict[str, str], path: Path, settings: ImportSettings) -> str:
     """Name of the beamformed data to read."""
-    objects = _objects(file)
     names = [name for name, kind in objects.items() if kind == _BEAMFORMED]
     asked = settings.arrays.get("data", names[0] if len(names) == 1 else None)
     if asked in names:
         return asked
     if names:
         raise InvalidInputError(
-            f"{path}: expected one {_BEAMFORMED}, got {', '.join(names)}: say which by arrays = "
+            f"expected one {_BEAMFORMED}, got {', '.join(names)}: say which by arrays = "
             f'{{ data = "{names[0]}" }} in {path.name}.toml beside it'
         )
-    got = ", ".join(sorted(set(objects.values())))
-    advice = f": beamform it by USTB's das on a {_LINEAR}" if _CHANNELS in objects.values() else ""
-    raise InvalidInputError(f"{path}: expected {_BEAMFORMED}, got {got}{advice}")
+    got = ", ".join(sorted({*objects.values()}))
+    raise InvalidInputError(
+        f"expected {_BEAMFORMED}, got {got}: beamform channels by USTB's das on a {_LINEAR}"
+    )
 
 
 def _scan(group: h5py.Group, said: str) -> tuple[int, int, dict[str, Value]]:

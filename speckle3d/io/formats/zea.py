@@ -18,7 +18,7 @@ References
 
 from __future__ import annotations
 
-from itertools import product
+from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import InvalidInputError, naming
+from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.printable import printable
 from speckle3d.core.sweep import Tracker
 from speckle3d.io.carrier import demodulation_of
@@ -56,7 +56,7 @@ from speckle3d.io.recordings import Recording, Row, Value, grid_values, rate_by_
 
 FORMAT = "zea"
 
-_READ = ("beamformed_data", "envelope_data", "image", "image_sc")
+_READ = ("beamformed_data", "envelope_data", "image_sc", "image")
 _NOT_BEAMFORMED = ("raw_data", "aligned_data")
 _POSES = "metadata/probe_pose"
 _TOLERANCE_MM = 1e-3
@@ -68,61 +68,76 @@ _ROTATIONS = ("quaternion_wxyz", "quaternion_xyzw", "euler_xyz")
 
 def is_zea(file: h5py.File) -> bool:
     """Whether an open file has zea's groups, and no format of this package's family."""
-    names = (*_READ, *_NOT_BEAMFORMED)
-    return not file_format(file) and any(
-        has_member(file, f"{home}data/{name}") for home in _homes(file) for name in names
-    )
+    return not file_format(file) and bool(_arrays(file, (*_READ, *_NOT_BEAMFORMED)))
 
 
 def open_zea(path: Path, settings: ImportSettings) -> Recording:
     """Read beamformed RF or I/Q, else an envelope, else images; with the probe's poses."""
     with open_hdf5(path) as file:
-        rows: list[Row] = [("holds", _contents(file), "")]
+        names = [f"{home}data/{printable(name)}" for home in _homes(file) for name in file[f"{home}data"]]
+        advice = ": channel data need beamforming, by zea's Pipeline, and its result written"
+        is_raw = any(name.endswith(_NOT_BEAMFORMED) for name in names)
+        rows: list[Row] = [("holds", ", ".join(names) + advice * is_raw, "")]
         return Recording.of(path, settings, rows, lambda: _recording(path, settings, file, rows))
 
 
+def _homes(file: h5py.File) -> list[str]:
+    """What stands before ``data``: nothing at the root, or tracks with a slash at the end."""
+    tracks = find_member(file, "tracks")
+    names = sorted(map(str, tracks)) if isinstance(tracks, h5py.Group) else []
+    homes = [""] if has_member(file, "data") else [f"tracks/{name}/" for name in names]
+    return [home for home in homes if isinstance(find_member(file, f"{home}data"), h5py.Group)]
+
+
+def _arrays(file: h5py.File, kinds: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Names of arrays of some kinds, their kinds, and what stands before their ``data``."""
+    names = ((f"{home}data/{kind}", kind, home) for kind in kinds for home in _homes(file))
+    return [one for one in names if has_member(file, one[0])]
+
+
 def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list[Row]) -> Recording:
-    name, home, kind = _chosen(file, path, settings)
+    asked = settings.arrays.get("data", "").strip("/").removesuffix("/values")
+    arrays = [one for one in _arrays(file, _READ) if asked in ("", one[0])]
+    if not arrays:
+        raise InvalidInputError(f"expected {' or '.join(_READ)}, got {rows[0][1]}")
+    name, kind, home = arrays[0]
+    if names := [other for other, same, _ in arrays[1:] if same == kind]:
+        raise InvalidInputError(
+            f"expected one track, got {name}, {', '.join(names)}: say which by arrays = "
+            f'{{ data = "{name}" }} in {path.name}.toml beside it'
+        )
     rows.append(("read", name, ""))
-    scan, node = f"{home}scan", require_dataset(file, name)
+    group, scan = find_member(file, name), f"{home}scan"
+    node = group if isinstance(group, h5py.Dataset) else require_dataset(group, "values")
     places = {"speed_of_sound_m_s": f"{scan}/sound_speed", "centre_frequency_hz": f"{scan}/center_frequency"}
     values = values_of(file, places)
     percent = single(file, f"{scan}/bandwidth_percent") or 0.0
     values |= band_about(values, percent / 100.0, f"in {scan}/bandwidth_percent")
     is_image, is_beamformed = node.dtype == np.uint8, kind == "beamformed_data"
-    shape, channels = node.shape[:3], node.shape[3:] if is_beamformed else ()
     is_sound = node.dtype.kind == "f" or (is_image and kind.startswith("image"))
-    if (
-        not is_sound
-        or len(shape) != 3
-        or node.shape != (*shape, *channels)
-        or channels not in ((), (1,), (2,))
-    ):
+    sizes, channels = node.shape[:3], node.shape[3:]
+    if not is_sound or len(sizes) < 3 or channels not in ([(1,), (2,)] if is_beamformed else [()]):
         raise InvalidInputError(
             f"{locate(node)}: expected echoes of shape (frame, z, x), of beamformed_data (frame, z, x, 1 or "
             f"2), got {node.shape} {node.dtype}"
         )
-    group, left_mm, x_first, is_placed = name.removesuffix("/values"), None, False, False
-    if group != name and has_member(file, f"{group}/coordinates"):
-        coordinates, is_placed = require_dataset(file, f"{group}/coordinates"), True
-        numbers, left_mm, x_first = _pixels(coordinates, shape)
+    left_mm, x_first, is_placed = None, False, has_member(group, "coordinates")
+    if is_placed:
+        numbers, left_mm, x_first = _pixels(require_dataset(group, "coordinates"), sizes)
         values |= numbers
-    lines, samples = shape[1:] if x_first else shape[:0:-1]
-    is_complex = channels == (2,)
-    source = HDF5Slices(path, (name,), Grid((lines, samples), not x_first, is_complex))
+    lines, samples = sizes[1:] if x_first else sizes[:0:-1]
+    shape, is_complex = (sizes[0], lines, samples), channels == (2,)
+    source = HDF5Slices(path, (str(node.name),), Grid((lines, samples), not x_first, is_complex))
     if is_beamformed or is_image:
-        dtype = np.uint8 if is_image else np.complex64 if is_complex else np.float32
-        frames = source.frames((shape[0], lines, samples), dtype)
+        frames = source.frames(shape, np.uint8 if is_image else np.complex64 if is_complex else np.float32)
     else:
         is_db, given_db = kind != "envelope_data", settings.dynamic_range_db
-        frames, values["dynamic_range_db"] = grey_frames(source, (shape[0], lines, samples), is_db, given_db)
-    shifts = {single(file, f"{home}scan/demodulation_frequency") for home in _homes(file)}
-    shift_hz = shifts.pop() if len(shifts) == 1 else None
+        frames, values["dynamic_range_db"] = grey_frames(source, shape, is_db, given_db)
+    shift_hz = single(file, f"{scan}/demodulation_frequency")
     if is_complex and shift_hz and is_placed and settings.demodulation_frequency_hz is None:
         rate_hz = rate_by_spacing(values["row_spacing_mm"], settings, values).value
         words = "of scan/demodulation_frequency and the phase of the data"
-        with naming(str(path)):
-            values["demodulation_frequency_hz"] = Value(demodulation_of(frames, shift_hz, rate_hz), words)
+        values["demodulation_frequency_hz"] = Value(demodulation_of(frames, shift_hz, rate_hz), words)
     tracker, remarks = _tracker(file, left_mm)
     return Recording(
         path,
@@ -136,47 +151,6 @@ def _recording(path: Path, settings: ImportSettings, file: h5py.File, rows: list
         assumptions=() if is_placed else ("parallel lines",),
         remarks=tuple(remarks),
     )
-
-
-def _homes(file: h5py.File) -> list[str]:
-    """What stands before ``data``: nothing at the root, or tracks with a slash at the end."""
-    tracks = find_member(file, "tracks")
-    names = sorted(map(str, tracks)) if isinstance(tracks, h5py.Group) else []
-    homes = [""] if has_member(file, "data") else [f"tracks/{name}/" for name in names]
-    return [home for home in homes if isinstance(find_member(file, f"{home}data"), h5py.Group)]
-
-
-def _chosen(file: h5py.File, path: Path, settings: ImportSettings) -> tuple[str, str, str]:
-    """Data set to read, what stands before its ``data``, and its kind: the earliest, unless one is named."""
-    asked = settings.arrays.get("data", "").strip("/")
-    arrays = [
-        (f"{home}data/{kind}{end}", home, kind)
-        for home, kind, end in product(_homes(file), _READ, ("", "/values"))
-        if isinstance(find_member(file, f"{home}data/{kind}{end}"), h5py.Dataset)
-        and asked in ("", f"{home}data/{kind}", f"{home}data/{kind}{end}")
-    ]
-    if not arrays:
-        raise InvalidInputError(f"{path}: expected {' or '.join(_READ[:3])}, got {_contents(file)}")
-    # What came before scan conversion may be polar, and says nothing of it without coordinates.
-    is_old = not asked and not any(name.endswith("/values") for name, _, _ in arrays)
-    order = [*_READ[3:], *_READ[:3]] if is_old else [*_READ]
-    first, *others = sorted(arrays, key=lambda one: order.index(one[2]))
-    if names := [name for name, _, kind in others if kind == first[2]]:
-        raise InvalidInputError(
-            f"{path}: expected one track, got {first[0]}, {', '.join(names)}: say which by "
-            f'arrays = {{ data = "{first[0]}" }} in {path.name}.toml beside it'
-        )
-    return first
-
-
-def _contents(file: h5py.File) -> str:
-    names = [f"{home}data/{printable(str(name))}" for home in _homes(file) for name in file[f"{home}data"]]
-    advice = ""
-    if any(name.endswith(_NOT_BEAMFORMED) for name in names):
-        advice = ": channel data need beamforming, by zea's Pipeline, and its result written"
-    elif any(has_member(file, f"{name}/pixels") for name in names):
-        advice = ": pixels with an extent, whose axes are not certain: write it by zea 0.0.12 or later"
-    return (", ".join(names) or "nothing") + advice
 
 
 def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value], float | None, bool]:
@@ -218,14 +192,15 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
     )
 
 
-def _times(file: h5py.File, group: str, scan: str, count: int) -> FloatArray | None:
+def _times(file: h5py.File, group: h5py.Group, scan: str, count: int) -> FloatArray | None:
     """Time of each frame after the first transmission: of the data, or of the times between transmissions.
 
     Where one of a frame's is not known, the next frame has no time, and later ones count the median for it.
     """
-    if has_member(file, f"{group}/timestamps"):
-        stamps = read_checked(file, f"{group}/timestamps", (count,))
-        return np.asarray(stamps + (single(file, f"{group}/start_time_offset") or 0.0))
+    if has_member(group, "timestamps"):
+        return np.asarray(
+            read_checked(group, "timestamps", (count,)) + (single(group, "start_time_offset") or 0)
+        )
     name = f"{scan}/time_to_next_transmit"
     if len(_homes(file)) > 1 or not has_member(file, name):
         return None
@@ -246,19 +221,19 @@ def _tracker(file: h5py.File, left_mm: float | None) -> tuple[Tracker | None, li
     kind = text_of(node["rotation_representation"][()]) if "rotation_representation" in node else ""
     if kind not in _ROTATIONS:
         return None, [f"{_POSES}: not read: expected a rotation_representation among {', '.join(_ROTATIONS)}"]
-    is_euler = kind == "euler_xyz"
-    places = read_checked(node, "translation", ("pose", 3))
-    rate, count = single(node, "sampling_frequency"), len(places)
+    is_euler, places_m = kind == "euler_xyz", read_checked(node, "translation", ("pose", 3))
+    rate, count = single(node, "sampling_frequency"), len(places_m)
     turns = read_checked(node, "rotation", (count, 3 if is_euler else 4))
     stamps = np.arange(count) / rate if rate else read_checked(node, "timestamps", (count,))
-    matrices = np.full((count, 4, 4), np.nan)
-    matrices[:, :3, 3], matrices[:, 3] = 1e3 * places, [0.0, 0.0, 0.0, 1.0]
     sound = np.isfinite(turns).all(axis=1) & (turns.any(axis=1) | is_euler)
-    matrices[sound, :3, :3] = (
-        Rotation.from_euler("xyz", turns[sound])
-        if is_euler
-        else Rotation.from_quat(turns[sound], scalar_first=kind == "quaternion_wxyz")
-    ).as_matrix()
+    turns[~sound] = 1.0
+    if is_euler:
+        turned = Rotation.from_euler("xyz", turns)
+    else:
+        turned = Rotation.from_quat(turns, scalar_first=kind == "quaternion_wxyz")
+    matrices = np.tile(np.eye(4), (count, 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = turned.as_matrix(), 1e3 * places_m
+    matrices[~sound] = np.nan
     readings, notes = timed_poses(stamps + (single(node, "start_time_offset") or 0.0), matrices)
     if readings is None:
         return None, [*notes, f"{_POSES}: no pose is of use"]
