@@ -205,7 +205,8 @@ def _repeats(readings: TimedPoses, sweep: Sweep, frame_time_s: FloatArray) -> li
     inside = np.flatnonzero((frame_time_s >= longest[0]) & (frame_time_s <= longest[-1]))
     if not changes.size or not odd or inside.size < 2:
         return []
-    if np.array_equal(*(sweep.frames[int(i)] for i in inside[[0, -1]])):
+    first, last = (sweep.frames[int(i)] for i in inside[[0, -1]])
+    if np.array_equal(first, last):
         return []
     return [
         f"poses: {odd} run(s) of one pose while images change, the longest of {longest.size} poses, "

@@ -94,7 +94,7 @@ def open_raw(member: Member, said: Description) -> ClariusFile:
         If its header contradicts the yml.
     """
     dtype, parts, _ = _SAMPLES[said.kind]
-    size = int(said.number("frames")), said.lines, said.samples
+    size = said.frames, said.size.lines, said.size.samples
     expected = (*size, parts * np.dtype(dtype).itemsize)
     got = HEADER.unpack(bytes(_content(member)[: HEADER.size]).ljust(HEADER.size, b"\0"))[1:]
     if got != expected or 0 in got:

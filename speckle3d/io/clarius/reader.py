@@ -32,16 +32,17 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from speckle3d.core.arrays import FloatArray
-from speckle3d.core.errors import FileError, InvalidInputError
+from speckle3d.core.errors import FileError, InvalidInputError, naming
 from speckle3d.core.printable import printable
 from speckle3d.io.clarius.imu import SensorSamples, read_samples
 from speckle3d.io.clarius.package import Files, find_files
 from speckle3d.io.clarius.raw import open_raw
-from speckle3d.io.clarius.sidecars import Description
+from speckle3d.io.clarius.sidecars import Description, parsed
 from speckle3d.io.clarius.spectrum import band_hz
 from speckle3d.io.frames import FileFrames
 from speckle3d.io.import_settings import SPEED_OF_SOUND_M_S, ImportSettings
 from speckle3d.io.recordings import Recording, Row, Value, step_of
+from speckle3d.io.toml import validated
 
 FORMAT = "Clarius raw package"
 
@@ -100,37 +101,37 @@ def _recording(
     files: Files, settings: ImportSettings, sensor: SensorSamples | None, remarks: list[str], rows: list[Row]
 ) -> Recording:
     """What a package holds, as a recording."""
-    described = {kind: Description(member) for kind, member in files.yml.items() if kind != "imu"}
-    for kind, one in described.items():
-        rows += [(f"{kind}: {name}", one.text(name), "") for name in _SAID if one.text(name)]
-    if not files.raw or not files.raw.keys() <= described.keys():
+    fields = {kind: parsed(one.text(), one.where) for kind, one in files.yml.items() if kind != "imu"}
+    for kind, one in fields.items():
+        rows += [(f"{kind}: {name}", printable(str(one[name])[:60]), "") for name in _SAID if one.get(name)]
+    if not files.raw or not files.raw.keys() <= fields.keys():
         names = ", ".join(member.name for member in (*files.raw.values(), *files.yml.values()))
-        raise InvalidInputError(f"{files.path}: expected raw files with a yml of each, got {names}")
+        raise InvalidInputError(f"expected raw files with a yml of each, got {names}")
+    described = {kind: validated(fields[kind], files.yml[kind].where, Description) for kind in files.raw}
     kind = min(files.raw, key=lambda kind: _ORDER.index(described[kind].kind))
     rows.append(("sweep is made from", kind, ""))
     said = described[kind]
     file = open_raw(files.raw[kind], said)
-    elements = _elements(said)
-    per_line = step_of(elements, f"{said.where}: lines of one place a packet are no image: rx element")
+    with naming(files.yml[kind].where):
+        elements = _elements(said)
+        per_line = step_of(elements, "lines (packets of a Doppler mode are no image): rx element")
     rows.append(("first line at element", f"{elements[0]:g}, taken as the image's left", ""))
 
-    own_speed = said.optional("vsound") or said.optional("speed of sound")
     rate_hz = settings.sampling_rate_hz or said.rate_hz
-    spacing_mm = 1e3 * (settings.speed_of_sound_m_s or own_speed or SPEED_OF_SOUND_M_S) / (2.0 * rate_hz)
-    delay, first_mm = said.optional("delay samples"), None
+    speed_m_s = settings.speed_of_sound_m_s or said.speed_m_s or SPEED_OF_SOUND_M_S
+    spacing_mm, first_mm = 1e3 * speed_m_s / (2.0 * rate_hz), None
     # Less than a sample above the array is 0: the delay is a whole number of samples.
-    if delay is not None and (after := delay - BEFORE_DEPTH_S * rate_hz) > -1.0:
+    if said.delay is not None and (after := said.delay - BEFORE_DEPTH_S * rate_hz) > -1.0:
         first_mm = max(after, 0.0) * spacing_mm
-    pitch, centre_hz = _pitch(said, per_line, settings), said.optional("transmit frequency")
-    probe = settings.probe or said.text("probe")
+    probe, pitch = settings.probe or said.probe.model, _pitch(said, per_line, settings)
     spreading = _spreading(said, elements[[0, -1]], per_line, pitch, probe)
     values = {
         "first_sample_depth_mm": Value(first_mm, "delay samples, less 1 us before depth 0 (assumed)", _OWN),
         "vector_pitch_mm": pitch,
         "row_spacing_mm": Value(spacing_mm, f"of {rate_hz / 1e6:g} MHz", _OWN),
         "sampling_rate_hz": Value(said.rate_hz, "", _OWN),
-        "centre_frequency_hz": Value(centre_hz, "transmit frequency", _OWN),
-        **({} if own_speed is None else {"speed_of_sound_m_s": Value(own_speed, "", _OWN)}),
+        "centre_frequency_hz": Value(said.sent_hz, "transmit frequency", _OWN),
+        **({} if said.speed_m_s is None else {"speed_of_sound_m_s": Value(said.speed_m_s, "", _OWN)}),
         **spreading,
     }
     shift_hz = None
@@ -139,7 +140,7 @@ def _recording(
         if receive is not None:
             shallow_hz, deep_hz, filter_mm = receive
             start_mm = first_mm or settings.first_sample_depth_mm or 0.0
-            depths_mm = start_mm + spacing_mm * np.arange(said.samples)
+            depths_mm = start_mm + spacing_mm * np.arange(said.size.samples)
             slid_hz = np.interp(depths_mm, [0.0, filter_mm], [shallow_hz, deep_hz])
             middle_hz = float(np.interp(depths_mm[[0, -1]].mean(), depths_mm, slid_hz))
             values["demodulation_frequency_hz"] = Value(middle_hz, "of the lines' middle", _OWN)
@@ -158,7 +159,7 @@ def _recording(
             shift_hz = middle_hz if shift_hz is None else shift_hz
     narrow = np.int16 if said.kind == "IQ" and file.turns is None else None
     frames = FileFrames(file.member.path, file, file.size, file.dtype, narrow)
-    sent_hz, band = settings.centre_frequency_hz or centre_hz, None
+    sent_hz, band = settings.centre_frequency_hz or said.sent_hz, None
     is_known = said.kind == "RF" or (said.kind == "IQ" and shift_hz is not None)
     if settings.bandwidth_hz is None and sent_hz and is_known:
         band = band_hz(frames, rate_hz, sent_hz, shift_hz)
@@ -189,19 +190,19 @@ def _elements(said: Description) -> FloatArray:
     elements, angle_deg = said.places.T
     if (steered := np.flatnonzero(angle_deg)).size:
         raise InvalidInputError(
-            f"{said.where}: lines[{steered[0]}]: angle: expected 0 (lines that are not steered), got "
-            f"{angle_deg[steered[0]]:g} deg, and {steered.size} of {said.lines} lines steered: record "
+            f"lines[{steered[0]}]: angle: expected 0 (lines that are not steered), got "
+            f"{angle_deg[steered[0]]:g} deg, and {steered.size} of {angle_deg.size} lines steered: record "
             "without steering and Doppler, or give another of its raw files"
         )
-    return elements
+    return np.asarray(elements)
 
 
 def _pitch(said: Description, per_line: float, settings: ImportSettings) -> Value:
     """Distance between lines at the array, mm: of the elements' as given, by the yml, or a table's."""
-    model = _model(settings.probe or said.text("probe"))
+    model = _model(settings.probe or said.probe.model)
     pitches = {
         "as given": settings.element_pitch_mm,
-        _OWN: said.optional("probe", "pitch"),
+        _OWN: said.probe.pitch,
         f"the maker's table, {model}": ELEMENT_PITCH_MM.get(model),
     }
     for source, element_mm in pitches.items():
@@ -215,7 +216,7 @@ def _spreading(
     said: Description, ends: FloatArray, per_line: float, pitch: Value, probe: str
 ) -> dict[str, Value]:
     """Where the lines of a curved array lie; of a curved model without its radius, that it is lacking."""
-    radius_mm, elements = said.optional("probe", "radius"), said.optional("probe", "elements")
+    radius_mm, elements = said.probe.radius, said.probe.elements
     if not radius_mm and not _model(probe).startswith(CONVEX):
         return {}
     angles = Value()

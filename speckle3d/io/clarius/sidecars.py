@@ -12,17 +12,16 @@ References
 
 from __future__ import annotations
 
+import math
 import re
-from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AliasChoices, BaseModel, BeforeValidator, Field
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.extras import extra_module
-from speckle3d.core.printable import printable
-from speckle3d.io.clarius.package import Member
 from speckle3d.io.import_settings import LEAST_HZ
 
 _KINDS = {"rf": "RF", "iq": "IQ", "b pre-scan": "envelope", "envelope": "envelope", "b": "envelope"}
@@ -43,7 +42,7 @@ def parsed(text: str, where: str) -> dict[str, Any]:
     """
     yaml = extra_module("yaml", "clarius", "a package of a Clarius scanner")
     try:
-        document = yaml.load(text, Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))
+        document = yaml.load(_GAIN_LINE.sub("", text), Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         words = " ".join(str(error).split())[:200]
         raise InvalidInputError(f"{where}: expected YAML, got an error: {words}") from error
@@ -52,99 +51,97 @@ def parsed(text: str, where: str) -> dict[str, Any]:
     return document
 
 
-class Description:
-    """The yml of a raw file, asked for its fields by the names that lead to them.
+def _quantity(text: object) -> float | None:
+    """Number in Hz, mm, m/s or degrees of text as ``60 MHz``; None of no text."""
+    if text in (None, "", "~"):
+        return None
+    parts = _NUMBER.fullmatch(str(text))
+    value = math.nan if parts is None else float(parts[1]) * _UNITS.get(parts[2].lower(), math.nan)
+    if not math.isfinite(value):
+        raise ValueError("expected a number and its unit")
+    return value
+
+
+Quantity = Annotated[float, BeforeValidator(_quantity)]
+Count = Annotated[int, BeforeValidator(_quantity)]
+Optional = Annotated[float | None, BeforeValidator(_quantity)]
+_LISTED = BeforeValidator(lambda value: value or [])
+
+
+class _Size(BaseModel):
+    lines: Count = Field(alias="number of lines")
+    samples: Count = Field(alias="samples per line")
+
+
+class _Line(BaseModel):
+    element: Quantity = Field(alias="rx element")
+    angle: Quantity
+
+
+class _Filter(BaseModel):
+    shallowfreq: Quantity
+    deepfreq: Quantity
+    filterdepth: Quantity
+
+
+class _Focus(BaseModel):
+    receive: Annotated[list[_Filter], _LISTED] = []
+
+
+class _Probe(BaseModel):
+    """Model of a probe, or its measures in mm."""
+
+    model: str = ""
+    radius: Optional = None
+    pitch: Optional = None
+    elements: Optional = None
+
+
+class Description(BaseModel):
+    """The yml of a raw file.
 
     Attributes
     ----------
     kind : str
         ``"RF"``, ``"IQ"`` or ``"envelope"``, by the field `type`, whatever the file is called.
-    rate_hz : float
-        Sampling rate.
-
-    Raises
-    ------
-    FileError
-        If it cannot be read.
-    InvalidInputError
-        If it describes no raw file.
     """
 
-    def __init__(self, member: Member) -> None:
-        self.where = member.where
-        self.values = parsed(_GAIN_LINE.sub("", member.text()), self.where)
-        self.kind, packing = _KINDS.get(self.text("type").strip().lower(), ""), self.text("compression")
-        self.rate_hz = self.number("sampling rate")
-        if not self.kind or packing.lower() not in ("", "none") or self.rate_hz < LEAST_HZ:
-            raise InvalidInputError(
-                f"{self.where}: type, compression, sampling rate: expected RF, IQ or B pre-scan, none, and a "
-                f"rate in MHz, got {self.text('type')}, {packing} and {self.rate_hz:g} Hz"
-            )
-        self.lines = int(self.number("size", "number of lines"))
-        self.samples = int(self.number("size", "samples per line"))
+    kind: Annotated[
+        Literal["RF", "IQ", "envelope"],
+        BeforeValidator(lambda text: _KINDS.get(str(text).strip().lower(), text)),
+    ] = Field(alias="type")
+    compression: Annotated[Literal["", "none"], BeforeValidator(lambda text: str(text).lower())] = ""
+    frames: Count
+    size: _Size
+    lines: list[_Line]
+    rate_hz: Quantity = Field(alias="sampling rate", ge=LEAST_HZ)
+    delay: Optional = Field(None, alias="delay samples")
+    sent_hz: Optional = Field(None, alias="transmit frequency")
+    speed_m_s: Optional = Field(None, validation_alias=AliasChoices("vsound", "speed of sound"))
+    focus: Annotated[list[_Focus], _LISTED] = []
+    probe: Annotated[
+        _Probe, BeforeValidator(lambda value: {"model": value} if isinstance(value, str) else value)
+    ] = _Probe()
 
-    def field(self, *names: str | int) -> Any:
-        """Value of a field; None where there is none."""
-        value: Any = self.values
-        for name in names:
-            is_inside = name in value if isinstance(value, dict) else isinstance(value, list)
-            value = value[name] if is_inside else None
-        return value
-
-    def text(self, *names: str | int) -> str:
-        """Text of a field as it may be shown; empty where there is none."""
-        value = self.field(*names)
-        return printable(value[:60]) if isinstance(value, str) else ""
-
-    def rows(self, *names: str | int) -> range:
-        """Numbers of a list's items; none where there is no list."""
-        value = self.field(*names)
-        return range(len(value) if isinstance(value, list) else 0)
-
-    def number(self, *names: str | int) -> float:
-        """A number in Hz, mm, m/s or degrees, as of ``"60 MHz"``.
-
-        Raises
-        ------
-        InvalidInputError
-            Naming the field that is missing or has another unit.
-        """
-        parts = _NUMBER.fullmatch(self.text(*names))
-        value = np.nan if parts is None else float(parts[1]) * _UNITS.get(parts[2].lower(), np.nan)
-        if not np.isfinite(value):
-            got = self.text(*names) or f"a {type(self.field(*names)).__name__}"
-            place = ": ".join(map(str, names))
-            raise InvalidInputError(f"{self.where}: {place}: expected a number and its unit, got {got}")
-        return value
-
-    def optional(self, *names: str | int) -> float | None:
-        """A number, or None where there is none."""
-        return None if self.field(*names) in (None, "", "~") else self.number(*names)
-
-    @cached_property
+    @property
     def places(self) -> FloatArray:
         """Element where each line is received and its angle in degrees, shape (line, 2).
 
         Files may give the first and the last alone.
         """
-        names = ("rx element", "angle")
-        rows = [[self.number("lines", i, name) for name in names] for i in self.rows("lines")]
+        rows = np.array([(line.element, line.angle) for line in self.lines]).reshape(-1, 2)
         if len(rows) == 2:
-            return np.asarray(np.linspace(*np.array(rows), self.lines))
-        if len(rows) != self.lines or not rows:
-            raise InvalidInputError(f"{self.where}: lines: expected {self.lines} lines, got {len(rows)}")
-        return np.array(rows)
+            return np.asarray(np.linspace(rows[0], rows[1], self.size.lines))
+        if len(rows) != self.size.lines or not len(rows):
+            raise InvalidInputError(f"lines: expected {self.size.lines} lines, got {len(rows)}")
+        return rows
 
     @property
-    def receive(self) -> tuple[float, ...] | None:
+    def receive(self) -> tuple[float, float, float] | None:
         """Demodulation frequency at depth 0, Hz, at a depth, and that depth, mm; linear between [2]_.
 
         None in older files, and where it differs between foci or filters.
         """
-        fields = ("shallowfreq", "deepfreq", "filterdepth")
-        ends = {
-            tuple(self.number("focus", i, "receive", k, name) for name in fields)
-            for i in self.rows("focus")
-            for k in self.rows("focus", i, "receive")
-        }
+        filters = (one for focus in self.focus for one in focus.receive)
+        ends = {(one.shallowfreq, one.deepfreq, one.filterdepth) for one in filters}
         return ends.pop() if len(ends) == 1 else None

@@ -9,11 +9,7 @@ RF and I/Q the edges move by 0.1 MHz from 40 to 0 dB over noise.
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.signal import csd
 
 from speckle3d.core.sweep import Frames
 
@@ -47,25 +43,24 @@ def band_hz(
     if vectors < 2 or samples < length:
         return None
     chosen = sorted({0, count // 2, count - 1})
-    spectra = len(chosen) * (vectors - 1) * (2 * samples // length - 1)
     shared, power = np.zeros(length), np.zeros(length)
-    cross = partial(csd, fs=sampling_rate_hz, nperseg=length, return_onesided=False, detrend=False)
     for i in chosen:
         lines = frames[i] - (frames[i].mean(axis=1, keepdims=True) if shift_hz is None else 0.0)
-        level = np.sqrt(uniform_filter1d(np.mean(np.abs(lines) ** 2, axis=0), length))
-        lines = lines / np.where(level > 0, level, 1.0)
-        frequency, density = cross(lines[:-1], lines[1:])
-        shared += density.real.mean(axis=0)
-        power += cross(lines[:-1], lines[:-1])[1].real.mean(axis=0)
-    frequency = np.fft.fftshift(frequency) + (shift_hz or 0.0)
-    shared, power = np.fft.fftshift(shared), np.fft.fftshift(power)
+        pieces = np.lib.stride_tricks.sliding_window_view(lines, length, axis=1)[:, :: length // 2]
+        level = np.sqrt(np.mean(np.abs(pieces) ** 2, axis=(0, 2), keepdims=True))
+        spectra = np.fft.fftshift(np.fft.fft(pieces / (level + (level == 0)) * np.hanning(length)), axes=-1)
+        shared += (spectra[:-1].conj() * spectra[1:]).real.mean(axis=(0, 1))
+        power += (np.abs(spectra) ** 2).mean(axis=(0, 1))
+    frequency = np.fft.fftshift(np.fft.fftfreq(length, 1 / sampling_rate_hz)) + (shift_hz or 0.0)
     near = np.flatnonzero((frequency > 0.5 * transmit_hz) & (frequency < 2 * transmit_hz))
     if not near.size:
         return None
     top = int(near[np.argmax(shared[near])])
     level = shared[top] / 4
     left, right = np.flatnonzero(shared[:top] < level), np.flatnonzero(shared[top:] < level) + top
-    if shared[top] <= _CLEAR / np.sqrt(spectra) * power[top] or not (left.size and right.size):
+    if shared[top] <= _CLEAR / np.sqrt(pieces[1:, :, 0].size * len(chosen)) * power[top] or not (
+        left.size and right.size
+    ):
         return None
     rise, fall = slice(left[-1], left[-1] + 2), slice(right[0], right[0] - 2, -1)
     edges = (np.interp(level, shared[edge], frequency[edge]) for edge in (rise, fall))

@@ -130,12 +130,12 @@ def _recording(path: Path, settings: ImportSettings, header: Any, rows: list[Row
         rows.append(("pixels", "packed with loss, which smooths speckle", ""))
     spread = _LOSSY_SPREAD if is_lossy or "YBR" in kind else 0
     source = DicomFile(path, part, kind == "MONOCHROME1", spread)
-    middle = source.read(count // 2)  # colour is told before a reconstruction begins
+    first = source.read(0)  # what cannot be decoded at all, and colour, is told at once
     if source.is_cut(count - 1):
         whole = bisect(range(count), False, key=source.is_cut)
         raise FileError(f"{path}: ends early: {whole} of {count} frames")
     times, values["frame_rate_hz"], remarks = _clock(header, count)
-    frames = FileFrames(path, source, (count, *middle.shape), np.uint8)
+    frames = FileFrames(path, source, (count, *first.shape), np.uint8)
     return Recording(path, settings, frames, values, time_s=times, remarks=remarks)
 
 

@@ -12,6 +12,7 @@ they are the image's columns and rows, and a row lies together.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,6 @@ _NAMES = (
     "rate_hz", "lines", "extra",
 )  # fmt: skip
 _HEADER = np.dtype([(name, "<i4") for name in _NAMES])
-_MOST_FRAMES, _MOST_LENGTH = 10**6, 2**16
 _READ = {2: ("B-mode before scan conversion (.bpr)", 8), 4: ("B-mode (.b8)", 8), 16: ("RF (.rf)", 16)}
 """Name and bits of the types that are read; all are powers of two."""
 _BMODE, _LAST_TYPE = 4, 2**19
@@ -59,24 +59,16 @@ def _header(content: bytes) -> Any:
 
 def _is_tagged(header: Any, size: int) -> bool | None:
     """Whether each frame has its number before it, by the file's size; None if that is neither's."""
-    pixels = int(header["width"]) * int(header["height"]) * int(header["bits"]) // 8
-    sizes = {_HEADER.itemsize + int(header["frames"]) * (pixels + tag): bool(tag) for tag in (0, 4)}
-    return sizes.get(size)
+    frames, *sides = (int(header[name]) for name in ("frames", "width", "height", "bits"))
+    sizes = {_HEADER.itemsize + frames * (math.prod(sides) // 8 + tag): bool(tag) for tag in (0, 4)}
+    return sizes.get(size) if frames > 0 < min(sides) else None
 
 
 def _claims(path: Path, start: bytes) -> bool:
-    if len(start) < _HEADER.itemsize:
+    if len(start) < _HEADER.itemsize or not 0 < (kind := int(_header(start)["kind"])) <= _LAST_TYPE:
         return False
-    header = _header(start)
-    kind = int(header["kind"])
-    return bool(
-        0 < kind <= _LAST_TYPE
-        and kind.bit_count() == 1
-        and all(0 < header[name] <= _MOST_LENGTH for name in ("width", "height"))
-        and 0 <= header["frames"] <= _MOST_FRAMES
-        and header["bits"] in (8, 16, 24, 32)
-        and (path.suffix.lower() in _SUFFIXES or _is_tagged(header, path.stat().st_size) is not None)
-    )
+    is_whole = _is_tagged(_header(start), path.stat().st_size) is not None
+    return kind.bit_count() == 1 and (is_whole or path.suffix.lower() in _SUFFIXES)
 
 
 def open_ultrasonix(path: Path, settings: ImportSettings) -> Recording:

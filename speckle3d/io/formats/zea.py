@@ -170,7 +170,7 @@ def _pixels(node: h5py.Dataset, shape: tuple[int, ...]) -> tuple[dict[str, Value
     said, where = "of the coordinates", locate(node)
 
     def is_zero(*off: FloatArray) -> bool:
-        return max(np.abs(one).max() for one in off) <= _TOLERANCE_MM
+        return bool(max(np.abs(one).max() for one in off) <= _TOLERANCE_MM)
 
     for x_first in (False, True):
         x, y, z = (start if x_first else start.swapaxes(0, 1)).transpose(2, 0, 1)

@@ -53,18 +53,6 @@ def test_rf_is_preferred_and_a_raw_file_gives_its_own_kind(tmp_path):
     require_equal(load_sweep(folder / f"{examples.NAME}_iq.raw", GIVEN), iq)
 
 
-def test_region_of_interest_without_data_around_is_cut_out(tmp_path):
-    sweep = sweep_of("rf")
-    frames = np.zeros_like(sweep.frames)
-    frames[:, 1:4, 8:30] = sweep.frames[:, 1:4, 8:30]
-    padded = replace(sweep, frames=frames)
-    roi = examples.yml_text(padded) + "roi: {start line: 1, end line: 3, start sample: 8, end sample: 29}\n"
-    got = load_sweep(examples.write_package(tmp_path / "p", padded, yml=roi), GIVEN)
-    np.testing.assert_array_equal(got.frames[2], sweep.frames[2][1:4, 8:30])
-    first_mm = sweep.grid.first_sample_depth_mm + 8 * sweep.grid.sample_spacing_mm
-    assert got.grid.first_sample_depth_mm == pytest.approx(first_mm, rel=1e-12)
-
-
 def falling(sweep, shallow, deep):
     said = f"shallowfreq: {shallow} MHz, deepfreq: {deep} MHz, filterdepth: 40 mm"
     return examples.yml_text(sweep).split("focus:")[0] + f"focus:\n  - receive:\n      - {{{said}}}\n"

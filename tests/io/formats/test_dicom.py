@@ -84,9 +84,24 @@ def test_grey_in_three_colours_and_inverted(written):
     inverted = load_sweep(written(photometric="MONOCHROME1"), RANGE)
     np.testing.assert_array_equal(frames_of(inverted), 255 - cropped(images()))
     coloured[3, 12, 9] = 200, 100, 0
-    sweep = load_sweep(written(coloured, photometric="RGB"), RANGE)
-    with pytest.raises(InvalidInputError, match="frame 3"):
-        sweep.frames[3]
+    with pytest.raises(InvalidInputError, match="colour"):
+        load_sweep(written(coloured, photometric="RGB"), RANGE)
+
+
+@pytest.mark.parametrize("reference", [True, False])
+def test_columns_in_degrees_are_the_lines_of_a_fan(written, reference):
+    """Twenty columns of 2 degrees, the tenth straight down; the array's radius is asked for."""
+    polar = {"PhysicalUnitsXDirection": 12, "PhysicalDeltaX": 2.0, "ReferencePixelX0": 10}
+    polar |= {} if reference else {"ReferencePixelX0": None}
+    path = written(regions=[region(*BOX, **polar)])
+    with pytest.raises(MissingSettingsError) as caught:
+        load_sweep(path, RANGE)
+    angles = {} if reference else {"line_angles_deg": (-20.0, 18.0)}
+    assert set(caught.value.settings) == {"array_radius_mm", *angles}
+    sweep = load_sweep(path, RANGE.model_copy(update={"array_radius_mm": 45.0, **angles}))
+    np.testing.assert_array_equal(frames_of(sweep), cropped(images()))
+    assert (sweep.grid.fan.radius_mm, sweep.grid.first_sample_depth_mm) == (45.0, 2.5)
+    np.testing.assert_allclose(np.rad2deg(sweep.grid.angle_rad([0, 19])), [-20.0, 18.0])
 
 
 @pytest.mark.parametrize("kept", [0.5, 0.99])

@@ -48,6 +48,22 @@ def test_rf_with_coordinates(tmp_path):
     assert (sweep.probe, sweep.name) == ("L11-4v", "a")
 
 
+@pytest.mark.parametrize("radius_mm", [0.0, 40.0])
+def test_coordinates_on_a_polar_grid_are_the_lines_of_a_fan(tmp_path, radius_mm):
+    path = write_zea(tmp_path / "a.hdf5", rf(), scan={"bandwidth_percent": 50})
+    angle, along = np.linspace(-0.3, 0.2, VECTORS), radius_mm + FIRST_MM + SPACING_MM * np.arange(SAMPLES)
+    places = along[:, None] * np.sin(angle), along[:, None] * np.cos(angle) - radius_mm
+    with h5py.File(path, "a") as file:
+        for k, place in zip((0, 2), places, strict=True):
+            file[PLACES][..., k] = 1e-3 * place
+    sweep = load_sweep(path, GIVEN)
+    np.testing.assert_array_equal(frames_of(sweep), rf())
+    assert sweep.grid.fan.radius_mm == pytest.approx(radius_mm, abs=0.01)
+    assert sweep.grid.first_sample_depth_mm == pytest.approx(FIRST_MM, abs=0.01)
+    assert sweep.grid.sample_spacing_mm == pytest.approx(SPACING_MM, rel=1e-5)
+    np.testing.assert_allclose(sweep.grid.angle_rad([0, VECTORS - 1]), [-0.3, 0.2], atol=1e-5)
+
+
 @pytest.mark.parametrize(("carried", "middle"), [(0.0, 6e6), (6e6, 0.0)])
 def test_iq_that_carry_their_frequency_or_do_not_are_told_by_their_phase(tmp_path, carried, middle):
     frames = carrying(carried)
