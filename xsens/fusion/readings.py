@@ -9,6 +9,7 @@ import numpy as np
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from xsens.fusion.settings import BRIDGED_S, LOST
+from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import measured
 from xsens.logs.samples import ImuLog
@@ -22,9 +23,6 @@ PAUSE_S = 1.25 * BRIDGED_S
 FASTEST_RAD_S = 60.0
 """The widest range of the sensors' gyroscopes ends at 35 rad/s about an axis, and a hand's ordinary movement
 in deg/s exceeds 60."""
-
-_SHORTEST_S = 1e-4
-"""Mean step of no sensor: they end at 2 kHz."""
 
 _SHOWN_BY = 99.0
 """Percentile of the gyroscope's rates that shows another unit."""
@@ -128,9 +126,9 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         )
     steps_s = np.diff(log.time_s)
     median_s, fast = np.median(steps_s), np.percentile(np.linalg.norm(rate[turns], axis=1), _SHOWN_BY)
-    if median_s > 1.05 * BRIDGED_S or steps_s.mean() < _SHORTEST_S:  # a clock of 10 Hz, and jitter
+    if median_s > 1.05 * BRIDGED_S or steps_s.mean() < SHORTEST_S:  # a clock of 10 Hz, and jitter
         raise InvalidInputError(
-            f"{source}: expected samples {_SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
+            f"{source}: expected samples {SHORTEST_S:g} to {BRIDGED_S:g} s apart, got a median of "
             f"{median_s:.4g} s: times in milliseconds?"
         )
     require_metres(force[told], source)
@@ -211,6 +209,7 @@ def require_metres(force_m_s2: FloatArray, source: str) -> None:
     if not low < median < high:
         raise InvalidInputError(
             f"{source}: expected an accelerometer in m/s^2, with norm near 9.8, got a median of {median:.3g}"
+            + (": in g, without saying so?" if 0.9 < median < 1.1 else "")
         )
 
 

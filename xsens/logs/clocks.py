@@ -6,6 +6,7 @@ both anew: the length of that pause is known only from the computer's clock, if 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -22,6 +23,9 @@ UNKNOWN_PAUSE_S = 1.0
 _RATES_HZ = (1e-3, 1e5)
 """Sampling rates that a sensor may have: they end at 2 kHz."""
 
+SHORTEST_S = 4e-4
+"""No sensor's samples are closer: they end at 2 kHz."""
+
 _TICK_SPAN = 1 << 32
 _RARE = 0.01
 _LONGER, _MUCH_LONGER = 1.6, 10.0
@@ -32,7 +36,7 @@ _SHORTER = 0.6
 
 _MOST_PERIODS = 2.0**53
 
-_LATE = 64
+LATE = 64
 """A sample that comes at most so many samples late was overtaken, whatever follows."""
 
 _OVERTAKINGS = 100
@@ -98,6 +102,28 @@ def require_rate(rate_hz: float, what: str) -> None:
         raise InvalidInputError(f"{what}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
 
 
+def spread(stamps: Stamps, readings: Sequence[FloatArray | None]) -> tuple[Stamps, tuple[str, ...]]:
+    """Spread samples that came together, stamped on arrival, over the time since those before; a note on it.
+
+    Rows of readings that repeat the one before are the same sample, sent twice.
+    """
+    if stamps.time_s is None or stamps.time_s.size < 2:
+        return stamps, ()
+    steps = np.diff(stamps.time_s)
+    together = (steps >= 0.0) & (steps < SHORTEST_S)
+    others = np.any([(rows[1:] != rows[:-1]).any(axis=1) for rows in readings if rows is not None], axis=0)
+    if together.all() or 2 * (together & others).sum() <= steps.size:
+        return stamps, ()
+    first = np.flatnonzero(np.append(True, ~together))
+    counts, arrived_s = np.diff(np.append(first, steps.size + 1)), stamps.time_s[first]
+    spans = np.diff(arrived_s, prepend=np.nan) / counts
+    period_s = np.fmin(spans, _LONGER * np.nanmedian(spans))
+    before = np.repeat(first + counts - 1, counts) - np.arange(steps.size + 1)
+    time_s = np.repeat(arrived_s, counts) - before * np.repeat(period_s, counts)
+    note = f"{counts.size} stamps for {time_s.size} samples: spread evenly between stamps"
+    return replace(stamps, time_s=time_s), (note,)
+
+
 def timeline(stamps: Stamps) -> Timeline:
     """Rebuild the times of samples from their stamps.
 
@@ -156,7 +182,7 @@ def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
         steps = (np.diff(values) + span // 2) % span - span // 2
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
     anew, key = np.zeros(values.size, dtype=bool), _summed(steps)
-    back = np.flatnonzero(steps < -_LATE * usual)
+    back = np.flatnonzero(steps < -LATE * usual)
     anew[back + 1] = True
     for i in back[:_OVERTAKINGS].tolist():
         there = key[i + 1 :] > key[i]
@@ -168,7 +194,7 @@ def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
     anew[0] = False
     if stamps.time_s is not None and not anew.any():
         return values, anew
-    steps[anew[1:]] = _LATE * usual
+    steps[anew[1:]] = LATE * usual
     return _summed(steps), anew
 
 

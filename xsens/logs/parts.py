@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import FloatArray
-from xsens.logs.clocks import Stamps, require_rate, timeline
+from xsens.logs.clocks import Stamps, require_rate, spread, timeline
 from xsens.logs.faults import measured
 from xsens.logs.samples import ImuLog
 from xsens.logs.worlds import Claim, nwu_from, quaternions_of, world_of
@@ -98,6 +98,8 @@ def assembled(parts: Parts, hints: Hints, source: str) -> ImuLog:
         own = nwu_from(world) * Rotation.from_quat(np.where(there[:, None], wxyz, 0.5), scalar_first=True)
         if not there.all():
             notes.append(f"{int((~there).sum())} samples lack the sensor's own orientation")
+    stamps, shared = spread(stamps, (*parts.vectors, rows))
+    notes += shared
     line = timeline(stamps)
     force, rate, field = (None if vectors is None else vectors[line.rows] for vectors in parts.vectors)
     log = ImuLog(

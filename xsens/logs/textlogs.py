@@ -19,10 +19,19 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
-from xsens.logs.clocks import Stamps
+from xsens.logs.clocks import SHORTEST_S, Stamps
 from xsens.logs.parts import Hints, Parts, assembled
 from xsens.logs.samples import VECTORS, ImuLog
-from xsens.logs.texttables import Names, TextTable, column_of, not_understood, number, read_table
+from xsens.logs.texttables import (
+    STAMPS,
+    TIMES,
+    Names,
+    TextTable,
+    column_of,
+    not_understood,
+    number,
+    read_table,
+)
 from xsens.logs.worlds import Claim, are_rotations
 
 _SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
@@ -49,7 +58,7 @@ followed."""
 
 _VECTORS = [[f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag")]
 _EULER = ["euler_roll", "euler_pitch", "euler_yaw"]
-_MATRIX = [f"mat_{row}{column}" for row in "123" for column in "123"]
+_MATRIX = [f"mat_{row}_{column}" for row in "123" for column in "123"]
 _QUATERNION, _OPTICAL = ([f"{source}_{axis}" for axis in "wxyz"] for source in ("quat", "optical"))
 
 
@@ -93,8 +102,13 @@ def _mt9_export(table: TextTable) -> TextTable:
 
 def _samples(table: TextTable) -> Parts:
     """Samples of a table whose columns are known."""
-    timed, columns, notes = np.ones(len(table.rows), dtype=bool), table.columns, list[str]()
-    stamps = columns.keys() & {"counter", "ticks", "time"}
+    timed, columns, notes = np.ones(len(table.rows), dtype=bool), dict(table.columns), list[str]()
+    stamps = columns.keys() & set(STAMPS)
+    if "time" in stamps and table.names and "time" not in table.stated:
+        unit, scale = _unit_of(columns["time"])
+        columns["time"] = columns["time"] * scale
+        if unit != "s":
+            notes.append(f"times without a unit: taken as in {unit}, by their steps")
     for key in stamps:
         with np.errstate(invalid="ignore"):
             whole = (columns[key] >= 0.0) & (columns[key] < 2.0**53) & (columns[key] % 1.0 == 0.0)
@@ -135,6 +149,16 @@ def _samples(table: TextTable) -> Parts:
     span, tick_s = (1 << 32, _DOT_TICK_S) if dot else (1 << 16, _TICK_S)
     sent = Stamps(counter, ticks, span, tick_s, period_s, time_s=columns.get("time"))
     return Parts(sent, (force, rate, field), own, claim, (*odd, *notes))
+
+
+def _unit_of(times: FloatArray) -> tuple[str, float]:
+    """Unit of times that makes their steps a sensor's, and that unit in s."""
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else float("nan")
+    for unit, scale in TIMES.items():
+        if SHORTEST_S <= usual * scale <= 1.0 / _SLOWEST_HZ:
+            return unit, scale
+    raise InvalidInputError(f"expected a time with its unit, as time_s or time_ms, got steps of {usual:g}")
 
 
 def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:

@@ -5,10 +5,13 @@ Cells without a number are NaN, lines of another length are left out.
 
 from __future__ import annotations
 
+import csv
 import re
 from array import array
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import chain
 
 import numpy as np
@@ -16,10 +19,11 @@ from scipy.constants import g
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
+from xsens.logs.clocks import LATE
 
 Names = tuple[str, ...]
 
-_SEPARATORS = ("\t", ";", ",", None)
+_SEPARATORS = ("\t", ";", "|", ",", None)
 """In order of trust: a tab only separates, a comma may be a decimal point, blanks (None) may be padding."""
 
 _LONGEST_HEADER = 64
@@ -27,36 +31,65 @@ _LONGEST_HEADER = 64
 
 _COMMENT = "#"
 _DIGIT = re.compile("[0-9]")
-_LIKE_NAMES = re.compile(r"(?:[a-z°²µ_][\w .()\[\]/^°²µ-]*|)$")
+_LIKE_NAMES = re.compile(r"(?:[a-z°²µ_%][\w .()\[\]/^°²µ-]*|)$")
 _AXES = frozenset("wxyzs")
 """Second line of names; s is the unit of a time."""
 
 # -- names of columns
 
 _DEG = 0.017453292519943295
-_UNITS = {
-    "acc": {"m_s2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g},
-    "gyr": {"rad_s": 1.0, "deg_s": _DEG, "dps": _DEG, "°_s": _DEG, "mdps": 1e-3 * _DEG, "mrad_s": 1e-3},
-    "mag": dict.fromkeys(("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss"), 1.0),
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
-}
-"""Units by quantity; the field stays in the unit it is in."""
-
-_VECTOR = re.compile(r"(?:imu )?(acc|gyr|mag)[a-z ]*[ _.]?([xyz])(?![a-z])\W*_?(.*?)\W*$", re.ASCII)
-_TIME = re.compile(r"time(?:[ _]?stamp)?[ _(\[/]+([a-zµ]+)[)\]]?$")
-_OTHERS = (
-    ("counter", re.compile(r"(?:packet)?counter$")),
-    ("ticks", re.compile(r"sampletimefine$")),
-    ("quat_{}", re.compile(r"quat(?:ernion)?_(?:q)?([wxyz0-3])$")),
-    ("optical_{}", re.compile(r"vicon orientation_([wxyz])$")),
-    ("euler_{}", re.compile(r"euler_([xyz])$|(roll|pitch|yaw)$")),
-    ("mat_{}{}", re.compile(r"mat\[([1-3])\]\[([1-3])\]$")),
+_FIELD_UNITS = ("au", "a_u", "ut", "µt", "nt", "mt", "t", "gauss", "g", "mgauss", "local_flux")
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_COLUMNS = (
+    ("acc", "(?:linear_)?acc(?:el(?:eration|erometer)?)?|a", "[xyz]"),
+    ("gyr", "gyro?(?:scope)?|angular_(?:velocity|rate)|[gw]", "[xyz]"),
+    ("mag", "mag(?:n|neto|netometer|netic)?(?:_field)?|m", "[xyz]"),
+    ("quat", "quat(?:ernion)?(?:_?q)?|q|orientation", "[wxyz0-3]"),
+    ("euler", "(?:euler)?", "roll|pitch|yaw|(?<=euler_)[xyz]"),
+    ("mat", "mat", "[1-3]_[1-3]"),
+    ("optical", "vicon_orientation", "[wxyz]"),
+    ("time", "time(?:_?stamp)?|ts?|epoch|elapsed", ""),
+    ("counter", "(?:packet)?counter|frame_?number", ""),
+    ("ticks", "sampletimefine", ""),
 )
+"""Quantity, its names with other characters than letters and digits as underscores, and those of its axes."""
+
+_PATTERNS = [
+    (
+        quantity,
+        re.compile(
+            rf"(?:(?:imu|field|sensor|shimmer)_)*(?:{names})(?:_rs_s|_ln|_wr|_unix)?_?({axes})(?:_cal)?(?:_(.+))?$"
+        ),
+    )
+    for quantity, names, axes in _COLUMNS
+]
+_UNITS = {
+    "acc": {"m_s2": 1.0, "m_s_2": 1.0, "m_s_s": 1.0, "g": g, "mg": 1e-3 * g},
+    "gyr": {
+        "rad_s": 1.0,
+        "rad_s_1": 1.0,
+        "deg_s": _DEG,
+        "dps": _DEG,
+        "°_s": _DEG,
+        "mdps": 1e-3 * _DEG,
+        "mrad_s": 1e-3,
+    },
+    "mag": dict.fromkeys(_FIELD_UNITS, 1.0),
+    "euler": {"deg": 1.0, "degrees": 1.0, "°": 1.0, "rad": 1.0 / _DEG},
+    "time": TIMES,
+}
+"""Units by quantity; the field stays in the unit it is in, and angles are in degrees."""
+
 _SAME = {
-    "quat_{}": {"0": "w", "1": "x", "2": "y", "3": "z"},
-    "euler_{}": {"x": "roll", "y": "pitch", "z": "yaw"},
+    "quat": {"0": "w", "1": "x", "2": "y", "3": "z"},
+    "euler": {"x": "roll", "y": "pitch", "z": "yaw"},
 }
 """Names of one axis."""
+
+STAMPS = ("time", "counter", "ticks")
+
+_SPANS = (1 << 8, 1 << 10, 1 << 12, 1 << 16, 86400, 1 << 32)
+"""At which counters and clocks wrap round: words of so many bits, and midnight."""
 
 _WHOSE = re.compile(
     r"(?:sensor|device|imu|node|unit)[ _]?(?:id|name|no|nr|number|tag|serial)?$"
@@ -70,18 +103,15 @@ def column_of(name: str) -> tuple[str, float | None] | None:
 
     With it comes what turns its numbers to SI units, None if the name states no unit.
     """
-    if match := _VECTOR.match(name):
-        quantity, axis, unit = match.groups()
-        unit = re.sub(r"[/^*·. ]+", "_", unit.replace("²", "2").replace("^2", "2")).strip("_")
-        if unit and unit not in _UNITS[quantity]:
-            return None
-        return f"{quantity}_{axis}", _UNITS[quantity][unit] if unit else None
-    if match := _TIME.match(name):
-        return ("time", _UNITS["time"][match[1]]) if match[1] in _UNITS["time"] else None
-    for key, pattern in _OTHERS:
-        if match := pattern.match(name):
-            parts = filter(None, match.groups())
-            return key.format(*(_SAME.get(key, {}).get(part, part) for part in parts)), None
+    words = re.sub(r"[^a-z0-9°µ]+", "_", name.replace("²", "2")).strip("_")
+    for quantity, pattern in _PATTERNS:
+        if match := pattern.match(words):
+            axis, unit = match.groups()
+            scale = _UNITS.get(quantity, {}).get(unit)
+            if unit and scale is None:
+                return None
+            axis = _SAME.get(quantity, {}).get(axis, axis)
+            return (f"{quantity}_{axis}" if axis else quantity), scale
     return None
 
 
@@ -130,14 +160,16 @@ def read_table(lines: Iterable[str]) -> TextTable:
         for separator in () if comment else _SEPARATORS:
             cells, above = _cells(line, separator), _cells(header[-1], separator)
             for names in (cells, _of_two_lines(above, cells)):
-                if sum(column_of(name) is not None for name in names) >= 2:
+                if _known(names) >= 2:
                     return _named(lines, tuple(header[1:]), names, separator)
             if len(cells) >= 4 and all(cell == "nan" or number(cell) == number(cell) for cell in cells):
                 for split in _SEPARATORS:  # a line above numbers may name their columns
-                    names = tuple(cell.strip(' "#') for cell in _cells(header[-1], split))
+                    names = tuple(cell.strip(' "#%') for cell in _cells(header[-1], split))
                     if len(names) == len(cells) and any(names) and all(map(_LIKE_NAMES.match, names)):
+                        if _known(names) >= 2:
+                            return _named(chain([line], lines), tuple(header[1:]), names, separator)
                         raise InvalidInputError(not_understood(names))
-                return _rows(chain([line], lines), tuple(header[1:]), (), separator, len(cells))
+                return _rows(chain([line], lines), tuple(header[1:]), (), {}, separator, len(cells))
         header.append(line.rstrip("\n"))
         count += not comment
         if count > _LONGEST_HEADER:
@@ -146,15 +178,33 @@ def read_table(lines: Iterable[str]) -> TextTable:
 
 
 def number(cell: str) -> float:
-    """The number in a cell, whose decimal point may be a comma; NaN if it is none."""
-    try:
-        return float(cell.strip().strip('"').replace(",", "."))
-    except ValueError:
-        return float("nan")
+    """The number in a cell, or the seconds of a date and time or a time of day; NaN if it is none.
+
+    A decimal point may be a comma.
+    """
+    cell = cell.strip().strip('"')
+    with suppress(ValueError):
+        return float(cell.replace(",", "."))
+    for text in (cell, f"1970-01-01T{cell}"):
+        with suppress(ValueError):
+            moment = datetime.fromisoformat(text)
+            return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    return float("nan")
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    line = line.rstrip("\r\n")
+    if '"' in line and separator:
+        return next(csv.reader([line], delimiter=separator))
+    return line.split(separator)
 
 
 def _cells(line: str, separator: str | None) -> Names:
-    return tuple(cell.strip().strip('"').lower() for cell in line.split(separator))
+    return tuple(cell.strip().strip('"').lower() for cell in _split(line, separator))
+
+
+def _known(names: Names) -> int:
+    return sum(column_of(name) is not None for name in names)
 
 
 def _of_two_lines(groups: Names, axes: Names) -> Names:
@@ -165,47 +215,65 @@ def _of_two_lines(groups: Names, axes: Names) -> Names:
     for above, axis in zip(groups, axes, strict=True):
         group = above or group
         names.append(f"{group}_{axis}" if axis in _AXES else above)
-    while not names[-1]:  # what a separator at the end of the line makes
-        names.pop()
     return tuple(names)
 
 
 def _named(lines: Iterator[str], header: Names, names: Names, separator: str | None) -> TextTable:
-    first = next((line for line in lines if line.strip("\r\n") and _DIGIT.search(line)), "")
+    while not names[-1]:  # what a separator at the end of the line makes
+        names = names[:-1]
+    lines = (line for line in lines if line.strip("\r\n"))
+    first = next(lines, "")
+    cells = _cells(first, separator)
+    if len(cells) == len(names) and not any(number(cell) == number(cell) for cell in cells):
+        joined = tuple(f"{name} {unit}" for name, unit in zip(names, cells, strict=True))
+        if _known(joined):  # a line of units
+            pairs = zip(names, joined, strict=True)
+            names, first = tuple(both if column_of(both) else name for name, both in pairs), next(lines, "")
     blanks = tuple(part for name in names for part in name.split())
-    if len(names) != len(_cells(first, separator)) == len(blanks):  # a blank where a tab should be
+    if len(names) != len(cells) == len(blanks):  # a blank where a tab should be
         names = blanks
-    keys: dict[str, str] = {}
-    for name in names:
-        key = (column_of(name) or ("",))[0]
-        if key not in ("", "counter") and key in keys:
+    columns: dict[str, tuple[int, float | None]] = {}
+    for i, name in enumerate(names):
+        if (column := column_of(name)) is None:
+            continue
+        key, scale = column
+        if key in columns and key not in ("counter", "time"):
             raise InvalidInputError(
-                f"expected the columns of one sensor, got two of {key}: {keys[key]}, {name}"
+                f"expected the columns of one sensor, got two of {key}: {names[columns[key][0]]}, {name}"
             )
-        keys[key] = name
-    return _rows(chain([first], lines), header, names, separator, len(names))
+        if key not in columns or columns[key][1] is None:  # of several times, one with its unit
+            columns[key] = i, scale
+    return _rows(chain([first], lines), header, names, columns, separator, len(names))
 
 
-def _rows(lines: Iterable[str], header: Names, names: Names, separator: str | None, count: int) -> TextTable:
+def _rows(
+    lines: Iterable[str],
+    header: Names,
+    names: Names,
+    columns: dict[str, tuple[int, float | None]],
+    separator: str | None,
+    count: int,
+) -> TextTable:
     """Read the columns that are understood, or all if none has a name."""
-    known = {i: column for i, name in enumerate(names) if (column := column_of(name)) is not None}
-    kept = list(known) or range(count)
+    which = [i for i, _ in columns.values()] or range(count)
     sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
     values, left_out, words = array("d"), 0, 0
     for line in lines:
         if not line.strip("\r\n"):
             continue
-        cells = (line if separator == "," else line.replace(",", ".")).split(separator)
+        cells = _split(line if separator == "," else line.replace(",", "."), separator)
+        while len(cells) > count and not cells[-1].strip():
+            cells.pop()
         if len(cells) != count or not _DIGIT.search(line):
             left_out += 1
             continue
         for i, ids in sensors.items():
             ids[cells[i].strip()] = None
         try:
-            values.extend([float(cells[i]) for i in kept])
-        except ValueError:  # quoted, blank, or a word
-            row = [number(cells[i]) for i in kept]
-            blank = [cells[i].strip().lower() in ("", "nan") for i in kept]
+            values.extend([float(cells[i]) for i in which])
+        except ValueError:  # quoted, blank, a time, or a word
+            row = [number(cells[i]) for i in which]
+            blank = [cells[i].strip().lower() in ("", "nan") for i in which]
             words += int(np.sum(np.isnan(row) & ~np.array(blank)))
             values.extend(row)
     if not values:
@@ -223,12 +291,25 @@ def _rows(lines: Iterable[str], header: Names, names: Names, separator: str | No
         notes.append(f"{left_out} lines of another length or without a digit were left out")
     if words:
         notes.append(f"{words} cells hold something else than a number: missing")
-    rows = np.frombuffer(values).reshape(-1, len(kept))
-    with np.errstate(over="ignore"):  # damage, which is left out as no measurement
-        columns = {
-            key: column * (scale or 1.0)
-            for (key, scale), column in zip(known.values(), rows.T, strict=False)
-            if np.isfinite(column).any()
-        }
-    stated = frozenset(key for key, scale in known.values() if scale is not None)
-    return TextTable(header, names, columns, stated, rows, tuple(notes))
+    rows, quantities = np.frombuffer(values).reshape(-1, len(which)), {}
+    for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=False):
+        if np.isfinite(column).any():
+            with np.errstate(over="ignore"):  # damage, which is left out as no measurement
+                quantities[key] = (unwrapped(column) if key in STAMPS else column) * (scale or 1.0)
+    stated = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
+    return TextTable(header, names, quantities, stated, rows, tuple(notes))
+
+
+def unwrapped(column: FloatArray) -> FloatArray:
+    """A counter or clock made to rise where it wraps round, as `_SPANS` have it; any other as it is."""
+    known = np.isfinite(column)
+    steps = np.diff(column[known])
+    for span in _SPANS:
+        falls = steps < -0.5 * span
+        if falls.any() and column[known].max() < span:
+            around = (steps + 0.5 * span) % span - 0.5 * span
+            if (np.abs(around[falls]) <= LATE * np.median(steps[steps > 0.0])).all():
+                rising = column.copy()
+                rising[known] = np.append(0.0, np.cumsum(around)) + column[known][0]
+                return rising
+    return column
