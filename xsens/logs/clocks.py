@@ -1,6 +1,6 @@
 """Rebuild the times of samples and find missing ones from the sensor's counter and clock.
 
-A counter of 16 bits and a clock of 32 bits wrap round; both are unwrapped. A sensor that was unplugged starts
+Counter and clock wrap round; both are unwrapped. A sensor that was unplugged starts
 both anew: the length of that pause is known only from the computer's clock, if the recording holds it.
 """
 
@@ -26,7 +26,9 @@ _RATES_HZ = (1e-3, 1e5)
 SHORTEST_S = 4e-4
 """No sensor's samples are closer: they end at 2 kHz."""
 
-_TICK_SPAN = 1 << 32
+COUNTS, TICKS, TICK_S = 1 << 16, 1 << 32, 1e-4
+"""Where the sensors' counter and clock wrap round, and the clock's unit."""
+
 _RARE = 0.01
 _LONGER, _MUCH_LONGER = 1.6, 10.0
 """A clock step of more periods is a gap; the latter if the clock is irregular."""
@@ -52,10 +54,10 @@ class Stamps:
 
     Attributes
     ----------
-    counter, ticks : ndarray of int, shape (m,), optional
-        As sent, wrapping round: the counter at `counter_span`, the ticks, of `tick_s` each, at 2**32.
+    counter : ndarray of int, shape (m,), optional
+        As `unwrapped` has it.
     time_s : ndarray, shape (m,), optional
-        Times, in place of ticks.
+        By the sensor's clock, likewise.
     period_s : float
         Sampling period as configured or stated; NaN if not known.
     others : ndarray of int, shape (m,), optional
@@ -67,14 +69,11 @@ class Stamps:
     """
 
     counter: IntArray | None = None
-    ticks: IntArray | None = None
-    counter_span: int = 1 << 16
-    tick_s: float = 1e-4
+    time_s: FloatArray | None = None
     period_s: float = float("nan")
     others: IntArray | None = None
     starts: BoolArray | None = None
     computer_s: FloatArray | None = None
-    time_s: FloatArray | None = None
 
     def __getitem__(self, which: Any) -> Stamps:
         arrays: dict[str, Any] = {k: v[which] for k, v in vars(self).items() if isinstance(v, np.ndarray)}
@@ -100,6 +99,12 @@ def require_rate(rate_hz: float, what: str) -> None:
     low, high = _RATES_HZ
     if not low <= rate_hz <= high:
         raise InvalidInputError(f"{what}: expected {low:g} to {high:g} Hz, got {rate_hz:g}")
+
+
+def unwrapped(values: Any, span: int) -> Any:
+    """Numbers of a counter or clock that wraps round at a span, going on beyond it."""
+    steps = (np.diff(values) + span // 2) % span - span // 2
+    return values[0] + _summed(steps)
 
 
 def spread(stamps: Stamps, readings: Sequence[FloatArray | None]) -> tuple[Stamps, tuple[str, ...]]:
@@ -137,7 +142,7 @@ def timeline(stamps: Stamps) -> Timeline:
     """
     if stamps.time_s is None and stamps.period_s > 0.0:
         require_rate(1.0 / stamps.period_s, "sampling rate")
-    elif stamps.time_s is None and stamps.ticks is None:
+    elif stamps.time_s is None:
         got = "neither" if stamps.counter is None else "a counter, but no rate"
         raise InvalidInputError(
             f"expected samples with a clock, or with a sampling rate, got {got}: give --rate-hz"
@@ -168,54 +173,46 @@ def _summed(steps: Any) -> Any:
 
 
 def _rising(stamps: Stamps) -> tuple[Any, BoolArray]:
-    """Times, or else ticks, or else counts, made to rise by their span and at new starts; new starts.
+    """Times, or else counts, made to rise at new starts; new starts.
 
     A step far back shows a new start, unless those overtaken were followed by a jump forward to where it was.
     """
-    if stamps.time_s is not None:
-        values: Any = stamps.time_s
-        steps = np.diff(values)
-    else:
-        values, span = stamps.ticks, _TICK_SPAN
-        if values is None:
-            values, span = stamps.counter, stamps.counter_span
-        steps = (np.diff(values) + span // 2) % span - span // 2
+    values: Any = stamps.counter if stamps.time_s is None else stamps.time_s
+    steps = np.diff(values)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-    anew, key = np.zeros(values.size, dtype=bool), _summed(steps)
+    anew = np.zeros(values.size, dtype=bool)
     back = np.flatnonzero(steps < -LATE * usual)
     anew[back + 1] = True
     for i in back[:_OVERTAKINGS].tolist():
-        there = key[i + 1 :] > key[i]
+        there = values[i + 1 :] > values[i]
         anew[i + 1] = not there.any() or steps[i + int(np.argmax(there))] < _LONGER * usual
-    if stamps.ticks is None and stamps.time_s is None and stamps.starts is not None:
+    if stamps.time_s is None and stamps.starts is not None:
         anew |= stamps.starts
     elif stamps.computer_s is not None:
         anew |= np.isfinite(stamps.computer_s)
     anew[0] = False
-    if stamps.time_s is not None and not anew.any():
-        return values, anew
-    steps[anew[1:]] = LATE * usual
-    return _summed(steps), anew
+    if anew.any():
+        steps[anew[1:]] = LATE * usual
+        values = _summed(steps)
+    return values, anew
 
 
 def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Timeline:
     """Times, rising counter and gaps of samples in order, without repeats."""
-    period_s, irregular, counts = stamps.period_s, False, None
+    period_s, irregular, taken = stamps.period_s, False, None
     if stamps.counter is not None:
-        counts = np.diff(stamps.counter) % stamps.counter_span
-    if stamps.time_s is None and stamps.ticks is None:
-        assert counts is not None  # one of the three is there
+        counts = np.diff(stamps.counter)
         taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
-        seconds = taken * period_s
-    else:
-        seconds = np.diff(key) * (1.0 if stamps.time_s is not None else stamps.tick_s)
-        if stamps.time_s is not None or not period_s > 0.0:
-            period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
-        if counts is None:
+    if stamps.time_s is not None:
+        seconds = np.diff(key)
+        period_s = float(np.median(seconds[~anew])) if (~anew).any() else float("nan")
+        if taken is None:
             taken, irregular = _by_clock(seconds, anew)
         else:
-            taken = _by_counter(counts if stamps.others is None else counts - np.diff(stamps.others), anew)
             _require_agreement(seconds[~anew], counts[~anew], 1.0 / stamps.period_s)
+    else:
+        assert taken is not None  # there is a clock or a counter
+        seconds = taken * period_s
     if irregular:
         shortest, longest = 1e3 * seconds.min(), 1e3 * seconds.max()
         notes.append(
@@ -233,14 +230,11 @@ def _spaced(stamps: Stamps, key: Any, anew: BoolArray, notes: list[str]) -> Time
     at = np.flatnonzero((taken > 1.5) | anew | long)
     missing = np.where(anew[at], 0, np.round(np.minimum(taken[at], _MOST_PERIODS)) - 1)
     gaps = tuple(Gap(int(i), int(lost), float(seconds[i])) for i, lost in zip(at, missing, strict=True))
-    time_s = stamps.time_s
+    time_s, counter = stamps.time_s, stamps.counter
     if time_s is None or anew.any():
-        first_s = 0.0 if stamps.ticks is None else float(stamps.ticks[0]) * stamps.tick_s
-        first_s = first_s if time_s is None else float(time_s[0])
-        time_s = first_s + _summed(seconds)
-    counter = None
-    if stamps.counter is not None and counts is not None:
-        counter = stamps.counter[0] + _summed(counts)
+        time_s = (0.0 if time_s is None else time_s[0]) + _summed(seconds)
+    if counter is not None:
+        counter = counter[0] + _summed(np.maximum(counts, 1))
     return Timeline(slice(None), time_s, counter, gaps, tuple(notes))
 
 

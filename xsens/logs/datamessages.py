@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import Stamps
+from xsens.logs.clocks import COUNTS, TICK_S, TICKS, Stamps, unwrapped
 from xsens.logs.faults import saturated
 from xsens.logs.parts import Parts
 from xsens.logs.samples import VECTORS
@@ -87,7 +87,7 @@ def legacy_samples(frames: Frames, which: IntArray) -> Parts:
         replace(
             _stretches(frames, which),
             period_s=1.0 / rate_hz,
-            counter=None if counter is None else counter[:, 0].astype(np.int64),
+            counter=None if counter is None else unwrapped(counter[:, 0].astype(np.int64), COUNTS),
         ),
         tuple(map(values.get, VECTORS)),
         next((values[name] for name in _NOTATIONS if name in values), None),
@@ -148,7 +148,10 @@ def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
         notes.append(f"{(~rows).sum()} messages without a measurement or its time are no samples")
         items = {name: values[rows] for name, values in items.items()}
         others, which = np.cumsum(~rows, dtype=np.int64)[rows], which[rows]
-    counter, ticks = (None if stamp is None else stamp[rows, 0].astype(np.int64) for stamp in stamps)
+    counter, ticks = (
+        None if stamp is None else unwrapped(stamp[rows, 0].astype(np.int64), span)
+        for stamp, span in zip(stamps, (COUNTS, TICKS), strict=True)
+    )
     force, rate = items.get("acceleration_m_s2"), items.get("rate_of_turn_rad_s")
     increments = []
     if force is None and (force := items.get("delta_v_m_s")) is not None:
@@ -163,7 +166,12 @@ def mtdata2_samples(frames: Frames, which: IntArray) -> Parts:
     if own is not None and notation == ORIENTATIONS[1]:
         own = own.reshape(-1, 3, 3).swapaxes(1, 2).reshape(-1, 9)
     return Parts(
-        replace(_stretches(frames, which), counter=counter, ticks=ticks, others=others),
+        replace(
+            _stretches(frames, which),
+            counter=counter,
+            time_s=None if ticks is None else ticks * TICK_S,
+            others=others,
+        ),
         (force, rate, items.get("magnetic_field_au")),
         own,
         Claim(world or "NWU", "as its messages say"),

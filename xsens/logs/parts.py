@@ -81,10 +81,10 @@ def assembled(parts: Parts, hints: Hints, source: str) -> ImuLog:
     stamps, notes, rows = parts.stamps, list(parts.notes), parts.orientations
     if hints.rate_hz is not None:
         stamps = replace(stamps, period_s=1.0 / hints.rate_hz)
-    counted = stamps.counter is not None or stamps.ticks is not None
+    counted = stamps.counter is not None
     if not counted and stamps.time_s is None and stamps.period_s > 0.0:
         samples = next(len(v) for v in (stamps.starts, *parts.vectors, rows) if v is not None)
-        stamps = replace(stamps, counter=np.arange(samples), counter_span=1 << 62)
+        stamps = replace(stamps, counter=np.arange(samples))
         notes.append("samples have no counter: losses cannot be found")
     own, there = None, np.zeros(0, dtype=bool)
     if rows is not None:

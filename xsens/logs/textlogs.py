@@ -19,7 +19,7 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError, naming
 from speckle3d.core.parts import whole_file
-from xsens.logs.clocks import SHORTEST_S, Stamps
+from xsens.logs.clocks import COUNTS, SHORTEST_S, TICK_S, TICKS, Stamps, unwrapped
 from xsens.logs.parts import Hints, Parts, assembled
 from xsens.logs.samples import VECTORS, ImuLog
 from xsens.logs.texttables import (
@@ -49,8 +49,8 @@ _WORLDS = (
 _ENOUGH = 1000
 """Lines that show whether nine numbers are a matrix."""
 
-_TICK_S, _DOT_TICK_S = 1e-4, 1e-6
-"""Ticks of MT Manager's clock, and of a DOT's."""
+_DOT_TICK_S = 1e-6
+"""Ticks of a DOT's clock."""
 
 _SLOWEST_HZ = 5.0
 """An MT Manager's clock by which samples come more slowly is a DOT's: at 5 Hz no hand's movement can be
@@ -118,13 +118,15 @@ def _samples(table: TextTable) -> Parts:
     if not timed.all():
         notes.append(f"{(~timed).sum()} lines without a time were left out")
         columns = {key: column[timed] for key, column in columns.items()}
-    counter, ticks = (
-        columns[key].astype(np.int64) if key in stamps else None for key in ("counter", "ticks")
-    )
+    counter, ticks, time_s = (columns.get(key) for key in ("counter", "ticks", "time"))
     dot = any("devicetag" in line.lower() for line in table.header)
-    if not dot and "time" not in stamps and _ticks_of_dot(counter, ticks):
+    if not dot and time_s is None and _ticks_of_dot(counter, ticks):
         dot = True
         notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
+    if counter is not None:
+        counter = unwrapped(counter.astype(np.int64), TICKS if dot else COUNTS)
+    if ticks is not None and time_s is None:
+        time_s = unwrapped(ticks.astype(np.int64), TICKS) * (_DOT_TICK_S if dot else TICK_S)
     force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
     if rate is not None and dot and "gyr_x" not in table.stated:
         rate = np.deg2rad(rate)
@@ -146,8 +148,7 @@ def _samples(table: TextTable) -> Parts:
     stated = _RATE.search("\n".join(table.header))
     rate_hz = number(stated[1]) if stated else float("nan")
     period_s = 1.0 / rate_hz if rate_hz > 0.0 else float("nan")
-    span, tick_s = (1 << 32, _DOT_TICK_S) if dot else (1 << 16, _TICK_S)
-    sent = Stamps(counter, ticks, span, tick_s, period_s, time_s=columns.get("time"))
+    sent = Stamps(counter, time_s, period_s)
     return Parts(sent, (force, rate, field), own, claim, (*odd, *notes))
 
 
@@ -184,7 +185,7 @@ def _ticks_of_dot(counter: IntArray | None, ticks: IntArray | None) -> bool:
         return False
     steps = np.diff(ticks) % (1 << 32)
     counts = np.ones(steps.size) if counter is None else np.maximum(np.diff(counter), 1)
-    return bool(np.median(steps / counts) * _TICK_S > 1.0 / _SLOWEST_HZ)
+    return bool(np.median(steps / counts) * TICK_S > 1.0 / _SLOWEST_HZ)
 
 
 def _not_understood(table: TextTable, plain: bool) -> Names:

@@ -19,7 +19,7 @@ from scipy.constants import g
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.clocks import LATE
+from xsens.logs.clocks import COUNTS, LATE, TICKS, unwrapped
 
 Names = tuple[str, ...]
 
@@ -88,7 +88,7 @@ _SAME = {
 
 STAMPS = ("time", "counter", "ticks")
 
-_SPANS = (1 << 8, 1 << 10, 1 << 12, 1 << 16, 86400, 1 << 32)
+_SPANS = (1 << 8, 1 << 10, 1 << 12, COUNTS, 86400, TICKS)
 """At which counters and clocks wrap round: words of so many bits, and midnight."""
 
 _WHOSE = re.compile(
@@ -295,21 +295,20 @@ def _rows(
     for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=False):
         if np.isfinite(column).any():
             with np.errstate(over="ignore"):  # damage, which is left out as no measurement
-                quantities[key] = (unwrapped(column) if key in STAMPS else column) * (scale or 1.0)
+                quantities[key] = (_risen(column) if key in STAMPS else column) * (scale or 1.0)
     stated = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
     return TextTable(header, names, quantities, stated, rows, tuple(notes))
 
 
-def unwrapped(column: FloatArray) -> FloatArray:
-    """A counter or clock made to rise where it wraps round, as `_SPANS` have it; any other as it is."""
+def _risen(column: FloatArray) -> FloatArray:
+    """A counter or clock unwrapped where it wraps round as `_SPANS` have it; any other as it is."""
     known = np.isfinite(column)
     steps = np.diff(column[known])
     for span in _SPANS:
         falls = steps < -0.5 * span
         if falls.any() and column[known].max() < span:
-            around = (steps + 0.5 * span) % span - 0.5 * span
-            if (np.abs(around[falls]) <= LATE * np.median(steps[steps > 0.0])).all():
-                rising = column.copy()
-                rising[known] = np.append(0.0, np.cumsum(around)) + column[known][0]
+            rising = column.copy()
+            rising[known] = unwrapped(column[known], span)
+            if np.diff(rising[known])[falls].max() <= LATE * np.median(steps[steps > 0.0]):
                 return rising
     return column
