@@ -11,6 +11,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation import inclination as kernel
+from speckle3d.kernels.orientation.smoothing import orient_samples, smooth_steps
 from xsens.fusion.heading import UNKNOWN, HeadingFilter, averaged_bins, lasts_of_bins, steps_per_bin
 from xsens.fusion.readings import Estimate, Samples, turned
 from xsens.fusion.settings import FusionSettings
@@ -100,7 +101,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     rows, _, covariance, transition = Filter(settings).steps(samples, to_end=True, covariances=True)
     n, first = len(rows), int(np.argmax(rows["started"]))
     nodes, biases = np.empty((n + 1, 4)), np.empty((n + 1, 3))  # at the start, and the end of each step
-    kernel.smooth_steps(rows, covariance, transition, first, nodes, biases)
+    smooth_steps(rows, covariance, transition, first, nodes, biases)
     variance = np.diagonal(covariance, axis1=1, axis2=2)[np.maximum(np.arange(n), first), :6]
     deviations, north = np.sqrt(np.maximum(variance, 0.0)), np.tile(UNKNOWN, (n, 1))
     sd = deviations[:, :3].copy()
@@ -115,7 +116,7 @@ def smoothed(samples: Samples, settings: FusionSettings) -> Estimate:
     elif settings.use_magnetometer:
         sd[:, 2] = np.pi
     xyzw, rates = np.empty((len(samples), 4)), np.ascontiguousarray(samples.rate_rad_s)
-    kernel.orient_samples(samples.step_s, rates, rows, nodes, biases, xyzw)
+    orient_samples(samples.step_s, rates, rows, nodes, biases, xyzw)
     of_step = np.repeat(np.arange(n), np.diff(rows["last"], prepend=0))
     _, _, disturbed, stray, iron = north[of_step].T
     resting = rows["resting"][of_step]

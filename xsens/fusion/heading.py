@@ -36,6 +36,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.kernels.orientation import heading as kernel
 from speckle3d.kernels.orientation.inclination import STEP
 from xsens.fusion.settings import FusionSettings
+from xsens.logs.samples import finite_rows
 
 _FILTERS = 3
 _FIRST, _BESIDE, _IRON = range(_FILTERS)
@@ -109,7 +110,7 @@ def averaged_bins(
     bins["bias"] = bias_rad_s[lasts]
     bins["bias_variance"] = (sd[lasts, 3:] ** 2).mean(axis=1) + settings.moving_bias_rad_s**2
     bins["tilt_rad2"] = np.add.reduceat((sd[:, :2] ** 2).mean(axis=1), firsts) / counts
-    seen = np.asarray(np.isfinite(rows["field"]).all(axis=1))
+    seen = finite_rows(rows["field"])
     readings = np.add.reduceat(seen.astype(float), firsts)[:, None]
     bins["seen"] = readings[:, 0] > 0.0
     field, level = np.where(seen[:, None], rows["field"], 0.0), Rotation.from_quat(levels)

@@ -16,7 +16,8 @@ from speckle3d.core.shown import shown
 from xsens.fusion.engines import Filter
 from xsens.fusion.readings import FASTEST_RAD_S, PAUSE_S, Samples, lost_variance, require_metres
 from xsens.fusion.settings import BRIDGED_S, LOST, FusionSettings
-from xsens.logs.faults import LiveFaults
+from xsens.logs.faults import LIMITS
+from xsens.logs.samples import VECTORS
 
 _JUDGED_S = 0.99
 """The accelerometer's unit is judged by the median of the first second, less rounding of the steps."""
@@ -80,7 +81,6 @@ class OnlineFilter:
     def __init__(self, settings: FusionSettings | None = None) -> None:
         self._settings = settings or FusionSettings()
         self._filter = Filter(self._settings)
-        self._live = LiveFaults()
         self._state: OnlineState | None = None
         self._pending: list[tuple[Any, ...]] = []  # since the filter ran: once in an increment is enough
         self._rate: FloatArray | None = None
@@ -159,7 +159,7 @@ class OnlineFilter:
 
     def _judge(self, step_s: float, force: FloatArray) -> None:
         """Raise if the accelerometer is in other units, after a second of it."""
-        if self._judged_s >= _JUDGED_S or not (np.isfinite(force).all() and force.any()):
+        if self._judged_s >= _JUDGED_S or not np.isfinite(force).all():
             return
         self._first.append(force)
         self._judged_s += min(step_s, BRIDGED_S)
@@ -172,7 +172,6 @@ class OnlineFilter:
         self, step_s: float, rate: FloatArray, force: FloatArray, field: FloatArray
     ) -> tuple[Any, ...] | None:
         """A sample as `Samples` has it, its step from the last one; None of what is no measurement."""
-        rate, force, field = self._live.measured(rate, force, field)
         self._forceless_s += step_s
         self._skipped_s += step_s
         if np.isfinite(force).all():
@@ -196,20 +195,22 @@ def _checked(
     accelerometer_m_s2: npt.ArrayLike,
     magnetometer_au: npt.ArrayLike | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Steps and readings; what is no measurement, zeros or out of range, is NaN."""
     step = np.atleast_1d(np.asarray(step_s, dtype=float))
     if not (np.isfinite(step) & (step > 0.0)).all():
         raise InvalidInputError("step_s: expected positive numbers, got one that is not")
-    vectors = (
-        gyroscope_rad_s,
-        accelerometer_m_s2,
-        np.full((step.size, 3), np.nan) if magnetometer_au is None else magnetometer_au,
-    )
-    rate, force, field = (np.atleast_2d(np.asarray(rows, dtype=float)) for rows in vectors)
+    if magnetometer_au is None:
+        magnetometer_au = np.full((step.size, 3), np.nan)
+    vectors = (accelerometer_m_s2, gyroscope_rad_s, magnetometer_au)
+    force, rate, field = (np.array(rows, dtype=float, ndmin=2) for rows in vectors)
     if not rate.shape == force.shape == field.shape == (step.size, 3):
         raise MismatchError(
             f"expected readings of shape {(step.size, 3)}, got {rate.shape}, {force.shape} and {field.shape}"
         )
-    fast = np.linalg.norm(np.where(np.isfinite(rate), rate, 0.0), axis=1).max(initial=0.0)
+    fast = np.linalg.norm(np.nan_to_num(rate), axis=1).max(initial=0.0)
     if fast > FASTEST_RAD_S:
         raise InvalidInputError(f"gyroscope_rad_s: expected rad/s, got a reading of {fast:.3g}: in deg/s?")
+    force[~force.any(axis=1) | ~(np.abs(force) < LIMITS[VECTORS[0]].largest).all(axis=1)] = np.nan
+    field[~field.any(axis=1)] = np.nan
+    rate[~rate.any(axis=1) & np.isnan(force[:, 0])] = np.nan
     return step, rate, force, field

@@ -14,7 +14,7 @@ from speckle3d.core.shown import shown
 from speckle3d.core.streams import TimedRotations
 from xsens.fusion.readings import PAUSE_S, Estimate, Samples, usable_samples
 from xsens.fusion.settings import DEFAULT_METHOD, FusionSettings, Method, method_of
-from xsens.logs.samples import ImuLog
+from xsens.logs.samples import ImuLog, finite_rows
 
 _FORESEEN = 3
 """Standard deviations of the gyroscope's bias that are foreseen; a larger one widens them."""
@@ -123,7 +123,7 @@ def orient(
         raise InvalidInputError(f"expected an ImuLog, as read_log(path) gives, got {type(log).__name__}")
     settings, method = settings or FusionSettings(), method_of(method)
     used, samples, notes = usable_samples(log)
-    if settings.use_magnetometer and not np.isfinite(samples.field_au).all(axis=1).any():
+    if settings.use_magnetometer and not finite_rows(samples.field_au).any():
         notes.append("no magnetometer: the heading is relative to the start")
         settings = replace(settings, use_magnetometer=False)
     breaks = np.flatnonzero(samples.step_s > PAUSE_S)

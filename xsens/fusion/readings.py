@@ -12,7 +12,7 @@ from xsens.fusion.settings import BRIDGED_S, LOST
 from xsens.logs.clocks import SHORTEST_S
 from xsens.logs.contradictions import contradictions
 from xsens.logs.faults import measured
-from xsens.logs.samples import ImuLog
+from xsens.logs.samples import ImuLog, finite_rows
 
 FORCE_M_S2 = (4.0, 25.0)
 """Limits of the median of the accelerometer's norm if it is in m/s^2."""
@@ -118,7 +118,7 @@ def usable_samples(log: ImuLog) -> tuple[IntArray, Samples, list[str]]:
         if log.oriented.any():
             got.append("--method sensor takes the sensor's own orientation")
         raise InsufficientDataError(f"{source}: expected gyroscope and accelerometer, got {'; '.join(got)}")
-    turns, told = (np.asarray(np.isfinite(rows).all(axis=1)) for rows in (rate, force))
+    turns, told = map(finite_rows, (rate, force))
     used = np.flatnonzero(_near(log.time_s, turns) & _near(log.time_s, told))
     if turns[used].sum() < 2 or told[used].sum() < 2:
         raise InsufficientDataError(

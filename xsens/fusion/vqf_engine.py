@@ -48,7 +48,7 @@ def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Es
     place = np.cumsum(stretch.step_s) - stretch.step_s[0]
     mean_s = float(place[-1]) / max(len(place) - 1, 1) or float(stretch.step_s[0])
     # Losses make the mean step longer than the median, bursts shorter: at most two for one.
-    step_s = mean_s * min(max(float(np.median(stretch.step_s)) / mean_s, 0.5), 1.0)
+    step_s = float(np.clip(np.median(stretch.step_s), 0.5 * mean_s, mean_s))
     place /= step_s
     grid = np.arange(round(float(place[-1])) + 1.0)
     # A gyroscope's reading is the mean rate since the one before, here too: turns stay what they were.
@@ -72,16 +72,13 @@ def by_vqf(stretch: Samples, own: Estimate, offline: bool, magnetic: bool) -> Es
         north_rad = 2.0 * float(np.arctan2(*first.as_quat()[2:]))
     xyzw = turned(north_rad, xyzw)
     at = np.minimum(np.rint(place).astype(np.int64), len(grid) - 1)
-    disturbed = np.zeros(len(stretch), dtype=bool)
-    if magnetic:
-        disturbed = estimate["magDistDetected"][at]
-    sd = np.minimum(np.hypot(own.sd_rad, _apart(xyzw, own.xyzw)), np.pi)
+    detected = estimate["magDistDetected"][at] if magnetic else np.zeros(len(stretch), dtype=bool)
     return replace(
         own,
         xyzw=xyzw,
-        sd_rad=sd,
+        sd_rad=np.minimum(np.hypot(own.sd_rad, _apart(xyzw, own.xyzw)), np.pi),
         bias_rad_s=estimate["bias"][at],
-        disturbed=disturbed,
+        disturbed=detected,
         resting=estimate["restDetected"][at],
     )
 
@@ -94,7 +91,4 @@ def _at(places: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray
 def _apart(one: FloatArray, other: FloatArray) -> FloatArray:
     """Turn between quaternions, scalar last, about each of the world's axes, to a sign, rad."""
     (v, w), (u, z) = ((q[:, :3], q[:, 3:]) for q in (one, other))
-    across = z * v - w * u - np.cross(v, u)
-    sine = np.sqrt(np.einsum("ij,ij->i", across, across))
-    angle = 2.0 * np.arctan2(sine, np.abs(np.einsum("ij,ij->i", one, other)))
-    return np.asarray(across * (angle / np.maximum(sine, 1e-300))[:, None])
+    return np.asarray(2.0 * np.arcsin(np.clip(z * v - w * u - np.cross(v, u), -1.0, 1.0)))

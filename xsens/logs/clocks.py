@@ -121,8 +121,9 @@ def spread(stamps: Stamps, readings: Sequence[FloatArray | None]) -> tuple[Stamp
         return stamps, ()
     first = np.flatnonzero(np.append(True, ~together))
     counts, arrived_s = np.diff(np.append(first, steps.size + 1)), stamps.time_s[first]
-    spans = np.diff(arrived_s, prepend=np.nan) / counts
-    period_s = np.fmin(spans, _LONGER * np.nanmedian(spans))
+    spans = np.diff(arrived_s) / counts[1:]
+    usual = np.median(spans)
+    period_s = np.append(usual, np.minimum(spans, _LONGER * usual))
     before = np.repeat(first + counts - 1, counts) - np.arange(steps.size + 1)
     time_s = np.repeat(arrived_s, counts) - before * np.repeat(period_s, counts)
     note = f"{counts.size} stamps for {time_s.size} samples: spread evenly between stamps"

@@ -75,7 +75,7 @@ def _rates_across(log: ImuLog, direction: FloatArray) -> tuple[FloatArray, Float
     if log.gyroscope_rad_s is None:
         return None
     columns = np.column_stack([log.time_s, log.gyroscope_rad_s, direction])
-    columns = columns[np.isfinite(columns).all(axis=1)]
+    columns = columns[np.isfinite(columns.sum(axis=1))]
     if len(columns) <= _FEWEST:
         return None
     width = max(1, round(_COMPARED_S / float(np.median(np.diff(columns[:, 0])))))

@@ -13,7 +13,7 @@ import numpy as np
 
 from speckle3d.core.arrays import BoolArray, FloatArray
 from speckle3d.core.errors import InvalidInputError
-from xsens.logs.samples import VECTORS, ImuLog
+from xsens.logs.samples import VECTORS, ImuLog, finite_rows
 
 
 class _Limits(NamedTuple):
@@ -25,7 +25,7 @@ class _Limits(NamedTuple):
 
 
 _OWN = "own orientation"
-_LIMITS = {
+LIMITS = {
     VECTORS[0]: _Limits(2000.0, 0.3, 100.0),
     VECTORS[1]: _Limits(60.0, 0.03, 10.0),
     VECTORS[2]: _Limits(100.0, 0.03, 1.0),
@@ -82,7 +82,7 @@ def measured(log: ImuLog) -> ImuLog:
         others = (None if others is None else others[some] for others in (force, rate))
         bad = _bad(name, rows[some], dead[some], *others)
         if name == VECTORS[0]:
-            dead = bad["readings of zero"] | ~_finite(rows)
+            dead = bad["readings of zero"] | ~finite_rows(rows)
         counts = ", ".join(f"{int(mask.sum())} {why}" for why, mask in bad.items() if mask.any())
         wrong = np.zeros(len(log), dtype=bool)
         wrong[some] = np.logical_or.reduce(list(bad.values()))
@@ -90,15 +90,10 @@ def measured(log: ImuLog) -> ImuLog:
             notes.append(f"{name.split('_')[0]}: {counts}: taken as missing")
         if name == _OWN:
             changed["oriented"] = log.oriented & ~wrong
-        elif counts or not _finite(rows).any():
+        elif counts or not finite_rows(rows).any():
             rows = np.where(wrong[:, None], np.nan, rows)
-            changed[name] = rows if _finite(rows).any() else None
+            changed[name] = rows if finite_rows(rows).any() else None
     return replace(log, **changed, notes=(*log.notes, *notes))
-
-
-def _finite(rows: FloatArray) -> BoolArray:
-    """Rows of finite numbers; many times faster than a reduction over a few columns."""
-    return np.asarray(np.isfinite(rows[:, 0]) & np.isfinite(rows[:, 1]) & np.isfinite(rows[:, 2]))
 
 
 def _norm(rows: FloatArray) -> FloatArray:
@@ -119,7 +114,7 @@ def _bad(
     name: str, rows: FloatArray, dead: BoolArray, force: FloatArray | None, rate: FloatArray | None
 ) -> dict[str, BoolArray]:
     """Rows that are no measurement of one sensor, by reason; `dead` where the accelerometer reads nothing."""
-    limits, size = _LIMITS[name], _norm(rows)
+    limits, size = LIMITS[name], _norm(rows)
     finite = ~np.isnan(size)
     size[~finite] = 0.0
     zero, unit = finite & (size < 1e-12), 1.0
@@ -230,27 +225,3 @@ def _median_norm(rows: FloatArray) -> float:
     norms = _norm(rows)
     norms = norms[np.isfinite(norms)]
     return float(np.median(norms)) if norms.size else float("nan")
-
-
-class LiveFaults:
-    """Readings that are no measurements, as they arrive: zeros, repeats in movement, values out of range."""
-
-    def __init__(self) -> None:
-        self._last = b""
-        self._run = 0
-
-    def measured(self, *readings: FloatArray) -> list[FloatArray]:
-        """Rate, force and field of a sample, each NaN if it is no measurement."""
-        rate, force, field = readings
-        row = b"".join(values.tobytes() for values in readings)
-        self._run, self._last = self._run + 1 if row == self._last else 1, row
-        stuck = self._run > 2 and float(np.linalg.norm(rate)) > _SLOW_RAD_S
-        dead = not (np.isfinite(force).all() and force.any())
-        bad = [dead and not rate.any(), dead, not field.any()]
-        return [
-            np.full(3, np.nan) if wrong or stuck or (np.abs(row) > most).any() else row
-            for row, wrong, most in zip(readings, bad, _LIVE, strict=True)
-        ]
-
-
-_LIVE = (_LIMITS[VECTORS[1]].largest, _LIMITS[VECTORS[0]].largest, 1e12)

@@ -25,6 +25,11 @@ _PAUSE = 2.5
 """A clock step of more periods is a pause, not jitter."""
 
 
+def finite_rows(rows: FloatArray) -> BoolArray:
+    """Mark the rows of three finite numbers; many times faster than a reduction over a few columns."""
+    return np.asarray(np.isfinite(rows[:, 0]) & np.isfinite(rows[:, 1]) & np.isfinite(rows[:, 2]))
+
+
 @dataclass(frozen=True)
 class Gap:
     """A pause between two samples in which samples were lost.

@@ -36,25 +36,17 @@ from xsens.logs.worlds import Claim, are_rotations
 
 _SENSOR_LIKE = re.compile(r"acc|gyr|mag|quat|euler|roll|pitch|yaw|time", re.ASCII)
 _RATE = re.compile(r"(?:update rate|output ?rate)\s*:[,;\s]*([0-9.e+-]+)\s*hz", re.IGNORECASE)
-_WORLDS = (
-    (re.compile(r"# world: (\w+)"), "as the file says", True),
-    (
-        re.compile(r".*coordinate system\s*:[,;\s]*(ENU|NED|NWU)\b", re.IGNORECASE),
-        "as its header says",
-        False,
-    ),
-)
-"""What names the orientation's world, who says so, and whether nothing outweighs it."""
+_WORLD = re.compile(r"(# world|.*coordinate system)\s*:[,;\s]*(ENU|NED|NWU)\b", re.IGNORECASE)
+"""What names the orientation's world; nothing outweighs a plain file's."""
 
 _ENOUGH = 1000
 """Lines that show whether nine numbers are a matrix."""
 
-_DOT_TICK_S = 1e-6
-"""Ticks of a DOT's clock."""
+_TICKS = {"MT Manager": TICK_S, "DOT": 1e-6}
+"""Ticks of the programs' clocks, s."""
 
 _SLOWEST_HZ = 5.0
-"""An MT Manager's clock by which samples come more slowly is a DOT's: at 5 Hz no hand's movement can be
-followed."""
+"""By times that come more slowly no hand's movement can be followed: they are in another unit."""
 
 _VECTORS = [[f"{quantity}_{axis}" for axis in "xyz"] for quantity in ("acc", "gyr", "mag")]
 _EULER = ["euler_roll", "euler_pitch", "euler_yaw"]
@@ -87,25 +79,27 @@ def parse_text(text: str | Iterable[str], hints: Hints | None = None, source: st
 
 def _mt9_export(table: TextTable) -> TextTable:
     """Name the columns of an export of the MT9 software; its kind is told by their number."""
-    count = table.rows.shape[1]
+    columns = list(table.columns.values())
     vectors = [*_VECTORS[0], *_VECTORS[1], *_VECTORS[2]]
-    keys = {4: _EULER, 10: vectors, 11: [*vectors, "temperature"]}.get(count)
+    keys = {4: _EULER, 10: vectors, 11: [*vectors, "temperature"]}.get(len(columns))
     if keys is None:
         raise InvalidInputError(
-            f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {count} without"
+            f"expected columns with names, or the 4, 10 or 11 of an MT9 export without, got {len(columns)} "
+            "without"
         )
     notes = table.notes
-    if count == 10 and np.mean(are_rotations(table.rows[:_ENOUGH, 1:])) > 0.5:
+    if keys == vectors and np.mean(are_rotations(np.stack(columns[1:], axis=1)[:_ENOUGH])) > 0.5:
         keys, notes = _MATRIX, (*notes, "matrices are taken row by row")
-    return replace(table, columns=dict(zip(["time", *keys], table.rows.T, strict=True)), notes=notes)
+    return replace(table, columns=dict(zip(["time", *keys], columns, strict=True)), notes=notes)
 
 
 def _samples(table: TextTable) -> Parts:
     """Samples of a table whose columns are known."""
-    timed, columns, notes = np.ones(len(table.rows), dtype=bool), dict(table.columns), list[str]()
+    columns, notes = dict(table.columns), list[str]()
+    timed = np.ones(len(next(iter(columns.values()), ())), dtype=bool)
     stamps = columns.keys() & set(STAMPS)
     if "time" in stamps and table.names and "time" not in table.stated:
-        unit, scale = _unit_of(columns["time"])
+        unit, scale = _unit_of(columns["time"], TIMES)
         columns["time"] = columns["time"] * scale
         if unit != "s":
             notes.append(f"times without a unit: taken as in {unit}, by their steps")
@@ -120,13 +114,14 @@ def _samples(table: TextTable) -> Parts:
         columns = {key: column[timed] for key, column in columns.items()}
     counter, ticks, time_s = (columns.get(key) for key in ("counter", "ticks", "time"))
     dot = any("devicetag" in line.lower() for line in table.header)
-    if not dot and time_s is None and _ticks_of_dot(counter, ticks):
-        dot = True
-        notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
+    if ticks is not None and time_s is None:
+        ticks = unwrapped(ticks.astype(np.int64), TICKS)
+        if not dot and _unit_of(ticks, _TICKS, "MT Manager")[0] == "DOT":
+            dot = True
+            notes.append("taken for a DOT's export by its clock: ticks of 1 us, gyroscope in deg/s")
+        time_s = ticks * _TICKS["DOT" if dot else "MT Manager"]
     if counter is not None:
         counter = unwrapped(counter.astype(np.int64), TICKS if dot else COUNTS)
-    if ticks is not None and time_s is None:
-        time_s = unwrapped(ticks.astype(np.int64), TICKS) * (_DOT_TICK_S if dot else TICK_S)
     force, rate, field = (_side_by_side(columns, keys) for keys in _VECTORS)
     if rate is not None and dot and "gyr_x" not in table.stated:
         rate = np.deg2rad(rate)
@@ -152,14 +147,18 @@ def _samples(table: TextTable) -> Parts:
     return Parts(sent, (force, rate, field), own, claim, (*odd, *notes))
 
 
-def _unit_of(times: FloatArray) -> tuple[str, float]:
-    """Unit of times that makes their steps a sensor's, and that unit in s."""
+def _unit_of(times: FloatArray, units: dict[str, float], otherwise: str = "") -> tuple[str, float]:
+    """The unit of times that makes their steps a sensor's, and its length in s."""
     steps = np.diff(times)
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else float("nan")
-    for unit, scale in TIMES.items():
+    for unit, scale in units.items():
         if SHORTEST_S <= usual * scale <= 1.0 / _SLOWEST_HZ:
             return unit, scale
-    raise InvalidInputError(f"expected a time with its unit, as time_s or time_ms, got steps of {usual:g}")
+    if not otherwise:
+        raise InvalidInputError(
+            f"expected a time with its unit, as time_s or time_ms, got steps of {usual:g}"
+        )
+    return otherwise, units[otherwise]
 
 
 def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray | None:
@@ -170,22 +169,12 @@ def _side_by_side(columns: dict[str, FloatArray], keys: list[str]) -> FloatArray
 
 def _claim(table: TextTable, plain: bool, dot: bool) -> Claim:
     """World of the orientations as the header says, or as its program has it."""
-    for pattern, by, final in _WORLDS:
-        for line in table.header:
-            if match := pattern.match(line):
-                return Claim(match[1], by, final)
+    for line in table.header:
+        if match := _WORLD.match(line):
+            return Claim(match[2].upper(), "as the file says", final=match[1] == "# world")
     if plain:
         return Claim("NWU", "as plain files are" if table.names else "as the MT9 software's are")
     return Claim("ENU", "as the sensor's are" if dot else "the program's default", assumed=True)
-
-
-def _ticks_of_dot(counter: IntArray | None, ticks: IntArray | None) -> bool:
-    """Whether a clock without a header is a DOT's, by how far its samples would be apart."""
-    if ticks is None or ticks.size < 2:
-        return False
-    steps = np.diff(ticks) % (1 << 32)
-    counts = np.ones(steps.size) if counter is None else np.maximum(np.diff(counter), 1)
-    return bool(np.median(steps / counts) * TICK_S > 1.0 / _SLOWEST_HZ)
 
 
 def _not_understood(table: TextTable, plain: bool) -> Names:
@@ -209,7 +198,7 @@ def write_csv(path: str | os.PathLike[str], log: ImuLog) -> None:
 
     Columns: ``time_s``, ``counter``, ``accelerometer_x_m_s2`` and so on, ``gyroscope_x_rad_s``,
     ``magnetometer_x_au``, ``quaternion_w`` to ``quaternion_z`` (``world_from_sensor``, x magnetic north, z
-    up); only those the log has, blank where a sample lacks them. Gaps and notes are comments before them.
+    up); only those the log has, blank where a sample lacks them. Notes are comments before them.
 
     Parameters
     ----------
@@ -257,6 +246,3 @@ def _comments(log: ImuLog) -> Iterator[str]:
         yield "# " + " ".join(note.split())
     if log.world_from_sensor is not None:
         yield "# world: NWU (x magnetic north, y west, z up)"
-    yield f"# gaps: {len(log.gaps)}"
-    for gap in log.gaps:
-        yield f"# gap: after sample {gap.after_index}, {gap.lost} lost, {gap.duration_s!r} s"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import re
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -130,16 +130,15 @@ def not_understood(names: Iterable[str]) -> str:
 class TextTable:
     """A table of numbers: the lines before it, names in lower case, and the columns that are understood.
 
-    `columns` are in SI units by key, without blank ones, those of `stated` by a unit in their name; where no
-    column has a name, `rows` has all cells. `notes` count lines of another length than the first or without a
-    digit, and cells that hold no number.
+    `columns` are in SI units by key, without blank ones, those of `stated` by a unit in their name; where
+    none has a name, all by number. `notes` count lines of another length than the first or without a digit,
+    and cells that hold no number.
     """
 
     header: Names
     names: Names
     columns: dict[str, FloatArray]
     stated: frozenset[str]
-    rows: FloatArray
     notes: Names = ()
 
 
@@ -169,7 +168,8 @@ def read_table(lines: Iterable[str]) -> TextTable:
                         if _known(names) >= 2:
                             return _named(chain([line], lines), tuple(header[1:]), names, separator)
                         raise InvalidInputError(not_understood(names))
-                return _rows(chain([line], lines), tuple(header[1:]), (), {}, separator, len(cells))
+                columns = {str(i): (i, None) for i in range(len(cells))}
+                return _rows(chain([line], lines), tuple(header[1:]), (), columns, separator, len(cells))
         header.append(line.rstrip("\n"))
         count += not comment
         if count > _LONGEST_HEADER:
@@ -250,12 +250,12 @@ def _rows(
     lines: Iterable[str],
     header: Names,
     names: Names,
-    columns: dict[str, tuple[int, float | None]],
+    columns: Mapping[str, tuple[int, float | None]],
     separator: str | None,
     count: int,
 ) -> TextTable:
-    """Read the columns that are understood, or all if none has a name."""
-    which = [i for i, _ in columns.values()] or range(count)
+    """Read columns, of which index and unit are known by key."""
+    which = [i for i, _ in columns.values()]
     sensors = {i: dict[str, None]() for i, name in enumerate(names) if _WHOSE.match(name)}
     values, left_out, words = array("d"), 0, 0
     for line in lines:
@@ -292,12 +292,12 @@ def _rows(
     if words:
         notes.append(f"{words} cells hold something else than a number: missing")
     rows, quantities = np.frombuffer(values).reshape(-1, len(which)), {}
-    for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=False):
-        if np.isfinite(column).any():
+    for (key, (_, scale)), column in zip(columns.items(), rows.T, strict=True):
+        if not names or np.isfinite(column).any():
             with np.errstate(over="ignore"):  # damage, which is left out as no measurement
                 quantities[key] = (_risen(column) if key in STAMPS else column) * (scale or 1.0)
     stated = frozenset(key for key, (_, scale) in columns.items() if scale is not None)
-    return TextTable(header, names, quantities, stated, rows, tuple(notes))
+    return TextTable(header, names, quantities, stated, tuple(notes))
 
 
 def _risen(column: FloatArray) -> FloatArray:

@@ -17,8 +17,6 @@ References
    disturbance rejection", Information Fusion, 2023 (rest detection; inclination and heading apart).
 .. [4] P. G. Savage, "Strapdown inertial navigation integration algorithm design", J. Guid. Control
    Dyn., 1998.
-.. [5] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA
-   J., 1965.
 """
 
 import math
@@ -29,15 +27,16 @@ import numpy as np
 from speckle3d.core.arrays import FloatArray
 from speckle3d.kernels.orientation.rotations import (
     Quaternion,
-    Vector,
     compiled,
     inverse,
     inverted,
+    norm,
     product,
     quaternion,
     quaternion_of,
     rotated,
-    vector_of,
+    three,
+    turn_by,
 )
 
 ATTITUDE, BIAS, SPEED, SIZE = 0, 3, 6, 9
@@ -113,16 +112,6 @@ _REST_MEMORY_S = 0.5
 
 
 @compiled
-def _three(v: FloatArray) -> Vector:
-    return v[0], v[1], v[2]
-
-
-@compiled
-def _norm(v: FloatArray) -> float:
-    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-
-
-@compiled
 def run_filter(
     step_s: FloatArray,
     rate_rad_s: FloatArray,
@@ -192,14 +181,14 @@ def _open(s: Any, step: Any) -> None:
 @compiled
 def _add(step: Any, dt: float, rate: FloatArray, force: FloatArray, field: FloatArray) -> None:
     """Add a sample to an increment, with the increment's bias."""
-    half = _turn(rate, step.start_bias, 0.5 * dt)
+    half = turn_by(rate, step.start_bias, 0.5 * dt)
     q = product(quaternion(step.turn), half)
-    for i, part in enumerate(rotated(q, _three(force))):
+    for i, part in enumerate(rotated(q, three(force))):
         step.force[i] += dt * part
         step.rate[i] += dt * rate[i]
     q = product(q, half)
     if math.isfinite(field[0] + field[1] + field[2]):
-        for i, part in enumerate(rotated(q, _three(field))):
+        for i, part in enumerate(rotated(q, three(field))):
             step.field[i] += part
         step.fields += 1.0
     step.turn[:] = q
@@ -227,59 +216,12 @@ def _complete(s: Any, r: Any, step: Any, f: FloatArray) -> None:
 
 
 @compiled
-def _turn(rate: FloatArray, bias: FloatArray, span_s: float) -> Quaternion:
-    """Turn by a reading of the gyroscope over some time."""
-    x, y, z = rate[0] - bias[0], rate[1] - bias[1], rate[2] - bias[2]
-    return quaternion_of(x * span_s, y * span_s, z * span_s)
-
-
-@compiled
-def orient_samples(
-    step_s: FloatArray,
-    rate_rad_s: FloatArray,
-    steps: Any,
-    nodes: FloatArray,
-    biases: FloatArray,
-    xyzw: FloatArray,
-) -> None:
-    """Fill the orientation of every sample, by the gyroscope, whose error is spread over each step.
-
-    Parameters
-    ----------
-    step_s, rate_rad_s : ndarray, shapes (m,) and (m, 3)
-    steps : structured ndarray, shape (n,), of `STEP`
-        At rest the sensor stays at a step's start.
-    nodes : ndarray, shape (n + 1, 4)
-        At the start and at the end of each step.
-    biases : ndarray, shape (n + 1, 3)
-    xyzw : ndarray, shape (m, 4)
-    """
-    first = 0
-    for n in range(steps.shape[0]):
-        q, span_s, last = quaternion(nodes[n]), 0.0, steps[n].last
-        for k in range(first, last):
-            if not steps[n].resting:
-                q = product(q, _turn(rate_rad_s[k], biases[n], step_s[k]))
-            xyzw[k] = q
-        x, y, z = vector_of(product(quaternion(nodes[n + 1]), inverted(q)))
-        whole_s = step_s[first:last].sum()
-        for k in range(first, last):
-            span_s += step_s[k]
-            share = span_s / whole_s
-            xyzw[k] = product(quaternion_of(share * x, share * y, share * z), quaternion(xyzw[k]))
-        first = last
-
-
-# -- start and rest
-
-
-@compiled
 def _upright(force: FloatArray) -> Quaternion:
     """The shortest rotation that takes a force to up."""
-    norm = _norm(force)
-    if norm == 0.0 or force[2] < -0.999999 * norm:
-        return (0.0, 0.0, 0.0, 1.0) if norm == 0.0 else (1.0, 0.0, 0.0, 0.0)
-    x, y, w = force[1] / norm, -force[0] / norm, 1.0 + force[2] / norm
+    size = norm(force)
+    if size == 0.0 or force[2] < -0.999999 * size:
+        return (0.0, 0.0, 0.0, 1.0) if size == 0.0 else (1.0, 0.0, 0.0, 0.0)
+    x, y, w = force[1] / size, -force[0] / size, 1.0 + force[2] / size
     length = math.sqrt(x * x + y * y + w * w)
     return x / length, y / length, 0.0, w / length
 
@@ -304,7 +246,7 @@ def _set_up(s: Any, r: Any, force: FloatArray) -> None:
 def _begin(s: Any, step: Any) -> None:
     """Set up from the mean force since the start."""
     turn = quaternion(s.start_turn)
-    s.start_force += np.array(rotated(turn, _three(step.force)))
+    s.start_force += np.array(rotated(turn, three(step.force)))
     turn = product(turn, quaternion(step.turn))
     s.start_turn[:] = turn
     s.start_s += step.duration_s
@@ -325,15 +267,12 @@ def _rest(s: Any, r: Any, step: Any) -> None:
     s.rest_force[:] = s.rest_force + share * force_off
     bias_sd = math.sqrt(max(s.p[3, 3], s.p[4, 4], s.p[5, 5], 0.0))
     still = (
-        _norm(rate_off) < r.rest_rate_rad_s
-        and _norm(force_off) < r.rest_force_m_s2
-        and _norm(s.rest_rate - s.bias) < r.rest_bias_rad_s + 3.0 * bias_sd
+        norm(rate_off) < r.rest_rate_rad_s
+        and norm(force_off) < r.rest_force_m_s2
+        and norm(s.rest_rate - s.bias) < r.rest_bias_rad_s + 3.0 * bias_sd
     )
     s.still_s = s.still_s + step.duration_s if still else 0.0
     s.resting = s.still_s > r.rest_after_s
-
-
-# -- the Kalman filter
 
 
 @compiled
@@ -344,12 +283,12 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     f[:] = np.eye(SIZE)
     span = 0.0 if s.resting else duration
     for j in range(3):
-        axis = np.array(rotated(level, _three(_AXES[j])))
+        axis = np.array(rotated(level, three(_AXES[j])))
         f[:BIAS, BIAS + j] = -span * axis
         f[SPEED:, BIAS + j] = span * np.cross(axis, s.speed)
     f[6, 1], f[7, 0] = r.gravity_m_s2 * duration, -r.gravity_m_s2 * duration
-    shock = max(_norm(step.force) - _SHOCK_M_S2 * duration, 0.0)  # a knock, whose reading may be cut off
-    noise = r.gyro_noise_rad_sqrt_s**2 + (r.gyro_scale_noise_sqrt_s * _norm(step.rate - s.bias)) ** 2
+    shock = max(norm(step.force) - _SHOCK_M_S2 * duration, 0.0)  # a knock, whose reading may be cut off
+    noise = r.gyro_noise_rad_sqrt_s**2 + (r.gyro_scale_noise_sqrt_s * norm(step.rate - s.bias)) ** 2
     if s.resting:
         noise = (_REST_NOISE * r.gyro_noise_rad_sqrt_s) ** 2
     step.noise[:3] = noise * duration + step.lost_rad2
@@ -358,7 +297,7 @@ def _predict(s: Any, r: Any, step: Any, f: FloatArray) -> None:
     s.p[:] = f @ s.p @ f.T
     for i in range(SIZE):
         s.p[i, i] += step.noise[i]
-    s.speed += np.array(rotated(level, _three(step.force)))
+    s.speed += np.array(rotated(level, three(step.force)))
     s.speed[2] -= r.gravity_m_s2 * duration
     if not s.resting:
         s.level[:] = product(level, quaternion(step.turn))
@@ -405,58 +344,6 @@ def _inject(s: Any, error: FloatArray) -> None:
     """Apply the estimated error to the state."""
     turn = quaternion_of(error[0], error[1], error[2])
     s.level[:] = product(turn, quaternion(s.level))
-    s.speed[:] = rotated(turn, _three(s.speed))
+    s.speed[:] = rotated(turn, three(s.speed))
     s.speed[:] = s.speed + error[SPEED:]
     s.bias[:] = s.bias + error[BIAS:SPEED]
-
-
-# -- backward
-
-
-@compiled
-def smooth_steps(
-    steps: Any,
-    covariance: FloatArray,
-    transition: FloatArray,
-    first: int,
-    levels: FloatArray,
-    biases: FloatArray,
-) -> None:
-    """Smooth the steps from `first` on [5]_; before it, go back by the gyroscope.
-
-    Parameters
-    ----------
-    steps : structured ndarray, shape (n,), of `STEP`
-    covariance, transition : ndarray, shape (n, 9, 9)
-        The covariances become the smoothed ones.
-    first : int
-        The step at whose end the filter had started.
-    levels, biases : ndarray, shapes (n + 1, 4) and (n + 1, 3)
-        Filled, at the start of the stretch and at the end of each step.
-    """
-    n = steps.shape[0]
-    levels[n], biases[n] = steps[n - 1].level, steps[n - 1].bias
-    speed, off = steps[n - 1].speed.copy(), np.empty(SIZE)
-    for k in range(n - 2, first - 1, -1):
-        step, after, f, p = steps[k], steps[k + 1], transition[k + 1], covariance[k]
-        ahead = f @ p
-        predicted = ahead @ f.T + np.diag(after.noise)
-        gain = np.linalg.solve(predicted, ahead).T
-        covariance[k] = p + gain @ (covariance[k + 1] - predicted) @ gain.T
-        turn = product(quaternion(levels[k + 2]), inverted(quaternion(after.predicted)))
-        off[:3] = vector_of(turn)
-        off[3:6] = biases[k + 2] - step.bias
-        off[6:] = speed
-        off[6:] -= np.array(rotated(turn, _three(after.predicted_speed)))
-        error = gain @ off
-        turn = quaternion_of(error[0], error[1], error[2])
-        levels[k + 1] = product(turn, quaternion(step.level))
-        biases[k + 1] = step.bias + error[BIAS:SPEED]
-        speed[:] = rotated(turn, _three(step.speed))
-        speed += error[SPEED:]
-    for k in range(first, -1, -1):
-        step = steps[k]
-        biases[k], levels[k] = biases[k + 1], levels[k + 1]
-        if not step.resting:
-            turn = product(quaternion(step.turn), _turn(step.start_bias, biases[k], step.duration_s))
-            levels[k] = product(quaternion(levels[k + 1]), inverted(turn))

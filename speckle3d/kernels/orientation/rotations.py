@@ -15,6 +15,18 @@ Vector: TypeAlias = tuple[float, float, float]
 
 
 @compiled
+def three(v: FloatArray) -> Vector:
+    """The vector in an array."""
+    return v[0], v[1], v[2]
+
+
+@compiled
+def norm(v: FloatArray) -> float:
+    """Length of the vector in an array."""
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+@compiled
 def quaternion(q: FloatArray) -> Quaternion:
     """The quaternion in an array, of unit length."""
     x, y, z, w = q[0], q[1], q[2], q[3]
@@ -29,6 +41,13 @@ def quaternion_of(x: float, y: float, z: float) -> Quaternion:
     angle = math.sqrt(square)
     s = math.sin(0.5 * angle) / angle if angle > 1e-3 else 0.5 - square / 48.0 + square * square / 3840.0
     return s * x, s * y, s * z, math.cos(0.5 * angle)
+
+
+@compiled
+def turn_by(rate: FloatArray, bias: FloatArray, span_s: float) -> Quaternion:
+    """Turn by a reading of the gyroscope over some time."""
+    x, y, z = rate[0] - bias[0], rate[1] - bias[1], rate[2] - bias[2]
+    return quaternion_of(x * span_s, y * span_s, z * span_s)
 
 
 @compiled

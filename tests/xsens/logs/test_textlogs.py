@@ -109,3 +109,44 @@ def test_a_plain_file_by_hand():
     assert log.time_s.tolist() == [0.5, 0.6, 0.7]
     np.testing.assert_array_equal(log.gyroscope_rad_s[:, 2], [1.0, np.nan, 2.0])
     assert log.accelerometer_m_s2 is None
+
+
+PLAIN = [f"{quantity}_{axis}" for quantity in ("acc", "gyr", "mag") for axis in "xyz"]
+ROS = [
+    f"{name}.{axis}"
+    for name in ("linear_acceleration", "angular_velocity", "magnetic_field")
+    for axis in "xyz"
+]
+SHORT = [f"{quantity}{axis}" for quantity in "agm" for axis in "xyz"]
+UNITS = [f"{name} ({unit})" for name, unit in zip(PLAIN, 3 * ["g"] + 3 * ["deg/s"] + 3 * ["uT"], strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("names", "separator", "scales"),
+    [
+        (["time_s", *PLAIN], "|", (1.0, 1.0, 1.0)),
+        (["timestamp", *ROS], ",", (1e9, 1.0, 1.0)),
+        (["t", *SHORT], ";", (1e3, 1.0, 1.0)),
+        (["#timestamp [us]", *UNITS], "\t", (1e6, 1 / 9.80665, np.rad2deg(1.0))),
+        (
+            ["time", *PLAIN, "\nms", *3 * ["m/s^2"], *3 * ["deg/s"], *3 * ["a.u."]],
+            ",",
+            (1e3, 1.0, np.rad2deg(1.0)),
+        ),
+    ],
+)
+def test_columns_by_other_names_with_and_without_units(s, names, separator, scales):
+    columns = [s[name] for name in ("time_s", *VECTORS)]
+    rows = lines(
+        [column * scale for column, scale in zip(columns, (*scales, 1.0), strict=True)], separator, 9
+    )
+    log = parse_text(separator.join(names).replace(separator + "\n", "\n") + "\n" + rows)
+    np.testing.assert_allclose(log.time_s, s["time_s"], atol=1e-9)
+    for name in VECTORS:
+        np.testing.assert_allclose(getattr(log, name), s[name], atol=1e-6)
+
+
+def test_dates_and_short_counters_that_wrap_round(s):
+    rows = [f"2024-05-01T23:59:59.{i:02d}0Z,{(230 + i) % 256},0,0,9.8" for i in range(60) if i != 30]
+    log = parse_text("timestamp,counter,acc_x,acc_y,acc_z\n" + "\n".join(rows))
+    assert (log.rate_hz, log.lost, log.duration_s) == pytest.approx((100.0, 1, 0.59))
