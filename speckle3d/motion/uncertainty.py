@@ -107,7 +107,7 @@ def joint_errors(
     share = np.sqrt(np.clip(way - begin[:, None], 0.0, width) / way)
     grown = np.einsum("ki,iam->kmia", share, root).reshape(-1, len(poses), 6)
     factors = np.concatenate([common, grown])
-    return PoseErrors(factors[np.abs(factors).max(axis=(1, 2)) > 1e-12])
+    return PoseErrors(factors[np.abs(factors).max(axis=(1, 2)) > 1e-12], world_from_image, centre_mm)
 
 
 NEAR_MM = 0.1

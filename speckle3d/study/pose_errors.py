@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InsufficientDataError
-from speckle3d.core.pose_errors import PosedErrors, PoseErrors
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.reconstruction import Reconstruction, SharedErrors
 from speckle3d.imaging.measures.belonging import require_inside
 from speckle3d.imaging.measures.measure import Measurement, measured
@@ -55,7 +57,7 @@ def measure(
     """
     points = np.asarray(points_mm, dtype=float).reshape(-1, 3)
     mode = default_mode(reconstruction)[0] if mode is None else mode
-    errors, grid = posed_errors_of(reconstruction, mode), reconstruction.grid
+    errors, grid = errors_of(reconstruction, mode), reconstruction.grid
     near = require_inside(points, grid, errors.world_from_image)
     return measured(points, near, errors, PICKED * grid.vector_pitch_mm if pick_mm is None else pick_mm)
 
@@ -71,14 +73,8 @@ def caution(reconstruction: Reconstruction, mode: str) -> str | None:
     return f"mode {mode} claims no errors of its own: those of the images are taken"
 
 
-def posed_errors_of(reconstruction: Reconstruction, mode: str = "image") -> PosedErrors:
-    """Errors of a mode's poses, with these poses; as `errors_of`."""
-    errors = errors_of(reconstruction, mode)
-    return PosedErrors(errors, poses_of(reconstruction, mode), reconstruction.grid.centre_mm)
-
-
 def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors:
-    """Joint errors of the poses of one mode.
+    """Joint errors of the poses of one mode, with these poses.
 
     `image`: what the file holds. Other modes: their own claims; the claimed error of the length stretches the
     whole sweep, and what the covariances have beyond it has grown from frame to frame. `consistent-subset`,
@@ -108,4 +104,5 @@ def errors_of(reconstruction: Reconstruction, mode: str = "image") -> PoseErrors
         own = trust.modes[mode]
         stretched = SharedErrors(0.0, own.length_sigma, np.zeros(2))
         return joint_errors(own.covariance, poses, centre, stretched)
-    return joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
+    images = joint_errors(trust.covariance, reconstruction.poses["image"], centre, trust.shared)
+    return replace(images, world_from_image=poses)

@@ -38,7 +38,6 @@ def test_spheres_swept_at_reconstructed_poses_are_as_far_apart_and_as_large_as_c
     Each quantity lies within three claimed deviations; over many sweeps `bench_surfaces` counts.
     """
     import speckle3d as s3
-    from speckle3d.core.pose_errors import PosedErrors
     from speckle3d.imaging.measures.belonging import belonging_of
     from speckle3d.imaging.measures.measure import measured
     from speckle3d.motion.uncertainty import joint_errors
@@ -50,9 +49,7 @@ def test_spheres_swept_at_reconstructed_poses_are_as_far_apart_and_as_large_as_c
     middles = [sweep.truth[frame].apply(grid.centre_mm) for frame in frames]
     phantom = Phantom(tuple(Ball(tuple(middle), 1.4) for middle in middles), grid)
     images, centre = phantom.images(sweep.truth), sweep.grid.centre_mm
-    errors = PosedErrors(
-        joint_errors(tracked.covariance, tracked.image, centre, tracked.shared), tracked.image, centre
-    )
+    errors = joint_errors(tracked.covariance, tracked.image, centre, tracked.shared)
     found = []
     for poses in (sweep.truth, tracked.image):
         surface = surface_of(compound(images, grid, poses, STEP_MM, splat="linear"), LEVEL)

@@ -13,7 +13,7 @@ from speckle3d.core.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from speckle3d.core.grid import ImageGrid
-    from speckle3d.core.pose_errors import PosedErrors
+    from speckle3d.core.pose_errors import PoseErrors
     from speckle3d.core.surface import Surface
     from speckle3d.core.volume import Volume
     from speckle3d.imaging.measures.measure import Measurement
@@ -191,11 +191,11 @@ def surface(
 
 def _errors(
     path: Path | None, mode: str | None, volume: Volume, where: Path
-) -> tuple[PosedErrors, ImageGrid] | None:
+) -> tuple[PoseErrors, ImageGrid] | None:
     """Errors of the poses that a volume was made at, and the grid of the images."""
     from speckle3d.io.reconstructions import read_reconstruction
     from speckle3d.scoring.trajectories import poses_of
-    from speckle3d.study.pose_errors import caution, posed_errors_of
+    from speckle3d.study.pose_errors import caution, errors_of
     from speckle3d.study.posed import MARK, pose_mark, require_made_at
 
     made_at = volume.fields.get("poses", mode or "image")
@@ -207,7 +207,7 @@ def _errors(
     require_made_at(volume.fields.get(MARK, ""), pose_mark(poses_of(made, made_at)), str(where))
     if (words := caution(made, made_at)) is not None:
         note(words)
-    return posed_errors_of(made, made_at), made.grid
+    return errors_of(made, made_at), made.grid
 
 
 def _sizes(place: Path, rough: Surface, surface: Surface, *errors: Any) -> dict[str, Any]:

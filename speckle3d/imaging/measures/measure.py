@@ -10,7 +10,7 @@ import numpy as np
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.pose_errors import Belonging, PosedErrors
+from speckle3d.core.pose_errors import Belonging, PoseErrors
 
 NORMAL_95 = 1.959964
 """Deviations of a normal variable that 95 % of its values lie within."""
@@ -68,7 +68,7 @@ class Measurement:
 
 
 def measured(
-    points_mm: FloatArray, belonging: Belonging, errors: PosedErrors, pick_mm: float
+    points_mm: FloatArray, belonging: Belonging, errors: PoseErrors, pick_mm: float
 ) -> list[Measurement]:
     """Measure what points have between them: distances in a row, their sum, angles at the points between.
 
@@ -78,7 +78,7 @@ def measured(
         In the world, k >= 2, in order.
     belonging : Belonging
         Of the points; see `speckle3d.imaging.measures.belonging`.
-    errors : PosedErrors
+    errors : PoseErrors
     pick_mm : float
         Standard deviation of each point's place on each axis by picking.
 
@@ -97,7 +97,7 @@ def measured(
 
     def row(kind: str, chosen: range, value_of: Valued, unit: str = "mm") -> Measurement:
         value, gradient = value_of(points[chosen])
-        by_poses = errors.of_gradient(points[chosen], gradient, belonging[np.array(chosen)])
+        by_poses = errors.of_gradient(points[chosen], gradient, belonging.of_points(np.array(chosen)))
         pose_sigma, pick_sigma = float(np.linalg.norm(by_poses)), pick_mm * float(np.linalg.norm(gradient))
         return Measurement(kind, tuple(chosen), value, pose_sigma, pick_sigma, unit)
 

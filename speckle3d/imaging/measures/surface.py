@@ -13,7 +13,7 @@ from speckle3d.core.arrays import BoolArray, FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.extras import extra_module
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.surface import Surface
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.measures.belonging import belonging_of
@@ -175,7 +175,7 @@ class PartMeasures:
 
 
 def measures_of(
-    surface: Surface, errors: PosedErrors | None = None, grid: ImageGrid | None = None
+    surface: Surface, errors: PoseErrors | None = None, grid: ImageGrid | None = None
 ) -> PartMeasures:
     """Measure a surface; with its sweep's pose errors and image grid also the standard errors.
 
@@ -220,11 +220,12 @@ def _closed_part(surface: Surface, open_edges: IntArray) -> Surface:
     return surface.of_triangles(whole[part])
 
 
-def _sigma(surface: Surface, gradient: FloatArray, errors: PosedErrors, grid: ImageGrid) -> float:
+def _sigma(surface: Surface, gradient: FloatArray, errors: PoseErrors, grid: ImageGrid) -> float:
     """Standard error of what has this derivative with respect to each triangle's corners."""
     near = belonging_of(surface.vertices_mm, grid, errors.world_from_image)
-    corners = surface.triangles.ravel()
-    by_errors = errors.of_gradient(surface.vertices_mm[corners], gradient.reshape(-1, 3), near[corners])
+    corner = surface.triangles.ravel()
+    points, gradient = surface.vertices_mm[corner], gradient.reshape(-1, 3)
+    by_errors = errors.of_gradient(points, gradient, near.of_points(corner))
     return float(np.linalg.norm(by_errors))
 
 

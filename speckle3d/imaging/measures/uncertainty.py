@@ -7,18 +7,18 @@ from scipy.ndimage import zoom
 
 from speckle3d.core.arrays import ByteArray, Float32Array, FloatArray
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.voxels.grid import VoxelGrid
 
 COARSE_MM = 0.75
 """Distance of the points at which the deviation is computed; between them it is interpolated linearly."""
-_AT_ONCE = 2**12
+_AT_ONCE = 2**11
 """Points worked on at a time: 20 MB with the errors of 300 frames."""
 
 
 def deviation_volume(
-    errors: PosedErrors, grid: ImageGrid, voxel_grid: VoxelGrid, state: ByteArray | None = None
+    errors: PoseErrors, grid: ImageGrid, voxel_grid: VoxelGrid, state: ByteArray | None = None
 ) -> Float32Array:
     """Standard deviation of position along the sweep in every voxel, shape (n_k, n_j, n_i), mm.
 
@@ -29,7 +29,7 @@ def deviation_volume(
 
     Parameters
     ----------
-    errors : PosedErrors
+    errors : PoseErrors
     grid : ImageGrid
     voxel_grid : VoxelGrid
     state : ndarray of uint8, shape (n_k, n_j, n_i), optional
@@ -49,7 +49,7 @@ def deviation_volume(
     return found
 
 
-def deviations(errors: PosedErrors, grid: ImageGrid, points_mm: FloatArray) -> FloatArray:
+def deviations(errors: PoseErrors, grid: ImageGrid, points_mm: FloatArray) -> FloatArray:
     """Standard deviation of points' positions along the sweep, shape (k,), mm."""
     near = belonging_of(points_mm, grid, errors.world_from_image)
     along = errors.world_from_image.rotation[near.frames[:, 0]].apply([0.0, 0.0, 1.0])

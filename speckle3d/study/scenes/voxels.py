@@ -15,7 +15,7 @@ from speckle3d.core.arrays import FloatArray, IntArray
 from speckle3d.core.errors import InsufficientDataError
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.labels import EMPTY, FILLED, MEASURED, STATE_SEGMENTS, LabelMap
-from speckle3d.core.pose_errors import PosedErrors
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.region import Region
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.axes import principal_axes, sweep_axes
@@ -25,7 +25,7 @@ from speckle3d.imaging.voxels.settings import CompoundingSettings
 from speckle3d.imaging.voxels.volume import compound_onto
 from speckle3d.io.voxels.volume_writer import write_volume
 from speckle3d.io.voxels.volumes import read_volume
-from speckle3d.study.pose_errors import posed_errors_of
+from speckle3d.study.pose_errors import errors_of
 from speckle3d.study.posed import MARK, PosedSweep, pose_mark
 
 _DEVIATION = "standard deviation of position along the sweep, mm"
@@ -208,7 +208,7 @@ def write_voxels(
     return VolumeReport(out, posed.mode, grid, counts, seconds)
 
 
-def _errors(posed: PosedSweep, purpose: str) -> PosedErrors:
+def _errors(posed: PosedSweep, purpose: str) -> PoseErrors:
     """Claimed errors of a reconstruction's poses.
 
     Raises
@@ -220,7 +220,7 @@ def _errors(posed: PosedSweep, purpose: str) -> PosedErrors:
         raise InsufficientDataError(
             f"{posed.sweep.name}: {purpose}: expected a reconstruction with claimed errors, got a recording"
         )
-    return posed_errors_of(posed.reconstruction, posed.mode)
+    return errors_of(posed.reconstruction, posed.mode)
 
 
 def confidence(posed: PosedSweep, grid: VoxelGrid) -> FloatArray:
@@ -233,7 +233,7 @@ def confidence(posed: PosedSweep, grid: VoxelGrid) -> FloatArray:
     InsufficientDataError
         If nothing says how well the frames' places are known.
     """
-    errors = _errors(posed, "rule weighted").errors
+    errors = _errors(posed, "rule weighted")
     along = grid.world_from_grid.rotation.inv().apply(posed.world_from_image[0].rotation.apply([0, 0, 1]))
     in_voxel = np.square(along * grid.spacing_mm).sum() / 12  # of a place that is anywhere in it
     place = (errors.factors[:, :, 2] ** 2).sum(axis=0) + in_voxel

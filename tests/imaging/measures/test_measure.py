@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PosedErrors, PoseErrors
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.imaging.measures.belonging import belonging_of, require_inside
 from speckle3d.imaging.measures.measure import angle, length, measured
 
@@ -27,7 +27,7 @@ def some_errors(poses, seed=0, size=1.0):
     waves = np.stack([along, along**2, np.sin(3 * along)])
     scale = size * np.array([0.1, 0.1, 0.3, 0.01, 0.01, 0.01])
     factors = np.einsum("mwc,wn->mnc", rng.normal(size=(7, 3, 6)) * scale, waves)
-    return PosedErrors(PoseErrors(factors), poses, GRID.centre_mm)
+    return PoseErrors(factors, poses, GRID.centre_mm)
 
 
 def inside(poses, places):
@@ -40,7 +40,7 @@ def drawn(errors, frames, points, normal):
     """Points after the frames they belong to have moved as rigid bodies, exactly: shape (draw, point, 3)."""
     first, moved = errors.world_from_image[0].rotation, []
     for frame, point in zip(frames, points, strict=True):
-        error = normal @ errors.errors.factors[:, frame]
+        error = normal @ errors.factors[:, frame]
         centre = errors.world_from_image[int(frame)].apply(errors.centre_mm)
         turn = first * Rotation.from_rotvec(error[:, 3:]) * first.inv()
         moved.append(centre + turn.apply(point - centre) + first.apply(error[:, :3]))

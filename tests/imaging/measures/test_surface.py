@@ -6,7 +6,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PosedErrors, PoseErrors
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.core.volume import Volume
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.measures.surface import (
@@ -97,7 +97,7 @@ def test_errors_of_volume_and_area_are_those_of_repeated_draws():
     rng = np.random.default_rng(4)
     along = np.linspace(0, 1, 41)[None, :, None]
     factors = rng.normal(size=(5, 1, 6)) * [0.3, 0.3, 0.6, 0.02, 0.02, 0.02] * along
-    errors = PosedErrors(PoseErrors(factors), poses, grid.centre_mm)
+    errors = PoseErrors(factors, poses, grid.centre_mm)
     told = measures_of(surface, errors, grid)
     near = belonging_of(surface.vertices_mm, grid, poses)
     arms = surface.vertices_mm[:, None] - poses.apply(grid.centre_mm)[near.frames]

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.pose_errors import PosedErrors, PoseErrors
+from speckle3d.core.pose_errors import PoseErrors
 from speckle3d.imaging.measures.belonging import belonging_of
 from speckle3d.imaging.measures.uncertainty import deviation_volume, deviations
 from speckle3d.imaging.voxels.grid import VoxelGrid, grid_around
@@ -21,7 +21,7 @@ def scaled(frames=41, turn_deg=0.0, sigma=0.05):
     factors = np.zeros((2, frames, 6))
     factors[0, :, 2] = sigma * 20 * t
     factors[1, :, 4] = 0.01 * t
-    return PosedErrors(PoseErrors(factors), poses, GRID.centre_mm)
+    return PoseErrors(factors, poses, GRID.centre_mm)
 
 
 def test_interpolated_deviations_are_those_of_the_voxels_themselves():
