@@ -92,7 +92,7 @@ def many_threads(monkeypatch):
     from speckle3d.core import threads
 
     threads.end_threads()
-    monkeypatch.setattr(threads, "cores", lambda: 5)
+    monkeypatch.setattr(threads, "processors", lambda: 5)
     yield
     threads.end_threads()
 

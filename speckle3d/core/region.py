@@ -87,12 +87,14 @@ class Region:
         return replace(grid, vectors=wide, samples=high, first_vector_mm=left, first_sample_depth_mm=top)
 
     def _inside(self, grid: ImageGrid) -> BoolArray:
-        inside = np.ones((grid.vectors, grid.samples), dtype=bool)
+        pixel = np.array([grid.vector_pitch_mm, grid.sample_spacing_mm])
+        places = grid.mm(np.arange(grid.vectors)[:, None], np.arange(grid.samples))
+        inside = np.ones(places.shape[:2], dtype=bool)
         for part in self.text.split(" and "):
             kind, *words = part.split() or [""]
             try:
                 corners = [(float(x), float(y)) for x, y in (word.split(",") for word in words)]
-                inside &= _SHAPES[kind](grid, *corners)
+                inside &= _SHAPES[kind](places, pixel, *corners)
             except InvalidInputError:
                 raise
             except (KeyError, TypeError, ValueError):
@@ -102,21 +104,21 @@ class Region:
         return inside
 
 
-def polygon_mask(shape: tuple[int, ...], corners: npt.ArrayLike, name: str = "polygon") -> BoolArray:
-    """Which pixels of an image are in a polygon, its sides included.
+def polygon_mask(places: FloatArray, corners: npt.ArrayLike, name: str = "polygon") -> BoolArray:
+    """Which places are in a polygon, its sides included.
 
     Parameters
     ----------
-    shape : tuple of int
-        Columns and rows of the image.
+    places : ndarray, shape (n, m, 2)
+        In pixels, whose millionth part is rounding.
     corners : array_like, shape (k, 2)
-        Three or more corners (column, row) of any simple polygon; pixel centres are whole numbers.
+        Three or more corners of any simple polygon, in the same unit.
     name : str
         Of the corners, for the errors.
 
     Returns
     -------
-    ndarray of bool, shape (columns, rows)
+    ndarray of bool, shape (n, m)
 
     Raises
     ------
@@ -127,46 +129,31 @@ def polygon_mask(shape: tuple[int, ...], corners: npt.ArrayLike, name: str = "po
     if outline.ndim != 2 or outline.shape[0] < 3 or outline.shape[1] != 2:
         raise InvalidInputError(f"{name}: expected shape (k, 2) with k of 3 or more, got {outline.shape}")
     require_finite(outline, name)
-    draw = extra_module("skimage.draw", "calibrate", "a region")
-    return np.asarray(draw.polygon2mask(shape, outline), dtype=bool)
+    measure = extra_module("skimage.measure", "calibrate", "a region")
+    inside = measure.points_in_poly(np.round(places.reshape(-1, 2), 6), np.round(outline, 6))
+    return np.asarray(inside.reshape(places.shape[:2]))
 
 
-def _rectangle(grid: ImageGrid, low: Pair, high: Pair) -> BoolArray:
+def _rectangle(places: FloatArray, pixel: FloatArray, low: Pair, high: Pair) -> BoolArray:
     if not np.less(low, high).all():
         raise ValueError
-    x, y, hair = _positions_mm(grid)
-    across = (x >= low[0] - hair) & (x <= high[0] + hair)
-    return np.asarray(across & (y >= low[1] - hair) & (y <= high[1] + hair))
+    hair = _HAIR * pixel
+    return np.asarray(((places >= low - hair) & (places <= high + hair)).all(axis=-1))
 
 
-def _fan(grid: ImageGrid, apex: Pair, angles_deg: Pair, radii: Pair) -> BoolArray:
+def _fan(places: FloatArray, pixel: FloatArray, apex: Pair, angles_deg: Pair, radii: Pair) -> BoolArray:
     (left, right), (near, far) = angles_deg, radii
     if not (-90 <= left < right <= 90 and 0 <= near < far):
         raise ValueError
-    x, y, hair = _positions_mm(grid)
-    x, y = x - apex[0], y - apex[1]
-    radius, angle = np.hypot(x, y), np.arctan2(x, y)
+    x, y = np.moveaxis(places - apex, -1, 0)
+    radius, angle, hair = np.hypot(x, y), np.arctan2(x, y), _HAIR * pixel.min()
     # Distances along the arc from the two sides, positive inside.
     between = radius * np.minimum(angle - np.radians(left), np.radians(right) - angle) >= -hair
     return np.asarray(between & (radius >= near - hair) & (radius <= far + hair))
 
 
-def _polygon(grid: ImageGrid, *corners: Pair) -> BoolArray:
-    outline = np.reshape(corners, (-1, 2))
-    if grid.fan is not None:
-        # Its sides are not straight from sample to sample.
-        measure = extra_module("skimage.measure", "calibrate", "a region")
-        places = np.stack(_positions_mm(grid)[:2], axis=-1)
-        inside = measure.points_in_poly(places.reshape(-1, 2), outline)
-        return np.asarray(inside.reshape(places.shape[:2]))
-    # Rounded, so that a sample on a side counts whatever the size of a pixel.
-    return polygon_mask((grid.vectors, grid.samples), np.round(grid.sample_at(outline), 6))
+def _polygon(places: FloatArray, pixel: FloatArray, *corners: Pair) -> BoolArray:
+    return polygon_mask(places / pixel, np.reshape(corners, (-1, 2)) / pixel)
 
 
 _SHAPES: dict[str, Callable[..., BoolArray]] = {"rectangle": _rectangle, "fan": _fan, "polygon": _polygon}
-
-
-def _positions_mm(grid: ImageGrid) -> tuple[FloatArray, FloatArray, float]:
-    """Where the samples lie, x and y of shape (vector, sample), and the rounding of such places."""
-    x, y = np.moveaxis(grid.mm(np.arange(grid.vectors)[:, None], np.arange(grid.samples)), -1, 0)
-    return x, y, _HAIR * min(grid.vector_pitch_mm, grid.sample_spacing_mm)

@@ -1,6 +1,7 @@
 """Work shared out to the cores of this machine: kernels that release the interpreter, on one pool of threads.
 
 Results do not depend on how many threads there are: each item is worked on alone, and fills its own place.
+Work that threads of the pool share out themselves is done on them, so that none waits for another.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
-from functools import cache, partial
+from functools import cache
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -34,24 +35,26 @@ def on_one_thread() -> Iterator[None]:
 
 
 def cores() -> int:
-    """Threads to work on at once: the processors this process may use, or fewer if the environment says so.
+    """Threads to work on at once: the processors this process may use, one inside `on_one_thread`."""
+    return 1 if _ALONE.get() else processors()
 
-    One inside `on_one_thread`. ``NUMBA_NUM_THREADS`` and ``OMP_NUM_THREADS``, with which clusters limit
-    their jobs, are obeyed.
+
+def processors() -> int:
+    """Count the processors this process may use, or fewer if the environment says so.
+
+    ``NUMBA_NUM_THREADS`` and ``OMP_NUM_THREADS``, with which clusters limit their jobs, are obeyed.
     """
-    if _ALONE.get():
-        return 1
     affinity = getattr(os, "sched_getaffinity", None)
     allowed = len(affinity(0)) if affinity else os.cpu_count() or 1
     # OpenMP's may be a list, by depth of nesting.
-    told = (os.environ.get(name, "").partition(",")[0].strip() for name in _LIMITS)
-    return max(1, min([allowed, *(int(value) for value in told if value.isascii() and value.isdecimal())]))
+    limits = (os.environ.get(name, "").partition(",")[0].strip() for name in _LIMITS)
+    return max(1, min([allowed, *(int(value) for value in limits if value.isascii() and value.isdecimal())]))
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
     """Return the threads that all of the process shares."""
-    return ThreadPoolExecutor(cores(), "speckle3d")
+    return ThreadPoolExecutor(processors(), "speckle3d")
 
 
 def end_threads() -> None:
@@ -68,14 +71,8 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-def _submitted(work: Callable[[], Result]) -> Future[Result]:
-    return _pool().submit(copy_context().run, work)
-
-
 def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1) -> None:
     """Call a function with the first and the end of slices of ``range(count)``, until all are done.
-
-    The calling thread does what no other has begun, so that calls may be nested.
 
     Parameters
     ----------
@@ -99,25 +96,23 @@ def in_parallel(function: Callable[[int, int], None], count: int, grain: int = 1
 def ahead(function: Callable[[Item], Result], items: Iterable[Item], most: int = 3) -> Generator[Result]:
     """Yield what a function makes of items, in order, `most` of them worked out before they are asked for.
 
-    Other threads work ahead; what none has begun when it is asked for is made on this one, so that calls may
-    be nested. On one core nothing is done ahead.
+    Other threads work ahead; on one core nothing is done ahead.
     """
     if cores() == 1:
         yield from map(function, items)
         return
-    waiting: deque[tuple[Future[Result], Callable[[], Result]]] = deque()
-
-    def first_result() -> Result:
-        future, work = waiting.popleft()
-        return work() if future.cancel() else future.result()
-
+    waiting: deque[Future[Result]] = deque()
     try:
         for item in items:
-            work = partial(function, item)
-            waiting.append((_submitted(work), work))
+            waiting.append(_pool().submit(copy_context().run, _alone, function, item))
             if len(waiting) > most:
-                yield first_result()
+                yield waiting.popleft().result()
         while waiting:
-            yield first_result()
+            yield waiting.popleft().result()
     finally:
-        wait([future for future, _ in waiting if not future.cancel()])
+        wait([future for future in waiting if not future.cancel()])
+
+
+def _alone(function: Callable[[Item], Result], item: Item) -> Result:
+    with on_one_thread():
+        return function(item)

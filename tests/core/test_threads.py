@@ -13,7 +13,7 @@ from speckle3d.core.threads import ahead, cores, in_parallel, on_one_thread
 
 @pytest.fixture(autouse=True)
 def four_cores(monkeypatch):
-    monkeypatch.setattr(threads, "cores", lambda: 4)
+    monkeypatch.setattr(threads, "processors", lambda: 4)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
@@ -99,7 +99,7 @@ def interrupted(thread):
     raise KeyboardInterrupt
 
 threading.Thread.start = interrupted
-threads.cores = lambda: 2
+threads.processors = lambda: 2
 try:
     threads.in_parallel(lambda first, end: None, 100)
 except KeyboardInterrupt:
