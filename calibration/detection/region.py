@@ -80,7 +80,7 @@ def region_mask(shape: tuple[int, ...], region_px: npt.ArrayLike) -> BoolArray:
     InvalidInputError
         If the region is not a polygon, or covers nothing.
     """
-    mask = polygon_mask(np.moveaxis(np.indices(shape), 0, -1), region_px, "region_px")
+    mask = polygon_mask(np.moveaxis(np.indices(shape, float), 0, -1), region_px, "region_px")
     if not mask.any():
         raise InvalidInputError(
             f"region_px: expected a polygon that covers part of the {shape[0]} x {shape[1]} pixels, got none"

@@ -230,22 +230,21 @@ def calibrated(sweep: Sweep, calibration: Calibration) -> Sweep:
     >>> speckle3d.calibrated(sweep, calibration).orientation.time_offset_s
     0.02
     """
-    name, known_s = calibration.sensor, calibration.time_offset_s
-    held: Any = getattr(sweep, name)
-    if held is None:
+    name, offset_s = calibration.sensor, calibration.time_offset_s
+    sensor: Any = getattr(sweep, name)
+    if sensor is None:
         raise MismatchError(f"{sweep.name}: expected the calibration's sensor, {name}, got none")
-    offset_s = held.time_offset_s if known_s is None else known_s
-    square = {"image_skew_rad": 0.0} if name == "tracker" else {}
-    mounted = replace(held, sensor_from_image=calibration.mounting, time_offset_s=offset_s, **square)
-    return replace(sweep, **{name: mounted})
+    changes: dict[str, Any] = {} if offset_s is None else {"time_offset_s": offset_s}
+    if name == "tracker":
+        changes["image_skew_rad"] = 0.0
+    return replace(sweep, **{name: replace(sensor, sensor_from_image=calibration.mounting, **changes)})
 
 
 def mounting_difference(sweep: Sweep, calibration: Calibration) -> tuple[float, float]:
     """Return how far a calibration's mounting is from the sweep's own, in degrees and mm; zero if unknown."""
-    held: Any = getattr(getattr(sweep, calibration.sensor), "sensor_from_image", None)
-    if held is None:
+    mounting: Any = getattr(getattr(sweep, calibration.sensor), "sensor_from_image", None)
+    if mounting is None:
         return 0.0, 0.0
-    step = held.inv() * calibration.mounting
-    if isinstance(step, Rotation):
-        return float(np.rad2deg(step.magnitude())), 0.0
-    return float(np.rad2deg(step.rotation.magnitude())), float(np.linalg.norm(step.translation))
+    step = mounting.inv() * calibration.mounting
+    turned, moved = (step, np.zeros(3)) if isinstance(step, Rotation) else (step.rotation, step.translation)
+    return float(np.rad2deg(turned.magnitude())), float(np.linalg.norm(moved))

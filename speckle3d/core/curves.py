@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -13,8 +13,6 @@ from speckle3d.core.geometry import require_increasing
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import BModeSettings, RFSettings
 
-PATCH_NUMBERS = ("vector_pitch_mm", "patch_width_mm", "patch_height_mm", "equalise_mm")
-"""Numbers in a `CurveKey` beside those of the signal, in every file of curves."""
 EDGE_FRACTION = 0.1
 """Of `CurveKey.edge_fraction` in files that do not give it: all that versions before wrote by default."""
 
@@ -71,30 +69,22 @@ class CurveKey:
 
     def require_same(self, other: CurveKey, what: str = "the curves do not match the sweep") -> None:
         """Raise `MismatchError` naming the first setting in which `other` (a sweep's key) differs."""
-        others = _settings(other)
+        mine, others = _settings(self), _settings(other)
         if any(getattr(key.signal, "dynamic_range_sigma_db", 0.0) for key in (self, other)):
-            others["dynamic_range_db"] = _settings(self).get("dynamic_range_db")
-        for name, mine in _settings(self).items():
-            theirs = others.get(name, mine)
-            if isinstance(mine, str):
-                same = theirs in (mine, "") or not mine
+            others["dynamic_range_db"] = mine.get("dynamic_range_db")
+        for name, value in mine.items():
+            theirs = others.get(name, value)
+            if isinstance(value, str):
+                same = theirs in (value, "") or not value
             else:
-                same = np.allclose(mine, theirs, rtol=1e-3, atol=1e-9)
+                same = np.allclose(value, theirs, rtol=1e-3, atol=1e-9)
             if not same:
                 advice = BAND_ADVICE if name == "bandwidth_hz" else ""
-                raise MismatchError(f"{what}: {name} is {mine!r} and {theirs!r}{advice}")
-
-
-class _ByDepth:
-    """Fields that are numbers by depth."""
-
-    def at(self, depth_mm: FloatArray, known_mm: FloatArray) -> Self:
-        """The same at other depths than those known, by linear interpolation."""
-        return type(self)(*(np.interp(depth_mm, known_mm, values) for values in vars(self).values()))
+                raise MismatchError(f"{what}: {name} is {value!r} and {theirs!r}{advice}")
 
 
 @dataclass(frozen=True)
-class TiltResponse(_ByDepth):
+class TiltResponse:
     """Effect of tilt, by depth, on the correlation.
 
     Speckle that is tilted by theta while its patch moves by z decorrelates as if it had moved by d, with
@@ -111,7 +101,7 @@ class TiltResponse(_ByDepth):
 
 
 @dataclass(frozen=True)
-class SpeckleSize(_ByDepth):
+class SpeckleSize:
     """Width of speckle in the image, by depth, as a probe and its settings make it.
 
     Attributes
@@ -122,6 +112,9 @@ class SpeckleSize(_ByDepth):
 
     lateral_mm: FloatArray
     axial_mm: FloatArray
+
+
+ByDepth = TypeVar("ByDepth", TiltResponse, SpeckleSize)
 
 
 @dataclass(frozen=True)
@@ -231,36 +224,42 @@ class DecorrelationCurves:
     of_tissue: bool = False
 
     def __post_init__(self) -> None:
-        if self.origin not in get_args(Origin):
-            raise InvalidInputError(f"origin: expected one of {get_args(Origin)}, got {self.origin!r}")
-        if not 0.0 <= self.scale_sigma < 1.0:
-            raise InvalidInputError(f"scale_sigma: expected a share from 0 to 1, got {self.scale_sigma}")
         rho, shape = self.correlation, (self.depth_mm.size, self.distance_mm.size)
-        if rho.shape != shape:
-            raise InvalidInputError(f"correlation: expected shape {shape}, got {rho.shape}")
         even = np.linspace(0.0, self.distance_mm[-1], shape[1])
-        if shape[1] < 2 or not (even[-1] > 0 and np.allclose(self.distance_mm, even)):
-            raise InvalidInputError("distance_mm: expected equal steps from zero, got others")
-        sizes = {"cells": self.cells, **(vars(self.speckle) if self.speckle else {})}
-        for name, values in (sizes | (vars(self.tilt) if self.tilt else {})).items():
-            usable = values.shape == self.depth_mm.shape and np.isfinite(values).all()
-            if not usable or (name in sizes and (values <= 0).any()):
-                least = " above zero" if name in sizes else ""
-                raise InvalidInputError(f"{name}: expected a number{least} for each depth, got others")
-        if not ((rho > 0) & (rho <= 1)).all() or (np.diff(rho, axis=1) > 0).any():
-            raise InvalidInputError("correlation: expected values in (0, 1] that fall, got others")
+        sizes = [self.cells, *(vars(self.speckle).values() if self.speckle else ())]
+        by_depth = [*sizes, *(vars(self.tilt).values() if self.tilt else ())]
+        falling = rho.shape == shape and ((rho > 0) & (rho <= 1)).all() and (np.diff(rho, axis=1) <= 0).all()
+        even_steps = shape[1] > 1 and even[-1] > 0 and np.allclose(self.distance_mm, even)
+        whole = all(values.shape == shape[:1] and np.isfinite(values).all() for values in by_depth)
+        requirements = {
+            f"origin: expected one of {get_args(Origin)}": self.origin in get_args(Origin),
+            "scale_sigma: expected a share from 0 to 1": 0.0 <= self.scale_sigma < 1.0,
+            "distance_mm: expected equal steps from zero": even_steps,
+            "correlation: expected values in (0, 1] that fall with distance": falling,
+            "cells, speckle, tilt: expected a number for each depth": whole,
+            "cells, speckle: expected values above zero": all((values > 0).all() for values in sizes),
+        }
+        for expected, holds in requirements.items():
+            if not holds:
+                raise InvalidInputError(f"{expected}, got others")
 
     def at(self, depth_mm: FloatArray) -> DecorrelationCurves:
         """Curves at other depths, shape (p,), by linear interpolation of sqrt(-ln rho)."""
+
+        def interpolate(values: FloatArray) -> FloatArray:
+            return np.interp(depth_mm, self.depth_mm, values)
+
+        def at_depths(fields: ByDepth | None) -> ByDepth | None:
+            return fields and type(fields)(*map(interpolate, vars(fields).values()))
+
         roots = np.sqrt(-np.log(self.correlation))
-        columns = [np.interp(depth_mm, self.depth_mm, column) for column in roots.T]
         return replace(
             self,
             depth_mm=np.asarray(depth_mm),
-            correlation=np.exp(-(np.stack(columns, axis=1) ** 2)),
-            cells=np.interp(depth_mm, self.depth_mm, self.cells),
-            tilt=self.tilt and self.tilt.at(depth_mm, self.depth_mm),
-            speckle=self.speckle and self.speckle.at(depth_mm, self.depth_mm),
+            correlation=np.exp(-(np.stack([*map(interpolate, roots.T)], axis=1) ** 2)),
+            cells=interpolate(self.cells),
+            tilt=at_depths(self.tilt),
+            speckle=at_depths(self.speckle),
         )
 
     def mismatch(self, same_probe: bool, attenuation_sigma: float = ATTENUATION_SIGMA) -> float:
@@ -286,12 +285,8 @@ def curve_widths(distance_mm: FloatArray, correlation: FloatArray) -> FloatArray
 
 def _settings(key: CurveKey) -> dict[str, Any]:
     kind = "RF" if isinstance(key.signal, RFSettings) else "B-mode"
-    numbers = {name: getattr(key, name) for name in (*PATCH_NUMBERS, "edge_fraction")}
-    if key.lines == "fan":
-        del numbers["vector_pitch_mm"]
-        numbers |= {name: getattr(key, name) for name in ("array_radius_mm", "line_step_rad")}
     # How finely the echo was sampled, real or as I/Q, is no property of the beam, and matching resamples it.
     left_out = ["demodulation_frequency_hz", "dynamic_range_sigma_db", *["sampling_rate_hz"] * (kind == "RF")]
-    signal = {name: value for name, value in vars(key.signal).items() if name not in left_out}
-    words = {"signal": kind, **{name: getattr(key, name) for name in ("correlation_of", "probe", "lines")}}
-    return words | signal | numbers
+    left_out += ["vector_pitch_mm"] if key.lines == "fan" else ["array_radius_mm", "line_step_rad"]
+    settings = {"signal": "", "lines": ""} | vars(key) | vars(key.signal) | {"signal": kind}
+    return {name: value for name, value in settings.items() if name not in left_out}

@@ -30,7 +30,7 @@ class Belonging(NamedTuple):
 
     def of_points(self, rows: IntArray) -> Belonging:
         """The same of some of the points."""
-        return Belonging(*(values[rows] for values in self))
+        return Belonging(self.frames[rows], self.weights[rows], self.gap_mm[rows])
 
 
 @shown
@@ -83,7 +83,7 @@ class PoseErrors:
             In the world; directions of length one.
         """
         forces, screws = _forces(points_mm, directions, belonging), self._screws
-        along = sum(forces[:, j, None] @ screws[belonging.frames[:, j]] for j in (0, 1))
+        along = np.sum([forces[:, j, None] @ screws[belonging.frames[:, j]] for j in (0, 1)], axis=0)
         return np.asarray((along**2).sum(axis=(1, 2)))
 
     def of_gradient(self, points_mm: FloatArray, gradient: FloatArray, belonging: Belonging) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import textwrap
 from dataclasses import fields
 from typing import Any, TypeVar
 
@@ -27,20 +27,15 @@ def shown(cls: Shown) -> Shown:
 
 def brief(value: Any) -> str:
     """One short line for a value."""
-    if isinstance(value, np.ndarray) and value.size <= 6:
-        text = np.array2string(value, precision=4)
-    elif hasattr(value, "dtype") and hasattr(value, "shape"):
+    if hasattr(value, "dtype") and np.prod(value.shape) > 6:
         text = f"{value.dtype} {value.shape}"
     elif isinstance(value, Rotation | RigidTransform):
         text = type(value).__name__ + ("" if value.single else f" ({len(value)},)")
-    elif isinstance(value, float):
-        text = f"{value:.4g}"
-    elif isinstance(value, Collection) and not isinstance(value, str):
+    elif isinstance(value, dict | tuple):
         text = ", ".join(map(brief, value)) if len(value) <= 4 else f"{len(value)}"
     else:
-        text = "" if value is None else str(value)
-    text = " ".join(text.split()) or "none"
-    return text if len(text) <= _MOST_LETTERS else f"{text[: _MOST_LETTERS - 1]}…"
+        text = f"{value:.4g}" if isinstance(value, float) else str(value or "none")
+    return textwrap.shorten(text, _MOST_LETTERS, placeholder="…")
 
 
 def _text(self: Any) -> str:

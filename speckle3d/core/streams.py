@@ -32,13 +32,10 @@ class TimedSamples(Generic[Samples]):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "time_s", require_increasing(self.time_s, "time_s"))
-        samples = len(self.world_from_sensor)
-        if self.time_s.size != samples:
+        if not 0 < self.time_s.size == len(self.world_from_sensor):
             raise InvalidInputError(
-                f"expected as many samples as times, got {samples} and {self.time_s.size}"
+                f"expected samples with times, got {len(self.world_from_sensor)} and {self.time_s.size}"
             )
-        if samples == 0:
-            raise InvalidInputError("expected at least one sensor sample, got none")
 
     def __len__(self) -> int:
         return int(self.time_s.size)
@@ -46,12 +43,10 @@ class TimedSamples(Generic[Samples]):
     def covers(self, times_s: npt.ArrayLike) -> BoolArray:
         """Whether each of `times_s` lies on a sample or between two that are close enough."""
         t = np.asarray(times_s, dtype=float)
-        if len(self) < 2:
-            return np.asarray(t == self.time_s[0])
-        right = np.clip(np.searchsorted(self.time_s, t), 1, len(self) - 1)
-        before, after = self.time_s[right - 1], self.time_s[right]
-        inside = (t > before) & (t < after) & (after - before <= self.max_gap_s)
-        return np.asarray(inside | (t == before) | (t == after))
+        after = np.searchsorted(self.time_s, t).clip(max=len(self) - 1)
+        first, last = self.time_s[(after - 1).clip(0)], self.time_s[after]
+        between = (t > first) & (t < last) & (last - first <= self.max_gap_s)
+        return np.asarray(between | (t == last))
 
     def at(self, times_s: npt.ArrayLike) -> Samples:
         """Sample at each of `times_s`: slerp of the rotation, linear interpolation of the translation.
@@ -65,11 +60,10 @@ class TimedSamples(Generic[Samples]):
         samples = self.world_from_sensor
         if len(self) == 1:
             return samples[np.zeros(t.shape, dtype=int)]
-        turned = self._slerp(t)
-        if isinstance(samples, RigidTransform):
-            moved = np.stack([np.interp(t, self.time_s, column) for column in samples.translation.T], axis=-1)
-            return RigidTransform.from_components(moved, turned)
-        return turned
+        if not isinstance(samples, RigidTransform):
+            return self._slerp(t)
+        moved = np.stack([np.interp(t, self.time_s, column) for column in samples.translation.T], axis=-1)
+        return RigidTransform.from_components(moved, self._slerp(t))
 
     def require_covered(self, times_s: npt.ArrayLike) -> FloatArray:
         """Return `times_s` as an array if `at` can read them.
@@ -83,10 +77,8 @@ class TimedSamples(Generic[Samples]):
         missing = np.flatnonzero(~self.covers(t))
         if missing.size:
             raise InsufficientDataError(
-                f"sensor samples do not cover time {t.flat[missing[0]]:.4f} s "
-                f"({missing.size} of {t.size} asked times): samples span "
-                f"{self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s, "
-                f"gaps over {self.max_gap_s:g} s are not bridged"
+                f"sensor samples do not cover time {t.flat[missing[0]]:.4f} s and {missing.size - 1} others: "
+                f"they span {self.time_s[0]:.4f} to {self.time_s[-1]:.4f} s, {self.max_gap_s:g} s bridged"
             )
         return t
 

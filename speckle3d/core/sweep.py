@@ -52,9 +52,9 @@ def stored_dtype(frames: Frames) -> np.dtype[Any]:
 
     Pairs of int16 (I/Q) are read as complex64, and would take twice the room so.
     """
-    pairs = np.dtype(np.int16)
     own: np.dtype[Any] = np.dtype(frames.dtype)
-    return pairs if own.kind == "c" and getattr(frames, "stored_dtype", own) == pairs else own
+    pairs = own.kind == "c" and getattr(frames, "stored_dtype", own) == np.int16
+    return np.dtype(np.int16) if pairs else own
 
 
 _READING = threading.Lock()
@@ -151,10 +151,10 @@ class RFSettings:
             Of shape (length // 2 + 1,) for real samples, whose negative frequencies say nothing new, else of
             shape (length,), in the order of ``scipy.fft.fft``.
         """
-        bins = np.arange(length if self.are_complex else length // 2 + 1, dtype=float)
-        if self.demodulation_frequency_hz:
-            bins[(length + 1) // 2 :] -= length
-        return bins * (self.sampling_rate_hz / length) + (self.demodulation_frequency_hz or 0.0)
+        rate_hz, middle_hz = self.sampling_rate_hz, self.demodulation_frequency_hz
+        frequencies = np.fft.fftfreq if self.are_complex else np.fft.rfftfreq
+        frequency = frequencies(length, 1 / rate_hz)
+        return np.asarray(frequency + middle_hz if middle_hz else frequency % rate_hz, dtype=float)
 
 
 @dataclass(frozen=True)
@@ -290,12 +290,17 @@ class Sweep:
     def __post_init__(self) -> None:
         times = require_increasing(self.frame_time_s, f"{self.name}: frame_time_s")
         object.__setattr__(self, "frame_time_s", times)
-        _require_kind(self)
         shape = times.size, self.grid.vectors, self.grid.samples
         if self.frames.shape != shape or (self.truth is not None and len(self.truth) != shape[0]):
             raise InvalidInputError(
                 f"{self.name}: expected frames of shape {shape} by times and grid, and as many true poses "
                 f"if any, got {self.frames.shape}"
+            )
+        are_complex = np.dtype(self.frames.dtype).kind == "c"
+        if are_complex != (isinstance(self.signal, RFSettings) and self.signal.are_complex):
+            raise InvalidInputError(
+                f"{self.name}: expected complex samples (I/Q) with a demodulation_frequency_hz (0: analytic "
+                f"signal), real ones without, got {self.frames.dtype}"
             )
 
     def __len__(self) -> int:
@@ -349,19 +354,17 @@ class Sweep:
         n, columns, rows = read.shape
         if frame_time_s is None and frame_rate_hz is not None:
             frame_time_s = np.arange(n) / frame_rate_hz
+        across, down = np.broadcast_to(USUAL_PIXEL_MM if pitch_mm is None else pitch_mm, (2,)).tolist()
         kind: RFSettings | BModeSettings | None = signal
         if signal is None and read.dtype == np.uint8:
-            sides = np.broadcast_to(USUAL_PIXEL_MM if pitch_mm is None else pitch_mm, (2,)).tolist()
-            seen = (
-                estimate_dynamic_range(read, *sides) if dynamic_range_db is None else (dynamic_range_db, 0.0)
-            )
-            kind = seen and BModeSettings(seen[0], dynamic_range_sigma_db=seen[1])
+            known_db = None if dynamic_range_db is None else (dynamic_range_db, 0.0)
+            range_db = known_db or estimate_dynamic_range(read, across, down)
+            kind = range_db and BModeSettings(range_db[0], dynamic_range_sigma_db=range_db[1])
         of_kind = "dynamic_range_db" if read.dtype == np.uint8 else "signal"
         if pitch_mm is None or frame_time_s is None or kind is None:
             known = {"pitch_mm": pitch_mm, "frame_rate_hz": frame_time_s, of_kind: kind}
             missing = ", ".join(name for name, value in known.items() if value is None)
             raise InvalidInputError(f"arrays do not say, so give {missing}: see docs/howto/pictures.md")
-        across, down = np.broadcast_to(np.asarray(pitch_mm, dtype=float), (2,)).tolist()
         if isinstance(kind, RFSettings):
             down = kind.sample_spacing_mm
         grid = ImageGrid(columns, rows, across, down, first_row_depth_mm)
@@ -437,13 +440,3 @@ def image_orientation(sensor: OrientationSensor | Tracker, frame_time_s: npt.Arr
     """Orientation ``world_from_image`` at each frame time, by either kind of sensor."""
     measured = sensor.world_from_image(frame_time_s)
     return measured.rotation if isinstance(measured, RigidTransform) else measured
-
-
-def _require_kind(sweep: Sweep) -> None:
-    """Raise unless samples are complex where the settings say so, and real where they do not."""
-    are_complex = np.dtype(sweep.frames.dtype).kind == "c"
-    if are_complex != (isinstance(sweep.signal, RFSettings) and sweep.signal.are_complex):
-        raise InvalidInputError(
-            f"{sweep.name}: expected complex samples (I/Q) with a demodulation_frequency_hz (0: analytic "
-            f"signal), real ones without, got {sweep.frames.dtype}"
-        )

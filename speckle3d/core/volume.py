@@ -49,14 +49,15 @@ class Volume:
     fields: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
-        if self.voxels.ndim != 3 or 0 in self.voxels.shape:
-            raise InvalidInputError(f"voxels: expected shape (n_i, n_j, n_k), got {self.voxels.shape}")
-        if self.voxels.dtype.name not in VOXEL_TYPES:
-            raise InvalidInputError(f"voxels: expected {', '.join(VOXEL_TYPES)}, got {self.voxels.dtype}")
-        spacing = tuple(float(step) for step in self.spacing_mm)
-        if len(spacing) != 3 or not all(0 < step < np.inf for step in spacing):
-            raise InvalidInputError(f"spacing_mm: expected three values above zero, got {spacing}")
-        object.__setattr__(self, "spacing_mm", spacing)
+        if self.voxels.ndim != 3 or not self.voxels.size or self.voxels.dtype.name not in VOXEL_TYPES:
+            raise InvalidInputError(
+                f"voxels: expected shape (n_i, n_j, n_k) of {', '.join(VOXEL_TYPES)}, got "
+                f"{self.voxels.shape} of {self.voxels.dtype}"
+            )
+        across, down, along = (float(step) for step in self.spacing_mm)
+        if not (np.isfinite(self.spacing_mm).all() and min(self.spacing_mm) > 0):
+            raise InvalidInputError(f"spacing_mm: expected three values above zero, got {self.spacing_mm}")
+        object.__setattr__(self, "spacing_mm", (across, down, along))
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -110,9 +110,9 @@ def doubt_size(
     left : ndarray, shape (r,)
         Part of the correlation of each row of patches that noise leaves.
     """
-    if curves.speckle is None:
+    known = curves.at(patches.row_depth_mm).speckle
+    if known is None:
         return ()
-    known = curves.speckle.at(patches.row_depth_mm, curves.depth_mm)
     found = []
     for name in ("lateral_mm", "axial_mm"):
         # Noise differs from sample to sample, so that speckle under it looks finer.

@@ -111,15 +111,15 @@ class MotionProblem:
     @cached_property
     def levers(self) -> Levers:
         """What slopes are multiplied by at each patch."""
-        tilt, (x, y) = self.curves.tilt, (self.patches.centre_mm - self.centre_mm[:2]).T
+        tilt = self.curves.at(self.patches.depth_mm).tilt
+        (x, y) = (self.patches.centre_mm - self.centre_mm[:2]).T
         if tilt is None:
             # Unknown, it is taken to turn about the focus, and the focus to be at the image's centre: all
             # depths then see the centre's distance.
             return Levers(np.ascontiguousarray(x), np.zeros(x.size), np.zeros(x.size))
-        at = tilt.at(self.patches.depth_mm, self.curves.depth_mm)
         # A vector of a fan turns about a point on itself, and by the part of the turn that is across it.
         sine, cosine = np.sin(self.patches.angle_rad), np.cos(self.patches.angle_rad)
-        return Levers(x - sine * at.pivot_mm, y - cosine * at.pivot_mm, cosine * at.spread_mm)
+        return Levers(x - sine * tilt.pivot_mm, y - cosine * tilt.pivot_mm, cosine * tilt.spread_mm)
 
     @cached_property
     def end_amplitude(self) -> FloatArray:

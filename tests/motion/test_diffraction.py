@@ -38,7 +38,7 @@ def test_calculated_curves_are_those_measured_on_a_phantom(sweep, curves):
     # Measured: 0.97 to 1.00; the phantom's own curves are known to 0.012.
     assert np.abs(ratio - 1).max() < 0.06
     assert abs(ratio.mean() - 1) < 0.03
-    pivot = curves.tilt.at(found.depth_mm, curves.depth_mm).pivot_mm
+    pivot = curves.at(found.depth_mm).tilt.pivot_mm
     # Beyond the focus speckle turned by hand seems to turn about a nearer point than the field has it.
     assert np.abs(found.tilt.pivot_mm - pivot).max() < 5.0
     assert np.median(np.abs(found.tilt.pivot_mm - pivot)) < 1.5

@@ -80,7 +80,7 @@ def splat_images(
         If images differ in type.
     InvalidInputError
         If a pose is not finite, there is not one weight per frame, the mask is not of the images' shape, no
-        sample counts, an image reaches too far beyond the grid, or with "plus" images are not of uint8.
+        sample counts, an image reaches too far beyond the grid, or with "plus" levels are not of 0 to 255.
     """
     side, n = (source.grid.vectors, source.grid.samples), len(source)
     mask = np.ones(side, dtype=bool) if mask is None else mask
@@ -94,14 +94,14 @@ def splat_images(
     if not near.size:
         return np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
     first = source.read_as_stored(int(near[0]))
-    if rule == "plus" and first.dtype != np.uint8:
-        raise InvalidInputError(
-            f"rule plus: expected images of type uint8, B-mode as stored, got {first.dtype}"
-        )
+    if rule == "plus":
+        if first.dtype.name not in ("uint8", "float32"):
+            raise InvalidInputError(f"rule plus: expected grey levels of 0 to 255, got {first.dtype}")
+        mask = mask & ~np.isnan(first)  # outside a fan there is nothing
     kernel, tables = _kernel(splat, rule, shape)
     turned = rule == "plus" or (first.flags.f_contiguous and not first.flags.c_contiguous)
     spans = _spans(mask, turned)
-    for images, frames in _batches(source, near, first, turned):
+    for images, frames in _batches(source, near, first, turned, rule == "plus"):
         fixed = _fixed_maps(maps[frames], splat, PLUS_BITS if rule == "plus" else POSITION_BITS, turned)
         tag = int(frames[0]) + 1 if rule == "latest" else 0
         samples = Samples(images, share[frames], fixed, spans, tag, splat == "linear")
@@ -170,13 +170,15 @@ def _frames_near(
 
 
 def _batches(
-    source: PosedImages, frames: IntArray, first: npt.NDArray[Any], turned: bool
+    source: PosedImages, frames: IntArray, first: npt.NDArray[Any], turned: bool, whole: bool
 ) -> Iterator[tuple[npt.NDArray[Any], IntArray]]:
     """Read frames a few at a time: images, shape (n, line, sample), and their numbers.
 
     Images keep the order that the first has in memory, since turning them takes as long as the work on them.
+    With `whole` they become whole grey levels.
     """
-    kind = first.dtype if first.dtype.name in _DIRECT and first.dtype.isnative else np.dtype(np.float32)
+    direct = first.dtype.name in _DIRECT and first.dtype.isnative
+    kind = np.dtype(np.uint8 if whole else first.dtype if direct else np.float32)
     size = min(max(_BATCH_BYTES // (first.size * kind.itemsize), 1), _BATCH_FRAMES, frames.size)
     images = np.empty((size, *(first.T if turned else first).shape), kind)
 
@@ -187,7 +189,8 @@ def _batches(
                 raise MismatchError(
                     f"images[{some[n]}]: expected {first.dtype} as the others, got {image.dtype}"
                 )
-            images[n] = image.T if turned else image
+            levels = np.nan_to_num(np.rint(image)).clip(0, 255) if whole else image
+            images[n] = levels.T if turned else levels
 
     for start in range(0, frames.size, size):
         some = frames[start : start + size]

@@ -86,7 +86,7 @@ def compound(
         Directions of the axes of cubic voxels; without it, the world's.
     **settings
         Fields of `CompoundingSettings`: `splat` ("nearest", "linear"), `rule` ("mean", "maximum", "latest",
-        "weighted", or "plus", whose images and voxels must be of uint8), `fill_radius` (half the edge of the
+        "weighted", or "plus", whose voxels must be of uint8), `fill_radius` (half the edge of the
         largest such cube, in voxels; by default 3), `fill_mm`, `max_memory_gb`, `voxel_type` (by default
         "float32", in which empty voxels are NaN; in others levels are rounded and clipped, and empty voxels
         0), and `backward_mm` for sparse sweeps: above zero, each voxel is interpolated between the images
