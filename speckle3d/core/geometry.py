@@ -73,10 +73,7 @@ def mirrored(world_from_image: RigidTransform) -> RigidTransform:
 
 def skew(vectors: FloatArray) -> FloatArray:
     """Matrices of the cross product ``v x``, shape (..., 3) to (..., 3, 3)."""
-    matrices = np.zeros((*vectors.shape, 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
-    return np.asarray(matrices - np.swapaxes(matrices, -1, -2))
+    return np.cross(np.eye(3), vectors[..., None, :])
 
 
 def nearest_rotation(matrices: npt.ArrayLike) -> FloatArray:
@@ -117,10 +114,7 @@ def rotations_from_quaternions(wxyz: npt.ArrayLike, where: str) -> Rotation:
     InvalidInputError
         Naming `where` and the first bad index.
     """
-    q = np.asarray(wxyz, dtype=float)
-    if q.ndim != 2 or q.shape[1] != 4:
-        raise InvalidInputError(f"{where}: expected shape (m, 4), got {q.shape}")
-    require_finite(q, where)
+    q = _require_rows(wxyz, (4,), where)
     with np.errstate(over="ignore"):
         off = np.abs(np.linalg.norm(q, axis=1) - 1.0) > RIGID_TOLERANCE
     if off.any():
@@ -137,10 +131,7 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
     InvalidInputError
         Naming `where` and the first index that is not a proper rotation with translation.
     """
-    m = np.array(matrices, dtype=float)
-    if m.ndim != 3 or m.shape[1:] != (4, 4):
-        raise InvalidInputError(f"{where}: expected shape (m, 4, 4), got {m.shape}")
-    require_finite(m, where)
+    m = _require_rows(matrices, (4, 4), where)
     r, last = m[:, :3, :3], [0.0, 0.0, 0.0, 1.0]
     with np.errstate(all="ignore"):
         square = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE
@@ -153,23 +144,25 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
 
 def require_finite(values: npt.NDArray[np.floating], where: str) -> None:
     """Raise `InvalidInputError` naming the first entry of `values` that is NaN or infinite."""
-    finite = np.isfinite(values)
-    if not finite.all():
-        first = tuple(np.argwhere(~finite)[0].tolist())
+    for first in map(tuple, np.argwhere(~np.isfinite(values)).tolist()):
         index = first if len(first) > 1 else first[0]
         raise InvalidInputError(f"{where}[{index}]: expected a finite value, got {values.item(first)}")
 
 
 def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:
     """Return `times_s`, shape (m,), if finite and strictly increasing; else raise `InvalidInputError`."""
-    t = np.asarray(times_s, dtype=float)
-    if t.ndim != 1:
-        raise InvalidInputError(f"{where}: expected shape (m,), got {t.shape}")
-    require_finite(t, where)
-    bad = np.flatnonzero(t[1:] <= t[:-1])
-    if bad.size:
-        i = int(bad[0]) + 1
+    t = _require_rows(times_s, (), where)
+    for i in np.flatnonzero(t[1:] <= t[:-1]) + 1:
         raise InvalidInputError(
             f"{where}[{i}]: expected strictly increasing times, got {t[i]:.6f} s after {t[i - 1]:.6f} s"
         )
     return t
+
+
+def _require_rows(values: npt.ArrayLike, row: tuple[int, ...], where: str) -> FloatArray:
+    """Copy finite values of shape (m, *row)."""
+    rows = np.array(values, dtype=float)
+    if rows.ndim != 1 + len(row) or rows.shape[1:] != row:
+        raise InvalidInputError(f"{where}: expected shape {('m', *row)}, got {rows.shape}")
+    require_finite(rows, where)
+    return rows

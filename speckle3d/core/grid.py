@@ -72,15 +72,14 @@ class ImageGrid:
 
     def __post_init__(self) -> None:
         require_positive(self, ("vectors", "samples", "vector_pitch_mm", "sample_spacing_mm"))
-        for name in ("first_sample_depth_mm", "first_vector_mm"):
-            if not np.isfinite(getattr(self, name)):
-                raise InvalidInputError(f"{name}: expected a finite value, got {getattr(self, name)}")
+        if not np.isfinite([self.first_sample_depth_mm, self.first_vector_mm]).all():
+            raise InvalidInputError("first_sample_depth_mm, first_vector_mm: expected finite values")
         if not abs(self.skew_rad) <= LARGEST_SKEW_RAD:
             raise InvalidInputError(
                 f"skew_rad: expected at most {LARGEST_SKEW_RAD:g} either way, got {self.skew_rad}"
             )
         if self.fan is not None and (
-            abs(self.angle_rad(np.array([0.0, self.vectors - 1.0]))).max() >= np.pi / 2
+            abs(self.angle_rad([0, self.vectors - 1])).max() >= np.pi / 2
             or self.fan.radius_mm + self.first_sample_depth_mm < 0
         ):
             raise InvalidInputError(
@@ -128,11 +127,9 @@ class ImageGrid:
 
     def mm(self, vector: npt.ArrayLike, sample: npt.ArrayLike) -> FloatArray:
         """Place of samples in P, shape (..., 2), mm; numbers may be fractional."""
-        v, s = np.asarray(vector, dtype=float), np.asarray(sample, dtype=float)
+        v, s = np.broadcast_arrays(np.asarray(vector, dtype=float), sample)
         if self.fan is None:
-            return np.asarray(
-                np.stack(np.broadcast_arrays(v, s, 1.0), axis=-1) @ self.image_from_sample[:2].T
-            )
+            return np.asarray(np.stack([v, s, np.ones(v.shape)], axis=-1) @ self.image_from_sample[:2].T)
         angle = self.angle_rad(v)
         radius = self.fan.radius_mm + self.first_sample_depth_mm + s * self.sample_spacing_mm
         return np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=-1) + self.fan.apex_mm
@@ -180,7 +177,7 @@ class ImageGrid:
         if self.fan is not None:
             (left, top), (right, bottom) = self.extent_mm
             corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-        return np.column_stack([corners, np.zeros(4)])
+        return np.pad(corners, ((0, 0), (0, 1)))
 
     @property
     def image_from_sample(self) -> FloatArray:
@@ -195,14 +192,11 @@ class ImageGrid:
             raise InvalidInputError("expected parallel vectors, got a fan's: take its images scan-converted")
         along, beside = np.cos(self.skew_rad / 2), np.sin(self.skew_rad / 2)
         across, down = self.vector_pitch_mm, self.sample_spacing_mm
-        return np.array(
-            [
-                [along * across, beside * down, self.first_vector_mm],
-                [beside * across, along * down, self.first_sample_depth_mm],
-                [0.0, 0.0, 0.0],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        affine = np.zeros((4, 3))
+        affine[0] = along * across, beside * down, self.first_vector_mm
+        affine[1] = beside * across, along * down, self.first_sample_depth_mm
+        affine[3, 2] = 1.0
+        return affine
 
 
 def require_positive(settings: object, names: tuple[str, ...]) -> None:

@@ -38,8 +38,8 @@ class Segment:
     colour: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        shown = len(self.colour) == 3 and all(0 <= part <= 1 for part in self.colour)
-        if not (0 < self.value < 2**16 and self.name.strip() and shown):
+        fair = len(self.colour) == 3 and all(0 <= part <= 1 for part in self.colour)
+        if not (0 < self.value < 2**16 and self.name.strip() and fair):
             raise InvalidInputError(
                 f"segment: expected a label from 1 to 65535, a name and a colour of three parts, got {self}"
             )
@@ -87,9 +87,8 @@ class LabelMap(Volume):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        labels, kind = [segment.value for segment in self.segments], self.voxels.dtype
-        if kind.name not in LABEL_TYPES:
-            raise InvalidInputError(f"labels: expected {' or '.join(LABEL_TYPES)}, got {kind}")
-        most = np.iinfo(kind.name).max
+        if self.voxels.dtype.name not in LABEL_TYPES:
+            raise InvalidInputError(f"labels: expected {' or '.join(LABEL_TYPES)}, got {self.voxels.dtype}")
+        labels, most = [segment.value for segment in self.segments], np.iinfo(self.voxels.dtype).max
         if len({*labels}) != len(labels) or max(labels, default=0) > most:
             raise InvalidInputError(f"segments: expected one for each label up to {most}, got {labels}")

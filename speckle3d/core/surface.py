@@ -47,7 +47,7 @@ class Surface:
             if values.ndim != 2 or values.shape[1] != 3:
                 raise InvalidInputError(f"{name}: expected shape (n, 3), got {values.shape}")
         require_finite(self.vertices_mm, "vertices_mm")
-        if ((self.triangles < 0) | (self.triangles >= len(self.vertices_mm))).any():
+        if not np.isin(self.triangles, range(len(self.vertices_mm))).all():
             raise InvalidInputError(f"triangles: expected vertices 0 to {len(self.vertices_mm) - 1}")
 
     def __len__(self) -> int:
@@ -88,7 +88,7 @@ class Surface:
         """Number, from 0, of the connected part that each triangle belongs to, shape (m,)."""
         n, edges = len(self.vertices_mm), self._edges()
         graph = coo_array((np.ones(len(edges), dtype=np.int8), edges.T), shape=(n, n))
-        _, part = connected_components(graph, directed=False)
+        part = connected_components(graph, directed=False)[1]
         return np.unique(part[self.triangles[:, 0]], return_inverse=True)[1].astype(np.int64)
 
     def of_triangles(self, chosen: IntArray | BoolArray) -> Surface:
@@ -99,6 +99,4 @@ class Surface:
 
     def _edges(self) -> IntArray:
         """Edges of all triangles, round each, shape (3 m, 2)."""
-        return np.concatenate(
-            [self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]]
-        )
+        return self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)

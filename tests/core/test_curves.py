@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 import speckle
 
-from speckle3d.core.curves import DecorrelationCurves
 from speckle3d.core.errors import InvalidInputError, MismatchError
-from speckle3d.core.sweep import BModeSettings
-
-BMODE = BModeSettings(60.0)
 
 
 @pytest.mark.parametrize(
@@ -60,33 +56,26 @@ def test_between_two_depths_the_width_lies_between():
         np.testing.assert_allclose(row[:60], speckle.gaussian_correlation(d, width), rtol=1e-9)
 
 
-def spoiled(**changes):
-    made = speckle.curves()
-    arrays = {
-        name: getattr(made, name).copy() for name in ("depth_mm", "distance_mm", "correlation", "cells")
-    }
-    for name, change in changes.items():
-        arrays[name] = change(arrays[name])
-    return lambda: DecorrelationCurves(made.key, **arrays)
-
-
-def put(index, value):
-    def change(array):
-        array[index] = value
-        return array
-
-    return change
-
-
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("name", "spoil"),
     [
-        ({"correlation": put((1, 5), np.nan)}, "correlation"),
-        ({"correlation": put((1, 30), 0.999)}, "fall"),
-        ({"distance_mm": lambda a: a**1.1}, "distance_mm"),
-        ({"cells": lambda a: a[:1]}, "cells"),
+        ("correlation", lambda rho: np.where(rho > 0.9, np.nan, rho)),
+        ("correlation", lambda rho: rho[:, ::-1]),
+        ("distance_mm", lambda distance: distance**1.1),
+        ("cells", lambda cells: cells[:1]),
     ],
 )
-def test_curves_that_cannot_be_are_refused(changes, message):
-    with pytest.raises(InvalidInputError, match=message):
-        spoiled(**changes)()
+def test_curves_that_cannot_be_are_refused(name, spoil):
+    made = speckle.curves()
+    with pytest.raises(InvalidInputError, match=name):
+        replace(made, **{name: spoil(getattr(made, name))})
+
+
+def test_curves_of_a_fan_are_of_its_array_however_deep_it_is_recorded():
+    fan = replace(speckle.KEY, lines="fan", array_radius_mm=60.0, line_step_rad=0.005)
+    fan.require_same(replace(fan, vector_pitch_mm=0.5))
+    speckle.KEY.require_same(fan)  # of a file that does not say how lines lie
+    parallel = replace(speckle.KEY, lines="parallel")
+    for other in (replace(fan, array_radius_mm=40.0), replace(fan, line_step_rad=0.006), parallel):
+        with pytest.raises(MismatchError):
+            fan.require_same(other)

@@ -7,7 +7,6 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.calibrating.recordings import open_recording
 from speckle3d.core.errors import InvalidInputError
 from speckle3d.core.grid import ImageGrid
-from speckle3d.core.region import Region
 from speckle3d.core.scan_conversion import ScanConversion
 from speckle3d.core.streams import TimedPoses
 from speckle3d.core.sweep import BModeSettings, Sweep, Tracker
@@ -68,19 +67,6 @@ def test_a_disc_is_drawn_where_it_is(grid):
     fan *= np.diff(np.square(grid.fan.radius_mm + np.array([grid.first_sample_depth_mm, grid.depth_mm])))[0]
     low, high = grid.corners_mm[0], grid.corners_mm[2]
     assert inside.mean() == pytest.approx(fan / np.prod((high - low)[:2]), rel=0.02)
-
-
-def test_a_region_in_millimetres_chooses_samples_of_a_fan():
-    low, high = CURVED.centre_mm[:2] - 5.0, CURVED.centre_mm[:2] + 5.0
-    square = Region(f"rectangle {low[0]},{low[1]} {high[0]},{high[1]}").mask(CURVED)
-    corners = f"{low[0]},{low[1]} {high[0]},{low[1]} {high[0]},{high[1]} {low[0]},{high[1]}"
-    assert (Region(f"polygon {corners}").mask(CURVED) != square).mean() < 1e-3
-    place = CURVED.mm(*np.nonzero(square))
-    assert (place >= low - 1e-6).all()
-    assert (place <= high + 1e-6).all()
-    radius_mm = np.linalg.norm(place - CURVED.fan.apex_mm, axis=1)
-    of_sample_mm2 = radius_mm * CURVED.fan.step_rad * CURVED.sample_spacing_mm
-    assert of_sample_mm2.sum() == pytest.approx(100.0, rel=0.03)
 
 
 def test_grey_images_of_a_fan_are_calibrated_scan_converted_and_no_sequence_takes_them(tmp_path):

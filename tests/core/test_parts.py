@@ -2,7 +2,6 @@
 
 import pytest
 
-from speckle3d.core.errors import FileError
 from speckle3d.core.parts import whole_file
 
 
@@ -28,8 +27,3 @@ def test_what_a_killed_process_left_is_removed_and_what_is_at_work_is_not(tmp_pa
     with pytest.raises(ZeroDivisionError):
         fail_to_write(target)
     assert sorted(tmp_path.iterdir()) == sorted([target, other])
-
-
-def test_a_name_that_is_too_long_is_told(tmp_path):
-    with pytest.raises(FileError, match="cannot be written"), whole_file(tmp_path / (255 * "a")):
-        pass

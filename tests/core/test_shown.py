@@ -54,16 +54,6 @@ def test_frames_become_a_labelled_array(sweep):
     assert float(array.depth_mm[-1]) == pytest.approx(sweep.grid.depth_mm)
 
 
-def test_poses_are_drawn_with_names_and_units(tracked):
-    figure = tracked.plot()
-    assert [each.get_ylabel() for each in figure.axes] == [
-        "length / mm", "tilt / degrees", "yaw / degrees", "roll / degrees",
-    ]  # fmt: skip
-    named = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert named[0] == "mode image"
-    assert "95 % interval of mode image" in named
-
-
 def test_a_volume_lies_in_napari_where_it_lies_in_the_world():
     turned = RigidTransform.from_components([1.0, 2.0, 3.0], RigidTransform.identity().rotation)
     volume = Volume(np.arange(24, dtype=np.uint8).reshape(4, 3, 2), (0.5, 0.5, 1.0), turned)
@@ -71,13 +61,3 @@ def test_a_volume_lies_in_napari_where_it_lies_in_the_world():
     assert kind == "image"
     assert voxels is volume.voxels
     np.testing.assert_allclose(known["affine"] @ [2, 1, 1, 1], [2.0, 2.5, 4.0, 1.0])
-
-
-def test_a_volume_lies_in_pyvista_where_it_lies_in_the_world():
-    pytest.importorskip("pyvista")
-    volume = Volume(
-        np.arange(24, dtype=np.uint8).reshape(4, 3, 2), (0.5, 0.5, 1.0), RigidTransform.identity()
-    )
-    grid = volume.to_pyvista()
-    index = grid.find_closest_point([1.0, 0.5, 1.0])
-    assert grid.point_data["levels"][index] == volume.voxels[2, 1, 1]

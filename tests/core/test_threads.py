@@ -27,15 +27,6 @@ def test_does_every_item_once(count):
     assert (done == 1).all()
 
 
-def test_an_error_of_any_thread_reaches_the_caller():
-    def bad(first, stop):
-        if first <= 37 < stop:
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        in_parallel(bad, 64)
-
-
 def test_calls_may_be_nested_deeper_than_there_are_threads():
     done = []
 
@@ -78,14 +69,6 @@ def test_an_error_made_ahead_is_raised_in_its_turn():
     assert [next(results), next(results)] == [-0.5, -1.0]
     with pytest.raises(ZeroDivisionError):
         next(results)
-
-
-def test_work_ahead_stops_where_no_more_is_asked_for():
-    made = []
-    results = ahead(made.append, range(100), most=2)
-    next(results)
-    results.close()
-    assert len(made) <= 4
 
 
 INTERRUPTED = """

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,16 +35,3 @@ def test_an_n_has_parallel_outer_wires_and_crosses_them_where_drawn():
     assert phantom.n_shapes == ((0, 1, 2),)
     # The middle wire falls 20 mm of x over 40 mm of y: it meets x = 30 at y = 50 and x = 60 at y = -10.
     np.testing.assert_allclose(phantom.crossings_mm(), [[[30.0, 50.0, 20.0], [60.0, -10.0, 20.0]]])
-
-
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda ends: ends[1].__setitem__(1, [55.0, 40.0, 20.0]),  # all three parallel
-        lambda ends: ends[2].__setitem__(1, [50.0, 40.0, 20.0]),  # outer wires askew
-    ],
-)
-def test_three_wires_that_are_no_n_are_none(spoil):
-    ends = N_ENDS.copy()
-    spoil(ends)
-    assert WirePhantom(NAMES, ends, ((0, 1, 2),)).n_shapes == ()

@@ -12,7 +12,7 @@ from speckle3d.io.igtl.messages import ImageReceived, TransformReceived
 from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.frames import ImageLayout
 from speckle3d.live.outgoing import ADVICE, POSE, VOLUME, pose_message
-from speckle3d.live.session import MOST_WAITING, Session, SessionSettings
+from speckle3d.live.session import Session, SessionSettings
 
 RF = ImportSettings(
     sampling_rate_hz=2e8 / 3,
@@ -96,19 +96,6 @@ def test_messages_that_make_no_sweep_are_counted_and_cost_nothing_else(recorded,
     assert (session.progress.recorded, session.progress.refused) == (5, 3)
     assert "rigid" in session.progress.last_refused
     assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 5
-
-
-@pytest.mark.slow
-def test_frames_that_come_too_fast_are_recorded_and_every_other_one_is_left(recorded, tmp_path):
-    frames, curves = recorded
-    many = [image(frames[k % 14], k / 1000) for k in range(40)]
-    session, _ = run([many], lambda p: p.matched + p.left == 40, curves, tmp_path)
-    progress = session.progress
-    assert len(s3.load_sweep(tmp_path / "sweep.h5")) == 40
-    assert progress.left > 0
-    assert progress.matched + progress.left == 40
-    assert "left for later" in progress.line
-    assert progress.waiting <= MOST_WAITING
 
 
 @pytest.mark.slow

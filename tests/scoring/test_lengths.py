@@ -10,10 +10,7 @@ from speckle3d.scoring.lengths import (
     accumulated,
     compare_modes,
     monotone_parts,
-    read_end,
-    travelled_mm,
 )
-from speckle3d.scoring.references import error_rows, sweep_curves
 
 
 def straight(length_mm, tilt_rad=0.0):
@@ -50,25 +47,6 @@ def test_a_uniform_stretch_and_tilt_are_exact_in_every_part(end_frames):
         assert (row.reference_mm, row.estimate_mm) == pytest.approx((10.0, 11.5), abs=1e-6)
         assert (row.length_error_mm, row.length_error_percent) == pytest.approx((1.5, 15.0), abs=1e-5)
         assert (row.tilt_error_deg, row.yaw_error_deg) == pytest.approx((1.0, 0.0), abs=1e-6)
-
-
-def test_the_references_length_is_its_own_whatever_is_compared_with_it():
-    rng = np.random.default_rng(1)
-    truth = hand_sweep(rng, 200)
-    tracker, image = tracked(truth, rng, outliers=0.02), drifted(truth, rng)
-    modes = {"image": image, "pose": truth, "still": RigidTransform.identity(200)}
-    rows = [compare_modes({mode: each}, tracker, CENTRE_MM)[0] for mode, each in modes.items()]
-    assert len({row.reference_mm for row in rows}) == 1
-    # The tracker's own length is the reference's, whether anything is compared with it or not.
-    own = abs(travelled_mm("tracker", tracker, CENTRE_MM))
-    (alone,) = error_rows({"tracker": tracker}, None, CENTRE_MM)
-    assert alone.estimate_mm == own == rows[0].reference_mm
-    # And so is its error, which is of the jitter at its ends, whatever the length between them.
-    (beside,) = compare_modes({"tracker": tracker}, truth, CENTRE_MM, end_frames=1)
-    assert beside.sigma_mm == rows[0].reference_sigma_mm > 0
-    # Its curve begins where the line through its first readings does.
-    drawn = sweep_curves({"tracker": tracker}, CENTRE_MM).modes["tracker"][0]
-    assert abs(read_end(drawn)) == pytest.approx(own)
 
 
 def test_a_jittery_tracker_scores_as_the_truth_does_and_says_how_sure_it_is():

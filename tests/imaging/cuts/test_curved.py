@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
-from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.cuts.curved import curved_sheet
-from speckle3d.imaging.cuts.reslice import reslice_frames
 
 
 def arc(radius_mm, degrees, n, tilt=None):
@@ -28,18 +26,3 @@ def test_columns_are_even_along_an_arc_of_known_radius():
     np.testing.assert_allclose(
         sheet.world_from_mm(10.0, 0.0), tilt.apply(20 * np.array([np.cos(0.5), np.sin(0.5), 0])), atol=2e-3
     )
-
-
-def test_frames_and_their_field_agree_along_a_curve():
-    grid = ImageGrid(41, 41, 0.5, 0.5)
-    poses = RigidTransform.from_translation(np.outer(np.arange(0, 12, 0.4), [0, 0, 1]))
-    gradient = np.array([0.7, -0.2, 1.1])
-    x, y = np.mgrid[:41, :41] * 0.5
-    images = [x * gradient[0] + y * gradient[1] + z * gradient[2] for z in poses.translation[:, 2]]
-    points = np.array([[2.0, 3.0, 1.0], [8.0, 3.0, 4.0], [10.0, 3.0, 9.0]])
-    sheet = curved_sheet(points, [0, 1, 0], (-3.0, 14.0), 0.25)
-    cut = reslice_frames(images, grid, poses, sheet, 0.5)
-    rows, columns = np.indices(sheet.shape)
-    world = sheet.world_from_mm(columns * 0.25, rows * 0.25 - 3.0)
-    # Single precision; the scene is linear, so blending adds nothing.
-    np.testing.assert_allclose(cut, world @ gradient, atol=1e-4)

@@ -29,30 +29,23 @@ def test_a_covering_plane_is_as_large_as_what_frames_show():
 
 def test_planes_of_several_modes_begin_with_one_line_and_show_what_became_longer():
     """Two worlds, one of them 6 % too long: the first frame's line has one place in both pictures."""
-    z = np.arange(0, 20, 0.5)
-    z = np.concatenate([z, z[::-1]])
-    rng = np.random.default_rng(4)
-    moved = np.outer(z, [0.1, 0.05, 1.0])
-    worlds = [
-        RigidTransform.from_components(rng.normal(0, 50, 3), Rotation.random(rng=rng)) for _ in range(2)
-    ]
+    there = np.arange(0, 20, 0.5)
+    moved = np.outer([*there, *there[::-1]], [0.1, 0.05, 1.0])
+    rng, line = np.random.default_rng(4), lateral_line(GRID, 2.5)
+    worlds = RigidTransform.from_components(rng.normal(0, 50, (2, 3)), Rotation.random(2, rng=rng))
     poses = {
         "image": worlds[0] * RigidTransform.from_translation(1.06 * moved),
         "truth": worlds[1] * RigidTransform.from_translation(moved),
     }
-    planes = planes_from_first_frame(poses, lateral_line(GRID, 2.5), 0.1)
+    planes = planes_from_first_frame(poses, line, 0.1)
     assert planes["image"].shape == planes["truth"].shape
-    line = lateral_line(GRID, 2.5)
+    assert planes["image"].first_mm == planes["truth"].first_mm
+    travelled = []
     for mode, plane in planes.items():
-        assert plane.first_mm == planes["truth"].first_mm
-        np.testing.assert_allclose(
-            plane.world_from_mm([0, 0], line[:, 1]), poses[mode][0].apply(line), atol=1e-9
-        )
-    far = int(np.argmax(z))
-    travelled = [
-        np.linalg.norm(each[far].apply(line[0]) - planes[mode].world_from_mm(0.0, 1.0))
-        for mode, each in poses.items()
-    ]
+        first = plane.world_from_mm([0, 0], line[:, 1])
+        np.testing.assert_allclose(first, poses[mode][0].apply(line), atol=1e-9)
+        far = poses[mode][there.size].apply(line[0])
+        travelled.append(np.linalg.norm(far - plane.world_from_mm(0.0, 1.0)))
     assert travelled[0] / travelled[1] == pytest.approx(1.06)
     # Large enough for the longer one.
     assert planes["truth"].width_mm == pytest.approx(1.06 * 19.5 * np.hypot(1.0, 0.1), rel=1e-9)
