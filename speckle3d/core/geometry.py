@@ -131,7 +131,7 @@ def transforms_from_matrices(matrices: npt.ArrayLike, where: str) -> RigidTransf
     InvalidInputError
         Naming `where` and the first index that is not a proper rotation with translation.
     """
-    m = _require_rows(matrices, (4, 4), where)
+    m = _require_rows(matrices, (4, 4), where).copy()
     r, last = m[:, :3, :3], [0.0, 0.0, 0.0, 1.0]
     with np.errstate(all="ignore"):
         square = np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max(axis=(1, 2)) <= RIGID_TOLERANCE
@@ -160,8 +160,8 @@ def require_increasing(times_s: npt.ArrayLike, where: str) -> FloatArray:
 
 
 def _require_rows(values: npt.ArrayLike, row: tuple[int, ...], where: str) -> FloatArray:
-    """Copy finite values of shape (m, *row)."""
-    rows = np.array(values, dtype=float)
+    """Finite values of shape (m, *row), as an array."""
+    rows = np.asarray(values, dtype=float)
     if rows.ndim != 1 + len(row) or rows.shape[1:] != row:
         raise InvalidInputError(f"{where}: expected shape {('m', *row)}, got {rows.shape}")
     require_finite(rows, where)

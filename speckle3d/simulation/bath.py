@@ -7,7 +7,7 @@ lie in that plane and cross at the origin.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -73,17 +73,6 @@ def _sheet_tile(entropy: int, i: int, j: int) -> FloatArray:
     return np.stack([x.ravel(), height, z.ravel()], axis=1)
 
 
-def _sheet_near(entropy: int, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
-    """Scatterers, in the sheet, on all tiles that may reach into a box of the image, shape (n, 3)."""
-    tiles = tiles_near(image_from_sheet.inv(), box)
-    middle = np.insert((tiles + 0.5) * TILE_MM, 1, 0.0, axis=1)
-    place, corner = image_from_sheet.apply(middle), TILE_MM / np.sqrt(2.0)
-    reached = ((place >= box[0] - corner) & (place <= box[1] + corner)).all(axis=1)
-    return np.concatenate(
-        [np.empty((0, 3)), *(_sheet_tile(entropy, i, j) for i, j in tiles[reached].tolist())]
-    )
-
-
 class Level(NamedTuple):
     """A plane in the image: ``normal @ position = offset_mm``, the normal pointing away from the probe."""
 
@@ -113,14 +102,12 @@ class Level(NamedTuple):
 
 @dataclass(frozen=True)
 class WaterBath:
-    """A medium whose reflector is a floor, or the bar of a Cambridge phantom.
+    """A medium whose reflector is a floor, or the bar of a Cambridge phantom, under water with a little dust.
 
     Parameters
     ----------
-    haze : TiledMedium
-        What drifts in the water above the floor.
     entropy : int
-        Seed of the reflector's surface.
+        Seed of the reflector's surface, and of the dust.
     reflector : str
         wall: the whole floor. bar: a strip in the floor's plane that is only in the middle of the beam, and
         always turned towards the probe.
@@ -131,7 +118,6 @@ class WaterBath:
        sections 3.3 and 3.4.
     """
 
-    haze: TiledMedium
     entropy: int
     reflector: Reflector = "wall"
     attenuation_db_cm_mhz: float = 0.0
@@ -164,13 +150,14 @@ class WaterBath:
             place = medium_from_image * level.image_from_sheet
             sheets.append((place.apply(position), _REVERBERATION**count))
         return [
-            *self.haze.seen(medium_from_image, box),
+            *_haze(self.entropy, 0.0).seen(medium_from_image, box),
             *((place, np.full(len(place), amplitude * strength, np.float32)) for place, amplitude in sheets),
         ]
 
     def _near(self, image_from_sheet: RigidTransform, box: Box) -> FloatArray:
-        """Those of the sheet's scatterers that the reflector has near a box of the image."""
-        position = _sheet_near(self.entropy, image_from_sheet, box)
+        """Scatterers of the reflector, in its sheet, on tiles that may reach into a box, shape (n, 3)."""
+        tiles = tiles_near(image_from_sheet.inv(), box).tolist()
+        position = np.concatenate([_sheet_tile(self.entropy, i, j) for i, j in tiles])
         return position if self.reflector == "wall" else position[np.abs(position[:, 2]) <= _BAR_MM / 2.0]
 
 
@@ -180,40 +167,28 @@ class CrossedThreads:
 
     A braid is rough on the scale of the wavelength, so that it echoes in all directions; a smooth wire would
     be a mirror, dark wherever the beam does not meet it squarely.
-
-    Parameters
-    ----------
-    haze : TiledMedium
-        What drifts in the water.
-    position_mm : ndarray, shape (n, 3)
-        Scatterers of both threads, in the medium.
     """
 
-    haze: TiledMedium
-    position_mm: FloatArray
+    entropy: int
     attenuation_db_cm_mhz: float = 0.0
 
     def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
-        """Haze and the parts of the threads in a box of the image."""
-        place = medium_from_image.inv().apply(self.position_mm)
-        near = self.position_mm[((place >= box[0]) & (place <= box[1])).all(axis=1)]
-        threads = near, np.full(len(near), _THREAD_STRENGTH, np.float32)
-        return [*self.haze.seen(medium_from_image, box), threads]
+        """Haze in a box of the image, and the threads."""
+        position = _threads(self.entropy)
+        threads = position, np.full(len(position), _THREAD_STRENGTH, np.float32)
+        return [*_haze(self.entropy, 30.0).seen(medium_from_image, box), threads]
 
 
+@cache
 def _haze(entropy: int, down_to_mm: float) -> TiledMedium:
     """Make a little dust in water, 34 dB weaker than speckle of unit strength."""
     still = np.zeros((0, 5))
     return TiledMedium(entropy, 2.0, 0.0, [Layer(-60.0, still, 0.02)], depth_mm=(-60.0, down_to_mm))
 
 
-def water_bath(entropy: int, reflector: Reflector) -> WaterBath:
-    """Make a bath with a little dust in its water."""
-    return WaterBath(_haze(entropy, 0.0), entropy, reflector)
-
-
-def crossed_threads(entropy: int) -> CrossedThreads:
-    """Stretch two threads across each other, their scatterers at random in them."""
+@cache
+def _threads(entropy: int) -> FloatArray:
+    """Scatterers of two threads, at random in them, shape (n, 3)."""
     rng = np.random.default_rng([entropy, 2])
     count = round(2.0 * _HALF_LENGTH_MM / _THREAD_SPACING_MM)
     threads = []
@@ -224,4 +199,4 @@ def crossed_threads(entropy: int) -> CrossedThreads:
         angle, radius = rng.uniform(0.0, 2.0 * np.pi, count), _THREAD_RADIUS_MM * np.sqrt(rng.random(count))
         aside = np.outer(radius * np.cos(angle), across) + np.outer(radius * np.sin(angle), [0.0, 1.0, 0.0])
         threads.append(np.outer(place, along) + aside)
-    return CrossedThreads(_haze(entropy, 30.0), np.concatenate(threads))
+    return np.concatenate(threads)

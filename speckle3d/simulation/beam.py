@@ -261,7 +261,7 @@ def _reach(amplitude: FloatArray, floor: float) -> IntArray:
     """Elevational steps beyond which the field stays below `floor` of that depth's peak."""
     nz = amplitude.shape[2]
     above = amplitude > floor * amplitude.max(axis=(1, 2), keepdims=True)
-    last = np.where(above.any(axis=2), nz - np.argmax(above[:, :, ::-1], axis=2), 0)
+    last = np.where(above, np.arange(1, nz + 1), 0).max(axis=2)
     reach = np.asarray(np.minimum(last, nz - 1), dtype=np.int64)
     # A cell between two tabulated depths or laterals must reach as far as the farther of its corners.
     reach[:-1] = np.maximum(reach[:-1], reach[1:])

@@ -27,6 +27,12 @@ _TREMOR_HZ = (8.0, 12.0)
 _TREMOR = np.repeat([0.012, np.deg2rad(0.016)], 3)
 """Physiological tremor: its band, and its standard deviation in each axis, mm and rad."""
 
+_SPEED_VARIATION = 0.3
+"""Slow unevenness of a hand's speed: the largest, over the mean."""
+
+_WANDER = np.array([0.5, 0.5, 0.0, *np.deg2rad([0.6, 0.6, 0.6])])
+"""Slow wander over a sweep: standard deviation of x, y (mm), tilt, yaw and roll (rad)."""
+
 _PAUSE_S = 0.3
 
 _WOBBLE_HZ = 3.0
@@ -52,18 +58,10 @@ _OFF_POINT_MM = 0.15
 
 @dataclass(frozen=True)
 class HandMotion:
-    """Parameters of a hand-held sweep. Standard deviations unless said otherwise.
+    """What a hand-held sweep does beside going straight on.
 
     Parameters
     ----------
-    speed_variation : float
-        Slow unevenness of the speed, as a fraction of its mean (largest, not standard, deviation).
-    pauses : int
-        How many times the hand stops.
-    drift_mm : float
-        Slow wander of the lateral and axial position over the sweep.
-    wander_rad : float
-        Slow wander of tilt, yaw and roll over the sweep.
     start_rad : tuple of float
         Tilt, yaw and roll of the first frame.
     turn_rad : tuple of float
@@ -72,16 +70,15 @@ class HandMotion:
         Sweep forward, then back over the same tissue.
     wobble_mm : float
         Deliberate to and fro along the elevational axis: amplitude, uneven as the frequency is.
+    pauses : int
+        How many times the hand stops.
     """
 
-    speed_variation: float = 0.3
-    pauses: int = 1
-    drift_mm: float = 0.5
-    wander_rad: float = np.deg2rad(0.6)
     start_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reverse: bool = False
     wobble_mm: float = 0.0
+    pauses: int = 1
 
 
 @dataclass(frozen=True)
@@ -168,9 +165,8 @@ def hand_sweep(
     phase = np.clip(time / duration_s, 0.0, 1.0)
     columns[:, 3:] = motion.start_rad + _smooth_step(phase)[:, None] * np.asarray(motion.turn_rad)
     for axis in range(6):
-        slow = motion.drift_mm if axis < 3 else motion.wander_rad
-        if axis != 2:
-            columns[:, axis] += slow * _band_noise(time, (0.0, 1.0 / duration_s), rng)
+        if _WANDER[axis] > 0:
+            columns[:, axis] += _WANDER[axis] * _band_noise(time, (0.0, 1.0 / duration_s), rng)
         columns[:, axis] += _TREMOR[axis] * _band_noise(time, _TREMOR_HZ, rng)
     if motion.wobble_mm > 0:
         columns[:, 2] += _wobble(time, duration_s, motion, rng)
@@ -227,7 +223,7 @@ def _progress(
     """Fraction of the length travelled: zero before the sweep, one (or zero again) after it."""
     inside = (time >= 0.0) & (time <= duration_s)
     duration = float(time[inside][-1])
-    speed = 1.0 + motion.speed_variation * np.tanh(_band_noise(time, (0.0, 0.8), rng))
+    speed = 1.0 + _SPEED_VARIATION * np.tanh(_band_noise(time, (0.0, 0.8), rng))
     # In a very short sweep a whole pause would leave no motion at all.
     pause_s = min(_PAUSE_S, 0.2 * duration)
     for centre in rng.uniform(0.15, 0.85, motion.pauses) * duration:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.shown import shown
 from speckle3d.core.sweep import OrientationSensor, Sweep, Tracker
-from speckle3d.simulation.bath import crossed_threads, water_bath
+from speckle3d.simulation.bath import CrossedThreads, WaterBath
 from speckle3d.simulation.beam import BeamTable, Probe, tabulate_beam
 from speckle3d.simulation.medium import Medium, fully_developed, phantom, tissue
 from speckle3d.simulation.movement import (
@@ -105,9 +105,9 @@ def simulate(settings: SimulationSettings) -> tuple[SimulatedSweep, ...]:
 
 def _medium(settings: SimulationSettings, entropy: int) -> Medium:
     if settings.preset == "plane":
-        return water_bath(entropy, settings.reflector)
+        return WaterBath(entropy, settings.reflector)
     if settings.preset == "wires":
-        return crossed_threads(entropy)
+        return CrossedThreads(entropy)
     if settings.preset == "stepped":
         return fully_developed(entropy)
     return (tissue if settings.preset in _TISSUE else phantom)(entropy, settings.length_mm)
@@ -185,13 +185,13 @@ def _trajectory(
 ) -> Trajectory:
     if settings.preset in _BATH:
         return calibration_scan(settings, image.width_mm, world, rng)
-    motion = HandMotion(reverse=settings.preset == "reversal", wobble_mm=settings.wobble_mm)
     fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
+    start, turns = 0.0, (0.0, 0.0, 0.0)
     if settings.preset == "crossed":
-        motion = replace(motion, start_rad=(-fan / 2.0, 0.0, 0.0), turn_rad=(fan, 0.0, 0.0))
+        start, turns = -fan / 2.0, (fan, 0.0, 0.0)
     elif settings.preset == "rotation":
         turns = (turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0)
-        motion = replace(motion, turn_rad=turns)
+    motion = HandMotion((start, 0.0, 0.0), turns, settings.preset == "reversal", settings.wobble_mm)
     centre = np.array([image.width_mm / 2.0, 0.0, settings.length_mm / 2.0])
     start = turned_about(centre, crossing * number)
     return hand_sweep(settings.length_mm, duration_s, image.width_mm, motion, start, world, rng)

@@ -107,8 +107,8 @@ class SimulatedFrames:
             place = image_from_medium.apply(position)
             inside = ((place > self._box[0]) & (place < self._box[1])).all(axis=1)
             lines = Fan(fan.apex_mm, fan.radius_mm, np.sin(angle), np.cos(angle))
-            far_mm = self.beam.lateral_extent_mm
-            scatter_fan_echoes(place[inside], strength[inside], lines, far_mm, *field)
+            reach_mm = self.beam.lateral_extent_mm
+            scatter_fan_echoes(place[inside], strength[inside], lines, reach_mm, *field)
         return out
 
     @cached_property
