@@ -12,6 +12,9 @@ from speckle3d.core.errors import InvalidInputError
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Of red, green and blue: ITU-R BT.601."""
 
+_KINDS = ("uint8", "int16", "float32", "complex64")
+"""Grey levels, echoes, and complex ones."""
+
 
 class ImageFrames:
     """Frames (column, row) of images; colours become grey by luminance.
@@ -30,16 +33,11 @@ class ImageFrames:
     def __init__(self, images: Any) -> None:
         shape: tuple[int, ...] = images.shape
         kind: np.dtype[Any] = np.dtype(images.dtype)
-        is_colour = len(shape) == 4 and shape[3] in (3, 4) and kind == np.uint8
-        if not (len(shape) == 3 or is_colour) or 0 in shape:
+        in_colour = shape[3:] in ((3,), (4,)) and kind == np.uint8
+        if len(shape) != 3 + in_colour or 0 in shape or kind.name not in _KINDS:
             raise InvalidInputError(
-                "frames: expected images of shape (n, row, column), or uint8 (n, row, column, 3), got "
-                f"{shape} of {kind}"
-            )
-        if kind.name not in ("uint8", "int16", "float32", "complex64"):
-            raise InvalidInputError(
-                "frames: expected grey levels as uint8, or echoes as int16, float32 or complex64, got "
-                f"{kind}: convert them with astype"
+                f"frames: expected images of shape (n, row, column) of {', '.join(_KINDS)}, or uint8 "
+                f"(n, row, column, 3), got {shape} of {kind}"
             )
         self.any_thread = isinstance(images, np.ndarray) or getattr(images, "any_thread", False)
         self._images, self.dtype = images, kind.newbyteorder("=")

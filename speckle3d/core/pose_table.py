@@ -54,8 +54,9 @@ def _columns(
     columns = dict(zip(_NAMES, values, strict=True))
     columns["length_mm"] = np.append(0.0, np.cumsum(elevational_steps(world_from_image, centre_mm)))
     if covariance is not None:
-        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0))
-        sigma[:, 3:] = np.rad2deg(sigma[:, 3:])
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(min=0.0)) * (
+            [1] * 3 + [180 / np.pi] * 3
+        )
         columns |= {f"sigma_{name}": column for name, column in zip(_NAMES, sigma.T, strict=True)}
     return columns
 
@@ -81,13 +82,12 @@ def plot_poses(
     for mode, world_from_image in poses.items():
         columns = _columns(world_from_image, centre_mm, covariance if mode == "image" else None)
         for panel, name in zip(axes, _PANELS, strict=True):
-            values = columns[name]
-            (line,) = panel.plot(values, label=f"mode {mode}")
+            (line,) = panel.plot(columns[name], label=f"mode {mode}")
             panel.set(xlabel="frame", ylabel=name.replace("_deg", " / degrees").replace("_mm", " / mm"))
-            half = columns.get(f"sigma_{name}".replace("length", "z"))
-            if half is not None:
-                low, high = values - _WITHIN * half, values + _WITHIN * half
-                within = {"label": f"95 % interval of mode {mode}", "color": line.get_color(), "alpha": 0.15}
-                panel.fill_between(np.arange(values.size), low, high, lw=0, **within)
+            sigma = columns.get(f"sigma_{name}".replace("length", "z"))
+            if sigma is not None:
+                ends = (columns[name] + side * _WITHIN * sigma for side in (-1, 1))
+                look = {"label": f"95 % interval of mode {mode}", "color": line.get_color(), "alpha": 0.15}
+                panel.fill_between(range(sigma.size), *ends, lw=0, **look)
     axes[0].legend(fontsize="small", frameon=False)
     return figure

@@ -10,7 +10,6 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.extras import extra_module
 from speckle3d.core.grid import ImageGrid
 from speckle3d.core.pose_table import plot_poses, pose_table
 from speckle3d.core.shown import shown
@@ -222,37 +221,25 @@ class Reconstruction:
 
     def to_dataframe(self, mode: str = "image") -> Any:
         """Poses of a mode as a `pandas.DataFrame`, a row for each frame; see `pose_table`."""
-        poses, trust = self._of(mode), self.trust
-        errors = None if trust is None else trust if mode == "image" else trust.modes.get(mode)
-        covariance = None if errors is None else errors.covariance
-        flags = None if trust is None else trust.flags
-        return pose_table(poses, self.grid.centre_mm, covariance, time_s=self.frame_time_s, flags=flags)
-
-    def to_pyvista(self, mode: str = "image") -> Any:
-        """Outlines of the frames at the poses of a mode as a `pyvista.PolyData`, mm (extra ``pyvista``)."""
-        pyvista = extra_module("pyvista", "pyvista", "a mesh of pyvista")
-        poses = self._of(mode)
-        corners = np.concatenate([pose.apply(self.grid.corners_mm) for pose in poses])
-        faces = np.insert(np.arange(4 * len(poses)).reshape(-1, 4), 0, 4, axis=1)
-        return pyvista.PolyData(corners, faces=faces.ravel())
-
-    def _of(self, mode: str) -> RigidTransform:
         if mode not in self.poses:
             raise InvalidInputError(f"mode: expected one of {', '.join(self.poses)}, got {mode!r}")
-        return self.poses[mode]
+        covariance = flags = None
+        if self.trust is not None:
+            errors = self.trust if mode == "image" else self.trust.modes.get(mode)
+            covariance, flags = errors and errors.covariance, self.trust.flags
+        others = {"time_s": self.frame_time_s, "flags": flags}
+        return pose_table(self.poses[mode], self.grid.centre_mm, covariance, **others)
 
     def __post_init__(self) -> None:
-        if "image" not in self.poses:
-            raise InvalidInputError("expected the poses of mode 'image' in a reconstruction, got none")
+        n = self.frame_time_s.size
+        if "image" not in self.poses or not {*self.poses} <= {*MODES}:
+            raise InvalidInputError(
+                f"expected mode image, and others among {', '.join(MODES)}, got {', '.join(self.poses)}"
+            )
         for mode, poses in self.poses.items():
-            if mode not in MODES:
-                raise InvalidInputError(f"expected a mode among {', '.join(MODES)}, got {mode!r}")
-            if len(poses) != self.frame_time_s.size:
-                raise InvalidInputError(
-                    f"mode {mode}: expected {self.frame_time_s.size} poses, got {len(poses)}"
-                )
+            if len(poses) != n:
+                raise InvalidInputError(f"mode {mode}: expected {n} poses, got {len(poses)}")
         if self.trust is not None:
-            n = self.frame_time_s.size
-            covariances = [self.trust.covariance, *(each.covariance for each in self.trust.modes.values())]
-            if self.trust.flags.shape != (n,) or any(each.shape != (n, 6, 6) for each in covariances):
+            claims = [self.trust.covariance, *(errors.covariance for errors in self.trust.modes.values())]
+            if self.trust.flags.shape != (n,) or any(claim.shape != (n, 6, 6) for claim in claims):
                 raise InvalidInputError(f"trust: expected flags and a covariance of each of {n} frames")

@@ -34,8 +34,10 @@ def text_table(lines: Sequence[Sequence[str]], left: Collection[int] = (0,), hea
         body.insert(1, ["-" * width for width in widths])
     text = ""
     for line in body:
-        pads = [" " * (width - cell_len(cell)) for cell, width in zip(line, widths, strict=True)]
-        cells = (cell + pads[k] if k in left else pads[k] + cell for k, cell in enumerate(line))
+        cells = []
+        for column, (cell, width) in enumerate(zip(line, widths, strict=True)):
+            pad = " " * (width - cell_len(cell))
+            cells.append(cell + pad if column in left else pad + cell)
         text += "  ".join(cells).rstrip() + "\n"
     return text
 

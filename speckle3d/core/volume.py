@@ -13,7 +13,6 @@ from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.arrays import FloatArray
 from speckle3d.core.errors import InvalidInputError
-from speckle3d.core.extras import extra_module
 from speckle3d.core.shown import shown
 
 VOXEL_TYPES = ("uint8", "int16", "uint16", "float32")
@@ -64,15 +63,6 @@ class Volume:
         """Number of voxels along i, j and k."""
         n_i, n_j, n_k = self.voxels.shape
         return n_i, n_j, n_k
-
-    def to_pyvista(self) -> Any:
-        """Voxels as a `pyvista.ImageData` at their place in the world, mm (extra ``pyvista``)."""
-        pyvista = extra_module("pyvista", "pyvista", "a grid of pyvista")
-        grid = pyvista.ImageData(dimensions=self.shape, spacing=self.spacing_mm)
-        grid.origin = self.world_from_grid.translation
-        grid.direction_matrix = self.world_from_grid.rotation.as_matrix()
-        grid.point_data["levels"] = self.voxels.ravel(order="F")
-        return grid
 
     def to_napari(self, viewer: Any = None) -> tuple[Any, dict[str, Any], str]:
         """Voxels as layer data of napari, added to a viewer if one is given (extra ``napari``)."""
