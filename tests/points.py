@@ -13,5 +13,5 @@ class PointMedium:
     strength: np.ndarray
     attenuation_db_cm_mhz: float = 0.0
 
-    def seen(self, medium_from_image, box):
+    def scatterers(self, medium_from_image, box):
         return [(self.position_mm, self.strength)]

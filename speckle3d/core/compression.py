@@ -74,7 +74,7 @@ def estimate_dynamic_range(
     quiet = np.argsort(below + above)[: int(QUIET * below.size)]
     below, above = np.maximum(np.median([below[quiet], above[quiet]], axis=1), 0.5)
     narrowing, sigma = (np.interp(below / above, SKEWNESS, by) for by in (NARROWING, NARROWING_SIGMA))
-    seen = np.log(SINGLE_LOOK_DB * full_scale / (below + above) / narrowing / USUAL_DB)
+    log_ratio = np.log(SINGLE_LOOK_DB * full_scale / (below + above) / narrowing / USUAL_DB)
     weight = USUAL_SIGMA**2 / (USUAL_SIGMA**2 + sigma**2)
-    range_db = USUAL_DB * float(np.exp(weight * seen))
+    range_db = USUAL_DB * float(np.exp(weight * log_ratio))
     return range_db, range_db * float(np.sqrt(weight) * sigma)

@@ -18,7 +18,7 @@ class Speckle3DError(Exception):
     """
 
     def __init__(self, *words: object) -> None:
-        super().__init__(*(_quotable(each) if isinstance(each, str) else each for each in words))
+        super().__init__(*(_quotable(word) if isinstance(word, str) else word for word in words))
 
 
 class InvalidInputError(Speckle3DError, ValueError):

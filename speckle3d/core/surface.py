@@ -94,8 +94,8 @@ class Surface:
     def of_triangles(self, chosen: IntArray | BoolArray) -> Surface:
         """Only some of the triangles (numbers, or a mask), with only their vertices."""
         triangles = self.triangles[chosen]
-        kept, renumbered = np.unique(triangles, return_inverse=True)
-        return Surface(self.vertices_mm[kept], renumbered.reshape(-1, 3).astype(np.int64), self.fields)
+        numbers, renumbered = np.unique(triangles, return_inverse=True)
+        return Surface(self.vertices_mm[numbers], renumbered.reshape(-1, 3).astype(np.int64), self.fields)
 
     def _edges(self) -> IntArray:
         """Edges of all triangles, round each, shape (3 m, 2)."""

@@ -97,9 +97,9 @@ def principal_axes(grid: ImageGrid, world_from_image: RigidTransform) -> Rotatio
 
     turned = lateral_first * _TURNS
     starts = turned[np.argsort(log_volumes(turned), kind="stable")[:_REFINED]]
-    found = Rotation.concatenate([lateral_first, Rotation.identity(), *map(smallest_near, starts)])
-    volume = log_volumes(found)
-    alike = found[int(np.argmax(volume <= volume.min() + 1e-4))] * Rotation.create_group("O")
+    ways = Rotation.concatenate([lateral_first, Rotation.identity(), *map(smallest_near, starts)])
+    volume = log_volumes(ways)
+    alike = ways[int(np.argmax(volume <= volume.min() + 1e-4))] * Rotation.create_group("O")
     return alike[int((lateral_first.inv() * alike).magnitude().argmin())]
 
 

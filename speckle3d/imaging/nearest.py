@@ -76,9 +76,9 @@ class NearestImages:
         def look(first: int, stop: int) -> None:
             for low in range(first, stop, few):
                 band = slice(low, min(low + few, stop))
-                kept = self._distance_mm[:, band], self._grey[:, band]
+                nearest = self._distance_mm[:, band], self._grey[:, band]
                 for image, index_from_world in looks:
-                    keep_nearest(image, index_from_world, self._lines[band], self._reach_mm, *kept)
+                    keep_nearest(image, index_from_world, self._lines[band], self._reach_mm, *nearest)
 
         in_parallel(look, len(self._lines), _GRAIN)
 
@@ -147,8 +147,8 @@ def look_up(sought: Sequence[NearestImages], region: BoolArray | None = None) ->
             image[~region] = np.nan
         return image
 
-    wanted = np.flatnonzero(np.any([each.near for each in sought], axis=0)).tolist()
+    wanted = np.flatnonzero(np.any([points.near for points in sought], axis=0)).tolist()
     for start in range(0, len(wanted), _BATCH):
         batch = {index: read(index) for index in wanted[start : start + _BATCH]}
-        for each in sought:
-            each.add(batch)
+        for points in sought:
+            points.add(batch)

@@ -122,7 +122,7 @@ class WaterBath:
     reflector: Reflector = "wall"
     attenuation_db_cm_mhz: float = 0.0
 
-    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
+    def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Reflector, its reverberations and the haze in a box of the image."""
         level, strength = Level.floor(medium_from_image), _STRENGTH_PER_MM2 * _SPACING_MM**2
         image_from_sheet, medium_from_sheet = medium_from_image.inv(), RigidTransform.identity()
@@ -150,7 +150,7 @@ class WaterBath:
             place = medium_from_image * level.image_from_sheet
             sheets.append((place.apply(position), _REVERBERATION**count))
         return [
-            *_haze(self.entropy, 0.0).seen(medium_from_image, box),
+            *_haze(self.entropy, 0.0).scatterers(medium_from_image, box),
             *((place, np.full(len(place), amplitude * strength, np.float32)) for place, amplitude in sheets),
         ]
 
@@ -172,11 +172,11 @@ class CrossedThreads:
     entropy: int
     attenuation_db_cm_mhz: float = 0.0
 
-    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
+    def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Haze in a box of the image, and the threads."""
         position = _threads(self.entropy)
         threads = position, np.full(len(position), _THREAD_STRENGTH, np.float32)
-        return [*_haze(self.entropy, 30.0).seen(medium_from_image, box), threads]
+        return [*_haze(self.entropy, 30.0).scatterers(medium_from_image, box), threads]
 
 
 @cache

@@ -50,16 +50,16 @@ class Medium(Protocol):
     def attenuation_db_cm_mhz(self) -> float:
         """One-way attenuation, proportional to frequency."""
 
-    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
+    def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Blocks of scatterers, in the medium, that include all those in a box of the image."""
 
 
 def tiles_near(medium_from_image: RigidTransform, box: Box) -> IntArray:
     """Indices of the tiles of a medium that together hold a box of the image, shape (n, 2)."""
     corners = np.stack(np.meshgrid(*np.stack(box, axis=-1)), axis=-1)
-    seen = medium_from_image.apply(corners.reshape(-1, 3))[:, [0, 2]]
-    first = np.floor(seen.min(axis=0) / TILE_MM).astype(int)
-    last = np.floor(seen.max(axis=0) / TILE_MM).astype(int)
+    extent = medium_from_image.apply(corners.reshape(-1, 3))[:, [0, 2]]
+    first = np.floor(extent.min(axis=0) / TILE_MM).astype(int)
+    last = np.floor(extent.max(axis=0) / TILE_MM).astype(int)
     return np.asarray(np.indices(last - first + 1).reshape(2, -1).T + first)
 
 
@@ -198,7 +198,7 @@ class TiledMedium:
     spheres: Sequence[Sphere] = ()
     depth_mm: tuple[float, float] = (-3.0, 50.0)
 
-    def seen(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
+    def scatterers(self, medium_from_image: RigidTransform, box: Box) -> list[Scatterers]:
         """Tiles that together hold all scatterers in a box of the image."""
         return [_tile(self, i, j) for i, j in tiles_near(medium_from_image, box).tolist()]
 
@@ -215,11 +215,11 @@ class TiledMedium:
         for sphere in self.spheres:
             inside = ((position - sphere.centre_mm) ** 2).sum(axis=1) < sphere.radius_mm**2
             strength[inside] *= sphere.factor
-        kept = np.flatnonzero(strength)
+        present = np.flatnonzero(strength)
         # By depth, so that neighbours meet the same part of the beam's table.
-        depth = (position[kept, 1] - self.depth_mm[0]) / _DEPTH_BIN_MM
-        kept = kept[np.argsort(depth.astype(np.int16), kind="stable")]
-        return position[kept], strength[kept]
+        depth = (position[present, 1] - self.depth_mm[0]) / _DEPTH_BIN_MM
+        present = present[np.argsort(depth.astype(np.int16), kind="stable")]
+        return position[present], strength[present]
 
     def _background(self, i: int, j: int) -> Scatterers:
         """Half of the scatterers Poisson distributed, half of them one anywhere in each of equal cells.
@@ -246,8 +246,8 @@ class TiledMedium:
             strength *= np.exp(wave_sum(self.texture, position))
         # Equal strengths of random sign give fully developed speckle with the fewest scatterers.
         strength *= rng.choice([-1.0, 1.0], n) / np.sqrt(self.per_mm3)
-        kept = rng.random(n) < fill
-        return position[kept], strength[kept].astype(np.float32)
+        present = rng.random(n) < fill
+        return position[present], strength[present].astype(np.float32)
 
     def _fascia(self, layer: Layer, number: int, i: int, j: int) -> Scatterers:
         rng = tile_rng(self.entropy, 1 + number, i=i, j=j)

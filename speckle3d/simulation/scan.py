@@ -99,7 +99,7 @@ class SimulatedFrames:
         image_from_medium = medium_from_image.inv()
         field = self._field, grid, out.view(np.float32)
         fan, angle = image.fan, image.angle_rad(np.arange(image.vectors))
-        for position, strength in self.medium.seen(medium_from_image, self._box):
+        for position, strength in self.medium.scatterers(medium_from_image, self._box):
             if fan is None:
                 matrix = image_from_medium.as_matrix()
                 scatter_echoes(position, strength, matrix, image.vector_pitch_mm, *field)

@@ -51,12 +51,12 @@ def crossings(outlines_mm: FloatArray, world_from_plane: RigidTransform) -> Floa
         frames that do not cross it.
     """
     n = len(outlines_mm)
-    there = world_from_plane.inv().apply(outlines_mm.reshape(-1, 3)).reshape(n, 5, 3)
-    there[np.abs(there[..., 2]) < _ON_PLANE_MM, 2] = 0.0
+    placed = world_from_plane.inv().apply(outlines_mm.reshape(-1, 3)).reshape(n, 5, 3)
+    placed[np.abs(placed[..., 2]) < _ON_PLANE_MM, 2] = 0.0
     # Along each edge of the outline from 0 at its first corner; edges count from the top one, clockwise.
-    start, change = there[:, :-1], np.diff(there, axis=1)
+    start, change = placed[:, :-1], np.diff(placed, axis=1)
     # A corner on the plane counts as in front of it, so that every line has two ends.
-    crossed = (start[..., 2] < 0) != (there[:, 1:, 2] < 0)
+    crossed = (start[..., 2] < 0) != (placed[:, 1:, 2] < 0)
     share = -start[..., 2] / np.where(crossed, change[..., 2], 1.0)
     at = start[..., :2] + share[..., None] * change[..., :2]
     depth = np.where(crossed, np.array([0.0, 0.0, 1.0, 1.0]) + share * [0.0, 1.0, 0.0, -1.0], np.inf)

@@ -202,8 +202,8 @@ def planes_from_first_frame(
     InsufficientDataError
         If the sweep moves along the line.
     """
-    placed = {mode: _travelled(each, line_mm) for mode, each in poses.items()}
-    ends = np.concatenate([each for _, each in placed.values()])
+    placed = {mode: _travelled(path, line_mm) for mode, path in poses.items()}
+    ends = np.concatenate([points for _, points in placed.values()])
     low = np.maximum(ends.min(axis=0), np.negative(largest_mm))
     high = np.min([ends.max(axis=0), largest_mm, low + largest_mm], axis=0)
     # Depth counts from the probe, lateral from the first vector.

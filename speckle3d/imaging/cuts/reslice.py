@@ -77,4 +77,4 @@ def reslice_at(
         for poses, cut in wanted
     ]
     look_up(sought, region)
-    return [np.ascontiguousarray(each.blended()[0].T) for each in sought]
+    return [np.ascontiguousarray(points.blended()[0].T) for points in sought]

@@ -53,16 +53,16 @@ def require_inside(
     lost = np.flatnonzero(~np.isfinite(points_mm).all(axis=1))
     if lost.size:
         raise InvalidInputError(f"point {lost[0] + 1}: expected a point in the sweep, got one beyond the cut")
-    found = belonging_of(points_mm, grid, world_from_image)
-    outside = np.flatnonzero(found.gap_mm > reach_mm)
+    near = belonging_of(points_mm, grid, world_from_image)
+    outside = np.flatnonzero(near.gap_mm > reach_mm)
     if outside.size:
         row = int(outside[0])
         x, y, z = points_mm[row]
         raise InvalidInputError(
             f"point {row + 1} ({x:g}, {y:g}, {z:g}): expected a point in the sweep, got one "
-            f"{found.gap_mm[row]:.2f} mm from its nearest image: is it a point of this mode's world?"
+            f"{near.gap_mm[row]:.2f} mm from its nearest image: is it a point of this mode's world?"
         )
-    return found
+    return near
 
 
 def _place(
@@ -76,10 +76,10 @@ def _place(
     row, best = np.arange(len(points)), away.argmin(axis=0)
     own, second, weight = q[best, row], np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
     for step in (-1, 1):
-        other = np.clip(best + step, 0, len(q) - 1)
-        share = np.abs(own) / np.maximum(np.abs(own) + np.abs(q[other, row]), 1e-12)
+        neighbour = np.clip(best + step, 0, len(q) - 1)
+        share = np.abs(own) / np.maximum(np.abs(own) + np.abs(q[neighbour, row]), 1e-12)
         # Of two neighbours on the other side, where the probe turns back, the nearer.
-        across = (own * q[other, row] < 0) & (other != best) & (share > weight)
-        second[across], weight[across] = other[across], share[across]
+        across = (own * q[neighbour, row] < 0) & (neighbour != best) & (share > weight)
+        second[across], weight[across] = neighbour[across], share[across]
     gap = np.sqrt(np.where(weight > 0.0, beside[best, row], away[best, row]))
     return np.stack([best, second], axis=1), np.stack([1.0 - weight, weight], axis=1), gap

@@ -101,10 +101,10 @@ def measured(
         pose_sigma, pick_sigma = float(np.linalg.norm(by_poses)), pick_mm * float(np.linalg.norm(gradient))
         return Measurement(kind, tuple(chosen), value, pose_sigma, pick_sigma, unit)
 
-    found = [row("distance", range(k, k + 2), length) for k in range(len(points) - 1)]
-    found += [row("length", range(len(points)), length)] if len(points) > 2 else []
-    found += [row("angle", range(k, k + 3), angle, "rad") for k in range(len(points) - 2)]
-    return found
+    rows = [row("distance", range(k, k + 2), length) for k in range(len(points) - 1)]
+    rows += [row("length", range(len(points)), length)] if len(points) > 2 else []
+    rows += [row("angle", range(k, k + 3), angle, "rad") for k in range(len(points) - 2)]
+    return rows
 
 
 Valued = Callable[[FloatArray], tuple[float, FloatArray]]
@@ -125,11 +125,11 @@ def angle(points_mm: FloatArray) -> tuple[float, FloatArray]:
     """Angle at the second of three points, rad, and its derivative, shape (3, 3)."""
     sides = points_mm[[0, 2]] - points_mm[1]
     sizes = np.linalg.norm(sides, axis=1, keepdims=True)
-    one, other = sides / sizes
-    normal = np.cross(one, other)
+    first, second = sides / sizes
+    normal = np.cross(first, second)
     sine, cosine = float(np.linalg.norm(normal)), float(one @ other)
     # Along a straight line every turn opens or closes the angle alike, to first order of its size.
     across = normal / sine if sine > 1e-9 else np.linalg.svd(one[None])[2][2]
-    ends = np.array([np.cross(one, across), -np.cross(other, across)]) / sizes
+    ends = np.array([np.cross(first, across), -np.cross(second, across)]) / sizes
     gradient = np.array([ends[0], -ends.sum(axis=0), ends[1]])
     return float(np.arctan2(sine, cosine)), gradient

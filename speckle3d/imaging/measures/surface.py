@@ -75,18 +75,18 @@ def surface_of(
     >>> round(surface.volume_mm3), round(4 / 3 * np.pi * 4**3)
     (266, 268)
     """
-    held = known_voxels(volume) if known is None else known
-    if smooth < 0 or held.shape != volume.shape:
+    known = known_voxels(volume) if known is None else known
+    if smooth < 0 or known.shape != volume.shape:
         raise InvalidInputError(
             f"surface: expected zero or more passes of smoothing and known voxels of shape {volume.shape}, "
-            f"got {smooth} and {held.shape}"
+            f"got {smooth} and {known.shape}"
         )
-    values = volume.voxels[held]
+    values = volume.voxels[known]
     if not (values.size and values.min() <= level <= values.max()):
         among = f"{values.min():g} to {values.max():g}" if values.size else "of which there is none"
         raise InvalidInputError(f"level: expected a grey level of the volume, {among}, got {level:g}")
-    found = _marched(volume, volume.voxels, level, inside, held)
-    return smoothed(found, smooth) if smooth else found
+    surface = _marched(volume, volume.voxels, level, inside, known)
+    return smoothed(surface, smooth) if smooth else surface
 
 
 def surfaces_of_labels(volume: Volume) -> dict[int, Surface]:

@@ -43,10 +43,10 @@ def deviation_volume(
     parts = range(0, len(world), _AT_ONCE)
     values = np.concatenate([deviations(errors, grid, world[k : k + _AT_ONCE]) for k in parts])
     fine = zoom(values.reshape(counts), np.divide(voxel_grid.shape, counts), order=1)
-    found = np.ascontiguousarray(fine.T, dtype=np.float32)
+    deviation = np.ascontiguousarray(fine.T, dtype=np.float32)
     if state is not None:
-        found[state == 0] = np.nan
-    return found
+        deviation[state == 0] = np.nan
+    return deviation
 
 
 def deviations(errors: PoseErrors, grid: ImageGrid, points_mm: FloatArray) -> FloatArray:

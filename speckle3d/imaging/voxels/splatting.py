@@ -127,11 +127,11 @@ def _kernel(
 
 def _levels(rule: Rule, tables: tuple[npt.NDArray[Any], ...]) -> Float32Array:
     """Levels of voxels by what was added; NaN where no sample was."""
-    table, other = tables[0], tables[-1]
+    table, weights = tables[0], tables[-1]
     if rule == "maximum":
         return np.asarray(table)
     if rule == "plus":
-        return np.asarray(np.where(other > 0, table, np.float32(np.nan)))
+        return np.asarray(np.where(weights > 0, table, np.float32(np.nan)))
     voxels = np.empty(table.shape[:3], np.float32)
 
     def divide(first: int, stop: int) -> None:
