@@ -34,10 +34,10 @@ class Deformed:
     shift_mm: object
     """Of depths, at a frame: (depth_mm, frame) to mm."""
 
-    def seen(self, medium_from_image, box):
+    def scatterers(self, medium_from_image, box):
         apart = self.poses.translation - medium_from_image.translation
         frame = int(np.argmin((apart**2).sum(axis=1)))
-        for position, strength in self.medium.seen(medium_from_image, box):
+        for position, strength in self.medium.scatterers(medium_from_image, box):
             moved = position.copy()
             moved[:, 1] += self.shift_mm(position[:, 1], frame)
             yield moved, strength

@@ -127,9 +127,9 @@ def angle(points_mm: FloatArray) -> tuple[float, FloatArray]:
     sizes = np.linalg.norm(sides, axis=1, keepdims=True)
     first, second = sides / sizes
     normal = np.cross(first, second)
-    sine, cosine = float(np.linalg.norm(normal)), float(one @ other)
+    sine, cosine = float(np.linalg.norm(normal)), float(first @ second)
     # Along a straight line every turn opens or closes the angle alike, to first order of its size.
-    across = normal / sine if sine > 1e-9 else np.linalg.svd(one[None])[2][2]
+    across = normal / sine if sine > 1e-9 else np.linalg.svd(first[None])[2][2]
     ends = np.array([np.cross(first, across), -np.cross(second, across)]) / sizes
     gradient = np.array([ends[0], -ends.sum(axis=0), ends[1]])
     return float(np.arctan2(sine, cosine)), gradient
