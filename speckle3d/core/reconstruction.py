@@ -226,7 +226,7 @@ class Reconstruction:
         covariance = flags = None
         if self.trust is not None:
             errors = self.trust if mode == "image" else self.trust.modes.get(mode)
-            covariance, flags = errors and errors.covariance, self.trust.flags
+            covariance, flags = getattr(errors, "covariance", None), self.trust.flags
         others = {"time_s": self.frame_time_s, "flags": flags}
         return pose_table(self.poses[mode], self.grid.centre_mm, covariance, **others)
 

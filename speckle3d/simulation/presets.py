@@ -186,12 +186,12 @@ def _trajectory(
     if settings.preset in _BATH:
         return calibration_scan(settings, image.width_mm, world, rng)
     fan, turn, crossing = np.deg2rad([settings.fan_deg, settings.turn_deg, settings.crossing_deg]).tolist()
-    start, turns = 0.0, (0.0, 0.0, 0.0)
+    tilt, turns = 0.0, (0.0, 0.0, 0.0)
     if settings.preset == "crossed":
-        start, turns = -fan / 2.0, (fan, 0.0, 0.0)
+        tilt, turns = -fan / 2.0, (fan, 0.0, 0.0)
     elif settings.preset == "rotation":
         turns = (turn, 0.0, 0.0) if settings.turn_axis == "tilt" else (0.0, turn, 0.0)
-    motion = HandMotion((start, 0.0, 0.0), turns, settings.preset == "reversal", settings.wobble_mm)
+    motion = HandMotion((tilt, 0.0, 0.0), turns, settings.preset == "reversal", settings.wobble_mm)
     centre = np.array([image.width_mm / 2.0, 0.0, settings.length_mm / 2.0])
     start = turned_about(centre, crossing * number)
     return hand_sweep(settings.length_mm, duration_s, image.width_mm, motion, start, world, rng)
