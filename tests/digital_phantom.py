@@ -1,13 +1,12 @@
-"""A phantom known by formula: spheres and a helix, cut by images at known poses.
+"""A phantom known by formula: spheres, cut by images at known poses.
 
 An image point's grey level follows from its distance to the nearest surface alone, as the share of its pixel
 that lies inside: no voxels, no splatting, and no model of the estimator.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.geometry import rotation_from_fixed_angles
@@ -32,34 +31,9 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Helix:
-    """A tube round a helix whose axis runs along z."""
-
-    centre_mm: tuple[float, float, float]
-    radius_mm: float
-    pitch_mm: float
-    turns: float
-    tube_mm: float
-
-    @property
-    def length_mm(self):
-        return self.turns * np.hypot(2 * np.pi * self.radius_mm, self.pitch_mm)
-
-    def at(self, angle):
-        x, y = self.radius_mm * np.cos(angle), self.radius_mm * np.sin(angle)
-        rise = self.pitch_mm * (angle / (2 * np.pi) - self.turns / 2)
-        return np.asarray(self.centre_mm) + np.stack([x, y, rise], axis=-1)
-
-    def depth(self, points):
-        # Places 0.01 mm apart: at the tube's surface, 0.9 mm away, the nearest is right to 2e-5 mm.
-        angle = np.linspace(0.0, 2 * np.pi * self.turns, int(self.length_mm / 0.01))
-        return self.tube_mm - cKDTree(self.at(angle)).query(points)[0]
-
-
-@dataclass(frozen=True)
 class Phantom:
-    shapes: tuple = ()
-    grid: ImageGrid = field(default_factory=lambda: ImageGrid(96, 120, 0.2, 0.2))
+    balls: tuple
+    grid: ImageGrid
 
     def image(self, pose):
         """Grey levels of the image at one pose, shape (vector, sample)."""
@@ -67,9 +41,7 @@ class Phantom:
         y = self.grid.first_sample_depth_mm + self.grid.sample_spacing_mm * np.arange(self.grid.samples)
         inside = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((x.size, y.size))], axis=-1)
         points = pose.apply(inside.reshape(-1, 3)).reshape(inside.shape)
-        depth = np.full(points.shape[:-1], -np.inf)
-        for shape in self.shapes:
-            depth = np.maximum(depth, shape.depth(points))
+        depth = np.max([ball.depth(points) for ball in self.balls], axis=0)
         share = np.clip(0.5 + depth / self.grid.sample_spacing_mm, 0.0, 1.0)
         return (OUTSIDE + (INSIDE - OUTSIDE) * share).astype(np.float32)
 
@@ -87,3 +59,11 @@ def curved_path(frames, length_mm, seed=0):
     places = np.column_stack([0.8 * waves[0], 0.5 * waves[1], length_mm * uneven])
     roll, yaw, tilt = (np.deg2rad(4.0) * wave for wave in waves[3:])
     return RigidTransform.from_components(places, rotation_from_fixed_angles(roll / 2, yaw, tilt))
+
+
+def voxel_volume(volume, ball, step_mm):
+    """Volume of a sphere by its voxels' grey levels, each counted by its share of the inside."""
+    index = np.moveaxis(np.indices(volume.shape), 0, -1).reshape(-1, 3)
+    near = ball.depth(volume.world_from_grid.apply(index * volume.spacing_mm)) > -3 * step_mm
+    share = (volume.voxels.reshape(-1)[near] - OUTSIDE) / (INSIDE - OUTSIDE)
+    return float(np.nansum(share) * np.prod(volume.spacing_mm))

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.core.streams import TimedPoses, TimedRotations
-from speckle3d.simulation.movement import HandMotion, hand_sweep
 
 
 def spoil(sweep, name):
@@ -74,20 +73,6 @@ def _mount_turned(degrees, axis):
     return lambda sweep, sensor, rng: replace(sensor, sensor_from_image=sensor.sensor_from_image * turn)
 
 
-def _of_another_sweep(sweep, tracker, rng):
-    duration = float(np.ptp(sweep.frame_time_s))
-    world = RigidTransform.from_components(rng.uniform(-300, 300, 3), Rotation.random(rng=rng))
-    length = rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 16.0)
-    start = RigidTransform.identity()
-    path = hand_sweep(length, duration, sweep.grid.width_mm, HandMotion(), start, world, rng)
-    times = tracker.readings.time_s + tracker.time_offset_s - sweep.frame_time_s[0]
-    times = np.clip(times, -0.49, duration + 0.49)
-    poses = path.world_from_image(times) * tracker.sensor_from_image.inv()
-    noise = Rotation.from_rotvec(np.deg2rad(0.1) * rng.standard_normal((times.size, 3)))
-    poses = poses * RigidTransform.from_components(0.15 * rng.standard_normal((times.size, 3)), noise)
-    return replace(tracker, readings=TimedPoses(tracker.readings.time_s, poses))
-
-
 def _quaternions(wxyz):
     return _readings(
         lambda turned, rng: Rotation.from_quat(turned.as_quat(scalar_first=True) * wxyz, scalar_first=True)
@@ -120,7 +105,6 @@ FAULTS = {
     "tracker noise of 3 mm": _positions(lambda places, rng: places + 3.0 * rng.standard_normal(places.shape)),
     "tracker drift of 5 mm": _positions(_drift),
     "tracker random": _readings(_random_poses),
-    "tracker of another sweep": _of_another_sweep,
     "orientation stored xyzw": _readings(
         lambda turned, rng: Rotation.from_quat(turned.as_quat(scalar_first=False), scalar_first=True)
     ),

@@ -43,14 +43,12 @@ class Motion(NamedTuple):
 
 def scene(motion, kind, amount, rng):
     """A recording as it would be in such a field or of such a sensor."""
-    if kind in SENSORS:
-        return Scene(*SENSORS[kind](motion, amount, rng))
+    if kind == "truncated":
+        return Scene(*truncated(motion, amount, rng))
     readings = FIELDS[kind](motion, amount, rng)
     residual = np.eye(3) + RESIDUAL * rng.standard_normal((3, 3))
     readings = readings @ residual.T + RESIDUAL * np.linalg.norm(EARTH_UT) * rng.standard_normal(3)
     readings = readings + NOISE_UT * rng.standard_normal(readings.shape)
-    if kind == "frozen":
-        readings = frozen(motion, readings, amount, rng)
     log = with_readings(motion.log, magnetometer_au=np.where(motion.known[:, None], readings, np.nan))
     return Scene(log, motion.true_wxyz, motion.moving)
 
@@ -154,16 +152,6 @@ def walk(motion, amount, rng):
     return seen_by(motion, EARTH_UT + iron * (amount * np.linalg.norm(EARTH_UT) / strength))
 
 
-def passing(motion, amount, rng):
-    """A magnet goes by six times, each for two to eight seconds."""
-    time_s, field = motion.log.time_s, room_ut(motion, rng)
-    for middle_s in rng.uniform(0.15, 0.95, 6) * time_s[-1]:
-        nearness = 1.0 / (1.0 + ((time_s - middle_s) / rng.uniform(0.5, 2.0)) ** 2) ** 1.5
-        turning = np.outer(np.cos(time_s - middle_s), direction(rng))
-        field += amount * nearness[:, None] * (turning + 0.5 * direction(rng)) / 1.5
-    return seen_by(motion, field)
-
-
 def start(motion, amount, rng):
     """Beside iron until five seconds after the first movement, free two seconds later."""
     begin_s = motion.log.time_s[np.flatnonzero(motion.moving)[0]] + 5.0
@@ -174,49 +162,16 @@ def start(motion, amount, rng):
 FIELDS = {
     "attached": attached,
     "walk": walk,
-    "passing": passing,
     "start": start,
-    "frozen": room,
 }
 
 
-# -- faults of the magnetometer
-
-
-def during(motion, seconds, rng):
-    """A stretch of the recording while the sensor moves, as many seconds long."""
-    middle_s = rng.uniform(0.35, 0.65) * motion.log.time_s[-1]
-    return np.abs(motion.log.time_s - middle_s) < 0.5 * seconds
-
-
-def frozen(motion, readings, amount, rng):
-    stuck = during(motion, amount, rng)
-    return np.where(stuck[:, None], readings[np.flatnonzero(stuck)[0]], readings)
-
-
 # -- other gyroscopes: log, truth, where it moves
-
-
-def worse_gyroscope(motion, rate):
-    return with_readings(motion.log, gyroscope_rad_s=rate), motion.true_wxyz, motion.moving
 
 
 def truncated(motion, amount, rng):
     """Coarser steps, cut toward zero, about another bias: at rest it differs from that in motion."""
     step = np.deg2rad(amount)
     rate = motion.log.gyroscope_rad_s + rng.uniform(-0.5, 0.5, 3) * step
-    return worse_gyroscope(motion, np.trunc(rate / step) * step)
-
-
-def cut(motion, amount, rng):
-    """Only what comes after some seconds of movement."""
-    first = np.flatnonzero(np.cumsum(motion.moving) > amount * motion.log.rate_hz)[0]
-    vectors = (getattr(motion.log, name)[first:] for name in VECTORS)
-    log = ImuLog(motion.log.time_s[first:] - motion.log.time_s[first], *vectors, source=motion.log.source)
-    return log, motion.true_wxyz[first:], motion.moving[first:]
-
-
-SENSORS = {
-    "cut": cut,
-    "truncated": truncated,
-}
+    log = with_readings(motion.log, gyroscope_rad_s=np.trunc(rate / step) * step)
+    return log, motion.true_wxyz, motion.moving

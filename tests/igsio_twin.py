@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+SIDE = 1.0 - 2.0**-17
+"""How far a fan's sides are moved in, pixels, but for rounding."""
+
 
 @dataclass(frozen=True)
 class Clip:
@@ -17,49 +20,19 @@ class Clip:
     fan: tuple[float, float, float, float, float, float] | None = None
     """Column and row of its origin, least and greatest radius, least and greatest angle in degrees."""
 
-    def spans(self, width, height):
-        """First and last column of both pieces of every row, shape (height, 2, 2); none if last < first."""
-        spans = np.tile([0, -1], (height, 2, 1))
-        left, right = max(self.columns[0], 0), min(self.columns[1], width - 1)
-        for row in range(max(self.rows[0], 0), min(self.rows[1], height - 1) + 1):
-            pieces = [(left, right)] if self.fan is None else self._of_fan(row, left, right)
-            for i, piece in enumerate(pieces):
-                spans[row, i] = piece
-        return spans
-
     def mask(self, width, height):
-        """Whether each pixel counts, shape (height, width)."""
-        columns, spans = np.arange(width), self.spans(width, height)
-        inside = (spans[..., 0, None] <= columns) & (columns <= spans[..., 1, None])
-        return inside.any(axis=1)
-
-    def _of_fan(self, row, left, right):
+        """Whether each pixel counts, shape (height, width); the sides of the fan are a pixel further in."""
+        row, column = np.mgrid[:height, :width]
+        inside = (self.columns[0] <= column) & (column <= self.columns[1])
+        inside &= (self.rows[0] <= row) & (row <= self.rows[1])
+        if self.fan is None:
+            return inside
         x, y, inner, outer, low, high = self.fan
-        down = row - y
-        lean = sorted(np.tan(np.deg2rad([low, high])))
-        left = max(left, _ceil(lean[0] * down + x + 1))
-        right = min(right, _floor(lean[1] * down + x - 1))
-        if outer**2 < down**2:
-            return []
-        half = np.sqrt(outer**2 - down**2)
-        left, right = max(left, _ceil(x - half + 1)), min(right, _floor(x + half - 1))
-        if left > right or inner**2 <= down**2:
-            return [(left, right)]
-        hole = np.sqrt(inner**2 - down**2)
-        first, last = _ceil(x - hole + 1), _floor(x + hole - 1)
-        if first < left:
-            return [(max(left, last + 1), right)]
-        if last > right:
-            return [(left, min(right, first - 1))]
-        return [(left, first - 1), (last + 1, right)]
-
-
-def _floor(value):
-    return int(np.floor(value + 2.0**-17))
-
-
-def _ceil(value):
-    return -_floor(-value)
+        down, over = row - y, column - x
+        left, right = np.sort(np.tan(np.deg2rad([low, high])))[:, None, None] * down
+        with np.errstate(invalid="ignore"):
+            rim, hole = (np.abs(over) <= np.sqrt(r**2 - down**2) - SIDE for r in (outer, inner))
+        return inside & (over >= left + SIDE) & (over <= right - SIDE) & rim & ~hole
 
 
 def grid_of(reference_from_image, clip, width, height, spacing_mm):

@@ -134,22 +134,17 @@ def of_patches(fixed, moving, first, size, shift, least_overlap, alike):
 
     alike: function of both frames' samples and of their places in the patch, (n, 2). Returns (p, 3, 3).
     """
-    lags = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-    out = np.full((len(first), len(lags)), np.nan)
+    out, places = np.full((len(first), 3, 3), np.nan), np.indices(size).reshape(2, -1).T
+    fixed, moving = (np.pad(image, 50, constant_values=np.nan) for image in (fixed, moving))
     for p, (corner, about) in enumerate(zip(first, shift, strict=True)):
-        partners = {}
-        for v, s in np.ndindex(*size):
-            at = corner[0] + v, corner[1] + s
-            theirs = [(at[0] + about[0] + i, at[1] + about[1] + j) for i, j in lags]
-            if all(0 <= a < fixed.shape[0] and 0 <= b < fixed.shape[1] for a, b in [at, *theirs]):
-                partners[v, s] = at, theirs
-        if not partners or len(partners) < least_overlap * size[0] * size[1]:
-            continue
-        a = np.array([fixed[at] for at, _ in partners.values()])
-        for n in range(len(lags)):
-            b = np.array([moving[theirs[n]] for _, theirs in partners.values()])
-            out[p, n] = alike(a, b, np.array(list(partners)))
-    return out.reshape(len(first), 3, 3)
+        at = 50 + np.add(corner, places)
+        a = fixed[tuple(at.T)]
+        b = {lag: moving[tuple((at + about + np.subtract(lag, 1)).T)] for lag in np.ndindex(3, 3)}
+        common = np.isfinite([a, *b.values()]).all(axis=0)
+        if common.any() and common.sum() >= least_overlap * common.size:
+            for lag, theirs in b.items():
+                out[p][lag] = alike(a[common], theirs[common], places[common])
+    return out
 
 
 def pearson(a, b, _):
@@ -188,37 +183,3 @@ def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
     most = max(count for count, _, _ in tried)
     closest = min(misfit for count, misfit, _ in tried if count == most)
     return [s for count, misfit, s in tried if count == most and misfit <= closest + 1e-9]
-
-
-def elevational_width_mm(beam):
-    """Full two-way thickness of a beam at each depth, by the pulse's power summed over lateral positions.
-
-    So a rough surface across the image sends it back. Where the profile has two peaks (nearer than half the
-    lens's focus) its outermost crossings of -6 dB, relative to its maximum, count.
-    """
-    spectra = beam.spectra(np.linspace(0.0, beam.probe.sampling_rate_hz / 2.0, 513))
-    field, sides = beam.residual, np.where(beam.lateral_mm > 0.0, 2.0, 1.0)
-    gram = spectra @ spectra.conj().T
-    power = np.einsum("yxzk,kl,yxzl,x->yz", field, gram, field.conj(), sides, optimize=True).real
-    level = power.max(axis=1) * 10.0**-0.6
-    last = power.shape[1] - 1 - np.argmax((power >= level[:, None])[:, ::-1], axis=1)
-    assert (last < power.shape[1] - 1).all()
-    inner, outer = (power[np.arange(len(power)), last + k] for k in (0, 1))
-    part = (inner - level) / (inner - outer)
-    return 2.0 * (beam.elevation_mm[last] + part * beam.elevation_mm[1])
-
-
-def look_up_on_planes(points_mm, volume, planes, pixels):
-    """Twin of `speckle3d.kernels.crossing.look_up`: values alone, every point against every plane."""
-    found = np.full(len(points_mm), np.nan)
-    for n, point in enumerate(points_mm):
-        local = planes[:, :, :3] @ point + planes[:, :, 3]
-        between = np.flatnonzero((local[:-1, 2] >= 0) & (local[1:, 2] < 0))
-        if between.size == 0:
-            continue
-        k = int(between[0])
-        share = local[k, 2] / (local[k, 2] - local[k + 1, 2])
-        x, y = ((1 - share) * local[k] + share * local[k + 1])[:2]
-        at = [[k + share], [(x - pixels[2]) / pixels[0]], [(y - pixels[3]) / pixels[1]]]
-        found[n] = ndimage.map_coordinates(volume.astype(float), at, order=1, mode="constant", cval=np.nan)[0]
-    return found

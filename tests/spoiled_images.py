@@ -69,13 +69,10 @@ def at_rest(sweep, snr_db):
     return replace(still, truth=sweep.truth[order])
 
 
-def cluttered(sweep, pattern, over_signal_db, depths=(0.0, 1.0)):
-    """The same pattern added to every frame, as strong at each depth as the signal is, and so much more."""
+def cluttered(sweep, pattern):
+    """The same pattern added to every frame, as strong at each depth as the signal is."""
     pattern = pattern / np.maximum(level_by_depth(pattern[None]), 1e-9)
-    level = level_by_depth(sweep.frames)
-    where = np.linspace(0.0, 1.0, level.size)
-    inside = (where >= depths[0]) & (where <= depths[1])
-    return spoiled(sweep, sweep.frames + 10 ** (over_signal_db / 20) * level * inside * pattern)
+    return spoiled(sweep, sweep.frames + level_by_depth(sweep.frames) * pattern)
 
 
 def interleaved(*sweeps):
@@ -87,7 +84,7 @@ def interleaved(*sweeps):
     return spoiled(sweeps[0], frames, np.repeat(np.arange(count), len(sweeps)))
 
 
-def resting_first(sweep, share=1 / 3, snr_db=40.0):
+def resting_first(sweep, share=1 / 3):
     """A sweep that begins with a rest of a share of its time."""
     rest = round(len(sweep) * share / (1 - share))
-    return noisy(in_order(sweep, np.concatenate([np.zeros(rest, dtype=int), np.arange(len(sweep))])), snr_db)
+    return in_order(sweep, np.concatenate([np.zeros(rest, dtype=int), np.arange(len(sweep))]))

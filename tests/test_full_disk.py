@@ -1,13 +1,14 @@
 """Every writer on a full disk: one line that names the file and the reason, and the old file as it was."""
 
+import resource
 import subprocess
 import sys
+from contextlib import closing, contextmanager
 
 import imu_logs
 import numpy as np
 import pytest
 import sweep_examples
-from disks import FULL, limited
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.core.errors import NoSpaceError
@@ -21,6 +22,8 @@ from xsens.live.recording import RawFile
 from xsens.logs.read import parse_stream
 from xsens.logs.textlogs import write_csv
 
+FULL = "File too large"
+"""What the system says where no file of a process may grow; of a disk, "No space left on device"."""
 SWEEP = sweep_examples.rf_sweep()
 VALUES = np.random.default_rng(0).random((99, 50), np.float32)
 VOLUME = Volume(
@@ -30,19 +33,21 @@ VOLUME = Volume(
 )
 
 
+@contextmanager
+def limited(size):
+    """Let no file of this process become larger than `size` bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
 def figure():
     drawn = new_figure(4, 3)
     drawn.subplots().plot(VALUES[0])
     return drawn
-
-
-def recorded(path):
-    path.unlink(missing_ok=True)  # a recording never replaces a file
-    file = RawFile(path)
-    try:
-        file.append(bytes(5000))
-    finally:
-        file.close()
 
 
 WRITERS = {
@@ -78,8 +83,8 @@ def test_a_full_disk_is_one_line_and_the_old_file_stays(tmp_path, name, capfd):
 
 
 def test_a_recording_keeps_what_fitted(tmp_path):
-    with limited(1200), pytest.raises(NoSpaceError, match=FULL):
-        recorded(tmp_path / "r.mtb")
+    with limited(1200), closing(RawFile(tmp_path / "r.mtb")) as file, pytest.raises(NoSpaceError, match=FULL):
+        file.append(bytes(50000))
     assert (tmp_path / "r.mtb").stat().st_size == 1200
 
 

@@ -4,13 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.config import Config
 from speckle3d.core.errors import InsufficientDataError, InvalidInputError, MismatchError
 from speckle3d.core.geometry import mirrored
-from speckle3d.core.streams import TimedRotations
-from speckle3d.core.sweep import OrientationSensor
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.matching.quality import FrameFlag
@@ -55,25 +52,6 @@ def test_setting_then_tracker_then_nothing_settles_the_direction(sweep, tracked)
     assert settle_direction(bare, other, SensorSettings()) == (1, "assumed")
 
 
-def test_turns_seen_by_the_orientation_sensor_settle_the_direction(sweep):
-    time_s = sweep.frame_time_s
-    tilt = np.deg2rad(1.5) * np.sin(2 * np.pi * 4 * (time_s - time_s[0]) / np.ptp(time_s))
-    turned = Rotation.from_rotvec(np.outer(tilt, [1.0, 0.3, 0.0]))
-    image = RigidTransform.from_rotation(turned)
-    sensor = OrientationSensor(TimedRotations(time_s, turned), Rotation.identity())
-    oriented = replace(sweep, tracker=None, orientation=sensor, truth=None)
-    assert settle_direction(oriented, image, SensorSettings()) == (1, "orientation sensor")
-    assert settle_direction(oriented, mirrored(image), SensorSettings()) == (-1, "orientation sensor")
-
-
-def test_a_sensor_that_does_not_turn_with_the_image_settles_nothing(sweep):
-    rng, n = np.random.default_rng(1), len(sweep)
-    image, sensed = (Rotation.from_rotvec(rng.normal(0, np.deg2rad(0.1), (n, 3))) for _ in range(2))
-    sensor = OrientationSensor(TimedRotations(sweep.frame_time_s, sensed), Rotation.identity())
-    oriented = replace(sweep, tracker=None, orientation=sensor, truth=None)
-    assert settle_direction(oriented, RigidTransform.from_rotation(image), SensorSettings()) == (1, "assumed")
-
-
 def spoilt(sweep, numbers, change):
     """The sweep with some frames changed by a function of the frame."""
     frames = np.stack([sweep.frames[k] for k in range(len(sweep))])
@@ -96,7 +74,7 @@ def test_frames_without_speckle_are_flagged_and_too_many_refused(sweep, curves):
         track(spoilt(short, range(8, 20), noise), curves)
 
 
-@pytest.mark.parametrize("lost", [(22, 23), (20, 21, 22, 23), (9, 10, 11), (23, 24, 25)])
+@pytest.mark.parametrize("lost", [(20, 21, 22, 23), (9, 10, 11)])
 def test_the_path_goes_on_past_frames_without_speckle(sweep, curves, lost):
     """Where the next is 0.6 mm on, speckle itself has little left."""
     found = track(spoilt(sweep.part(0, 48), lost, np.zeros_like), curves)

@@ -1,24 +1,33 @@
-"""Precision and error of calibrations from simulated images, lines found in them: Housden 2008, Table 1.
+"""Calibrations from simulated images against the truth and against what they claim: Housden 2008, Table 1.
 
-Each trial is another scan of the plane by another hand, with the sensors of the simulator, their noise, drift
-and clock offset; the first line of each block gives the published precision.
+Run: ``python tests/benchmarks/bench_calibration_accuracy.py [PHANTOM ...] [--scans N]``.
 
-    python tests/benchmarks/bench_calibration_accuracy.py [--trials 25] [--frames 100]
+Each scan is another hand's, with the sensors of the simulator, their noise, drift and clock offset, over a
+plane (a thin bar or a wall) or two crossing threads; or a package of a handheld with a sensor inside over a
+plane: I/Q, packed, the sensor in bursts, of which the command sees nothing else.
 """
 
 import argparse
 import os
+import sys
+import tempfile
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from commands import run_command
+from handheld import PITCH_MM, write_handheld
 from options import parsed
+from scipy.spatial.transform import RigidTransform
 
 from calibration.detection.lines import detect_lines
 from calibration.recording import Recording
-from speckle3d.calibrating.phantoms import solved
-from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings
+from speckle3d.calibrating.phantoms import found, solved
+from speckle3d.calibrating.settings import OrientationSettings, PlaneSettings, WireSettings
 from speckle3d.core.errors import InsufficientDataError
+from speckle3d.io.calibrations import read_calibration
 from speckle3d.simulation.presets import SimulationSettings, simulate
 from speckle3d.simulation.sensors import ORIENTATION_FROM_IMAGE, TRACKER_FROM_IMAGE
 from speckle3d.study.images import GreyImages
@@ -27,86 +36,112 @@ FIRST_SEED = 3001
 """Seeds that no test and no development used."""
 
 
+def simulated(preset, seed, frames, **settings):
+    settings = SimulationSettings(preset=preset, seed=seed, frames=frames, **settings)
+    return simulate(settings)[0].sweep
+
+
 def recording_of(sweep, sensor):
     images = GreyImages(sweep, 60.0, clipped=False)
     size = np.array([images.grid.vector_pitch_mm, images.grid.sample_spacing_mm])
-    return Recording(
-        images,
-        size,
-        np.array([0.0, images.grid.first_sample_depth_mm]) / size,
-        sweep.frame_time_s,
-        sensor.readings,
-        sensor.time_offset_s,
-    )
+    origin = np.array([0.0, images.grid.first_sample_depth_mm]) / size
+    return Recording(images, size, origin, sweep.frame_time_s, sensor.readings, sensor.time_offset_s)
 
 
-def trial(seed, frames, reflector):
-    """Errors of one scan: (tilt, yaw, roll) degrees of both sensors, centre mm of the tracker, or reasons."""
-    simulated = simulate(
-        SimulationSettings(
-            preset="plane", seed=seed, frames=frames, reflector=reflector, duration_s=frames / 5
-        )
-    )[0]
-    sweep = simulated.sweep
-    recording = recording_of(sweep, sweep.orientation)
-    seen = detect_lines(recording.images, recording.pixel_mm)
-    found = {}
+def plane(reflector, seed, frames):
+    """Name and calibration of both sensors by one scan of a plane."""
+    sweep = simulated("plane", seed, frames, reflector=reflector, duration_s=frames / 5)
+    turned, placed = (recording_of(sweep, sensor) for sensor in (sweep.orientation, sweep.tracker))
+    seen = detect_lines(turned.images, turned.pixel_mm)
     for level in (False, True):
-        outcome = solved(recording, seen, OrientationSettings(level=level))
-        turn = ORIENTATION_FROM_IMAGE.inv() * outcome.calibration.rotation
-        found[f"orientation sensor, {'level' if level else 'any'} plane"] = (
-            np.rad2deg(turn.as_rotvec()),
-            np.rad2deg(np.sqrt(np.diag(outcome.calibration.covariance))),
-            None,
-        )
-    for fit in (True, False):
-        outcome = solved(
-            recording_of(sweep, sweep.tracker), seen, PlaneSettings(fixed_pixels=not fit, reflector="bar")
-        )
-        step = TRACKER_FROM_IMAGE.inv() * outcome.calibration.sensor_from_image
-        centre = sweep.grid.centre_mm
-        found[f"tracker, pixels {'fitted' if fit else 'held'}"] = (
-            np.rad2deg(step.rotation.as_rotvec()),
-            np.rad2deg(np.sqrt(np.diag(outcome.calibration.covariance)[:3])),
-            step.apply(centre) - centre,
-        )
-    return found
+        outcome = solved(turned, seen, OrientationSettings(level=level))
+        yield f"orientation sensor, {'level' if level else 'any'} plane", outcome.calibration
+    for held in (False, True):
+        outcome = solved(placed, seen, PlaneSettings(fixed_pixels=held, reflector="bar"))
+        yield f"tracker, pixels {'held' if held else 'fitted'}", outcome.calibration
+
+
+def wires(seed, frames):
+    sweep = simulated("wires", seed, frames, vectors=64)
+    recording = recording_of(sweep, sweep.tracker)
+    yield "tracker", solved(recording, found(recording, WireSettings()), WireSettings()).calibration
+
+
+def handheld(reflector, seed, frames):
+    sweep = simulated("plane", seed, frames, reflector=reflector, vectors=48, signal="iq")
+    with tempfile.TemporaryDirectory() as folder:
+        settings, out = Path(folder) / "import.toml", Path(folder) / "mounting.h5"
+        settings.write_text(f"vector_pitch_mm = {PITCH_MM}\nbandwidth_hz = [5e6, 10e6]\n", encoding="utf-8")
+        package = write_handheld(Path(folder) / "bath.tar", sweep)
+        run_command("calibrate", "orientation", package, "-o", out)
+        yield "orientation sensor", read_calibration(out)
+
+
+SCANS = {
+    "bar": lambda *scan: plane("bar", *scan),
+    "wall": lambda *scan: plane("wall", *scan),
+    "wires": wires,
+    "handheld": lambda *scan: handheld("wall", *scan),
+    "handheld-bar": lambda *scan: handheld("bar", *scan),
+}
+
+
+def errors_of(calibration):
+    """Errors about and along the image's x, y, z, degrees and mm, and those claimed; NaN without a place."""
+    units = np.repeat([180.0 / np.pi, 1.0], 3)
+    claimed = np.full(6, np.nan)
+    variance = np.diag(calibration.covariance)[:6]
+    claimed[: variance.size] = np.sqrt(variance)
+    if calibration.sensor == "orientation":
+        shift, turn = np.full(3, np.nan), ORIENTATION_FROM_IMAGE.inv() * calibration.rotation
+    else:
+        place = RigidTransform.from_components(calibration.translation_mm, calibration.rotation)
+        shift, turn = (TRACKER_FROM_IMAGE.inv() * place).as_components()
+    return np.array([[*turn.as_rotvec(), *shift], claimed]) * units
 
 
 def report(name, errors):
-    angles = np.array([error[0] for error in errors])
-    claims = np.array([error[1] for error in errors])
-    sd = np.sqrt(np.mean((angles - angles.mean(axis=0)) ** 2, axis=0) * len(angles) / (len(angles) - 1))
-    shown = ", ".join(f"{value:.3f}" for value in sd[::-1])
-    bias = ", ".join(f"{value:+.3f}" for value in angles.mean(axis=0)[::-1])
-    honest = ", ".join(f"{value:.2f}" for value in np.sqrt(np.mean((angles / claims) ** 2, axis=0))[::-1])
-    print(f"  {name}: sd of roll, yaw, tilt {shown} degrees; mean error {bias}; error over claim {honest}")
-    centres = [error[2] for error in errors if error[2] is not None]
-    if centres:
-        rms = np.sqrt(np.mean(np.sum(np.square(centres), axis=1)))
-        mean = np.mean(centres, axis=0).round(2)
-        print(f"    centre: mean error {mean} mm (x, y, z), RMS distance {rms:.2f} mm")
+    """Print bias, spread and claims of some scans."""
+    known = ~np.isnan(errors[0, 0])
+    error, claimed = errors[:, 0, known], errors[:, 1, known]
+    scores = error / claimed
+    print(f"  {name}, {len(error)} scans: tilt, yaw, roll (and x, y, z)")
+    rows = {
+        "mean error, deg, mm": error.mean(axis=0),
+        "standard deviation": error.std(axis=0, ddof=min(1, len(error) - 1)),
+        "claimed": np.median(claimed, axis=0),
+        "rms over claims": np.sqrt(np.mean(scores**2, axis=0)),
+    }
+    for row, values in rows.items():
+        print(f"    {row:26}" + "".join(f"{value:8.3f}" for value in values))
+    turns = np.linalg.norm(error[:, :3], axis=1)
+    inside = [np.mean(np.abs(scores) < limit) for limit in (1.0, 1.96)]
+    print(
+        f"    turned by {np.median(turns):.2f} deg (median), {turns.max():.2f} at most; within the 68 % "
+        f"interval {inside[0]:.0%}, the 95 % interval {inside[1]:.0%}, largest {np.abs(scores).max():.1f}"
+    )
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--trials", type=int, default=25)
+    parser.add_argument("phantoms", nargs="*", metavar="PHANTOM", help=f"of {', '.join(SCANS)}; or all")
+    parser.add_argument("--scans", type=int, default=25)
     parser.add_argument("--frames", type=int, default=100)
-    parser.add_argument("--reflector", choices=["bar", "wall"], action="append")
-    options = parsed(parser, trials=2, frames=40, reflector=["bar"])
-    for reflector in options.reflector or ["bar", "wall"]:
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
+    options = parsed(parser, phantoms=["bar"], scans=1, frames=40)
+    for phantom in options.phantoms or SCANS:
         print(
-            f"{reflector}, {options.trials} scans of {options.frames} frames (published sd 0.08, 1.10, 1.50):"
+            f"{phantom}, {options.frames} frames (published, plane: sd of tilt, yaw, roll 1.50, 1.10, 0.08)"
         )
         collected = {}
-        for number in range(options.trials):
+        for seed in range(options.first_seed, options.first_seed + options.scans):
             try:
-                for name, error in trial(FIRST_SEED + number, options.frames, reflector).items():
-                    collected.setdefault(name, []).append(error)
+                for name, calibration in SCANS[phantom](seed, options.frames):
+                    collected.setdefault(name, []).append(errors_of(calibration))
             except InsufficientDataError as error:
-                print(f"  seed {FIRST_SEED + number} refused: {error}")
+                print(f"  seed {seed} refused: {error}")
         for name, errors in collected.items():
-            report(name, errors)
+            report(name, np.array(errors))
 
 
 if __name__ == "__main__":

@@ -1,110 +1,87 @@
 """How far halving and doubling each constant between the correlation table and the path moves lengths.
 
-Run: ``python tests/benchmarks/bench_constants.py SWEEP... --curves CURVES``, with sweeps that have a truth.
+Run: ``python tests/benchmarks/bench_constants.py [SWEEP...] [--curves CURVES]``, with sweeps that have a
+truth.
 
-Every module constant of `speckle3d.motion` that is a number or a tuple of numbers, and every numeric setting
-of the stages there, is halved and doubled in turn; printed are those that move a length by more than
-`--least` per cent, with the largest change and its sweep. Constants of kernels are compiled in and stay.
+Every module constant of `speckle3d.motion` that is a number is halved and doubled in turn; changes of
+lengths are printed in per cent, the largest first. Constants of kernels are compiled in and stay.
 """
 
 import argparse
-import importlib
 import pkgutil
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from itertools import islice
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
+from options import parsed
 
 import speckle3d.motion
-from speckle3d.config import Config
 from speckle3d.core.errors import Speckle3DError
 from speckle3d.io.curves import read_curves
 from speckle3d.io.load import load_sweep
 from speckle3d.pipeline import track
 
-STAGES = ("planes", "trajectory")
+SHIPPED = Path(__file__).resolve().parents[2] / "data"
 NOT_OF_THE_PATH = ("diffraction", "lens", "phantom")
 """Modules of curves, which change no estimate."""
-
-
-def module_constants():
-    """Module, name and value of every numeric constant."""
-    for info in pkgutil.iter_modules(speckle3d.motion.__path__):
-        if info.name in NOT_OF_THE_PATH:
-            continue
-        module = importlib.import_module(f"speckle3d.motion.{info.name}")
-        for name, value in vars(module).items():
-            numbers = value if isinstance(value, tuple) else (value,)
-            if name.isupper() and all(type(n) in (int, float) and n != 0 for n in numbers):
-                yield module, name, value
-
-
-def settings():
-    """Stage, name and value of every numeric setting."""
-    for stage in STAGES:
-        for name, value in getattr(Config(), stage):
-            if type(value) in (int, float) and value != 0:
-                yield stage, name, value
+MODULES = [
+    import_module(f"speckle3d.motion.{info.name}")
+    for info in pkgutil.iter_modules(speckle3d.motion.__path__)
+    if info.name not in NOT_OF_THE_PATH
+]
 
 
 @contextmanager
-def changed(module, name, value, factor):
-    """Multiply a constant where it stands and wherever it was imported."""
-    new = type(value)(v * factor for v in value) if isinstance(value, tuple) else type(value)(value * factor)
-    holders = [
-        m
-        for info in pkgutil.iter_modules(speckle3d.motion.__path__)
-        if getattr(m := importlib.import_module(f"speckle3d.motion.{info.name}"), name, None) is value
-    ]
-    for holder in holders:
-        setattr(holder, name, new)
-    try:
+def constant(name, value):
+    """Another value of a constant in all modules that have it."""
+    with ExitStack() as stack:
+        for module in MODULES:
+            if hasattr(module, name):
+                stack.enter_context(patch.object(module, name, value))
         yield
-    finally:
-        for holder in holders:
-            setattr(holder, name, value)
+
+
+def changes():
+    """Name and context of every change."""
+    constants = {name: value for module in MODULES for name, value in vars(module).items() if name.isupper()}
+    for name, value in constants.items():
+        if type(value) in (int, float) and value != 0:
+            for factor in (0.5, 2.0):
+                yield f"{name} x {factor:g}", constant(name, type(value)(value * factor))
+
+
+def travels(sweeps, curves):
+    """Travel along the normal of every sweep; NaN where it is refused."""
+    lengths = np.full(len(sweeps), np.nan)
+    for k, sweep in enumerate(sweeps):
+        try:
+            poses = track(sweep, curves).image
+        except Speckle3DError:
+            continue
+        centre = sweep.grid.centre_mm
+        lengths[k] = np.abs(np.cumsum((poses[:-1].inv() * poses[1:]).apply(centre)[:, 2] - centre[2])).max()
+    return lengths
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("sweeps", nargs="+", type=Path)
-    parser.add_argument("--curves", type=Path, required=True)
-    parser.add_argument("--least", type=float, default=0.3, help="per cent below which nothing is said")
-    chosen = parser.parse_args()
-    sweeps, curves = [load_sweep(path) for path in chosen.sweeps], read_curves(chosen.curves)
-
-    def lengths(config):
-        """Travel along the normal of every sweep; NaN where it is refused."""
-        every = []
-        for sweep in sweeps:
-            try:
-                poses = track(sweep, curves, config).image
-            except Speckle3DError:
-                every.append(np.nan)
-                continue
-            centre = sweep.grid.centre_mm
-            steps = (poses[:-1].inv() * poses[1:]).apply(centre)[:, 2] - centre[2]
-            every.append(np.abs(np.cumsum(steps)).max())
-        return np.array(every)
-
-    usual, moved = lengths(Config()), {}
-    for module, name, value in module_constants():
-        for factor in (0.5, 2.0):
-            with changed(module, name, value, factor):
-                moved[f"{module.__name__.split('.')[-1]}.{name} x {factor:g}"] = lengths(Config())
-    for stage, name, value in settings():
-        for factor in (0.5, 2.0):
-            try:
-                config = Config.model_validate({stage: {name: type(value)(value * factor)}})
-            except ValueError:
-                continue
-            moved[f"[{stage}] {name} x {factor:g}"] = lengths(config)
-    print(f"{len(moved)} changes; those that move a length by {chosen.least:g} % or more, in per cent:")
-    changes = {what: 100 * (length / usual - 1) for what, length in moved.items()}
-    largest = {what: np.nan_to_num(np.abs(change), nan=np.inf).max() for what, change in changes.items()}
-    for what in sorted(largest, key=lambda name: -largest[name]):
-        if largest[what] >= chosen.least:
-            print(f"  {what:50s}" + "".join(f"{value:+8.2f}" for value in changes[what]))
+    parser.add_argument("sweeps", nargs="*", type=Path, default=[SHIPPED / "phantom.h5"])
+    parser.add_argument("--curves", type=Path, default=SHIPPED / "curves.h5")
+    parser.add_argument("--frames", type=int, default=100000, help="of each sweep, at most")
+    parser.add_argument("--most", type=int, default=1000, help="changes, at most")
+    options = parsed(parser, frames=12, most=4)
+    sweeps = [load_sweep(path) for path in options.sweeps]
+    sweeps = [sweep.part(0, min(options.frames, len(sweep))) for sweep in sweeps]
+    curves, rows = read_curves(options.curves), {}
+    usual = travels(sweeps, curves)
+    for name, context in islice(changes(), options.most):
+        with context:
+            rows[name] = 100 * (travels(sweeps, curves) / usual - 1)
+    for name in sorted(rows, key=lambda name: -np.nan_to_num(np.abs(rows[name]), nan=np.inf).max()):
+        print(f"  {name:50s}" + "".join(f"{value:+8.2f}" for value in rows[name]))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
 """Delay from a frame's message to its pose's, as the scanner's side sees it, beside recording and the volume.
 
-python tests/benchmarks/bench_live.py SWEEP CURVES [--seconds 20] [--no-volume]
-
-The sweep (RF) is played over the loopback at its own rate, to and fro so that it can go on.
+Run: ``python tests/benchmarks/bench_live.py [SWEEP CURVES] [--seconds 20]``. The sweep (RF) is played over
+the loopback at its own rate, to and fro so that it can go on.
 """
 
 import argparse
@@ -22,68 +21,62 @@ from speckle3d.io.import_settings import ImportSettings
 from speckle3d.live.session import Session, SessionSettings
 from speckle3d.live.warming import warm_up
 
+SHIPPED = Path(__file__).resolve().parents[2] / "data"
 
-def play(path, seconds, told):
-    """Send frames when they are due; tell the delays of the poses that came back, and the frames sent."""
+
+def play(path, seconds, answers):
+    """Send frames when they are due; answer with how many, and the delays of poses that came back."""
     sweep = s3.load_sweep(path)
-    there = list(range(len(sweep)))
-    frames = [np.asarray(sweep.frames[k]).T for k in there]
-    order = (there + there[-2:0:-1]) * 1000
+    ahead = [np.asarray(sweep.frames[k]).T for k in range(len(sweep))]
+    order = ahead + ahead[-2:0:-1]
     interval_s = float(np.median(np.diff(sweep.frame_time_s)))
-    sent, delays = {}, []
+    sent, delays, over = {}, [], threading.Event()
     with Server(0) as server:
-        told.put(server.port)
+        answers.put(server.port)
         server.wait_connected(60.0)
 
         def listen():
             while not over.is_set():
-                found, now = server.receive(0.05), time.monotonic()
-                poses = (each for each in found if isinstance(each, TransformReceived))
+                messages, now = server.receive(0.05), time.monotonic()
+                poses = (each for each in messages if isinstance(each, TransformReceived))
                 delays.extend(now - sent[round(each.time_s / interval_s)] for each in poses)
 
-        over = threading.Event()
         listening = threading.Thread(target=listen)
         listening.start()
         begin, count = time.monotonic(), int(seconds / interval_s)
         for k in range(count):
-            message = packed_image("Image", (k + 1) * interval_s, frames[order[k]], np.eye(4))
+            message = packed_image("Image", (k + 1) * interval_s, order[k % len(order)], np.eye(4))
             time.sleep(max(0.0, begin + k * interval_s - time.monotonic()))
             sent[k + 1] = time.monotonic()
             server.send(message)
         time.sleep(2.0)
         over.set()
         listening.join()
-    told.put((count, delays))
+    answers.put((count, delays))
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("sweep", type=Path)
-    parser.add_argument("curves", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sweep", type=Path, nargs="?", default=SHIPPED / "phantom.h5")
+    parser.add_argument("curves", type=Path, nargs="?", default=SHIPPED / "curves.h5")
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--no-volume", action="store_true")
-    options = parsed(parser, seconds=5.0)
+    options = parsed(parser, seconds=2.0)
     curves, sweep = s3.load_curves(options.curves), s3.load_sweep(options.sweep)
-    signal = sweep.signal
-    imported = ImportSettings(
-        sampling_rate_hz=signal.sampling_rate_hz,
-        vector_pitch_mm=sweep.grid.vector_pitch_mm,
-        speed_of_sound_m_s=signal.speed_of_sound_m_s,
-        centre_frequency_hz=signal.centre_frequency_hz,
-        bandwidth_hz=signal.bandwidth_hz,
-    )
+    signal = {
+        name: getattr(sweep.signal, name)
+        for name in vars(sweep.signal)
+        if name in ImportSettings.model_fields
+    }
+    imported = ImportSettings(vector_pitch_mm=sweep.grid.vector_pitch_mm, **signal)
     warm_up(curves, s3.Config())
     context = get_context("spawn")
-    told = context.Queue()
-    playing = context.Process(target=play, args=(options.sweep, options.seconds, told))
+    answers = context.Queue()
+    playing = context.Process(target=play, args=(options.sweep, options.seconds, answers))
     playing.start()
-    with tempfile.TemporaryDirectory() as folder, Connection("127.0.0.1", told.get()) as connection:
-        settings = SessionSettings(
-            Path(folder) / "sweep.h5", imported=imported, volume=not options.no_volume, check=True
-        )
-        session = Session(connection, [connection.send], curves, settings)
-        session.run(options.seconds + 3.0)
-        count, delays = told.get()
+    with tempfile.TemporaryDirectory() as folder, Connection("127.0.0.1", answers.get()) as connection:
+        settings = SessionSettings(Path(folder) / "sweep.h5", imported=imported, volume=True, check=True)
+        Session(connection, [connection.send], curves, settings).run(options.seconds + 3.0)
+        count, delays = answers.get()
         kept = len(s3.load_sweep(settings.recording))
     playing.join()
     middle, late, last = 1e3 * np.quantile(delays, [0.5, 0.95, 1.0])

@@ -1,25 +1,27 @@
 """Length over tissue that is not at rest: pressed, sliding along with the probe, pulsating.
 
-python tests/benchmarks/bench_moving_tissue.py [--seeds 3] [--length-mm 6] [--vectors 36] [--signal rf|bmode]
+Run: ``python tests/benchmarks/bench_moving_tissue.py [--seeds 3] [--length-mm 6] [--signal rf|bmode]``.
 """
 
 import argparse
 import os
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
+from accuracy_set import SHEET, grey
 from options import parsed
 from scipy.spatial.transform import RigidTransform
 
 from speckle3d.pipeline import track
-from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
+from speckle3d.sheet_curves import data_sheet_curves
 from speckle3d.simulation.presets import SimulationSettings, simulate
-from speckle3d.simulation.receiver import received
 
 FIRST_SEED = 5001
-SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=20.0, band_mhz=(5.0, 10.0))
 STRAIN, SLIDING, PULSE_MM, PULSE_HZ, VESSEL_MM = 0.01, 0.05, 0.1, 1.2, 4.0
 """Strain at the end of the sweep; share of the probe's way that tissue goes along; pulse; depth over which it
 falls to 1/e on either side of a vessel in the middle of the image."""
@@ -45,22 +47,21 @@ class Deformed:
 
 def cases(sweep):
     """Frames of the same sweep over tissue at rest and in motion."""
-    frames, time_s = sweep.frames, sweep.frame_time_s - sweep.frame_time_s[0]
-    poses, count = frames.medium_from_image, len(sweep)
+    frames, poses = sweep.frames, sweep.frames.medium_from_image
     way = poses.translation[:, 2] - poses.translation[0, 2]
-    pulse = PULSE_MM * np.sin(2 * np.pi * PULSE_HZ * time_s)
+    pulse = PULSE_MM * np.sin(2 * np.pi * PULSE_HZ * (sweep.frame_time_s - sweep.frame_time_s[0]))
     middle = sweep.grid.depth_mm / 2
 
     def along_beam(shift_mm):
         return replace(frames, medium=Deformed(frames.medium, poses, shift_mm))
 
     def along_sweep(moved_mm):
-        back = np.column_stack([np.zeros((count, 2)), -moved_mm])
-        return replace(frames, medium_from_image=RigidTransform.from_translation(back) * poses)
+        back = RigidTransform.from_translation(np.outer(moved_mm, [0.0, 0.0, -1.0]))
+        return replace(frames, medium_from_image=back * poses)
 
     return {
         "at rest": frames,
-        "pressed by 1 %": along_beam(lambda y, k: -STRAIN * y * k / count),
+        "pressed by 1 %": along_beam(lambda y, k: -STRAIN * y * k / len(sweep)),
         "sliding along by 5 %": along_sweep(SLIDING * way),
         "pulsating 0.1 mm along the sweep": along_sweep(pulse),
         "pulsating 0.1 mm along the beam": along_beam(
@@ -70,22 +71,20 @@ def cases(sweep):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--length-mm", type=float, default=6.0)
     parser.add_argument("--vectors", type=int, default=36)
     parser.add_argument("--signal", choices=("rf", "bmode"), default="rf")
-    given = parsed(parser, seeds=1, length_mm=2.0)
+    options = parsed(parser, seeds=1, length_mm=1.5, vectors=20)
+    size = {"length_mm": options.length_mm, "vectors": options.vectors, "samples": 2600}
     rows = {}
-    for seed in range(FIRST_SEED, FIRST_SEED + given.seeds):
-        settings = SimulationSettings(
-            preset="tissue", seed=seed, length_mm=given.length_mm, vectors=given.vectors, samples=2600
-        )
-        sweep = simulate(settings)[0].sweep
+    for seed in range(FIRST_SEED, FIRST_SEED + options.seeds):
+        sweep = simulate(SimulationSettings(preset="tissue", seed=seed, **size))[0].sweep
         true = np.ptp((sweep.truth[0].inv() * sweep.truth).apply(sweep.grid.centre_mm)[:, 2])
         for name, frames in cases(sweep).items():
             case = replace(sweep, frames=frames, truth=None, tracker=None, orientation=None)
-            case = received(case, dynamic_range_db=60.0) if given.signal == "bmode" else case
+            case = grey(case) if options.signal == "bmode" else case
             case = replace(case, frames=np.stack([case.frames[k] for k in range(len(case))]))
             tracked = track(case, data_sheet_curves(SHEET, case))
             length = np.ptp(tracked.image.apply(sweep.grid.centre_mm)[:, 2])

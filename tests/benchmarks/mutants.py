@@ -1,8 +1,8 @@
 """Break the package on purpose, one way at a time, and see which test notices.
 
-Run: ``python tests/benchmarks/mutants.py [NAME ...] [--all] [--keep FOLDER]``. A mutant changes what a public
-function takes or returns, in the process of the tests alone, so that no file is touched; the tests that it
-selects are run, or those of the README's command. Ends with 1 if a mutant survives or no longer applies.
+Run: ``python tests/benchmarks/mutants.py [NAME ...] [--keep FOLDER]``. A mutant changes what a function
+takes or returns, in the process of the tests alone, so that no file is touched; then the tests that are to
+notice are run. Ends with 1 if a mutant survives or no longer applies.
 """
 
 import argparse
@@ -40,12 +40,16 @@ class Mutant:
     change : callable
         Called with the function, its arguments and those with names; returns what the mutant returns.
     tests : str
-        Which rows of the accuracy set, or else which tests, as pytest's ``-k`` has it.
+        A file of tests, or which rows of the accuracy set, as pytest's ``-k`` has it.
     """
 
     function: str
     change: Callable
     tests: str
+
+    @property
+    def selection(self):
+        return [f"tests/{self.tests}"] if "/" in self.tests else ["tests/accuracy", "-k", self.tests]
 
 
 def unadapted(function, problem, *others):
@@ -62,20 +66,12 @@ def bent(function, sweep, curves, *others, **named):
     return function(sweep, replace(curves, correlation=np.array(rho)), *others, **named)
 
 
-def claimed(change):
-    def changed(function, *arguments, **named):
-        tracked = function(*arguments, **named)
-        return replace(tracked, covariance=change(tracked))
-
-    return changed
-
-
 def without_curves(tracked):
-    """Covariance without what the curves' common error adds to the distance."""
+    """Claims without what the curves' common error adds to the distance."""
     covariance = tracked.covariance.copy()
     z = tracked.image.apply(tracked.grid.centre_mm)[:, 2]
     covariance[:, 2, 2] -= (tracked.curves_sigma * (z - z[0])) ** 2
-    return covariance
+    return replace(tracked, covariance=covariance)
 
 
 def overcorrected(function, tracked, *arguments, **named):
@@ -92,32 +88,19 @@ def overcorrected(function, tracked, *arguments, **named):
     return changed
 
 
-def late(function, *arguments, **named):
-    sweep = function(*arguments, **named)
+def late(sweep):
     sensors = {"tracker": sweep.tracker, "orientation": sweep.orientation}
     moved = {k: v and replace(v, time_offset_s=v.time_offset_s + 0.05) for k, v in sensors.items()}
     return replace(sweep, **moved)
 
 
-def shifted(function, *arguments, **named):
-    volume = function(*arguments, **named)
-    return replace(volume, voxels=np.roll(volume.voxels, 1, axis=2))
-
-
-def mislabelled(function, *arguments, **named):
-    labelled = function(*arguments, **named)
-    swapped = np.where(labelled.wire < 2, 1 - labelled.wire, labelled.wire)
-    return replace(labelled, wire=swapped)
-
-
-def enlarged(function, *arguments, **named):
-    solution = function(*arguments, **named)
+def enlarged(solution):
     return replace(solution, chain=replace(solution.chain, pixel_mm=1.03 * solution.chain.pixel_mm))
 
 
-def wrong_sign(function, *arguments, **named):
-    sign, source = function(*arguments, **named)
-    return -sign, source
+def returned(change):
+    """A change of what a function returns."""
+    return lambda function, *arguments, **named: change(function(*arguments, **named))
 
 
 TRACK, DIRECTION = "speckle3d.pipeline:track", "speckle3d.motion.direction:settle_direction"
@@ -125,20 +108,58 @@ COHERENCE = "speckle3d.motion.coherence:estimate_coherence"
 MUTANTS = {
     "tissue correction off": Mutant(COHERENCE, unadapted, "tilt and tissue and not independent"),
     "straightening as it is": Mutant(TRACK, bent, "tilt or length"),
-    "claims halved": Mutant(TRACK, claimed(lambda tracked: tracked.covariance / 4.0), "claim"),
-    "claim without the curves' part": Mutant(TRACK, claimed(without_curves), "claim"),
+    "claims halved": Mutant(TRACK, returned(lambda t: replace(t, covariance=t.covariance / 4.0)), "claim"),
+    "claim without the curves' part": Mutant(TRACK, returned(without_curves), "claim"),
     "drift correction in the wrong sense": Mutant("speckle3d.corrections:correct", overcorrected, "tilt"),
     "mirror not resolved": Mutant(DIRECTION, lambda *_, **__: (1, "assumed"), "length and phantom"),
-    "sign of the motion": Mutant(DIRECTION, wrong_sign, "length and phantom"),
-    "sensors' clock off by 50 ms": Mutant("speckle3d.io.load:load_sweep", late, "clock"),
+    "sign of the motion": Mutant(DIRECTION, returned(lambda r: (-r[0], r[1])), "length and phantom"),
+    "sensors' clock off by 50 ms": Mutant("speckle3d.io.load:load_sweep", returned(late), "clock"),
     "quaternion order swapped": Mutant(
         "speckle3d.core.geometry:rotations_from_quaternions",
         lambda function, wxyz, where: function(np.roll(wxyz, 1, axis=-1), where),
         "orientation_sensor",
     ),
-    "voxels shifted by one": Mutant("speckle3d.imaging.voxels.volume:compound", shifted, "voxel"),
-    "wires mislabelled": Mutant("calibration.detection.labelling:label_by_calibration", mislabelled, "wires"),
-    "calibration's scale 3 % off": Mutant("calibration.plane:calibrate_plane", enlarged, "scale"),
+    "voxels shifted by one": Mutant(
+        "speckle3d.imaging.voxels.volume:compound",
+        returned(lambda volume: replace(volume, voxels=np.roll(volume.voxels, 1, axis=2))),
+        "voxel",
+    ),
+    "wires mislabelled": Mutant(
+        "calibration.detection.labelling:label_by_calibration",
+        returned(lambda seen: replace(seen, wire=np.where(seen.wire < 2, 1 - seen.wire, seen.wire))),
+        "wires",
+    ),
+    "calibration's scale 3 % off": Mutant("calibration.plane:calibrate_plane", returned(enlarged), "scale"),
+    "frames never flagged": Mutant(
+        "speckle3d.matching.quality:flag_frames", returned(np.zeros_like), "matching/test_quality.py"
+    ),
+    "patches half a millimetre deeper": Mutant(
+        "speckle3d.matching.patches:lay_patches",
+        returned(lambda grid: replace(grid, centre_mm=grid.centre_mm + np.array([0.0, 0.5]))),
+        "matching/test_patches.py",
+    ),
+    "planes without a side": Mutant(
+        "speckle3d.motion.signs:on_path", lambda function, planes, path: planes, "motion/test_signs.py"
+    ),
+    "a sensor's spikes kept": Mutant(
+        "speckle3d.examine.readings:spikes", returned(np.zeros_like), "examine/test_sensors.py"
+    ),
+    "claims of fusion a third": Mutant(
+        "speckle3d.correction.fused:fuse",
+        returned(lambda fused: replace(fused, covariance=fused.covariance / 9.0)),
+        "correction/test_fused.py",
+    ),
+    "mounting in metres": Mutant(
+        "speckle3d.io.calibrations:read_calibration",
+        returned(lambda read: replace(read, translation_mm=1e-3 * read.translation_mm)),
+        "io/test_calibrations.py",
+    ),
+    "wrong lines weigh as much": Mutant(
+        "calibration.robust:absolute_weights", returned(np.ones_like), "calibration/test_plane.py"
+    ),
+    "worlds taken the other way": Mutant(
+        "xsens.logs.worlds:nwu_from", returned(lambda turn: turn.inv()), "xsens/logs/test_worlds.py"
+    ),
 }
 
 
@@ -168,7 +189,18 @@ def tested(name, selection, folder):
     """Code with which the tests end, and their output."""
     paths = os.pathsep.join([str(ROOT), str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": paths, CHOSEN: name, "SPECKLE3D_ACCURACY_SWEEPS": str(folder)}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "mutants", *selection]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "mutants",
+        "-x",
+        *selection,
+    ]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     return done.returncode, done.stdout + done.stderr
 
@@ -178,7 +210,6 @@ def main():
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help=f"of {', '.join(MUTANTS)}; by default all".replace("%", "%%")
     )
-    parser.add_argument("--all", action="store_true", help="run the README's tests, not those selected")
     parser.add_argument("--keep", type=Path, help="folder of the accuracy set's sweeps, made if not there")
     options = parser.parse_args()
     sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
@@ -190,15 +221,11 @@ def main():
 
             folder.mkdir(parents=True)
             simulate_set(folder, ROOT / "data")
-        names = options.names or list(MUTANTS)
-        selected = " or ".join(f"({MUTANTS[name].tests})" for name in names)
-        code, output = tested("", ["-x", "tests/accuracy", "-k", selected], folder)
-        if code:
-            sys.exit(f"{output}\nexpected tests that pass without a mutant")
-        for name in names:
-            wanted = ["-n", "auto", "--dist", "loadfile"] if options.all else ["-x", "tests/accuracy"]
-            selected = wanted if options.all else [*wanted, "-k", MUTANTS[name].tests]
-            code, output = tested(name, selected, folder)
+        for name in options.names or MUTANTS:
+            code, output = tested("", MUTANTS[name].selection, folder)
+            if code:
+                sys.exit(f"{output}\nexpected tests that pass without a mutant")
+            code, output = tested(name, MUTANTS[name].selection, folder)
             killers = re.findall(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", output, re.MULTILINE)
             if code == 1 and killers:
                 print(f"{name}: killed by {'; '.join(killers)}", flush=True)

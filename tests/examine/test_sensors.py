@@ -37,7 +37,6 @@ BESIDE_THE_IMAGES = {
     "tracker mount turned by 180 deg about x": "length",
     "tracker mount turned by 20 deg about y": "x ",
     "tracker drift of 5 mm": "x ",
-    "tracker of another sweep": "",
 }
 """Faults that only the images contradict: both numbers are told."""
 REFUTED = (

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from digital_phantom import INSIDE, LEVEL, OUTSIDE, Ball, Phantom, curved_path
+from digital_phantom import LEVEL, Ball, Phantom, curved_path, voxel_volume
 
 from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.measures.surface import largest_part, surface_of
@@ -12,20 +12,12 @@ GRID = ImageGrid(120, 120, 0.1, 0.1)
 STEP_MM = 0.25
 
 
-def voxel_volume(volume, body):
-    """Volume of a body by its voxels, each counted by its share of the inside."""
-    index = np.moveaxis(np.indices(volume.shape), 0, -1).reshape(-1, 3)
-    near = body.depth(volume.world_from_grid.apply(index * volume.spacing_mm)) > -3 * STEP_MM
-    share = (volume.voxels.reshape(-1)[near] - OUTSIDE) / (INSIDE - OUTSIDE)
-    return np.nansum(share) * np.prod(volume.spacing_mm)
-
-
 def test_a_sphere_swept_by_hand_has_its_size():
     body = Ball((6.0, 6.0, 6.0), 3.0)
     poses = curved_path(120, 12.0, seed=1)
     images = [np.rint(image).astype(np.uint8) for image in Phantom((body,), GRID).images(poses)]
     voxels = compound(images, GRID, poses, STEP_MM)
     surface = largest_part(surface_of(voxels, LEVEL))
-    assert voxel_volume(voxels, body) == pytest.approx(body.volume_mm3, rel=0.005)
+    assert voxel_volume(voxels, body, STEP_MM) == pytest.approx(body.volume_mm3, rel=0.005)
     assert surface.volume_mm3 == pytest.approx(body.volume_mm3, rel=0.01)
     assert np.abs(body.depth(surface.vertices_mm)).max() < STEP_MM / 2

@@ -1,15 +1,10 @@
 """A sweep that grows: read at any moment, after a kill, and when closed."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import sweep_examples
 
 from speckle3d.core.errors import FileError, InvalidInputError
-from speckle3d.core.parts import locks
 from speckle3d.core.sweep import stored_dtype
 from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.sweep_writer import GrowingSweep
@@ -45,14 +40,6 @@ def test_a_file_that_is_there_stays_as_it_is(tmp_path):
     with pytest.raises(FileError, match="there already"), growing(tmp_path / "s.h5", SWEEPS["rf"]):
         pass
     assert (tmp_path / "s.h5").read_text() == "mine"
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(locks() is None, reason="processes that fork")
-def test_killed_at_some_moments_all_that_was_appended_is_read():
-    script = Path(__file__).parents[1] / "benchmarks" / "bench_growing.py"
-    done = subprocess.run([sys.executable, script, "15", "7"], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_what_is_refused_is_not_in_the_file_and_the_recording_goes_on(tmp_path):

@@ -1,42 +1,35 @@
 """Points looked up in images along a bent path."""
 
 import numpy as np
-import oracles
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from speckle3d.kernels.crossing import look_up
 
+SHAPE, PIXELS = (12, 9, 11), np.array([0.3, 0.5, -1.2, -2.5])
 
-def bent_planes(rng):
-    along = np.arange(12) * 0.4
+
+def test_grey_levels_that_grow_evenly_in_space_are_found_with_their_slopes():
+    rng, along = np.random.default_rng(5), 0.4 * np.arange(SHAPE[0])
     turns = Rotation.from_rotvec(0.01 * rng.normal(size=3) * along[:, None])
     poses = RigidTransform.from_components(
         np.stack([0.1 * np.sin(along), 0.05 * along, along], axis=1), turns
     )
-    return np.ascontiguousarray(poses.inv().as_matrix()[:, :3])
-
-
-def test_values_are_the_twins_and_slopes_their_differences():
-    rng = np.random.default_rng(5)
-    volume = rng.normal(size=(12, 9, 11)).astype(np.float32)
+    local = np.indices(SHAPE[1:]).reshape(2, -1).T * PIXELS[:2] + PIXELS[2:]
+    places = np.stack([pose.apply(np.pad(local, ((0, 0), (0, 1)))) for pose in poses])
+    growth = np.array([1.0, -0.7, 0.4])
+    volume = (places @ growth).reshape(SHAPE).astype(np.float32)
     volume[4, 3, 5] = np.nan
-    planes, pixels = bent_planes(rng), np.array([0.3, 0.5, -1.2, -2.5])
     points = rng.uniform([-1.4, -2.8, -0.3], [1.4, 2.8, 4.8], (400, 3))
     values, place, slopes = np.empty(400), np.empty(400), np.zeros((400, 3))
-    look_up(points, volume, planes, pixels, values, slopes, place)
-    expected = oracles.look_up_on_planes(points, volume, planes, pixels)
-    np.testing.assert_allclose(values, expected, atol=1e-6)
-    assert 100 < np.isfinite(values).sum() < 400
-    # Within a cell the interpolation is trilinear: differences over 1 um are its slope but for the curvature.
-    for axis in range(3):
-        moved = []
-        for sign in (1, -1):
-            other = np.empty(400)
-            there = points + sign * 5e-4 * np.eye(3)[axis]
-            look_up(there, volume, planes, pixels, other, np.empty((400, 3)), place)
-            moved.append(other)
-        difference = (moved[0] - moved[1]) / 1e-3
-        kept = np.isfinite(difference) & np.isfinite(values)
-        off = np.abs(difference - slopes[:, axis])[kept]
-        # Points within 0.5 um of a cell's side have the mean of two slopes.
-        assert np.quantile(off, 0.97) < 0.02
+    planes = np.ascontiguousarray(poses.inv().as_matrix()[:, :3])
+    look_up(points, volume, planes, PIXELS, values, slopes, place)
+    known = np.isfinite(values)
+    # Inside the images all but those beside the one that is missing.
+    low, high = PIXELS[2:], PIXELS[2:] + PIXELS[:2] * np.subtract(SHAPE[1:], 1)
+    inside = ((points[:, :2] > low + 0.3) & (points[:, :2] < high - 0.3)).all(axis=1)
+    inside &= (points[:, 2] > 0.1) & (points[:, 2] < 4.3)
+    assert inside.sum() > 150
+    assert 0 < (~known & inside).sum() < 10
+    # Neighbouring planes are turned by 0.004 rad against each other, 0.4 mm apart.
+    np.testing.assert_allclose(values[known], points[known] @ growth, atol=2e-3)
+    np.testing.assert_allclose(slopes[known], np.tile(growth, (known.sum(), 1)), atol=0.02)

@@ -1,1 +1,1 @@
-"""Whether lengths hold when the curves do not: the scenes and the rows of `bench_length.py`."""
+"""Whether lengths hold when the curves do not: the two parts of `bench_length.py`."""

@@ -5,93 +5,97 @@ by more than 3 %.
 """
 
 import json
-import os
-import shutil
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
-import h5py
 import numpy as np
+from cache import simulated, written
 
-from length.scenes import borrowed_curves, crossing_pair, short
 from speckle3d.io.curves import write_curves
+from speckle3d.io.load import load_sweep
+from speckle3d.phantom_curves import calibrate_curves
+from speckle3d.sheet_curves import ProbeSheet, data_sheet_curves
+from speckle3d.simulation.beam import Probe, tabulate_beam
+from speckle3d.simulation.presets import simulate
+from speckle3d.simulation.settings import SimulationSettings
 
 RIGHT = Path(__file__).resolve().parents[3] / "data" / "curves.h5"
 """Of the simulator's default probe, over a phantom that attenuates as the tissue does."""
-SHEET = """# A data sheet whose focal length is 15 % off: the sweeps' lens focuses at 20 mm.
-elevation_aperture_mm = 5.0
-elevation_focus_mm = 23.0
-band_mhz = [5.0, 10.0]
-attenuation_db_cm_mhz = 0.5
-"""
-SENSORS = ("orientation", "tracker")
+SHEET = ProbeSheet(elevation_aperture_mm=5.0, elevation_focus_mm=23.0, band_mhz=(5.0, 10.0))
+"""Its focal length is 15 % off: the sweeps' lens focuses at 20 mm."""
+WRONG = {"elevation_focus_mm": 22.0}, 0.8
+"""Lens and attenuation in dB/cm/MHz of a phantom; the sweeps have 20 mm and 0.5."""
 CROSSED = ("crossed", "fused", "image")
+_PAIR = {"preset": "crossed", "vectors": 96, "samples": 2600, "length_mm": 24.0, "frames": 150}
+_STEPS = {"preset": "stepped", "vectors": 48, "steps": 41, "step_mm": 0.05, "blocks": 3}
 
 
-def wrong_curves(cache):
-    """Curves of a lens that focuses at 22 mm, in 0.8 dB/cm/MHz; the sweeps have 20 mm and 0.5."""
-    path = cache / "wrong-curves.h5"
-    if not path.is_file():
-        write_curves(path, borrowed_curves(22.0, 0.8, cache))
-    return path
-
-
-def sheet_curves(cache):
-    """Curves from a data sheet, by the public command."""
-    path, sheet = cache / "sheet-curves.h5", cache / "sheet.toml"
-    if not path.is_file():
-        sheet.write_text(SHEET, encoding="utf-8")
-        like = crossing_pair(1, 90.0, cache)[0]
-        command("calibrate", "curves", "--probe", sheet, "--like", like, "-o", path)
-    return path
-
-
-def saved_curves(seed, cache):
-    """Curves that a crossing pair over other tissue corrected."""
-    path = cache / f"saved-{seed}.h5"
-    if not path.is_file():
-        command("reconstruct", *crossing(seed, 90.0, wrong_curves(cache), cache), "--save-curves", path)
-    return path
+def crossing_pair(seed, angle_deg, cache):
+    """Two tissue sweeps of 24 mm that cross in their middle; the first is the same at all angles."""
+    settings = [SimulationSettings(seed=seed, crossing_deg=a, **_PAIR) for a in (90.0, angle_deg)]
+    return [without_sensors(simulated(each, cache, number)) for number, each in enumerate(settings)]
 
 
 def without_sensors(path):
     """A copy of a sweep without its sensors."""
     copy = path.with_name(f"{path.stem}-no-sensors.h5")
-    if not copy.is_file():
-        part = copy.with_suffix(f".part{os.getpid()}")
-        shutil.copy(path, part)
-        with h5py.File(part, "a") as file:
-            for sensor in SENSORS:
-                del file[sensor]
-        part.replace(copy)
-    return copy
+    return written(copy, lambda: replace(load_sweep(path), orientation=None, tracker=None))
+
+
+def wrong_curves(cache):
+    """Curves of another lens and attenuation."""
+    path, (lens, attenuation) = cache / "wrong-curves.h5", WRONG
+    if not path.is_file():
+        beam = tabulate_beam(Probe(**lens), attenuation_db_cm_mhz=attenuation)
+        sweeps = []
+        for seed in (11, 12):
+            sweep = simulate(SimulationSettings(seed=seed, **_STEPS))[0].sweep
+            medium = replace(sweep.frames.medium, attenuation_db_cm_mhz=attenuation)
+            sweeps.append(replace(sweep, frames=replace(sweep.frames, medium=medium, beam=beam)))
+        write_curves(path, calibrate_curves(sweeps))
+    return path
+
+
+def sheet_curves(cache):
+    """Curves from a data sheet."""
+    path = cache / "sheet-curves.h5"
+    if not path.is_file():
+        write_curves(path, data_sheet_curves(SHEET, load_sweep(crossing_pair(1, 90.0, cache)[0])))
+    return path
 
 
 def crossing(seed, angle_deg, curves, cache):
     """Arguments of the command for a pair."""
-    first, second = map(without_sensors, crossing_pair(seed, angle_deg, cache))
+    first, second = crossing_pair(seed, angle_deg, cache)
     out = cache / "out" / f"crossed-{seed}-{angle_deg:g}-{curves.stem}"
     return [first, "--crossing", second, "--curves", curves, "-o", out, "--drift=crossed", "--drift=fused"]
 
 
-def single(sweep, curves, cache, *modes):
-    """Arguments of the command for one sweep."""
-    out = cache / "out" / f"{sweep.stem}-{curves.stem}"
-    return [sweep, "--curves", curves, "-o", out, *(f"--drift={mode}" for mode in modes)]
-
-
 def corrected(seed, cache):
-    """A single sweep with curves that a pair of another seed corrected."""
-    curves = saved_curves(seed + 1 if seed % 2 else seed - 1, cache)
-    return single(without_sensors(crossing_pair(seed, 90.0, cache)[0]), curves, cache)
+    """A single sweep with wrong curves that a crossing pair of another seed, over other tissue, corrected."""
+    curves, other = cache / f"saved-{seed}.h5", seed + 1 if seed % 2 else seed - 1
+    if not curves.is_file():
+        command("reconstruct", *crossing(other, 90.0, wrong_curves(cache), cache), "--save-curves", curves)
+    return [crossing_pair(seed, 90.0, cache)[0], "--curves", curves, "-o", cache / "out" / f"single-{seed}"]
 
 
 def fused(seed, cache):
-    """A short sweep with both sensors."""
-    return single(short(seed, cache), RIGHT, cache, "pose", "orientation", "fused")
+    """A sweep of 3.6 to 6 mm with both sensors, over tissue or a phantom."""
+    settings = SimulationSettings(
+        preset=("tissue", "phantom")[seed % 2],
+        seed=seed,
+        vectors=48,
+        samples=2600,
+        length_mm=3.6 + 0.4 * (seed % 7),
+        frames=45,
+    )
+    modes = [f"--drift={mode}" for mode in ("pose", "orientation", "fused")]
+    out = cache / "out" / f"short-{seed}"
+    return [simulated(settings, cache), "--curves", RIGHT, "-o", out, *modes]
 
 
 CASES = {
@@ -131,8 +135,8 @@ def outcomes(name, seed, cache):
             found.append(held["left_out"].get(mode, "no row"))
             continue
         length, tilt = (
-            max((row[f"{kind}_error_{unit}"] for row in rows), key=abs)
-            for kind, unit in (("length", "percent"), ("tilt", "deg"))
+            max((row[column] for row in rows), key=abs)
+            for column in ("length_error_percent", "tilt_error_deg")
         )
         found.append((length, tilt, 100 * held["claims"].get(mode, np.nan)))
     return found

@@ -1,5 +1,6 @@
 """Commands from start to end, beside what Python needs to start and to load the libraries they stand on."""
 
+import os
 import statistics
 import subprocess
 import sys
@@ -9,39 +10,54 @@ from pathlib import Path
 
 from speed.rows import Row
 
-SHIPPED = Path(__file__).resolve().parents[3] / "data" / "phantom.h5"
-HELP_S, RECONSTRUCT_S = 0.3, 3.0
+DATA = Path(__file__).resolve().parents[3] / "data"
+HELP_S, RECONSTRUCT_S, MEMORY_GB = 0.3, 3.0, 0.5
+FRAMES = (300, 1200, 2000)
+"""Of the sweeps whose memory is measured."""
 LIBRARIES = "import numpy, scipy.optimize, scipy.spatial.transform, numba, h5py, matplotlib.figure"
-COMMAND = [sys.executable, "-m", "speckle3d.cli"]
 
 
 def rows(runs):
     """Help, and the sweep that comes with the project reconstructed in two modes."""
-    bare = seconds([sys.executable, "-c", "import typer, rich.console"], runs)
-    helped = seconds([*COMMAND, "--help"], runs)
-    libraries = seconds([sys.executable, "-c", LIBRARIES], runs)
-    with tempfile.TemporaryDirectory() as folder:
-        modes = ["--drift", "orientation", "--drift", "pose"]
-        whole = seconds([*COMMAND, "reconstruct", str(SHIPPED), "-o", folder, *modes], runs)
+    bare = seconds(["-c", "import typer, rich.console"], runs)
+    helped = seconds(["-m", "speckle3d.cli", "--help"], runs)
+    libraries = seconds(["-c", LIBRARIES], runs)
+    whole = statistics.median([reconstructed(DATA / "phantom.h5")[0] for _ in range(runs + 1)][1:])
+    beside = {"falling": True, "unit": "s"}
     return [
-        Row("speckle3d --help", helped, "s", "importing typer and rich", bare, HELP_S, falling=True),
-        Row(
-            "speckle3d reconstruct data/phantom.h5, two modes",
-            whole,
-            "s",
-            "importing its libraries",
-            libraries,
-            RECONSTRUCT_S,
-            falling=True,
-        ),
-    ]
+        Row("speckle3d --help", helped, peer="importing typer and rich", peer_value=bare,
+            target=HELP_S, **beside),
+        Row("speckle3d reconstruct data/phantom.h5, two modes", whole, peer="importing its libraries",
+            peer_value=libraries, target=RECONSTRUCT_S, **beside),
+    ]  # fmt: skip
 
 
-def seconds(command, runs):
+def memory(paths, curves):
+    """Peak resident memory of a reconstruction by length of the sweep."""
+    for path in paths:
+        spent, peak_gb = reconstructed(path, "--curves", curves)
+        size = f"{path.stem.rpartition('-')[2]} frames, {path.stat().st_size / 1e9:.2f} GB"
+        what = f"reconstruct, {size}, in {spent:.1f} s: peak memory"
+        yield Row(what, peak_gb, "GB", target=MEMORY_GB, falling=True)
+
+
+def seconds(arguments, runs):
     """Median of several runs, after one in which kernels are compiled and files are read from the disk."""
-    spent = []
-    for _ in range(runs + 1):
-        began = time.perf_counter()
-        subprocess.run(command, check=True, capture_output=True)
-        spent.append(time.perf_counter() - began)
-    return statistics.median(spent[1:])
+    return statistics.median([finished(arguments)[0] for _ in range(runs + 1)][1:])
+
+
+def reconstructed(path, *options):
+    with tempfile.TemporaryDirectory() as out:
+        modes = ["--drift", "orientation", "--drift", "pose"]
+        return finished(["-m", "speckle3d.cli", "reconstruct", path, *options, "-o", out, *modes])
+
+
+def finished(arguments):
+    """Seconds and the peak memory, GB, of Python with some arguments."""
+    began = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, *map(str, arguments)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    assert status == 0, f"{arguments}: status {status}"
+    return time.perf_counter() - began, usage.ru_maxrss / 2**20

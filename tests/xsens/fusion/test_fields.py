@@ -17,11 +17,8 @@ KINDS = [
     ("attached", 5.0),
     ("attached", 30.0),
     ("walk", 0.3),
-    ("passing", 100.0),
     ("start", 20.0),
-    ("frozen", 20.0),
     ("truncated", 0.25),
-    ("cut", 10.0),
 ]
 
 
