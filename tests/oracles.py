@@ -163,23 +163,16 @@ def coherence(ramp_rad):
 
 
 def consistent_patches(distance_mm, sigma_mm, at_mm, slopes, support_sigma):
-    """Twin of `speckle3d.motion.subset.consistent_subset`: every plane, every patch, one after the other.
+    """Twin of `speckle3d.motion.subset.consistent_subset`: every patch against every plane through another.
 
     Returns all best subsets: placements may tie but for rounding.
     """
-    n = len(distance_mm)
-    tried = []
-    for i in np.flatnonzero(np.isfinite(distance_mm)):
-        for sign in (1.0, -1.0):
-            offset = sign * distance_mm[i] - at_mm[i] @ slopes
-            support, misfit = np.zeros(n, bool), 0.0
-            for j in range(n):
-                error = abs(abs(offset + at_mm[j] @ slopes) - distance_mm[j]) / sigma_mm[j]
-                if error <= support_sigma:
-                    support[j], misfit = True, misfit + error
-            tried.append((support.sum(), misfit, support))
-    if not tried:
-        return [np.zeros(n, bool)]
-    most = max(count for count, _, _ in tried)
-    closest = min(misfit for count, misfit, _ in tried if count == most)
-    return [s for count, misfit, s in tried if count == most and misfit <= closest + 1e-9]
+    raised, known = at_mm @ slopes, np.isfinite(distance_mm)
+    if not known.any():
+        return [known]
+    offset = np.concatenate([distance_mm - raised, -distance_mm - raised])[np.tile(known, 2)]
+    error = np.abs(np.abs(offset[:, None] + raised) - distance_mm) / sigma_mm
+    support = error <= support_sigma
+    misfit, count = np.where(support, error, 0.0).sum(axis=1), support.sum(axis=1)
+    most = count == count.max()
+    return list(support[most & (misfit <= misfit[most].min() + 1e-9)])

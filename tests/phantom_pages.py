@@ -5,9 +5,6 @@ import shlex
 import subprocess
 import sys
 
-import h5py
-import numpy as np
-
 _WHERE = """name => {
     const figure = Bokeh.documents[0].get_model_by_name(name)
     const view = Bokeh.index.find_one(figure), at = view.el.getBoundingClientRect(), box = view.frame.bbox
@@ -56,17 +53,3 @@ def by_command(saved, out):
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout.split("made by: ")[0].strip()
-
-
-def require_same(one, other):
-    """All that two calibration files hold, but where the settings say that points were, to the last digit."""
-    with h5py.File(one) as a, h5py.File(other) as b:
-        names, others = [], []
-        a.visit(names.append)
-        b.visit(others.append)
-        assert names == others
-        for name in names:
-            if isinstance(a[name], h5py.Dataset):
-                np.testing.assert_array_equal(a[name][()], b[name][()], err_msg=name)
-        for name in set(a.attrs) - {"created"}:
-            np.testing.assert_array_equal(a.attrs[name], b.attrs[name], err_msg=name)

@@ -35,13 +35,6 @@ def test_static_clutter_as_strong_as_the_signal_is_refused(narrow, curves, patte
         track(spoil.cluttered(narrow, pattern), curves)
 
 
-def test_two_sweeps_frame_by_frame_are_refused(narrow, curves):
-    half = len(narrow) // 2
-    sweeps = spoil.in_order(narrow, range(half)), spoil.in_order(narrow, range(half, 2 * half))
-    with pytest.raises(InsufficientDataError, match="sweeps interleaved"):
-        track(spoil.interleaved(*sweeps), curves)
-
-
 def test_noise_on_a_probe_at_rest_is_no_sweep(narrow, curves):
     with pytest.raises(InsufficientDataError):
         track(spoil.at_rest(spoil.in_order(narrow, range(40)), 3.0), curves)
@@ -64,15 +57,6 @@ def test_what_stands_still_outside_the_region_changes_nothing(sweep, curves):
     true, seen, claimed = length_of(part, track(spoil.spoiled(part, frames), curves, settings))
     assert abs(seen / true - 1) < 0.03
     assert abs(seen - true) < 2 * claimed
-
-
-@pytest.mark.slow
-def test_a_third_of_the_time_at_rest_in_noise_is_measured_and_holds(narrow, curves):
-    sweep = spoil.noisy(spoil.resting_first(narrow), 10.0)
-    found = track(sweep, curves)
-    true, seen, sigma = length_of(sweep, found)
-    assert not found.doubts
-    assert abs(seen - true) < 4 * sigma
 
 
 @pytest.mark.slow

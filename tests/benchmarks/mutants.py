@@ -122,14 +122,16 @@ MUTANTS = {
     "voxels shifted by one": Mutant(
         "speckle3d.imaging.voxels.volume:compound",
         returned(lambda volume: replace(volume, voxels=np.roll(volume.voxels, 1, axis=2))),
-        "voxel",
+        "imaging/test_digital_phantom.py",
     ),
     "wires mislabelled": Mutant(
         "calibration.detection.labelling:label_by_calibration",
         returned(lambda seen: replace(seen, wire=np.where(seen.wire < 2, 1 - seen.wire, seen.wire))),
-        "wires",
+        "calibration/detection/test_labelling.py",
     ),
-    "calibration's scale 3 % off": Mutant("calibration.plane:calibrate_plane", returned(enlarged), "scale"),
+    "calibration's scale 3 % off": Mutant(
+        "calibration.plane:calibrate_plane", returned(enlarged), "calibration/test_plane.py"
+    ),
     "frames never flagged": Mutant(
         "speckle3d.matching.quality:flag_frames", returned(np.zeros_like), "matching/test_quality.py"
     ),
@@ -147,7 +149,7 @@ MUTANTS = {
     "claims of fusion a third": Mutant(
         "speckle3d.correction.fused:fuse",
         returned(lambda fused: replace(fused, covariance=fused.covariance / 9.0)),
-        "correction/test_fused.py",
+        "claim and fused and not independent",
     ),
     "mounting in metres": Mutant(
         "speckle3d.io.calibrations:read_calibration",

@@ -1,19 +1,23 @@
+"""Images, sensors and other evidence fused; that lengths and claims hold, the accuracy set asserts."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from fused_scenes import CENTRE_MM, errors, scene
 from scipy.spatial.transform import RigidTransform
+from spoiled_images import in_order, narrowed
 
 from speckle3d.core.errors import MismatchError
 from speckle3d.core.streams import TimedPoses
 from speckle3d.correction.fused import fuse
 from speckle3d.correction.scale import ScaleEvidence
-from speckle3d.simulation.movement import HandMotion
+from speckle3d.pipeline import track
 
 
-def path_mm(poses):
-    return float((poses[0].inv() * poses[-1]).apply(CENTRE_MM)[2])
+def fused(tracked, sweep, scale_sigma=0.03, **evidence):
+    turns, centre_mm = tracked.shared.turn_sigma_per_mm, sweep.grid.centre_mm
+    images = tracked.edges, tracked.image, 0.0, scale_sigma, 0.0
+    return fuse(*images, turns, centre_mm, sweep.frame_time_s, **evidence)
 
 
 def moved(tracker, shift_mm=0.0, factor=1.0):
@@ -23,61 +27,33 @@ def moved(tracker, shift_mm=0.0, factor=1.0):
     return replace(tracker, readings=readings)
 
 
-def test_evidence_of_the_scale_counts_by_its_information_against_the_images_claim():
-    made = scene(2, frames=16, length_mm=2.0, scale_sigma=0.05)
-    told = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))
-    found = fuse(*made.given(), evidence=[told])
-    # Variances of the mean scale before: common and changing parts; after: the evidence's own, nearly.
-    prior, own = 0.05**2 * (1.0 + 2.0 / 2.0), 0.01**2
-    assert found.log_scale == pytest.approx(0.04 * prior / (prior + own), abs=2e-3)
+def test_evidence_of_the_scale_counts_by_its_information_against_the_images_claim(sweep, tracked):
+    evidence = ScaleEvidence("crossing", np.array([0.04, 0.0, 0.0]), np.diag([1.0 / 0.01**2, 0.0, 0.0]))
+    found = fused(tracked, sweep, 0.02, evidence=[evidence])
+    # Variances before: of the common scale, and of its changes along the sweep between nothing and as much.
+    least, most = (0.04 * prior / (prior + 0.01**2) for prior in (0.02**2, 2 * 0.02**2))
+    assert least - 5e-4 < found.log_scale < most + 5e-4
     assert found.log_scale_sigma == pytest.approx(0.01, rel=0.2)
     assert found.used == ("images", "crossing")
 
 
-def test_a_loop_of_the_images_says_nothing_of_their_scale():
+def test_a_loop_of_the_images_says_nothing_of_their_scale(sweep, curves):
     # Edges between both visits once made shrinking cheap: every edge counts in the images' own millimetres.
-    made = scene(5, frames=40, length_mm=4.0, motion=HandMotion(reverse=True, pauses=0))
-    found = fuse(*made.given(), made.orientation)
+    loop = in_order(narrowed(sweep), [*range(32), *range(31, -1, -1)])
+    found = fused(track(loop, curves), loop)
     assert found.log_scale == pytest.approx(0.0, abs=1e-3)
-    assert found.log_scale_sigma > 0.8 * made.scale_sigma
+    assert found.log_scale_sigma > 0.8 * 0.03
 
 
-def test_a_tracker_much_too_far_from_the_images_is_not_averaged_with_them():
-    made = scene(3, frames=40, length_mm=4.0)
-    with pytest.raises(MismatchError, match=r"times as far: compare modes"):
-        fuse(*made.given(), tracker=moved(made.tracker, factor=1e-3))
+def test_a_tracker_much_too_far_from_the_images_is_not_averaged_with_them(sweep, tracked):
+    with pytest.raises(MismatchError):
+        fused(tracked, sweep, tracker=moved(sweep.tracker, factor=1e-3))
 
 
-LENGTHS = {"short": (60, 5.0), "long": (240, 20.0)}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", LENGTHS)
-def test_with_a_tracker_lengths_are_no_worse_than_the_better_of_both_and_their_claims_hold(case):
-    frames, length_mm = LENGTHS[case]
-    found = {"images": [], "tracker": [], "fused": []}
-    inside = []
-    for seed in range(100, 112):
-        made = scene(seed, frames=frames, length_mm=length_mm)
-        both = fuse(*made.given(), made.orientation, made.tracker)
-        sensed = made.tracker.world_from_image(made.time_s)
-        for name, poses in (("images", made.image), ("tracker", sensed), ("fused", both.poses)):
-            found[name].append(100 * (path_mm(poses) / path_mm(made.truth) - 1))
-        inside.append(np.abs(errors(both.poses, made.truth)) / np.sqrt(np.diag(both.covariance[-1])))
-    rms = {name: float(np.sqrt(np.mean(np.square(values)))) for name, values in found.items()}
-    assert rms["fused"] < 1.1 * min(rms["images"], rms["tracker"])
-    lengths = np.array(inside)[:, 2]
-    assert lengths.max() < 3.0
-    # Measured: 1.1 claims rms at 20 mm.
-    assert np.sqrt(np.mean(lengths**2)) < 1.5
-
-
-@pytest.mark.slow
-def test_outliers_of_a_tracker_move_the_poses_little():
-    made = scene(7, noise=0.7)
-    rng = np.random.default_rng(7)
-    many = len(made.tracker.readings.time_s)
+def test_outliers_of_a_tracker_move_the_poses_little(sweep, tracked):
+    rng, many = np.random.default_rng(7), len(sweep.tracker.readings)
     wild = np.where(rng.random((many, 1)) < 0.05, rng.choice([-3.0, 3.0], (many, 3)), 0.0)
-    clean = fuse(*made.given(), tracker=made.tracker)
-    spiked = fuse(*made.given(), tracker=moved(made.tracker, wild))
-    assert abs(path_mm(spiked.poses) - path_mm(clean.poses)) < np.sqrt(clean.covariance[-1, 2, 2])
+    clean, spiked = (fused(tracked, sweep, tracker=moved(sweep.tracker, shift)) for shift in (0.0, wild))
+    ends = [(each.poses[0].inv() * each.poses[-1]).apply(sweep.grid.centre_mm)[2] for each in (clean, spiked)]
+    # A tenth of the readings near the end are off by ten claimed deviations of it and more.
+    assert abs(ends[1] - ends[0]) < 2 * np.sqrt(clean.covariance[-1, 2, 2])

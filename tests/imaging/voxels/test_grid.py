@@ -1,28 +1,33 @@
 """Grids: as asked for to the last bit, around all images, and small."""
 
 import numpy as np
+from drifting import hand_sweep
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from posed_sweeps import GRID, KINDS, corners_in, sweep
 from scipy.spatial.transform import Rotation
 
+from speckle3d.core.grid import ImageGrid
 from speckle3d.imaging.axes import principal_axes, sweep_axes
 from speckle3d.imaging.voxels.grid import grid_around, spacing_within
+
+GRID = ImageGrid(
+    vectors=41, samples=60, vector_pitch_mm=0.5, sample_spacing_mm=0.4, first_sample_depth_mm=2.0
+)
 
 
 @settings(max_examples=8, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
-    kind=KINDS,
+    turns=st.integers(0, 2),
     spacing=st.tuples(*[st.floats(0.2, 3.0)] * 3),
     way=st.integers(0, 2),
 )
-def test_every_image_corner_is_within_the_grid(seed, kind, spacing, way):
-    passes, frames, turned = kind
-    poses, _ = sweep(np.random.default_rng(seed), frames, passes, turned)
+def test_every_image_corner_is_within_the_grid(seed, turns, spacing, way):
+    poses = hand_sweep(np.random.default_rng(seed), 20, 40.0, turns)
     axes = (None, sweep_axes(poses), principal_axes(GRID, poses))[way]
     voxels = grid_around(GRID, poses, spacing, axes)
-    index = corners_in(voxels, poses)
+    corners = np.concatenate([poses.apply(corner) for corner in GRID.corners_mm])
+    index = voxels.world_from_grid.inv().apply(corners) / voxels.spacing_mm
     # In the voxels, which reach half a voxel beyond their centres, and in no others.
     assert (index > -0.5).all()
     assert (index < np.array(voxels.shape) - 0.5 + 1e-5).all()
@@ -32,7 +37,7 @@ def test_every_image_corner_is_within_the_grid(seed, kind, spacing, way):
 
 def test_what_is_asked_for_is_had_to_the_last_bit():
     rng = np.random.default_rng(0)
-    poses, _ = sweep(rng, 3)
+    poses = hand_sweep(rng, 6, 40.0)
     spacing, origin, shape = (0.37, 1.1, 0.051), (-7.3, 123.456, 0.1), (30, 7, 1)
     for axes in (None, Rotation.random(rng=rng)):
         voxels = grid_around(GRID, poses, spacing, axes, origin_mm=origin, shape=shape)
@@ -49,7 +54,8 @@ def test_what_is_asked_for_is_had_to_the_last_bit():
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), gigabytes=st.floats(1e-7, 10.0))
 def test_the_spacing_within_a_memory_is_the_finest_round_one(seed, gigabytes):
-    poses, axes = sweep(np.random.default_rng(seed), 4)
+    poses = hand_sweep(np.random.default_rng(seed), 8, 40.0)
+    axes = sweep_axes(poses)
     found = spacing_within(GRID, poses, gigabytes, axes)
 
     def memory(spacing):
