@@ -21,7 +21,7 @@ import sweep_examples
 from options import parsed
 
 from speckle3d.core.sweep import stored_dtype
-from speckle3d.io.load import import_notes, load_sweep
+from speckle3d.io.load import load_sweep, open_recording
 from speckle3d.io.sweep_writer import GrowingSweep
 
 LONGEST_S = 0.6
@@ -65,7 +65,7 @@ def check(path, sweep, count):
     """Fail where what was left is not what was written."""
     read = load_sweep(path)
     assert len(read) >= count
-    assert import_notes(path), "nothing says that it was not closed"
+    assert open_recording(path).notes, "nothing says that it was not closed"
     for i in range(len(read)):
         np.testing.assert_array_equal(read.frames[i], frame(sweep, i))
     np.testing.assert_allclose(read.frame_time_s, 0.04 * np.arange(len(read)))
